@@ -1,0 +1,148 @@
+"""Frozen geometry values: optics, reconstruction grid, microlens lattice. Millimetres; arrays ordered (z, y, x)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+LAYOUTS = ("square", "hexagonal")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optics:
+    """Nominal optics of one plenoptic camera: what a data sheet says (Table 2 of the paper)."""
+
+    focal_length_mm: float
+    """Main lens focal length f [mm]."""
+    magnification: float
+    """Main lens magnification M; the sign (inverted image) does not matter here."""
+    f_number: float
+    """Main lens f-number N."""
+    microlens_pitch_mm: float
+    """Microlens pitch p_m [mm]."""
+    microlens_focal_length_mm: float
+    """Microlens focal length f_m [mm]; the sensor lies f_m behind the array."""
+    pixel_mm: float
+    """Pixel pitch [mm]."""
+    sensor_shape: tuple[int, int]
+    """Sensor size [pixel], order (rows, columns)."""
+    layout: str = "square"
+    """Microlens layout, "square" or "hexagonal"."""
+
+    @property
+    def object_distance_mm(self) -> float:
+        """Main lens to the focal plane, s_o = f (1 + 1/|M|) [mm]."""
+        return self.focal_length_mm * (1 + 1 / abs(self.magnification))
+
+    @property
+    def image_distance_mm(self) -> float:
+        """Main lens to the microlens array, s_i = f (1 + |M|) [mm]."""
+        return self.focal_length_mm * (1 + abs(self.magnification))
+
+    @property
+    def pupil_radius_mm(self) -> float:
+        """Radius of the main lens pupil, R = f / 2N [mm]."""
+        return self.focal_length_mm / (2 * self.f_number)
+
+    @property
+    def sensor_per_pupil(self) -> float:
+        """Image scale of the pupil behind a microlens, f_m / s_i (Eq. 9)."""
+        return self.microlens_focal_length_mm / self.image_distance_mm
+
+    @property
+    def pupil_pixel_mm(self) -> float:
+        """Width of one pixel projected on the pupil, pixel * s_i / f_m [mm]."""
+        return self.pixel_mm / self.sensor_per_pupil
+
+    @property
+    def microimage_pitch_px(self) -> float:
+        """Pitch of the microimages on the sensor, p_m (1 + f_m/s_i) / pixel [pixel]."""
+        return self.microlens_pitch_mm * (1 + self.sensor_per_pupil) / self.pixel_mm
+
+    def sensor_mm(self, position_px: np.ndarray) -> np.ndarray:
+        """Convert (column, row) positions [pixel, integer at a pixel's centre] to sensor millimetres.
+
+        The origin is the centre of the sensor; pixel i spans [i - n/2, i + 1 - n/2] * pixel.
+        """
+        rows, columns = self.sensor_shape
+        return (np.asarray(position_px, float) + 0.5 - np.array([columns, rows]) / 2) * self.pixel_mm
+
+    def sensor_px(self, position_mm: np.ndarray) -> np.ndarray:
+        """Inverse of `sensor_mm`: sensor millimetres to (column, row) [pixel, integer at a pixel's centre]."""
+        rows, columns = self.sensor_shape
+        return np.asarray(position_mm, float) / self.pixel_mm + np.array([columns, rows]) / 2 - 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Regular grid of cubic voxels."""
+
+    shape: tuple[int, int, int]
+    """Voxel counts, order (z, y, x)."""
+    voxel_mm: float
+    """Voxel edge [mm]."""
+    first_centre_mm: tuple[float, float, float]
+    """Centre of voxel (0, 0, 0) [mm], order (z, y, x)."""
+
+    @classmethod
+    def from_extent(
+        cls, *, centre_mm: tuple[float, float, float], size_mm: tuple[float, float, float], voxel_mm: float
+    ) -> Grid:
+        """Grid of n = round(size / voxel) voxels per axis around a centre; both in the order (x, y, z)."""
+        counts = [round(size / voxel_mm) for size in size_mm]
+        first = [centre - (n - 1) / 2 * voxel_mm for centre, n in zip(centre_mm, counts, strict=True)]
+        return cls(shape=tuple(counts[::-1]), voxel_mm=voxel_mm, first_centre_mm=tuple(first[::-1]))
+
+    @property
+    def size(self) -> int:
+        """Number of voxels."""
+        return math.prod(self.shape)
+
+    def axis_mm(self, axis: int) -> np.ndarray:
+        """Voxel centres along one axis (0: z, 1: y, 2: x) [mm]."""
+        return self.first_centre_mm[axis] + self.voxel_mm * np.arange(self.shape[axis])
+
+    def centres_mm(self) -> np.ndarray:
+        """All voxel centres in C order of (z, y, x), as (x, y, z) points [mm], shape (voxel, 3)."""
+        z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in range(3)), indexing="ij")
+        return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensLattice:
+    """The microlens array as a lattice in its own plane: lens (i, j) is centred at origin + i basis[0] + j basis[1].
+
+    A ray belongs to the lens whose centre is nearest.
+    """
+
+    origin_mm: tuple[float, float]
+    """Centre (s, t) of lens (0, 0) [mm], a lens near the sensor's centre."""
+    basis_mm: tuple[tuple[float, float], tuple[float, float]]
+    """Lattice vectors (s, t) to the neighbours (1, 0) and (0, 1) [mm]; 90 or 60 degrees apart."""
+    layout: str = "square"
+    """"square" or "hexagonal"."""
+
+    @property
+    def pitch_mm(self) -> float:
+        """Distance between neighbouring lenses, from the area of the lattice's cell [mm]."""
+        area = abs(np.linalg.det(np.asarray(self.basis_mm)))
+        return float(np.sqrt(area * (2 / np.sqrt(3) if self.layout == "hexagonal" else 1)))
+
+    def centres_mm(self, index: np.ndarray) -> np.ndarray:
+        """Lens centres (s, t) [mm] of lattice indices (i, j), shape (..., 2)."""
+        return np.asarray(self.origin_mm) + np.asarray(index, float) @ np.asarray(self.basis_mm)
+
+    def nearest(self, position_mm: np.ndarray) -> np.ndarray:
+        """Lattice index (i, j) of the lens nearest to each position (s, t) [mm], shape (..., 2)."""
+        offset = np.asarray(position_mm, float) - np.asarray(self.origin_mm)
+        guess = np.rint(offset @ np.linalg.inv(np.asarray(self.basis_mm)))
+        best, best_distance = guess.copy(), np.full(guess.shape[:-1], np.inf)
+        for i in (-1, 0, 1):
+            for j in (-1, 0, 1):
+                candidate = guess + (i, j)
+                distance = ((offset - candidate @ np.asarray(self.basis_mm)) ** 2).sum(-1)
+                closer = distance < best_distance - 1e-15
+                best[closer], best_distance[closer] = candidate[closer], distance[closer]
+        return best.astype(int)

@@ -1,0 +1,114 @@
+"""The only owner of Taichi's and Warp's global state: picks the device, starts both, runs Warp launches on threads.
+
+A second ``ti.init`` would kill every live Taichi field, so the runtime starts once per process.
+"""
+
+import logging
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+log = logging.getLogger(__name__)
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # Taichi prints a banner on import otherwise
+
+CHUNKS = 8
+"""Parts into which a CPU launch is cut. Fixed, so that results do not depend on the number of threads."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where kernels run."""
+
+    kind: str
+    """ "cpu" or "cuda"."""
+    threads: int
+    """Threads used by CPU launches."""
+    reason: str = ""
+    """Why this device was picked, where the request left a choice."""
+
+    @property
+    def warp(self) -> str:
+        """Warp's name of the device."""
+        return "cuda:0" if self.kind == "cuda" else "cpu"
+
+
+_device: Device | None = None
+_pool: ThreadPoolExecutor | None = None
+
+
+def start(request: str = "auto", *, threads: int | None = None) -> Device:
+    """Start the kernels' runtime once per process and return its device.
+
+    Parameters
+    ----------
+    request : {"auto", "cpu", "cuda"}
+        "auto" takes a CUDA device where there is one and says once why not; "cuda" never falls back.
+    threads : int, optional
+        CPU threads; default: the cores this process may use.
+
+    Raises
+    ------
+    ValueError
+        If `request` is none of the three.
+    RuntimeError
+        If "cuda" was requested and none is visible, or the runtime already runs on another device.
+    """
+    global _device, _pool
+    if request not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"device: expected 'auto', 'cpu' or 'cuda', got {request!r}.")
+    if _device is not None:
+        if request not in ("auto", _device.kind):
+            raise RuntimeError(
+                f"device: the runtime already runs on {_device.kind!r}; {request!r} needs a new process."
+            )
+        return _device
+
+    import warp as wp
+
+    wp.config.quiet = True
+    wp.init()
+    if request == "cuda" and not wp.is_cuda_available():
+        raise RuntimeError("device: 'cuda' was requested but none is visible; use 'auto' to allow the CPU.")
+    kind = "cuda" if request != "cpu" and wp.is_cuda_available() else "cpu"
+    reason = "no CUDA device visible" if request == "auto" and kind == "cpu" else ""
+    count = threads or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+
+    import taichi as ti
+
+    ti.init(
+        arch=ti.cuda if kind == "cuda" else ti.cpu,
+        cpu_max_num_threads=count,
+        log_level=ti.ERROR,
+        offline_cache=True,
+        fast_math=True,
+    )
+    _device = Device(kind, count, reason)
+    _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
+    if reason:
+        log.info("kernels run on the CPU (%d threads): %s", count, reason)
+    return _device
+
+
+def device() -> Device:
+    """Return the running device; starts it with "auto" where nothing ran yet."""
+    return _device or start("auto")
+
+
+def run_chunks(size: int, job: Callable[[int, int, int], None], *, chunks: int = CHUNKS) -> None:
+    """Call ``job(chunk, first, last)`` for contiguous parts of ``range(size)``: threaded on the CPU, once on CUDA.
+
+    A Warp launch on the CPU runs on one thread and releases the GIL, so Python threads scale. Jobs must write disjoint
+    memory. Exceptions of a job are raised here.
+    """
+    where = device()
+    if where.kind == "cuda":
+        job(0, 0, size)
+        return
+    edges = [size * part // chunks for part in range(chunks + 1)]
+    futures = [
+        _pool.submit(job, part, edges[part], edges[part + 1]) for part in range(chunks) if edges[part + 1] > edges[part]
+    ]
+    for future in futures:
+        future.result()
