@@ -1,0 +1,63 @@
+"""Multi-camera light-field particle image velocimetry: raw plenoptic images in, 3D velocity volumes out.
+
+Public names load their module on first use, so that importing the package starts no device and reads no heavy library.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+__version__ = "0.1.0"
+
+_MODULES = {
+    "Calibration": "lfpiv.calibration",
+    "Experiment": "lfpiv.experiment",
+    "Grid": "lfpiv.rig",
+    "InputError": "lfpiv.errors",
+    "LensArray": "lfpiv.lensarray",
+    "LensLattice": "lfpiv.rig",
+    "Optics": "lfpiv.rig",
+    "build_weights": "lfpiv.weights",
+    "calibrate": "lfpiv.calibration",
+    "correlate": "lfpiv.vectors",
+    "find_lens_array": "lfpiv.lensarray",
+    "load_calibration": "lfpiv.calibration",
+    "open_experiment": "lfpiv.experiment",
+    "reconstruct": "lfpiv.volume",
+    "run": "lfpiv.pipeline",
+    "thin_lens": "lfpiv.calibration",
+    "write_report": "lfpiv.report",
+}
+
+__all__ = [
+    "Calibration",
+    "Experiment",
+    "Grid",
+    "InputError",
+    "LensArray",
+    "LensLattice",
+    "Optics",
+    "build_weights",
+    "calibrate",
+    "correlate",
+    "find_lens_array",
+    "load_calibration",
+    "open_experiment",
+    "reconstruct",
+    "run",
+    "thin_lens",
+    "write_report",
+]
+
+
+def __getattr__(name: str):
+    """Load the module of a public name on first use."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

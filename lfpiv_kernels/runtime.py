@@ -3,6 +3,8 @@
 A second ``ti.init`` would kill every live Taichi field, so the runtime starts once per process.
 """
 
+import contextlib
+import io
 import logging
 import os
 from collections.abc import Callable
@@ -67,7 +69,7 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
 
     import warp as wp
 
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_ERROR  # no banner, no compilation notes on the user's terminal
     wp.init()
     if request == "cuda" and not wp.is_cuda_available():
         raise RuntimeError("device: 'cuda' was requested but none is visible; use 'auto' to allow the CPU.")
@@ -77,13 +79,14 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
 
     import taichi as ti
 
-    ti.init(
-        arch=ti.cuda if kind == "cuda" else ti.cpu,
-        cpu_max_num_threads=count,
-        log_level=ti.ERROR,
-        offline_cache=True,
-        fast_math=True,
-    )
+    with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that log_level does not silence
+        ti.init(
+            arch=ti.cuda if kind == "cuda" else ti.cpu,
+            cpu_max_num_threads=count,
+            log_level=ti.ERROR,
+            offline_cache=True,
+            fast_math=True,
+        )
     _device = Device(kind, count, reason)
     _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
     if reason:

@@ -1,0 +1,154 @@
+"""Calibration boards: the dots of one camera in all planes, named, and their rays labelled for the calibration."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfpiv.boardfind import DotBoard, find_dots
+from lfpiv.dotlabel import Labels, label_by_gaussian, label_by_integral
+from lfpiv.errors import InputError
+from lfpiv.lightfield import LightFieldDecoder
+from lfpiv.rig import Optics
+
+__all__ = ["ESTIMATORS", "BoardDots", "DotBoard", "measure_board"]
+
+log = logging.getLogger(__name__)
+
+ESTIMATORS = ("lens_integral", "gaussian")
+"""The integrated dot model on raw pixels, and the paper's Gaussian fit in sub-aperture views."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BoardDots:
+    """Labelled rays of the dots of one camera, for the calibration, and the dots themselves, for the report.
+
+    Dot numbers count over all planes: plane * (nx ny) + row * nx + column.
+    """
+
+    points_mm: np.ndarray
+    """Board position (x, y, z) of each label's dot [mm], shape (n, 3)."""
+    pupil_mm: np.ndarray
+    """Pupil point (u, v) of each label [mm], shape (n, 2)."""
+    array_mm: np.ndarray
+    """Where that ray meets the microlens array, (s, t) [mm], shape (n, 2)."""
+    std_mm: np.ndarray
+    """Standard error of a label, per coordinate [mm], shape (n,)."""
+    dot: np.ndarray
+    """Number of each label's dot, shape (n,)."""
+    found: np.ndarray
+    """Dots measured in each plane, shape (plane,)."""
+    expected: np.ndarray
+    """Dots of each plane in the camera's field, shape (plane,)."""
+    rejected: np.ndarray
+    """Dots of each plane that were seen but not trusted, shape (plane,)."""
+    rejected_dot: np.ndarray
+    """Numbers of the dots that were seen but not trusted, shape (r,)."""
+    measured_dot: np.ndarray
+    """Numbers of the measured dots, shape (d,)."""
+    chief_mm: np.ndarray
+    """Where their rays through the pupil's centre meet the array [mm], shape (d, 2)."""
+    slope: np.ndarray
+    """Their slopes d(s, t)/d(u, v), shape (d, 2, 2)."""
+    reduced_chi2: np.ndarray
+    """Quality of their fits, about 1; nan for the Gaussian estimator, shape (d,)."""
+    response_share: float
+    """Part of the white image's scatter from pixel to pixel that is pixel response, the rest being its noise; see
+    `LightFieldDecoder.shrunk_gain`. nan for the Gaussian estimator."""
+
+    def outlines_px(self, optics: Optics, points: int = 48) -> np.ndarray:
+        """Outline of each measured dot's light on the sensor as (column, row) [pixel], shape (d, points, 2)."""
+        angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
+        rim = optics.pupil_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        on_array = self.chief_mm[:, None] + np.einsum("dab,pb->dpa", self.slope, rim)
+        return optics.sensor_px(on_array + (on_array - rim) * optics.sensor_per_pupil)
+
+
+def measure_board(
+    images: Sequence[np.ndarray],
+    decoder: LightFieldDecoder,
+    board: DotBoard,
+    *,
+    nominal_angle_deg: float,
+    estimator: str = "lens_integral",
+) -> BoardDots:
+    """Find, name and label the dots of one camera in all planes of its board.
+
+    Parameters
+    ----------
+    images : sequence of ndarray, shape (rows, columns)
+        Raw image of each plane [counts]; dots brighter or darker than the board.
+    decoder : LightFieldDecoder
+        The camera's decoder.
+    board : DotBoard
+        The board and the depths of its planes.
+    nominal_angle_deg : float
+        Planned camera angle alpha (Eqs. 1-3) [degree], right to about 10 degrees.
+    estimator : {"lens_integral", "gaussian"}
+        "lens_integral" fits each dot to all its raw pixels, integrated over the microlenses. "gaussian" fits a Gaussian
+        to the few lenses around the dot in each sub-aperture view (section 3.1 (2) of the paper), which is biased
+        towards the lens centres because a dot is hardly wider than a lens.
+
+    Raises
+    ------
+    InputError
+        If the images do not match the board or the camera, or no plane shows the board's dots.
+    ValueError
+        If `estimator` is unknown.
+    """
+    if estimator not in ESTIMATORS:
+        raise ValueError(f"estimator: expected one of {', '.join(map(repr, ESTIMATORS))}, got {estimator!r}.")
+    if len(images) != len(board.planes_mm):
+        raise InputError(f"images: expected one per plane, {len(board.planes_mm)}, got {len(images)}.")
+    signals = _Signals(images, decoder)
+    detection = find_dots(signals, decoder, board, nominal_angle_deg)
+    if estimator == "gaussian":
+        labels = label_by_gaussian(signals, decoder, board, detection)
+    else:
+        labels = label_by_integral(signals, signals.noise, decoder, board, detection)
+    return _collect(labels, board, detection.in_field)
+
+
+class _Signals(Sequence):
+    """The planes' images above their dark levels; only the last one asked for is kept as float."""
+
+    def __init__(self, images: Sequence[np.ndarray], decoder: LightFieldDecoder):
+        self._images, self._last = images, (-1, None)
+        levels = []
+        for plane, image in enumerate(images):
+            if np.shape(image) != tuple(decoder.optics.sensor_shape):
+                raise InputError(
+                    f"plane {plane} of the board: expected an image of shape {tuple(decoder.optics.sensor_shape)}, "
+                    f"got {np.shape(image)}."
+                )
+            levels.append(decoder.background(image))
+        self._levels = [level for level, _ in levels]
+        self.noise = float(np.median([sigma for _, sigma in levels]))
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, plane: int) -> np.ndarray:
+        if plane != self._last[0]:
+            signal = np.asarray(self._images[plane], np.float32) - np.float32(self._levels[plane])
+            self._last = plane, signal
+        return self._last[1]
+
+
+def _collect(labels: Labels, board: DotBoard, in_field: np.ndarray) -> BoardDots:
+    planes = len(board.planes_mm)
+    found = np.bincount(labels.measured_dot // board.size, minlength=planes)
+    visible = in_field.copy()
+    visible.ravel()[labels.measured_dot] = True
+    dots = BoardDots(
+        points_mm=board.of_dots_mm(labels.dot),
+        found=found,
+        expected=visible.sum(1),
+        rejected=np.bincount(labels.rejected_dot // board.size, minlength=planes),
+        **vars(labels),
+    )
+    log.info("board: %d of %d dots measured, %d rejected", found.sum(), dots.expected.sum(), dots.rejected.sum())
+    return dots

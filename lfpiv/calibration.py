@@ -1,0 +1,409 @@
+"""`calibrate`: white images and board images -> the mapping of every camera, with what is known of its quality."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lfpiv.board import BoardDots, DotBoard, measure_board
+from lfpiv.errors import InputError
+from lfpiv.experiment import CameraSetup, Experiment
+from lfpiv.lensarray import find_lens_array
+from lfpiv.lightfield import LightFieldDecoder
+from lfpiv.network import Network, train
+from lfpiv.rig import Grid, LensLattice, Optics
+from lfpiv.thinlens import ThinLensModel, fit_thin_lens, thin_lens_model
+from lfpiv_kernels import mapping
+
+log = logging.getLogger(__name__)
+
+SCHEMA_VERSION = 1
+OUTLIER = 6.0
+"""A dot whose labels miss the fitted mapping by this many robust standard deviations is left out."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibratedCamera:
+    """One camera: its microlens array, its light-field decoder, and the mapping of its rays."""
+
+    name: str
+    optics: Optics
+    lattice: LensLattice
+    decoder: LightFieldDecoder
+    """Pupil points, coverage, gain and background of the sensor's pixels."""
+    network: Network | None = None
+    """BP-NN of Eqs. 6-7, (x, y, z, u, v) -> (s, t) [mm], or its correction to `baseline`; None for DRT."""
+    baseline: ThinLensModel | None = None
+    """Thin lens under the network, or None."""
+    region_mm: np.ndarray | None = None
+    """Corners (x, y, z) of the box that the board's dots spanned [mm], shape (2, 3); None for DRT."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """Figures of quality, JSON-able: sigma_nor_test, dots_found, dots_expected, lens_array_rms_px, ..."""
+    dots: BoardDots | None = None
+    """The labels the network was trained on."""
+    test_errors: np.ndarray | None = None
+    """Error of each held-out label [microlens pitch], shape (n,)."""
+
+    @property
+    def gain(self) -> np.ndarray:
+        """White-image gain of every pixel, shape (rows, columns), float32."""
+        return self.decoder.gain
+
+    def map(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+        """Trace rays to the microlens array (Eqs. 6-7).
+
+        Parameters
+        ----------
+        points_mm : array_like, shape (n, 3)
+            Object points (x, y, z) [mm].
+        pupil_mm : array_like, shape (n, 2)
+            Where the rays cross the main lens pupil, (u, v) [mm].
+
+        Returns
+        -------
+        ndarray, shape (n, 2), float64
+            Where they meet the microlens array, (s, t) [mm].
+
+        Raises
+        ------
+        ValueError
+            If the shapes are not (n, 3) and (n, 2).
+        """
+        points, pupil = np.asarray(points_mm, float), np.asarray(pupil_mm, float)
+        if points.ndim != 2 or points.shape[1] != 3 or pupil.shape != (len(points), 2):
+            raise ValueError(
+                f"points_mm, pupil_mm: expected shapes (n, 3) and (n, 2), got {points.shape} and {pupil.shape}."
+            )
+        rays = 0.0 if self.baseline is None else self.baseline(points, pupil)
+        return rays if self.network is None else rays + self.network(np.hstack([points, pupil]))
+
+    def map_fast(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+        """`map` in single precision, the network on the running device; for many rays."""
+        if self.network is None:
+            return self.map(points_mm, pupil_mm).astype(np.float32)
+        rays = mapping.evaluate(
+            self.network.to_arrays(), np.ascontiguousarray(np.hstack([points_mm, pupil_mm]), np.float32)
+        )
+        return rays if self.baseline is None else rays + self.baseline(points_mm, pupil_mm).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The calibrated cameras of a rig. Made by `calibrate`, `load_calibration` or `thin_lens`."""
+
+    cameras: dict[str, CalibratedCamera]
+    """Camera name -> camera."""
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration to an HDF5 file, overwriting it."""
+        with h5py.File(path, "w") as file:
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            file.attrs["cameras"] = list(self.cameras)
+            for name, camera in self.cameras.items():
+                _write_camera(file.create_group(f"camera/{name}"), camera)
+
+
+def calibrate(experiment: Experiment, progress: Progress | None = None) -> Calibration:
+    """Calibrate every camera of an experiment from its white and board images (section 3.1 of the paper).
+
+    No camera angle enters the mapping; the nominal one only names the board's dots.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        From `open_experiment`.
+    progress : callable, optional
+        Called with the finished fraction.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        If a white image shows no microlens array or the board's dots cannot be found; names camera and file.
+    """
+    cameras = {}
+    for number, setup in enumerate(experiment.cameras):
+
+        def step(fraction, number=number):
+            if progress is not None:
+                progress((number + fraction) / len(experiment.cameras))
+
+        cameras[setup.name] = _calibrate_camera(experiment, setup, step)
+    return Calibration(cameras)
+
+
+def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibration:
+    """Calibration by direct ray tracing (DRT): the ideal thin lens of section 2.1 at the nominal camera angles.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        From `open_experiment`; its white images give the microlens arrays.
+    angle_error_deg : float
+        Error added to the magnitude of every camera's angle [degree], Eqs. 11-12.
+    """
+    cameras = {}
+    for setup in experiment.cameras:
+        lattice, decoder, report = _decode(experiment, setup)
+        angle = setup.nominal_angle_deg
+        cameras[setup.name] = CalibratedCamera(
+            name=setup.name,
+            optics=setup.optics,
+            lattice=lattice,
+            decoder=decoder,
+            baseline=thin_lens_model(setup.optics, angle + np.copysign(angle_error_deg, angle) if angle else angle_error_deg),
+            report=report,
+        )
+    return Calibration(cameras)
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a calibration that `Calibration.save` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or of another schema version.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            version = file.attrs.get("schema_version")
+            if version != SCHEMA_VERSION:
+                raise InputError(
+                    f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {version}; calibrate anew."
+                )
+            return Calibration({name: _read_camera(file[f"camera/{name}"], name) for name in file.attrs["cameras"]})
+    except (OSError, KeyError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: expected a calibration file, could not read it ({error}); calibrate anew.") from None
+
+
+def outside_region(camera: CalibratedCamera, grid: Grid) -> tuple[float, float]:
+    """Fraction of a grid's voxels outside the calibrated region, and the largest distance from it [mm].
+
+    The region is the box that the board's dots spanned, widened by half a voxel.
+    """
+    if camera.region_mm is None:
+        return 0.0, 0.0
+    inside, distance = 1.0, 0.0
+    for axis in range(3):
+        centres = grid.axis_mm(2 - axis)
+        low, high = camera.region_mm[:, axis]
+        over = np.maximum(np.maximum(low - centres, centres - high) - grid.voxel_mm / 2, 0.0)
+        inside *= float((over <= 1e-9).mean())
+        distance = float(np.hypot(distance, over.max()))
+    return 1.0 - inside, distance
+
+
+def _decode(experiment: Experiment, setup: CameraSetup) -> tuple[LensLattice, LightFieldDecoder, dict[str, Any]]:
+    white, dark = experiment.white(setup.name), experiment.dark(setup.name)
+    optics = setup.optics
+    try:
+        array = find_lens_array(white, dark, nominal_pitch_px=optics.microimage_pitch_px, layout=optics.layout)
+        lattice = array.lattice(optics)
+        decoder = LightFieldDecoder.from_white(optics, lattice, white, dark)
+    except ValueError as error:
+        raise InputError(f"{setup.white_path}: white_image of camera {setup.name!r}: {error}") from None
+    report = {
+        "lens_array_rms_px": float(array.rms_px),
+        "lens_array_pitch_px": float(array.pitch_px),
+        "lens_array_rotation_deg": float(array.rotation_deg),
+        "lenses": len(array.centres_px),
+        "warnings": [],
+    }
+    return lattice, decoder, report
+
+
+def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress) -> CalibratedCamera:
+    lattice, decoder, report = _decode(experiment, setup)
+    step(0.15)
+    dark = experiment.dark(setup.name)
+    images = [experiment.board_image(setup.name, plane) for plane in range(len(experiment.board.planes_mm))]
+    if dark is not None:
+        images = [image - dark for image in images]
+    step(0.2)
+    board, settings = experiment.board, experiment.network
+    try:
+        dots = measure_board(
+            images,
+            decoder,
+            DotBoard(
+                dots=tuple(board.dots),
+                spacing_mm=board.spacing_mm,
+                diameter_mm=board.dot_diameter_mm,
+                planes_mm=tuple(board.planes_mm),
+            ),
+            nominal_angle_deg=setup.nominal_angle_deg,
+            estimator=settings.estimator,
+        )
+    except ValueError as error:
+        raise InputError(f"{experiment.path}: board.images of camera {setup.name!r}: {error}") from None
+    step(0.75)
+
+    points, pupil, array = dots.points_mm, dots.pupil_mm, dots.array_mm
+    fitted = fit_thin_lens(points, pupil, array, setup.optics)
+    keep = _agreeing_dots(dots, np.linalg.norm(fitted(points, pupil) - array, axis=1))
+    baseline = fitted if settings.baseline == "thin_lens" else None
+    target = array if baseline is None else array - baseline(points, pupil)
+    pitch = lattice.pitch_mm
+    try:
+        training = train(
+            np.hstack([points, pupil])[keep],
+            target[keep],
+            hidden=settings.hidden,
+            epochs=settings.epochs,
+            groups=dots.dot[keep],
+            std=dots.std_mm[keep],
+            seed=settings.seed,
+            unit=pitch,
+        )
+    except ValueError as error:
+        raise InputError(f"{experiment.path}: [network], camera {setup.name!r}: {error}") from None
+    step(0.95)
+    found, expected = int(dots.found.sum()), int(dots.expected.sum())
+    report |= {
+        "sigma_nor_test": training.sigma_nor,
+        "dots_found": found,
+        "dots_expected": expected,
+        "dots_found_per_plane": dots.found.tolist(),
+        "dots_expected_per_plane": dots.expected.tolist(),
+        "dots_rejected": int(dots.rejected.sum()) + len(np.unique(dots.dot[~keep])),
+        "labels": int(keep.sum()),
+        "epochs": training.epochs,
+        "stop": training.stop.value,
+        "training_s": training.seconds,
+    }
+    camera = CalibratedCamera(
+        name=setup.name,
+        optics=setup.optics,
+        lattice=lattice,
+        decoder=decoder,
+        network=training.network,
+        baseline=baseline,
+        region_mm=np.stack([points[keep].min(0), points[keep].max(0)]),
+        report=report,
+        dots=dots,
+        test_errors=training.test_errors,
+    )
+    _warn(camera, experiment)
+    log.info("%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots", setup.name, found, expected, training.sigma_nor)
+    step(1.0)
+    return camera
+
+
+def _agreeing_dots(dots: BoardDots, distance: np.ndarray) -> np.ndarray:
+    """Labels of the dots that agree with a smooth mapping: bool, shape (n,).
+
+    `distance` is each label's distance from a fitted thin lens; real optics depart from that smoothly, so a dot is
+    compared with the typical departure, not with zero.
+    """
+    number, inverse = np.unique(dots.dot, return_inverse=True)
+    mean = np.bincount(inverse, weights=distance) / np.bincount(inverse)
+    typical = np.median(mean)
+    spread = 1.4826 * np.median(np.abs(mean - typical)) + 1e-12
+    bad = mean > typical + OUTLIER * spread + 0.1 * typical
+    if bad.any():
+        log.info("%d dots disagree with the others and are left out: %s", bad.sum(), number[bad].tolist())
+    return ~bad[inverse]
+
+
+def _warn(camera: CalibratedCamera, experiment: Experiment) -> None:
+    """Put what a user must know into the report's warnings, and log it."""
+    report, warnings = camera.report, camera.report["warnings"]
+    outside, distance = outside_region(camera, experiment.grid)
+    report["volume_outside_calibration"] = outside
+    if outside > 0:
+        low, high = camera.region_mm
+        box = ", ".join(f"{name} {a:g} to {b:g}" for name, a, b in zip("xyz", low, high, strict=True))
+        warnings.append(
+            f"{camera.name}: {100 * outside:.0f} % of the volume lies outside the calibrated region ({box} mm), by up to "
+            f"{distance:.2f} mm. A network extrapolates badly: shrink the volume, use a larger board or more planes, or "
+            'set network.baseline = "thin_lens".'
+        )
+    if report["dots_found"] < 0.9 * report["dots_expected"]:
+        warnings.append(
+            f"{camera.name}: only {report['dots_found']} of {report['dots_expected']} board dots in the field were found; "
+            "check focus, exposure and the planes listed in the report."
+        )
+    if report["lens_array_rms_px"] > 0.25:
+        warnings.append(
+            f"{camera.name}: microimages lie {report['lens_array_rms_px']:.2f} px (rms) off a regular lattice; check the "
+            "white image."
+        )
+    for text in warnings:
+        log.warning("%s", text)
+
+
+def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:
+    for name, value in vars(camera.optics).items():
+        group.attrs[f"optics.{name}"] = value
+    for name, value in vars(camera.lattice).items():
+        group.attrs[f"lattice.{name}"] = value
+    group.attrs["report"] = json.dumps(camera.report)
+    if camera.region_mm is not None:
+        group["region_mm"] = camera.region_mm
+    if camera.test_errors is not None:
+        group["test_errors"] = camera.test_errors
+    for label, part in (("decoder", camera.decoder), ("dots", camera.dots)):
+        if part is not None:
+            for item in fields(part):
+                value = getattr(part, item.name)
+                if isinstance(value, np.ndarray):
+                    group.create_dataset(f"{label}/{item.name}", data=value, compression="gzip", compression_opts=1)
+                elif isinstance(value, int | float):
+                    group.require_group(label).attrs[item.name] = value
+    if camera.network is not None:
+        for name, value in camera.network.to_arrays().items():
+            group[f"network/{name}"] = value
+    if camera.baseline is not None:
+        for name, value in camera.baseline.to_arrays().items():
+            group[f"baseline/{name}"] = value
+
+
+def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
+    def values(prefix):
+        found = {}
+        for key, value in group.attrs.items():
+            if key.startswith(prefix):
+                found[key[len(prefix) :]] = value.item() if isinstance(value, np.generic) else value
+        return found
+
+    optics = values("optics.")
+    optics["sensor_shape"] = tuple(int(n) for n in optics["sensor_shape"])
+    lattice = values("lattice.")
+    lattice["origin_mm"] = tuple(float(x) for x in lattice["origin_mm"])
+    lattice["basis_mm"] = tuple(tuple(float(x) for x in row) for row in lattice["basis_mm"])
+    optics, lattice = Optics(**optics), LensLattice(**lattice)
+
+    def arrays(label):
+        part = group[label]
+        return {key: value[()] for key, value in part.items()} | {
+            key: value.item() for key, value in part.attrs.items()
+        }
+
+    return CalibratedCamera(
+        name=name,
+        optics=optics,
+        lattice=lattice,
+        decoder=LightFieldDecoder(optics=optics, lattice=lattice, **arrays("decoder")),
+        network=Network.from_arrays(arrays("network")) if "network" in group else None,
+        baseline=ThinLensModel.from_arrays(arrays("baseline")) if "baseline" in group else None,
+        region_mm=group["region_mm"][()] if "region_mm" in group else None,
+        report=json.loads(group.attrs["report"]),
+        dots=BoardDots(**arrays("dots")) if "dots" in group else None,
+        test_errors=group["test_errors"][()] if "test_errors" in group else None,
+    )
+

@@ -1,0 +1,280 @@
+"""Files of a run: one writer, reader and validator of vectors and volumes. A finished name is the resume marker."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+import lfpiv
+from lfpiv.errors import InputError
+
+SCHEMA_VERSION = 1
+"""Version of the form of the files; readers refuse newer ones."""
+
+VECTOR_UNITS = {
+    "u": "m/s",
+    "v": "m/s",
+    "w": "m/s",
+    "displacement_x": "voxel",
+    "displacement_y": "voxel",
+    "displacement_z": "voxel",
+    "valid": "1",
+    "peak_ratio": "1",
+    "uncertainty": "voxel",
+}
+"""Variables of a vector dataset and their units."""
+
+_AXES = ("z", "y", "x")
+_RECONSTRUCTION = "reconstruction"  # NetCDF group beside the vectors: projections and residuals of the two volumes
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a scratch path in the folder of `path`; renamed to `path` at the end, removed on any failure."""
+    scratch = path.with_name(f".{path.name}.tmp")
+    try:
+        yield scratch
+        os.replace(scratch, path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def write_text(text: str, path: Path) -> None:
+    """Write a text file, whole or not at all."""
+    with replacing(path) as scratch:
+        scratch.write_text(text, "utf-8")
+
+
+def write_json(value: Any, path: Path) -> None:
+    """Write a JSON file, whole or not at all; NaN and infinity become null."""
+    write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n", path)
+
+
+def plain(value: Any) -> Any:
+    """Turn arrays, NumPy numbers, tuples and non-finite numbers into what JSON knows."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def settings_hash(**parts: Any) -> str:
+    """Short hash of everything a result depends on; the order of keys does not matter."""
+    text = json.dumps(plain(parts), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def content_hash(paths: Iterable[Path]) -> str:
+    """Hash of the bytes of several files, in order."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in paths:
+        with path.open("rb") as file:
+            for block in iter(lambda file=file: file.read(1 << 20), b""):
+                digest.update(block)
+        digest.update(b"end of file")
+    return digest.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package, of Python and of the libraries its numbers depend on."""
+    names = ("numpy", "scipy", "taichi", "warp-lang", "xarray", "opencv-python-headless", "scikit-learn")
+    found = {"lfpiv": lfpiv.__version__, "python": platform.python_version()}
+    for name in names:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
+
+
+def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
+    """Condense the volumes of a pair to what a report shows: maximum projections and the residual history.
+
+    Parameters
+    ----------
+    volumes : dict
+        Frame name -> volume (z, y, x) with ``residual`` (one number per iteration) and ``stop`` in its attributes.
+
+    Returns
+    -------
+    Dataset
+        ``projection_z`` (frame, y, x), ``projection_y`` (frame, z, x), ``projection_x`` (frame, z, y) [counts],
+        ``residual`` (frame, iteration) and ``stop`` (frame).
+    """
+    frames = list(volumes)
+    first = volumes[frames[0]]
+    variables = {}
+    for axis in _AXES:
+        kept = tuple(name for name in _AXES if name != axis)
+        stack = np.stack([volume.max(axis).transpose(*kept).values for volume in volumes.values()])
+        variables[f"projection_{axis}"] = (("frame", *kept), stack.astype(np.float32))
+    histories = [np.atleast_1d(np.asarray(volume.attrs["residual"], float)) for volume in volumes.values()]
+    residual = np.full((len(frames), max(map(len, histories))), np.nan)
+    for row, history in zip(residual, histories, strict=True):
+        row[: len(history)] = history
+    variables["residual"] = (("frame", "iteration"), residual)
+    variables["stop"] = (("frame",), [str(volume.attrs["stop"]) for volume in volumes.values()])
+    coordinates = {"frame": frames} | {axis: (axis, first[axis].values, {"units": "mm"}) for axis in _AXES}
+    return xr.Dataset(variables, coordinates)
+
+
+def check_vectors(vectors: xr.Dataset) -> None:
+    """Check the form of a vector dataset.
+
+    Raises
+    ------
+    ValueError
+        If a variable, a coordinate or a unit is missing or wrong, or u, v, w do not follow from the displacements.
+    """
+    for axis in _AXES:
+        if axis not in vectors.coords or vectors[axis].dims != (axis,):
+            raise ValueError(f"vectors: expected the coordinate {axis} in mm, found {list(vectors.coords)}.")
+    for name, unit in VECTOR_UNITS.items():
+        if name not in vectors:
+            raise ValueError(f"vectors: expected the variable {name!r}, found {list(vectors.data_vars)}.")
+        if vectors[name].dims[-3:] != _AXES:
+            raise ValueError(f"vectors: expected {name!r} over (z, y, x), found {vectors[name].dims}.")
+        if vectors[name].attrs.get("units", "1") != unit:
+            raise ValueError(f"vectors: expected {name!r} in {unit}, found {vectors[name].attrs.get('units')}.")
+    if vectors["valid"].dtype != bool:
+        raise ValueError(f"vectors: expected 'valid' to be boolean, found {vectors['valid'].dtype}.")
+    if not vectors.attrs.get("dt_s", 0) > 0:
+        raise ValueError(f"vectors: expected the attribute dt_s > 0, found {vectors.attrs.get('dt_s')}.")
+
+
+def write_vectors(
+    vectors: xr.Dataset, path: Path, *, attributes: Mapping[str, Any], reconstruction: xr.Dataset | None = None
+) -> None:
+    """Write the vectors of one pair as NetCDF4, whole or not at all.
+
+    Parameters
+    ----------
+    vectors : Dataset
+        Dims z, y, x [mm]; the variables of `VECTOR_UNITS`.
+    path : Path
+        Target; an existing file is replaced.
+    attributes : dict
+        Added to the dataset's attributes: settings, their hash, seconds.
+    reconstruction : Dataset, optional
+        From `build_reconstruction`; stored as the group "reconstruction".
+
+    Raises
+    ------
+    ValueError
+        If the dataset does not have the form `check_vectors` asks for.
+    """
+    check_vectors(vectors)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as scratch:
+        _write(vectors, scratch, {**attributes, "versions": versions()}, mode="w")
+        if reconstruction is not None:
+            _write(reconstruction, scratch, {}, mode="a", group=_RECONSTRUCTION)
+
+
+def read_vectors(path: Path) -> xr.Dataset:
+    """Read the vectors of one pair into memory.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, unreadable, of a newer schema, or no vector dataset.
+    """
+    vectors = _read(path, None)
+    try:
+        check_vectors(vectors)
+    except ValueError as error:
+        raise InputError(f"{path}: {error} Remove the file and run again.") from None
+    return vectors
+
+
+def read_reconstruction(path: Path) -> xr.Dataset | None:
+    """Read the projections and residuals stored beside the vectors of a pair; None where there are none."""
+    try:
+        return _read(path, _RECONSTRUCTION)
+    except InputError:
+        return None
+
+
+def write_volume(volume: xr.DataArray, path: Path, *, attributes: Mapping[str, Any]) -> None:
+    """Write one volume (z, y, x) [counts] as NetCDF4, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as scratch:
+        _write(volume.rename("intensity").to_dataset(), scratch, {**attributes, "versions": versions()}, mode="w")
+
+
+def read_volume(path: Path) -> xr.DataArray:
+    """Read one volume into memory; raises InputError as `read_vectors` does."""
+    dataset = _read(path, None)
+    if "intensity" not in dataset or dataset["intensity"].dims != _AXES:
+        raise InputError(f"{path}: expected a volume 'intensity' over (z, y, x), found {list(dataset.data_vars)}.")
+    return dataset["intensity"]
+
+
+def stored_hash(path: Path) -> str | None:
+    """Return the settings hash in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            return str(file.attrs["settings_hash"])
+    except (OSError, KeyError):
+        return None
+
+
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Read the attributes of a finished NetCDF or HDF5 file."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        found = dict(file.attrs)
+    return {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in found.items()}
+
+
+def _write(dataset: xr.Dataset, path: Path, attributes: Mapping[str, Any], **where: Any) -> None:
+    dataset = dataset.copy()
+    dataset.attrs = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
+    for item in (dataset, *dataset.variables.values()):
+        item.attrs = {key: _attribute(value) for key, value in item.attrs.items()}
+    packed = {"zlib": True, "complevel": 1, "shuffle": True}
+    encoding = {
+        name: packed for name, item in dataset.data_vars.items() if item.ndim >= 2 and item.dtype.kind in "fiub"
+    }
+    dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding, **where)
+
+
+def _attribute(value: Any) -> Any:
+    """Put a value into the form of a NetCDF attribute: numbers and text as they are, all else as JSON."""
+    if isinstance(value, (str, int, float, np.number)) and not isinstance(value, bool):
+        return value
+    if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiu":
+        return value
+    return json.dumps(plain(value))
+
+
+def _read(path: Path, group: str | None) -> xr.Dataset:
+    if not path.is_file():
+        raise InputError(f"{path}: expected a NetCDF file of a run, found no such file. Run the step that writes it.")
+    try:
+        dataset = xr.load_dataset(path, engine="h5netcdf", group=group)
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: expected a NetCDF4 file, found {error}. Remove it and run again.") from None
+    version = dataset.attrs.get("schema_version", 0)
+    if not 1 <= version <= SCHEMA_VERSION:
+        raise InputError(f"{path}: expected schema version 1 to {SCHEMA_VERSION}, found {version}. Update lfpiv.")
+    return dataset

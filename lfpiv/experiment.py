@@ -1,0 +1,371 @@
+"""The experiment file: TOML to a frozen value, everything it names checked before any work."""
+
+from __future__ import annotations
+
+import math
+import string
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from lfpiv import images
+from lfpiv.errors import InputError
+from lfpiv.rig import Grid, Optics
+from lfpiv.settings import SMALLEST_WINDOW, Compute, Correlation, Count, Network, Number, Positive, Smart, Table
+from lfpiv.toml import read_toml
+
+DECODED_PIXELS = 100_000_000
+"""Particle images decoded before the work starts [pixel], in order; the others are checked by header and length."""
+
+FEWEST_LENSES = 3
+"""Microlenses a sensor must hold along each axis; fewer are a slip in the pitch or the pixel."""
+
+
+class CameraTable(Table):
+    """Table ``[[camera]]``: nominal optics and images of one camera."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    white_image: Annotated[str, Field(min_length=1)]
+    dark_image: Annotated[str, Field(min_length=1)] | None = None
+    image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
+    focal_length_mm: Positive
+    magnification: Number
+    f_number: Positive
+    microlens_pitch_mm: Positive
+    microlens_focal_length_mm: Positive
+    pixel_um: Positive
+    microlens_layout: Literal["square", "hexagonal"] = "square"
+    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
+
+    @field_validator("magnification")
+    @classmethod
+    def _not_zero(cls, value: float) -> float:
+        if value == 0:
+            raise ValueError("a number other than 0")
+        return value
+
+
+class Board(Table):
+    """Table ``[board]``: the dot board and the depths it was recorded at."""
+
+    dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
+    """Dots along x and y."""
+    spacing_mm: Positive
+    """Distance of neighbouring dots [mm]."""
+    dot_diameter_mm: Positive
+    """Diameter of a dot [mm]."""
+    planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
+    """Depth z of each plane [mm]."""
+    images: Annotated[str, Field(min_length=1)]
+    """Path with ``{camera}`` and ``{plane}``, planes counted from 0."""
+
+    @field_validator("planes_mm")
+    @classmethod
+    def _distinct(cls, planes: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(planes)) != len(planes):
+            raise ValueError("a different depth for each plane")
+        return planes
+
+    @model_validator(mode="after")
+    def _dots_apart(self) -> Board:
+        if self.dot_diameter_mm >= self.spacing_mm:
+            raise ValueError("dot_diameter_mm smaller than spacing_mm")
+        return self
+
+
+class Volume(Table):
+    """Table ``[volume]``: the grid to reconstruct on; (x, y, z) order."""
+
+    centre_mm: tuple[Number, Number, Number]
+    size_mm: tuple[Positive, Positive, Positive]
+    voxel_mm: Positive
+
+
+class Particles(Table):
+    """Table ``[particles]``: the image pairs."""
+
+    images: Annotated[str, Field(min_length=1)]
+    """Path with ``{camera}``, ``{pair}`` and ``{frame}``, pairs counted from 0."""
+    pairs: Count
+    frames: tuple[Annotated[str, Field(min_length=1)], Annotated[str, Field(min_length=1)]] = ("a", "b")
+
+    @field_validator("frames")
+    @classmethod
+    def _differ(cls, frames: tuple[str, str]) -> tuple[str, str]:
+        if frames[0] == frames[1]:
+            raise ValueError("two different frame names")
+        return frames
+
+
+class ExperimentTable(Table):
+    """The whole file."""
+
+    name: Annotated[str, Field(min_length=1)]
+    dt_s: Positive
+    camera: Annotated[tuple[CameraTable, ...], Field(min_length=1)]
+    board: Board
+    volume: Volume
+    particles: Particles
+    smart: Smart = Smart()
+    correlation: Correlation = Correlation()
+    network: Network = Network()
+    compute: Compute = Compute()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSetup:
+    """One camera: its name, nominal optics and white and dark image."""
+
+    name: str
+    optics: Optics
+    """Nominal optics; ``sensor_shape`` is that of the white image."""
+    nominal_angle_deg: float
+    """Angle about y [degree]; names the board's dots and serves the thin-lens mapping, never the network."""
+    image_flip: str
+    """How the camera's images are mirrored; undone on reading."""
+    white_path: Path
+    dark_path: Path | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """An experiment whose files exist and fit each other. Made by `open_experiment`."""
+
+    path: Path
+    name: str
+    dt_s: float
+    """Time between the two frames of a pair [s]."""
+    cameras: tuple[CameraSetup, ...]
+    board: Board
+    grid: Grid
+    pairs: int
+    frames: tuple[str, str]
+    smart: Smart
+    correlation: Correlation
+    network: Network
+    compute: Compute
+    particle_images: str
+    """Path pattern of the particle images, relative to the experiment file."""
+
+    def camera(self, name: str) -> CameraSetup:
+        """Return the camera called `name`; KeyError names the known ones."""
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        raise KeyError(f"no camera {name!r}; the experiment has {', '.join(c.name for c in self.cameras)}")
+
+    def white(self, name: str) -> np.ndarray:
+        """White image of a camera, float32 (rows, columns), dark not subtracted."""
+        camera = self.camera(name)
+        return images.read_image(camera.white_path, f"white_image of camera {name!r}", flip=camera.image_flip)
+
+    def dark(self, name: str) -> np.ndarray | None:
+        """Dark image of a camera, float32 (rows, columns), or None where the file names none."""
+        camera = self.camera(name)
+        if camera.dark_path is None:
+            return None
+        return images.read_image(camera.dark_path, f"dark_image of camera {name!r}", flip=camera.image_flip)
+
+    def board_image(self, name: str, plane: int) -> np.ndarray:
+        """Board image of a camera at plane number `plane`, float32 (rows, columns)."""
+        label = f"board.images, camera {name!r}, plane {plane}"
+        return images.read_image(self.board_path(name, plane), label, flip=self.camera(name).image_flip)
+
+    def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
+        """Particle image of a camera, float32 (rows, columns); InputError where it holds one value everywhere."""
+        label = f"particles.images, camera {name!r}, pair {pair}, frame {frame!r}"
+        path = self.particle_path(name, pair, frame)
+        image = images.read_image(path, label, flip=self.camera(name).image_flip)
+        images.require_contrast(image, path, label)
+        return image
+
+    def board_path(self, name: str, plane: int) -> Path:
+        """Path of a board image."""
+        return self.path.parent / self.board.images.format(camera=name, plane=plane)
+
+    def particle_path(self, name: str, pair: int, frame: str) -> Path:
+        """Path of a particle image."""
+        return self.path.parent / self.particle_images.format(camera=name, pair=pair, frame=frame)
+
+    def calibration_paths(self) -> list[Path]:
+        """All images the calibration reads, in a fixed order."""
+        paths = [path for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
+        return paths + [self.board_path(c.name, p) for c in self.cameras for p in range(len(self.board.planes_mm))]
+
+    def pair_paths(self, pair: int) -> list[Path]:
+        """All images of one pair, in a fixed order."""
+        return [self.particle_path(camera.name, pair, frame) for frame in self.frames for camera in self.cameras]
+
+
+def open_experiment(path: str | Path) -> Experiment:
+    """Read an experiment file and check everything it says and names, before any work.
+
+    White, dark and board images are decoded, and particle images up to `DECODED_PIXELS`; of the others the header and
+    the length are checked.
+
+    Parameters
+    ----------
+    path : str or Path
+        TOML file in the form described in the README.
+
+    Returns
+    -------
+    Experiment
+
+    Raises
+    ------
+    InputError
+        If a key is unknown, missing or out of range, or an image is missing, damaged, or does not fit the others.
+    """
+    path = Path(path)
+    table = read_toml(path, ExperimentTable)
+    names = [camera.name for camera in table.camera]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
+    _check_pattern(
+        path, "board.images", table.board.images, {"camera": names, "plane": range(len(table.board.planes_mm))}
+    )
+    _check_pattern(
+        path,
+        "particles.images",
+        table.particles.images,
+        {"camera": names, "pair": range(table.particles.pairs), "frame": table.particles.frames},
+    )
+    grid = _grid(path, table.volume)
+    _check_windows(path, table.correlation, grid)
+    experiment = Experiment(
+        path=path,
+        name=table.name,
+        dt_s=table.dt_s,
+        cameras=tuple(_camera(path, camera) for camera in table.camera),
+        board=table.board,
+        grid=grid,
+        pairs=table.particles.pairs,
+        frames=table.particles.frames,
+        smart=table.smart,
+        correlation=table.correlation,
+        network=table.network,
+        compute=table.compute,
+        particle_images=table.particles.images,
+    )
+    _check_images(experiment)
+    return experiment
+
+
+def _check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any]) -> None:
+    """Refuse a path pattern that cannot be filled in, or that names one file for several images."""
+    known = ", ".join("{" + name + "}" for name in fields)
+    try:
+        used = {name for _, name, _, _ in string.Formatter().parse(pattern) if name is not None}
+        if used <= set(fields):
+            pattern.format(**{name: values[0] for name, values in fields.items()})
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{path}: {key}: expected a path with {known}, found {pattern!r} ({error}).") from None
+    if used - set(fields):
+        raise InputError(f"{path}: {key}: expected only {known}, found {{{min(used - set(fields))}}} in {pattern!r}.")
+    for name, values in fields.items():
+        if len(values) > 1 and name not in used:
+            raise InputError(
+                f"{path}: {key}: expected {{{name}}} in the path, since there are {len(values)}, found {pattern!r}."
+            )
+
+
+def _grid(path: Path, volume: Volume) -> Grid:
+    for axis, size in zip("xyz", volume.size_mm, strict=True):
+        if not SMALLEST_WINDOW <= size / volume.voxel_mm + 0.5 < 2**31:
+            raise InputError(
+                f"{path}: volume.size_mm: expected {SMALLEST_WINDOW} voxels or more along {axis}, at most 2^31, "
+                f"found {size:g} mm with voxel_mm = {volume.voxel_mm:g}."
+            )
+    return Grid.from_extent(centre_mm=volume.centre_mm, size_mm=volume.size_mm, voxel_mm=volume.voxel_mm)
+
+
+def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
+    for window in correlation.windows or ():
+        edges = window if isinstance(window, tuple) else (window,) * 3
+        for axis, edge, n in zip("zyx", edges, grid.shape, strict=True):
+            if edge > n:
+                raise InputError(
+                    f"{path}: correlation.windows: expected windows inside the volume, found {edge} voxels "
+                    f"along {axis} where the volume has {n}. Use a smaller window, or one edge per axis, [z, y, x]."
+                )
+
+
+def _camera(path: Path, table: CameraTable) -> CameraSetup:
+    white_path = path.parent / table.white_image
+    header = images.read_header(white_path, f"white_image of camera {table.name!r}")
+    optics = Optics(
+        focal_length_mm=table.focal_length_mm,
+        magnification=table.magnification,
+        f_number=table.f_number,
+        microlens_pitch_mm=table.microlens_pitch_mm,
+        microlens_focal_length_mm=table.microlens_focal_length_mm,
+        pixel_mm=table.pixel_um / 1000,
+        sensor_shape=header.shape,
+        layout=table.microlens_layout,
+    )
+    pitch_px = optics.microimage_pitch_px
+    if not (math.isfinite(pitch_px) and 2 <= pitch_px <= min(header.shape) / FEWEST_LENSES):
+        raise InputError(
+            f"{path}: camera {table.name!r}, microlens_pitch_mm: expected microimages of at least 2 pixels, and "
+            f"at least {FEWEST_LENSES} of them across the sensor of {header.shape} pixels, found {pitch_px:.4g}. "
+            "Check microlens_pitch_mm and pixel_um."
+        )
+    return CameraSetup(
+        name=table.name,
+        optics=optics,
+        nominal_angle_deg=table.nominal_angle_deg,
+        image_flip=table.image_flip,
+        white_path=white_path,
+        dark_path=None if table.dark_image is None else path.parent / table.dark_image,
+    )
+
+
+def _check_images(experiment: Experiment) -> None:
+    """Check that every image is there, fits its camera's white image and can be decoded."""
+    for camera in experiment.cameras:
+        for path, label in _other_images(experiment, camera):
+            shape = images.read_header(path, label).shape
+            if shape != camera.optics.sensor_shape:
+                raise InputError(
+                    f"{path} ({label}): expected {camera.optics.sensor_shape} pixels (rows, columns) as in the white "
+                    f"image {camera.white_path}, found {shape}. All images of a camera have one size."
+                )
+    for camera in experiment.cameras:
+        white, dark = experiment.white(camera.name), experiment.dark(camera.name)
+        label = f"white_image of camera {camera.name!r}"
+        images.require_contrast(white, camera.white_path, label)
+        if dark is not None and float((white - dark).max()) <= 0:
+            raise InputError(
+                f"{camera.white_path} ({label}): expected a white image brighter than the dark image, found none of "
+                f"its pixels above {camera.dark_path}. Are the two files exchanged?"
+            )
+        for plane in range(len(experiment.board.planes_mm)):
+            board = experiment.board_image(camera.name, plane)
+            label = f"board.images, camera {camera.name!r}, plane {plane}"
+            images.require_contrast(board, experiment.board_path(camera.name, plane), label)
+    decoded = 0
+    for pair in range(experiment.pairs):
+        for camera in experiment.cameras:
+            decoded += 2 * math.prod(camera.optics.sensor_shape)
+            if decoded > DECODED_PIXELS and pair > 0:
+                return
+            for frame in experiment.frames:
+                experiment.particle_image(camera.name, pair, frame)
+
+
+def _other_images(experiment: Experiment, camera: CameraSetup) -> Iterator[tuple[Path, str]]:
+    """Paths and labels of a camera's images beside the white one."""
+    if camera.dark_path is not None:
+        yield camera.dark_path, f"dark_image of camera {camera.name!r}"
+    for plane in range(len(experiment.board.planes_mm)):
+        yield experiment.board_path(camera.name, plane), f"board.images, camera {camera.name!r}, plane {plane}"
+    for pair in range(experiment.pairs):
+        for frame in experiment.frames:
+            label = f"particles.images, camera {camera.name!r}, pair {pair}, frame {frame!r}"
+            yield experiment.particle_path(camera.name, pair, frame), label

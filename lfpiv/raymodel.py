@@ -1,0 +1,66 @@
+"""Local polynomials of a calibrated mapping in the pupil point: what the weight kernels take instead of the mapping."""
+
+from __future__ import annotations
+
+import numpy as np
+
+RINGS = ((0.0, 1), (0.5, 6), (0.97, 12))
+"""Pupil points at which the mapping is evaluated: (radius / pupil radius, points on the ring)."""
+POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Exponents of u and v in the polynomial's terms, as ``lfpiv_kernels.trace.POWERS``."""
+CHUNK_POINTS = 100_000
+"""Object points per evaluation: bounds the scratch memory."""
+
+
+def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
+    """Fit polynomials of the pupil point to the rays of object points.
+
+    Parameters
+    ----------
+    camera : CalibratedCamera
+        Its ``map_fast(points, pupil)`` is evaluated at the points of `RINGS`.
+    points_mm : ndarray, shape (point, 3)
+        Object points (x, y, z) [mm].
+    degree : {2, 3}
+        Degree of the polynomial.
+
+    Returns
+    -------
+    ndarray, shape (point, 2, 6 or 10), float32
+        Coefficients of s and t [mm] in the pupil point [mm], terms as in `POWERS`.
+    """
+    radius = camera.optics.pupil_radius_mm
+    unit = np.array([(r * np.cos(a), r * np.sin(a)) for r, n in RINGS for a in 2 * np.pi * (np.arange(n) + 0.25) / n])
+    powers = [power for power in POWERS if sum(power) <= degree]
+    terms = np.stack([unit[:, 0] ** a * unit[:, 1] ** b for a, b in powers], axis=1)
+    solve = np.linalg.pinv(terms) / np.array([radius ** (a + b) for a, b in powers])[:, None]
+    pupil = (unit * radius).astype(np.float32)
+    out = np.empty((len(points_mm), 2, len(powers)), np.float32)
+    for first in range(0, len(points_mm), CHUNK_POINTS):
+        part = np.asarray(points_mm[first : first + CHUNK_POINTS], np.float32)
+        rays = camera.map_fast(np.repeat(part, len(pupil), axis=0), np.tile(pupil, (len(part), 1)))
+        rays = rays.reshape(len(part), len(pupil), 2)
+        middle = rays[:, :1].copy()  # differences keep single precision where it matters
+        out[first : first + len(part)] = np.einsum("kp,npc->nck", solve.astype(np.float32), rays - middle)
+        out[first : first + len(part), :, 0] += middle[:, 0]
+    return out
+
+
+def ray_models(camera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
+    """Ray models of voxels for the footprint kernels, see ``lfpiv_kernels.footprint.MODEL_SIZE``.
+
+    The projected edges are differences of the mapping between opposite faces of the voxel.
+
+    Returns
+    -------
+    ndarray, shape (voxel, 30), float32
+    """
+    model = np.empty((len(centres_mm), 30), np.float32)
+    model[:, :12] = fit_rays(camera, centres_mm, degree=2).reshape(-1, 12)
+    for axis in range(3):
+        face = np.zeros(3)
+        face[axis] = voxel_mm / 2
+        edge = fit_rays(camera, centres_mm + face, degree=2) - fit_rays(camera, centres_mm - face, degree=2)
+        model[:, 12 + 2 * axis : 14 + 2 * axis] = edge[:, :, 0]
+        model[:, 18 + 4 * axis : 22 + 4 * axis] = edge[:, :, 1:3].reshape(-1, 4)
+    return np.nan_to_num(model, nan=1e9, posinf=1e9, neginf=-1e9)  # a voxel in the lens's own plane: far off the sensor

@@ -1,0 +1,166 @@
+"""The machine-readable figures of a run, ``summary.json``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from lfpiv import dataset
+from lfpiv.experiment import Experiment
+from lfpiv.vectors import Verdict
+
+if TYPE_CHECKING:
+    from lfpiv.calibration import Calibration
+    from lfpiv_kernels.runtime import Device
+
+SCHEMA_VERSION = 1
+
+_STAGES = ("calibration", "network_training", "weights", "reconstruction", "correlation")
+
+
+def build(
+    *,
+    experiment: Experiment,
+    calibration: Calibration,
+    calibration_path: Path,
+    vectors: Mapping[int, Path],
+    previous: Mapping[str, Any],
+    weights_s: float | None,
+    weights: Mapping[str, Any],
+    device: Device,
+    warnings: Sequence[str],
+    reused: Sequence[str],
+) -> dict[str, Any]:
+    """Put together the figures of everything a folder holds.
+
+    ``timings_s`` says what the results in the folder took, read from the files themselves, so also where this
+    invocation found them finished. ``total`` is the time of this invocation.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What was run.
+    calibration, calibration_path
+        The calibration and its file.
+    vectors : dict
+        Pair -> file of finished vectors.
+    previous : dict
+        Earlier summary of the folder, or nothing.
+    weights_s, weights
+        Seconds and figures of the weights; None and nothing where this invocation built none.
+    device : Device
+        Where the kernels ran.
+    warnings, reused : sequence of str
+        What was warned of, and what was kept from an earlier invocation.
+
+    Returns
+    -------
+    dict
+        JSON-able content of ``summary.json``; ``total`` and the peak memory are filled in at the very end of a run.
+    """
+    reports = {name: dict(camera.report) for name, camera in calibration.cameras.items()}
+    pairs = [_pair(number, path) for number, path in vectors.items()]
+    earlier = previous.get("timings_s", {})
+    timings = {
+        "calibration": float(dataset.read_attributes(calibration_path)["seconds"]),
+        "network_training": sum(float(report.get("training_s", 0.0)) for report in reports.values()),
+        "weights": weights_s if weights_s is not None else float(earlier.get("weights") or 0.0),
+        "reconstruction": sum(pair["reconstruction_s"] for pair in pairs),
+        "correlation": sum(pair["correlation_s"] for pair in pairs),
+    }
+    said = [text for report in reports.values() for text in report.get("warnings", ())]
+    poor = [
+        f"pair {pair['pair']}: {100 * pair['valid_fraction']:.0f} % of the vectors are valid; {pair['verdict']}"
+        for pair in pairs
+        if pair["verdict"] != Verdict.GOOD.value
+    ]
+    grid = experiment.grid
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "experiment": {
+            "name": experiment.name,
+            "file": str(experiment.path),
+            "dt_s": experiment.dt_s,
+            "pairs": experiment.pairs,
+            "volume_shape": list(grid.shape),
+            "voxel_mm": grid.voxel_mm,
+        },
+        "device": {"kind": device.kind, "threads": device.threads, "reason": device.reason},
+        "versions": dataset.versions(),
+        "settings": {
+            "smart": experiment.smart.model_dump(),
+            "correlation": experiment.correlation.model_dump(),
+            "network": experiment.network.model_dump(),
+            "compute": experiment.compute.model_dump(),
+        },
+        "timings_s": {stage: timings[stage] for stage in _STAGES},
+        "peak_memory_mib": None,
+        "calibration": {name: _scalars(report) for name, report in reports.items()},
+        "weights": dict(weights) or previous.get("weights", {}),
+        "pairs": pairs,
+        "valid_fraction": _mean(pair["valid_fraction"] for pair in pairs),
+        "finite_fraction": _mean(pair["finite_fraction"] for pair in pairs),
+        "warnings": list(dict.fromkeys([*said, *warnings, *poor])),
+        "reused": list(reused),
+    }
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read an earlier summary; nothing where there is none or it cannot be read."""
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) and found.get("schema_version") == SCHEMA_VERSION else {}
+
+
+def _pair(number: int, path: Path) -> dict[str, Any]:
+    vectors, reconstruction = dataset.read_vectors(path), dataset.read_reconstruction(path)
+    valid = vectors["valid"].values
+    finite = np.isfinite(vectors["u"].values) & np.isfinite(vectors["v"].values) & np.isfinite(vectors["w"].values)
+    result = {
+        "pair": number,
+        "file": path.name,
+        "vectors": list(vectors["u"].shape),
+        "valid_fraction": float(valid.mean()),
+        "finite_fraction": float(finite.mean()),
+        "verdict": str(vectors.attrs["verdict"]),
+        "reconstruction_s": float(vectors.attrs["reconstruction_s"]),
+        "correlation_s": float(vectors.attrs["correlation_s"]),
+        "velocity_m_per_s": {name: _spread(vectors[name], valid & finite) for name in ("u", "v", "w")},
+        "uncertainty_voxel": _median(vectors["uncertainty"].values[valid]),
+        "peak_ratio": _median(vectors["peak_ratio"].values[valid]),
+    }
+    if reconstruction is not None:
+        frames = [str(frame) for frame in reconstruction["frame"].values]
+        history = reconstruction["residual"].values
+        result["residual"] = {frame: row[np.isfinite(row)].tolist() for frame, row in zip(frames, history, strict=True)}
+        result["stop"] = {frame: str(stop) for frame, stop in zip(frames, reconstruction["stop"].values, strict=True)}
+    return result
+
+
+def _spread(values: xr.DataArray, valid: np.ndarray) -> dict[str, float | None]:
+    good = values.values[valid]
+    if good.size == 0:
+        return {"mean": None, "sd": None, "min": None, "max": None}
+    return {"mean": float(good.mean()), "sd": float(good.std()), "min": float(good.min()), "max": float(good.max())}
+
+
+def _median(values: np.ndarray) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if values.size else None
+
+
+def _mean(values) -> float | None:
+    values = list(values)
+    return float(np.mean(values)) if values else None
+
+
+def _scalars(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers and short texts of a camera's report; arrays belong to the calibration file."""
+    return {key: dataset.plain(value) for key, value in report.items() if not isinstance(value, np.ndarray)}

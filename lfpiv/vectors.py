@@ -1,0 +1,364 @@
+"""`correlate`: two particle volumes to a displacement field by multi-pass 3D cross-correlation.
+
+Each pass correlates windows of both volumes, validates the peaks, and hands its field to the next pass, which deforms
+both volumes by half of it, one back and one forth, before it correlates again. Displacements are means over the window.
+"""
+
+from __future__ import annotations
+
+import enum
+import json
+import logging
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.interpolate
+import scipy.ndimage
+import xarray as xr
+
+from lfpiv import validation
+from lfpiv_kernels import correlate as kernel
+from lfpiv_kernels import deform
+from lfpiv_kernels.uncertainty import displacement_deviation
+
+log = logging.getLogger(__name__)
+
+DEFAULT_WINDOWS = (32, 24, 16, 16)
+"""Window edges [voxel] of the passes where none are given, cut to the volume along each axis."""
+REFINE_SEARCH = 3
+"""Largest lag of the passes after the first [voxel]; what the predictor leaves is found up to 2.5 voxels."""
+FIRST_SEARCH = 0.25
+"""Largest displacement of the first pass, as a part of its window, where none is given (the one-quarter rule)."""
+CONTROL_SPACING = 4
+"""Largest distance of the points between which a deformation field is linear [voxel]."""
+
+LOWEST_SECOND_PEAK = 1e-3
+"""Coefficient that stands for a second peak where there is none, so that peak ratios stay finite."""
+_AXES = ("z", "y", "x")
+_SPACING_TOLERANCE = 1e-3  # coordinates written as decimal numbers of float32 are that even, relative to the spacing
+
+
+class Verdict(enum.Enum):
+    """What the valid part of the last pass says about the measurement; the text is the advice."""
+
+    GOOD = "most vectors are valid"
+    POOR = "many vectors were replaced: use larger windows, or look at the seeding and at the volumes"
+    FAILED = "hardly any vector is valid: check that both volumes show the same particles and that displacements fit"
+
+
+def correlate(
+    volume_a: xr.DataArray | np.ndarray,
+    volume_b: xr.DataArray | np.ndarray,
+    *,
+    dt_s: float,
+    windows: Sequence[int | Sequence[int]] | None = None,
+    overlap: float = 0.5,
+    voxel_mm: float | None = None,
+    max_displacement_voxel: float | None = None,
+    smoothing_voxel: float = 0.0,
+) -> xr.Dataset:
+    """Measure the displacement of the particles between two volumes.
+
+    Windows of the first pass are correlated over a wide range of lags, those of later passes around the field of the
+    pass before, by which both volumes are deformed (`lfpiv_kernels.deform`). Peaks are located by a three-point
+    Gaussian fit and validated by the normalised median test; where a vector fails it, the second peak is taken if that
+    passes, else what the neighbours predict.
+
+    Parameters
+    ----------
+    volume_a, volume_b : DataArray or ndarray, shape (z, y, x)
+        Intensities at the first and the second instant; finite, of any sign. DataArrays carry coordinates z, y, x [mm].
+    dt_s : float
+        Time between the two [s].
+    windows : sequence, optional
+        Window of each pass [voxel], one edge or (z, y, x). The last one sets the vector grid; name it twice to iterate.
+        Default: `DEFAULT_WINDOWS`, cut to the volume.
+    overlap : float
+        Part of a window shared with its neighbour, 0 <= overlap < 1.
+    voxel_mm : float, optional
+        Voxel edge [mm]; needed for ndarrays, whose first voxel is then centred at 0, and only for them.
+    max_displacement_voxel : float, optional
+        Largest displacement the first pass looks for along each axis [voxel]. Default: a quarter of its window.
+    smoothing_voxel : float
+        Standard deviation of a Gaussian applied to both volumes first [voxel]; 0: none. About 0.5 helps where particles
+        are single bright voxels.
+
+    Returns
+    -------
+    Dataset
+        Dims z, y, x: window centres [mm]. ``u``, ``v``, ``w`` [m/s] and ``displacement_x``, ``_y``, ``_z`` [voxel]:
+        means over the window, finite unless no vector at all is valid; ``valid``: true where the vector was measured
+        and passed validation, false where it was replaced; ``peak_ratio``: highest over second correlation peak;
+        ``correlation``: coefficient at the peak; ``uncertainty`` [voxel]: standard deviation of the displacement
+        vector (root of the summed variances of its components ``uncertainty_x``, ``_y``, ``_z``), from the correlation
+        statistics of [1]_, NaN where the vector was replaced. Attributes: settings, what each pass did and a verdict,
+        as JSON.
+
+    Raises
+    ------
+    ValueError
+        If the volumes differ in shape or coordinates, are not finite, or an argument is out of range.
+
+    References
+    ----------
+    .. [1] B. Wieneke, "PIV uncertainty quantification from correlation statistics", Meas. Sci. Technol. 26 (2015)
+       074002, doi:10.1088/0957-0233/26/7/074002.
+    """
+    axes_mm, spacing_mm = _check_axes(volume_a, volume_b, voxel_mm)
+    first, second = _check_volume(volume_a, "volume_a"), _check_volume(volume_b, "volume_b")
+    if not (math.isfinite(dt_s) and dt_s > 0):
+        raise ValueError(f"dt_s: expected a positive time [s], got {dt_s}.")
+    if not 0 <= overlap < 1:
+        raise ValueError(f"overlap: expected 0 <= overlap < 1, got {overlap}.")
+    if not (math.isfinite(smoothing_voxel) and smoothing_voxel >= 0):
+        raise ValueError(f"smoothing_voxel: expected a value >= 0, got {smoothing_voxel}.")
+    schedule = _check_windows(windows, first.shape)
+    search = _first_search(max_displacement_voxel, schedule[0])
+    if smoothing_voxel > 0:
+        first, second = (scipy.ndimage.gaussian_filter(v, smoothing_voxel, mode="constant") for v in (first, second))
+    multi_pass = _MultiPass(first, second)
+    for window in schedule:
+        multi_pass.run(window, tuple(max(1, round(edge * (1 - overlap))) for edge in window), search)
+        search = (REFINE_SEARCH,) * 3
+    settings = {
+        "windows": [list(window) for window in schedule],
+        "overlap": overlap,
+        "max_displacement_voxel": max_displacement_voxel,
+        "smoothing_voxel": smoothing_voxel,
+    }
+    return _dataset(multi_pass, axes_mm, spacing_mm, dt_s, settings)
+
+
+class _MultiPass:
+    """The field after each pass, order (z, y, x) [voxel], and what the next pass needs of it."""
+
+    def __init__(self, first: np.ndarray, second: np.ndarray):
+        self.volumes = first, second
+        self.coefficients = None
+        self.field = self.valid = self.peaks = self.deviation = None
+        self.centres: list[np.ndarray] = []
+        self.passes: list[dict] = []
+
+    def run(self, window: tuple[int, int, int], step: tuple[int, int, int], search: tuple[int, int, int]) -> None:
+        """Deform by the field so far, correlate, validate."""
+        shape = self.volumes[0].shape
+        origin, count = kernel.window_grid(shape, window, step)
+        centres = [o + (w - 1) / 2 + s * np.arange(n) for o, w, s, n in zip(origin, window, step, count, strict=True)]
+        first, second, predicted = *self.volumes, np.zeros(3)
+        refining = self.passes != []
+        if refining:
+            if self.coefficients is None:
+                self.coefficients = [deform.spline_coefficients(volume) for volume in self.volumes]
+            predictor = _Predictor(np.nan_to_num(self.field), self.centres, shape)  # no valid vector: start from 0
+            first, second = deform.deform_pair(*self.coefficients, predictor.field, predictor.spacing)
+            predicted = predictor.window_means(origin, step, count, window)
+            centres = [centre + deform.OFFSET for centre in centres]
+        self.peaks = kernel.correlate_windows(
+            first, second, window=window, step=step, search=search, symmetric=refining
+        )
+        self.field, self.valid = validation.validate(
+            self.peaks.displacement + predicted, self.peaks.second_displacement + predicted, self.peaks.measured
+        )
+        self.centres, self.deformed, self.layout = centres, (first, second), (window, origin, step, count)
+        left = np.linalg.norm((self.field - predicted)[self.valid], axis=-1)
+        self.passes.append(
+            {
+                "window": list(window),
+                "search": list(search),
+                "vectors": self.valid.size,
+                "valid": round(float(self.valid.mean()), 4),
+                "median_correlation": round(float(np.median(self.peaks.correlation)), 4),
+                "median_step_voxel": round(float(np.median(left)), 4) if left.size else None,
+            }
+        )
+        log.debug("correlation pass %d: %s", len(self.passes), self.passes[-1])
+
+
+def _dataset(
+    result: _MultiPass,
+    axes_mm: list[np.ndarray],
+    spacing_mm: tuple[float, float, float],
+    dt_s: float,
+    settings: dict,
+) -> xr.Dataset:
+    """Put the last pass into the form of the product, with units and a verdict."""
+    window, origin, step, count = result.layout
+    deviation = displacement_deviation(*result.deformed, window=window, origin=origin, step=step, count=count)
+    deviation[~result.valid] = np.nan
+    second = np.maximum(result.peaks.second_correlation, LOWEST_SECOND_PEAK)
+    ratio = np.where(result.peaks.correlation > 0, result.peaks.correlation / second, np.nan)
+    dims = _AXES
+    variables = {}
+    for k, (name, axis) in enumerate(zip("wvu", _AXES, strict=True)):
+        metres = spacing_mm[k] * 1e-3
+        velocity = result.field[..., k] * metres / dt_s
+        variables[name] = (dims, velocity, {"units": "m/s", "long_name": f"velocity along {axis}"})
+        attributes = {"units": "voxel", "long_name": f"displacement along {axis}, mean over the window"}
+        variables[f"displacement_{axis}"] = (dims, result.field[..., k], attributes)
+        attributes = {"units": "voxel", "long_name": f"standard deviation of the displacement along {axis}"}
+        variables[f"uncertainty_{axis}"] = (dims, deviation[..., k], attributes)
+    total = np.sqrt((deviation**2).sum(-1))
+    attributes = {
+        "units": "voxel",
+        "long_name": "standard deviation of the displacement vector, correlation statistics",
+    }
+    variables["uncertainty"] = (dims, total, attributes)
+    variables = {name: (d, values.astype(np.float32), a) for name, (d, values, a) in variables.items()}
+    ratio_name = "highest over second correlation peak"
+    variables["peak_ratio"] = (dims, ratio.astype(np.float32), {"units": "1", "long_name": ratio_name})
+    coefficient = {"units": "1", "long_name": "correlation coefficient at the peak"}
+    variables["correlation"] = (dims, result.peaks.correlation, coefficient)
+    variables["valid"] = (dims, result.valid, {"long_name": "measured and passed validation; false: replaced"})
+    places = {}
+    for axis, centres, positions in zip(_AXES, result.centres, axes_mm, strict=True):
+        distance = (positions[-1] - positions[0]) / max(len(positions) - 1, 1)
+        attributes = {"units": "mm", "long_name": "centre of the window"}
+        places[axis] = (axis, positions[0] + distance * centres, attributes)
+    share = float(result.valid.mean())
+    verdict = Verdict.GOOD if share >= 0.8 else Verdict.POOR if share >= 0.3 else Verdict.FAILED
+    attributes = {
+        "title": "displacement and velocity of particles between two volumes",
+        "dt_s": float(dt_s),
+        "voxel_mm": [float(s) for s in spacing_mm],
+        "valid_fraction": share,
+        "verdict": verdict.value,
+        "settings": json.dumps(settings),
+        "passes": json.dumps(result.passes),
+    }
+    if verdict is not Verdict.GOOD:
+        log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
+    return xr.Dataset(variables, places, attributes)
+
+
+def _check_volume(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
+    """Background-free copy of a volume as float32, scaled to a largest magnitude of 1."""
+    values = np.asarray(volume)
+    if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fiub":
+        raise ValueError(f"{name}: expected a volume of numbers (z, y, x), got {values.dtype} of shape {values.shape}.")
+    if not np.isfinite(values).all():
+        bad = int((~np.isfinite(values)).sum())
+        raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
+    values = values.astype(np.float32) - np.float32(np.median(values))
+    return values / max(float(np.abs(values).max()), np.finfo(np.float32).tiny)
+
+
+def _check_axes(
+    volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np.ndarray, voxel_mm: float | None
+) -> tuple[list[np.ndarray], tuple[float, float, float]]:
+    """Voxel centres [mm] along z, y, x and their spacing [mm]."""
+    if np.shape(volume_a) != np.shape(volume_b):
+        raise ValueError(f"volume_b: expected the shape of volume_a, {np.shape(volume_a)}, got {np.shape(volume_b)}.")
+    labelled = [isinstance(volume, xr.DataArray) for volume in (volume_a, volume_b)]
+    if not all(labelled):
+        if voxel_mm is None or not (math.isfinite(voxel_mm) and voxel_mm > 0):
+            raise ValueError(f"voxel_mm: expected the voxel edge [mm] > 0, which arrays need, got {voxel_mm}.")
+        return [voxel_mm * np.arange(n) for n in np.shape(volume_a)], (voxel_mm,) * 3
+    if voxel_mm is not None:
+        raise ValueError("voxel_mm: expected no value with DataArrays, whose coordinates tell it. Leave it out.")
+    axes, spacing = [], []
+    for axis in _AXES:
+        for name, volume in (("volume_a", volume_a), ("volume_b", volume_b)):
+            if volume.dims != _AXES or axis not in volume.coords or volume.sizes[axis] < 2:
+                raise ValueError(
+                    f"{name}: expected dims (z, y, x) with coordinates [mm] and at least 2 voxels each, got "
+                    f"{dict(volume.sizes)} with coordinates {list(volume.coords)}."
+                )
+        centres = np.asarray(volume_a[axis], float)
+        distance = (centres[-1] - centres[0]) / (len(centres) - 1)
+        if not distance > 0 or np.abs(np.diff(centres) - distance).max() > _SPACING_TOLERANCE * distance:
+            raise ValueError(f"volume_a: expected increasing, evenly spaced coordinates {axis} [mm], got {centres}.")
+        if np.abs(np.asarray(volume_b[axis], float) - centres).max() > _SPACING_TOLERANCE * distance:
+            raise ValueError(f"volume_b: expected the coordinates {axis} of volume_a, got others.")
+        axes.append(centres)
+        spacing.append(float(distance))
+    return axes, tuple(spacing)
+
+
+def _check_windows(windows, shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:
+    """Window of each pass as (z, y, x)."""
+    if windows is None:
+        return [tuple(min(edge, n) for n in shape) for edge in DEFAULT_WINDOWS]
+    schedule = []
+    for window in windows:
+        edges = tuple(window) if np.ndim(window) else (window,) * 3
+        if len(edges) != 3 or any(int(edge) != edge or edge < 4 for edge in edges):
+            raise ValueError(f"windows: expected edges of whole voxels >= 4, one or (z, y, x) per pass, got {window}.")
+        edges = tuple(int(edge) for edge in edges)
+        for axis, edge, n in zip(_AXES, edges, shape, strict=True):
+            if edge > n:
+                raise ValueError(
+                    f"windows: expected edges within the volume, got {edge} along {axis}, which has {n} voxels. "
+                    "Use a smaller window, or give each axis its own edge, (z, y, x)."
+                )
+        schedule.append(edges)
+    if not schedule:
+        raise ValueError("windows: expected at least one pass, got none.")
+    return schedule
+
+
+def _first_search(max_displacement_voxel: float | None, window: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Largest lag of the first pass: a peak needs one lag beyond it."""
+    if max_displacement_voxel is None:
+        return tuple(max(2, math.ceil(FIRST_SEARCH * edge) + 1) for edge in window)
+    if not (math.isfinite(max_displacement_voxel) and max_displacement_voxel > 0):
+        raise ValueError(f"max_displacement_voxel: expected a value > 0, got {max_displacement_voxel}.")
+    return (max(2, math.ceil(max_displacement_voxel) + 1),) * 3
+
+
+class _Predictor:
+    """Displacement field between window centres, as the deformation applies it."""
+
+    def __init__(self, field: np.ndarray, nodes: list[np.ndarray], shape: tuple[int, int, int]):
+        field = smooth(field)
+        counts = [max(2, math.ceil((n - 1) / CONTROL_SPACING) + 1) for n in shape]
+        points = [np.linspace(0, max(n - 1, 1), count) for n, count in zip(shape, counts, strict=True)]
+        self.spacing = tuple(float(p[1] - p[0]) for p in points)
+        for axis in range(3):
+            field = _along(_spline_matrix(nodes[axis], points[axis]), field, axis)
+        self.field = field.astype(np.float32)
+        self._points, self._shape = points, shape
+
+    def window_means(self, origin, step, count, window) -> np.ndarray:
+        """Mean displacement over the windows, shape (z, y, x, 3) [voxel]."""
+        means = self.field.astype(float)
+        for axis in range(3):
+            linear = _linear_matrix(self._points[axis], deform.OFFSET + np.arange(self._shape[axis]))
+            first = origin[axis] + step[axis] * np.arange(count[axis])
+            matrix = np.stack([linear[start : start + window[axis]].mean(0) for start in first])
+            means = _along(matrix, means, axis)
+        return means
+
+
+def smooth(field: np.ndarray) -> np.ndarray:
+    """Smooth a vector field (z, y, x, 3) by the weights 1/4, 1/2, 1/4; linear fields stay as they are."""
+    for axis in range(3):
+        if field.shape[axis] > 1:
+            pad = [(1, 1) if axis == k else (0, 0) for k in range(4)]
+            wide = np.moveaxis(np.pad(field, pad, mode="reflect", reflect_type="odd"), axis, 0)
+            field = np.moveaxis(0.25 * wide[:-2] + 0.5 * wide[1:-1] + 0.25 * wide[2:], 0, axis)
+    return field
+
+
+def _along(matrix: np.ndarray, field: np.ndarray, axis: int) -> np.ndarray:
+    """Apply a matrix along one axis."""
+    return np.moveaxis(np.tensordot(matrix, field, (1, axis)), 0, axis)
+
+
+def _spline_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Matrix from values at nodes to values at points: natural cubic spline, straight on beyond the outer nodes."""
+    if len(nodes) == 1:
+        return np.ones((len(points), 1))
+    spline = scipy.interpolate.CubicSpline(nodes, np.eye(len(nodes)), bc_type="natural")
+    inside = np.clip(points, nodes[0], nodes[-1])
+    return spline(inside) + spline(inside, 1) * (points - inside)[:, None]
+
+
+def _linear_matrix(points: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Matrix from values at evenly spaced points to values at positions, linear between and beyond the points."""
+    place = (positions - points[0]) / (points[1] - points[0])
+    cell = np.clip(place.astype(int), 0, len(points) - 2)
+    rows = np.arange(len(positions))
+    matrix = np.zeros((len(positions), len(points)))
+    matrix[rows, cell], matrix[rows, cell + 1] = 1 - (place - cell), place - cell
+    return matrix

@@ -1,0 +1,154 @@
+"""Slow, obvious NumPy twins of the kernels: specification and oracle. Nobody may optimise them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def position(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
+    """(s, t) [mm] of a voxel's rays through pupil points, shape (..., 2); `model` as in ``footprint.MODEL_SIZE``."""
+    u, v = pupil[..., 0], pupil[..., 1]
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    return np.stack([terms @ model[:6], terms @ model[6:12]], axis=-1)
+
+
+def slope(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
+    """K = d(s, t)/d(u, v) at one pupil point, shape (2, 2)."""
+    u, v = pupil
+    return np.array([[c[1] + 2 * c[3] * u + c[4] * v, c[2] + c[4] * u + 2 * c[5] * v] for c in (model[:6], model[6:12])])
+
+
+def smeared_step(x, widths):
+    """Integral from -infinity to x of a unit mass smeared by the two boxes."""
+    wide, narrow = widths
+
+    def ramp(y):
+        return np.where(y > narrow / 2, y, np.where(y < -narrow / 2, 0.0, (y + narrow / 2) ** 2 / (2 * narrow)))
+
+    return (ramp(x + wide / 2) - ramp(x - wide / 2)) / wide
+
+
+def two_widths(smears):
+    """Return the widest smear and one box with the variance of the others, widest first."""
+    smears = np.sort(np.abs(smears))
+    rest = np.sqrt((smears[:-1] ** 2).sum())
+    return max(smears[-1], rest, 1e-4), max(min(smears[-1], rest), 1e-4)
+
+
+def footprint(model, *, optics, lattice, frame, rectangles, local=False):
+    """Sensor image of one voxel's weights, the formulas of ``lfpiv_kernels.footprint`` pixel by pixel.
+
+    Parameters
+    ----------
+    model : ndarray, shape (30,)
+        Ray model.
+    optics, lattice
+        Values with the attributes of ``lfpiv.rig.Optics`` and ``LensLattice``.
+    frame, rectangles
+        From ``footprint.cell_frame`` and ``footprint.cell_rectangles``.
+    local : bool
+        Slopes followed pixel by pixel instead of taken under the lens's middle.
+
+    Returns
+    -------
+    ndarray, shape (rows, columns), float64
+    """
+    model = np.asarray(model, float)
+    r, pixel, radius = optics.sensor_per_pupil, optics.pixel_mm, optics.pupil_radius_mm
+    width = pixel / r
+    image = np.zeros(optics.sensor_shape)
+    rows, columns = optics.sensor_shape
+    row, column = np.mgrid[:rows, :columns]
+    position_mm = np.stack([(column + 0.5 - columns / 2) * pixel, (row + 0.5 - rows / 2) * pixel], axis=-1)
+    middle = lattice.nearest(position(model, np.zeros(2)))
+    reach = 2 + int(np.ceil(np.abs(slope(model, np.zeros(2))).max() * radius / lattice.pitch_mm * 1.3))
+    for i in range(middle[0] - reach, middle[0] + reach + 1):
+        for j in range(middle[1] - reach, middle[1] + reach + 1):
+            centre = lattice.centres_mm(np.array([i, j]))
+            pupil = ((1 + r) * centre - position_mm) / r
+            near = (np.abs(pupil) < radius + 2 * width).all(-1)
+            if not near.any():
+                continue
+            points = pupil[near]
+            offset = position(model, points) - centre
+            weight = np.zeros(len(points))
+            jacobian0 = np.linalg.inv(np.eye(2) - slope(model, np.zeros(2)))
+            rough = np.abs((offset @ jacobian0.T) @ np.asarray(frame).T).max(-1)
+            if rough.min() > 4:
+                continue
+            seen = rough < 4
+            at = points[seen].mean(0)
+            at *= min(1.0, radius / max(np.linalg.norm(at), 1e-9))
+            for k in np.flatnonzero(seen):
+                k_slope = slope(model, points[k] if local else at)
+                jacobian = np.linalg.inv(np.eye(2) - k_slope)
+                turn = np.asarray(frame) @ jacobian
+                edges = [model[12 + 2 * a : 14 + 2 * a] + model[18 + 4 * a : 22 + 4 * a].reshape(2, 2) @ at for a in range(3)]
+                smear = np.stack([turn @ edge for edge in edges] + list((turn @ k_slope * width).T), axis=1)
+                widths = [two_widths(smear[0]), two_widths(smear[1])]
+                g = jacobian @ offset[k]
+                a, b = np.asarray(frame) @ g
+                inside = sum(
+                    (smeared_step(q[1] - a, widths[0]) - smeared_step(q[0] - a, widths[0]))
+                    * (smeared_step(q[3] - b, widths[1]) - smeared_step(q[2] - b, widths[1]))
+                    for q in np.asarray(rectangles, float)
+                )
+                true_pupil = points[k] + g
+                distance = np.linalg.norm(true_pupil)
+                normal = np.sort(np.abs(true_pupil) / max(distance, 1e-9))[::-1]
+                covered = smeared_step((radius - distance) / width, np.maximum(normal, 1e-4))
+                weight[k] = covered * inside * width**2 / (np.pi * radius**2) * abs(np.linalg.det(jacobian))
+            image[near] += weight
+    return image
+
+
+def count(rays, shift, window, first_pixel, *, optics, lattice, samples, shape):
+    """Rays per pixel, ray by ray; arguments and result as ``trace.count_rays``."""
+    counts = np.zeros((len(first_pixel), *shape), np.int64)
+    total = np.zeros(len(first_pixel), np.int64)
+    step = 2 * optics.pupil_radius_mm / samples
+    rows, columns = optics.sensor_shape
+    a, b = np.mgrid[:samples, :samples]
+    for point in range(len(rays)):
+        u = (a + shift[point, 0]) * step - optics.pupil_radius_mm
+        v = (b + shift[point, 1]) * step - optics.pupil_radius_mm
+        seen = u * u + v * v <= optics.pupil_radius_mm**2
+        u, v = u[seen], v[seen]
+        terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3])
+        st = (np.asarray(rays[point], float) @ terms).T
+        centre = lattice.centres_mm(lattice.nearest(st))
+        x = (centre + optics.sensor_per_pupil * (st - np.stack([u, v], axis=1))) / optics.pixel_mm
+        column = np.floor(x[:, 0] + columns / 2).astype(int) - first_pixel[window[point], 0]
+        row = np.floor(x[:, 1] + rows / 2).astype(int) - first_pixel[window[point], 1]
+        hit = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+        np.add.at(counts, (window[point], row[hit], column[hit]), 1)
+        total[window[point]] += len(u)
+    return counts, total
+
+
+def dense(blocks) -> np.ndarray:
+    """Matrix of a ``project.Blocks``, shape (padded pixel, voxel), float64."""
+    matrix = np.zeros((blocks.shape[0] * blocks.shape[1], len(blocks.scale)))
+    for voxel in range(len(blocks.scale)):
+        row = blocks.first_row[voxel]
+        for block in range(blocks.first_block[voxel], blocks.first_block[voxel + 1]):
+            for y in range(blocks.height[block]):
+                at = blocks.pixel[block] + y * blocks.shape[1]
+                matrix[at : at + blocks.value.shape[1], voxel] += blocks.value[row] * float(blocks.scale[voxel])
+                row += 1
+    return matrix
+
+
+def smart(matrix, image, volume, *, iterations, relaxation=1.0, floor=0.0, paper=False):
+    """SMART with a dense matrix (pixel, voxel): Eq. 5, normalised by column, or as printed with `paper`."""
+    column_sum = matrix.sum(0)
+    pixels = (matrix > 0).sum(0)
+    for _ in range(iterations):
+        projected = matrix @ volume
+        seen = projected + floor > 0
+        ratio = np.zeros_like(projected)
+        ratio[seen] = np.log((image[seen] + floor) / (projected[seen] + floor))
+        exponent = matrix.T @ ratio
+        scale = matrix.max() * pixels if paper else column_sum
+        volume = volume * np.exp(relaxation * exponent / scale)
+    return volume

@@ -1,0 +1,104 @@
+"""Shared fixtures: the kernels' device, and the sample data beside the checkout."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+SAMPLE_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--device",
+        choices=("cpu", "cuda"),
+        default="cpu",
+        help="device on which kernel tests run; cuda never falls back to the CPU",
+    )
+
+
+@pytest.fixture(scope="session")
+def device(request):
+    """The running kernel device, started once."""
+    from lfpiv_kernels import runtime
+
+    return runtime.start(request.config.getoption("--device"))
+
+
+@pytest.fixture(scope="session")
+def sample_data():
+    """Folder of the sample data; its tests are skipped where it is absent, unless it is required."""
+    if SAMPLE_DATA.is_dir():
+        return SAMPLE_DATA
+    message = f"the sample data folder {os.path.relpath(SAMPLE_DATA, SAMPLE_DATA.parents[1])} is not there"
+    if os.environ.get("LFPIV_REQUIRE_SAMPLE_DATA") == "1":
+        pytest.fail(message)
+    pytest.skip(message)
+
+
+TINY_EXPERIMENT = """
+name = "tiny"
+dt_s = 1e-3
+
+[[camera]]
+name = "left"
+white_image = "white/left.tif"
+focal_length_mm = 100.0
+magnification = -1.0
+f_number = 4.0
+microlens_pitch_mm = 0.1
+microlens_focal_length_mm = 0.8
+pixel_um = 10.0
+nominal_angle_deg = 30.0
+
+[[camera]]
+name = "right"
+white_image = "white/right.tif"
+dark_image = "dark/right.tif"
+focal_length_mm = 100.0
+magnification = -1.0
+f_number = 4.0
+microlens_pitch_mm = 0.1
+microlens_focal_length_mm = 0.8
+pixel_um = 10.0
+nominal_angle_deg = -30.0
+
+[board]
+dots = [5, 5]
+spacing_mm = 0.1
+dot_diameter_mm = 0.02
+planes_mm = [-0.2, 0.2]
+images = "board/{camera}/plane_{plane:02d}.tif"
+
+[volume]
+centre_mm = [0.0, 0.0, 0.1]
+size_mm = [0.8, 0.6, 0.4]
+voxel_mm = 0.05
+
+[particles]
+images = "particles/{camera}/{pair:04d}{frame}.tif"
+pairs = 2
+"""
+
+
+@pytest.fixture
+def tiny_experiment(tmp_path):
+    """Experiment file whose images are small random arrays: right in form, without any physics."""
+    import numpy as np
+    import tifffile
+
+    folder = tmp_path / "tiny"
+    rng = np.random.default_rng(0)
+    shapes = {"left": (48, 64), "right": (56, 40)}
+    for camera, shape in shapes.items():
+        names = [f"white/{camera}", *(f"board/{camera}/plane_{plane:02d}" for plane in range(2))]
+        names += [f"particles/{camera}/{pair:04d}{frame}" for pair in range(2) for frame in "ab"]
+        names += ["dark/right"] if camera == "right" else []
+        for name in names:
+            path = folder / f"{name}.tif"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            counts = rng.integers(0, 20 if name.startswith("dark") else 4096, shape, dtype=np.uint16)
+            tifffile.imwrite(path, counts, compression="zlib")
+    file = folder / "experiment.toml"
+    file.write_text(TINY_EXPERIMENT, "utf-8")
+    return file

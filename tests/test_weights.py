@@ -1,0 +1,233 @@
+"""Weights: kernels against their twins, footprint against counted rays, and the invariants of a linear operator."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
+
+import lfpiv
+from lfpiv.raymodel import ray_models
+from lfpiv.weights import count_voxels, estimate_memory
+from lfpiv_kernels import footprint, reference, runtime, trace
+from lfpiv_kernels.lattice import pack_lattice
+
+VOXEL_MM = 0.1
+LEVEL = 0.5 / footprint.LEVELS * 1.1  # rounding to 8 bits, in units of the largest weight; the bound is 4-10 % above it
+TOLERANCE_TWIN = 2e-3  # float32 polynomials against float64, of the largest weight
+TOLERANCE_ADJOINT = 1e-5  # the issue's figure; float32 sums of about 1e5 terms with random signs
+FOOTPRINT_MEAN, FOOTPRINT_WORST = 0.02, 0.035  # relative L2 against a converged count: the project's goal
+SAMPLES = 100  # pupil points per axis: counting noise of about 1 %, subtracted by the two halves' difference
+
+VOXELS_MM = np.array([(0.0, 0.0, 0.05), (0.13, 0.2, 0.9), (0.5, 0.6, -0.7), (-0.6, -0.5, 0.8)])
+
+RIGS = {
+    "aligned": IdealCamera("aligned", rotation(45)),
+    "misaligned": IdealCamera("misaligned", rotation(33, 3, 2), lattice=lattice(roll_deg=1.0)),
+    "elevated": IdealCamera("elevated", rotation(35, 20, 5)),
+    "hexagonal": IdealCamera(
+        "hexagonal", rotation(-45), optics=optics(layout="hexagonal"), lattice=lattice("hexagonal", roll_deg=0.4)
+    ),
+    "mild coma": IdealCamera("mild coma", rotation(45), coma=0.01),
+}
+
+
+def whole(image, window, corner):
+    """Put a window of the sensor into a whole image."""
+    padded = np.zeros((image.shape[0] + 2000, image.shape[1] + 2000))
+    column, row = corner + 1000
+    padded[row : row + window.shape[0], column : column + window.shape[1]] = window
+    return padded[1000:-1000, 1000:-1000]
+
+
+def counted(camera, centre, seed):
+    counts, total, corner = count_voxels(camera, centre[None], VOXEL_MM, samples=SAMPLES, seed=seed)
+    return whole(camera.gain, counts[0] / total[0], corner[0])
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_footprint_agrees_with_a_converged_count(name):
+    camera = RIGS[name]
+    errors = []
+    for centre in VOXELS_MM:
+        grid = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=VOXEL_MM, first_centre_mm=tuple(centre[::-1]))
+        weights = lfpiv.build_weights(IdealRig({name: camera}), grid)
+        image = weights.image(name, (0, 0, 0)).astype(float)
+        first, second = counted(camera, centre, 1), counted(camera, centre, 2)
+        reference_image = (first + second) / 2
+        noise = np.linalg.norm(first - second) / 2  # of the mean of two independent counts
+        error = np.sqrt(max(np.linalg.norm(image - reference_image) ** 2 - noise**2, 0.0))
+        errors.append(error / np.linalg.norm(reference_image))
+        assert image.sum() == pytest.approx(reference_image.sum(), rel=0.01)  # no light gained or lost
+    assert np.mean(errors) <= FOOTPRINT_MEAN, errors
+    assert np.max(errors) <= FOOTPRINT_WORST, errors
+
+
+@pytest.mark.parametrize("name", ["aligned", "hexagonal", "mild coma"])
+def test_footprint_kernel_equals_its_twin(name):
+    camera = RIGS[name]
+    centre = VOXELS_MM[1]
+    grid = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=VOXEL_MM, first_centre_mm=tuple(centre[::-1]))
+    image = lfpiv.build_weights(IdealRig({name: camera}), grid).image(name, (0, 0, 0))
+    twin = reference.footprint(
+        ray_models(camera, centre[None], VOXEL_MM)[0],
+        optics=camera.optics,
+        lattice=camera.lattice,
+        frame=footprint.cell_frame(camera.lattice.basis_mm, camera.lattice.layout),
+        rectangles=footprint.cell_rectangles(camera.lattice.layout),
+        local=name == "mild coma",
+    )
+    separable = 0.5 * footprint.SKEW  # profiles shared by the pixels under a lens, in pitches of about one weight
+    assert np.abs(image - twin).max() <= (LEVEL + TOLERANCE_TWIN + separable) * twin.max()
+    assert np.linalg.norm(image - twin) <= 0.01 * np.linalg.norm(twin)
+
+
+@pytest.mark.parametrize("layout", ["square", "hexagonal"])
+def test_count_kernel_equals_its_twin(layout):
+    runtime.device()
+    rng = np.random.default_rng(3)
+    setup, lenses = optics(layout=layout), lattice(layout, roll_deg=0.7)
+    rays = np.zeros((6, 2, 10), np.float32)
+    rays[:, :, 0] = rng.uniform(-0.3, 0.3, (6, 2))
+    rays[:, [0, 1], [1, 2]] = rng.uniform(0.005, 0.02, (6, 2))
+    rays[:, :, 3:6] = rng.normal(0, 1e-5, (6, 2, 3))
+    rays[:, :, 6:] = rng.normal(0, 1e-6, (6, 2, 4))
+    shift = rng.random((6, 2)).astype(np.float32)
+    window, corner = np.array([0, 0, 0, 1, 1, 1], np.int32), np.array([(100, 80), (130, 90)], np.int32)
+    count, total = trace.count_rays(
+        rays,
+        shift,
+        window,
+        corner,
+        footprint.pack_camera(
+            sensor_per_pupil=setup.sensor_per_pupil,
+            pixel_mm=setup.pixel_mm,
+            sensor_shape=setup.sensor_shape,
+            pupil_radius_mm=setup.pupil_radius_mm,
+            stride=0,
+        ),
+        pack_lattice(lenses.origin_mm, lenses.basis_mm),
+        hexagonal=layout == "hexagonal",
+        samples=60,
+        shape=(260, 240),
+    )
+    twin, twin_total = reference.count(
+        rays, shift, window, corner, optics=setup, lattice=lenses, samples=60, shape=(260, 240)
+    )
+    assert count.sum() > 0.9 * total.sum()
+    # a ray within float32's reach of an edge may fall to the other side: a few in 17,000
+    assert np.abs(total - twin_total).max() <= 4
+    assert np.abs(count - twin).sum() <= 2e-3 * total.sum()
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A 5 x 6 x 7 grid seen by two misaligned cameras with uneven gain."""
+    rig = two_cameras()
+    rng = np.random.default_rng(0)
+    for camera in rig.cameras.values():
+        camera.gain[:] = rng.uniform(0.7, 1.2, camera.gain.shape)
+        camera.gain[100:110, 200:220] = 0.0
+    grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.7, 0.6, 0.5), voxel_mm=VOXEL_MM)
+    return lfpiv.build_weights(rig, grid)
+
+
+def random_images(weights, seed):
+    rng = np.random.default_rng(seed)
+    return {name: rng.normal(size=c.optics.sensor_shape).astype(np.float32) for name, c in weights.cameras.items()}
+
+
+def test_back_projection_is_the_adjoint(small):
+    rng = np.random.default_rng(1)
+    volume = rng.normal(size=small.grid.shape).astype(np.float32)
+    images = random_images(small, 2)
+    forward = sum((p.astype(float) * images[name]).sum() for name, p in small(volume).items())
+    backward = (small.T(images).astype(float) * volume).sum()
+    scale = sum(np.linalg.norm(p) * np.linalg.norm(images[name]) for name, p in small(volume).items())
+    assert abs(forward - backward) <= TOLERANCE_ADJOINT * scale
+    assert small.T.T is small
+
+
+def test_operator_is_the_stored_matrix(small):
+    rng = np.random.default_rng(4)
+    volume = rng.normal(size=small.grid.shape).astype(np.float32)
+    images = small(volume)
+    for name, projector in small._projectors.items():
+        matrix = reference.dense(projector.blocks)
+        twin = (matrix @ small.to_storage(volume)).reshape(projector.blocks.shape)
+        camera = small.cameras[name]
+        expected = twin[:, : camera.optics.sensor_shape[1]] * camera.gain
+        assert np.abs(images[name] - expected).max() <= 1e-5 * np.abs(expected).max()  # float32 sums of <= 210 terms
+
+
+def test_image_of_a_voxel_is_the_projection_of_a_unit_voxel(small):
+    volume = np.zeros(small.grid.shape, np.float32)
+    volume[1, 2, 3] = 1.0
+    for name, image in small(volume).items():
+        assert np.allclose(image, small.image(name, (1, 2, 3)), rtol=1e-6, atol=0)
+        assert 0.5 < image.sum() < 1.2  # a fraction of the rays, times the gain
+
+
+def test_out_is_reused_and_results_do_not_depend_on_threads(small, monkeypatch):
+    volume = np.random.default_rng(5).random(small.grid.shape).astype(np.float32)
+    first = small(volume)
+    kept = {name: image.copy() for name, image in first.items()}
+    again = small(volume * 0, out=first)
+    assert all(again[name] is first[name] and not again[name].any() for name in first)
+    back = small.T(kept)
+    assert small.T(kept, out=np.empty_like(back)).tobytes() == back.tobytes()
+    with ThreadPoolExecutor(1) as one:
+        monkeypatch.setattr(runtime, "_pool", one)
+        serial = small(volume)
+        assert all(serial[name].tobytes() == kept[name].tobytes() for name in kept)
+        assert small.T(kept).tobytes() == back.tobytes()
+
+
+def test_counted_operator_agrees_with_the_footprint(small):
+    grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.3, 0.2, 0.2), voxel_mm=VOXEL_MM)
+    rig = IdealRig(small.cameras)
+    by_count, by_footprint = (lfpiv.build_weights(rig, grid, method=method) for method in ("count", "footprint"))
+    single = by_count.image("cam1", (0, 1, 2))  # traced alone, with more rays
+    volume = np.random.default_rng(6).random(grid.shape).astype(np.float32)
+    counted_images, images = by_count(volume), by_footprint(volume)
+    for name, image in images.items():
+        # twelve voxels' footprint errors and counting noise partly average out
+        assert np.linalg.norm(image - counted_images[name]) <= FOOTPRINT_MEAN * np.linalg.norm(image)
+    stored = by_count.image("cam1", (0, 1, 2))
+    assert np.linalg.norm(stored - single) <= 0.06 * np.linalg.norm(single)  # the smaller count's noise of about 4 %
+    unit = {name: np.ones(c.optics.sensor_shape, np.float32) for name, c in rig.cameras.items()}
+    ones = by_count.T(unit)
+    assert np.allclose(ones, by_footprint.T(unit), rtol=0.02)
+
+
+def test_a_voxel_outside_the_field_has_no_weights():
+    grid = lfpiv.Grid(shape=(1, 1, 2), voxel_mm=VOXEL_MM, first_centre_mm=(0.0, 9.0, 0.0))
+    weights = lfpiv.build_weights(two_cameras(), grid)
+    assert not any(image.any() for image in weights(np.ones(grid.shape)).values())
+    assert not weights.column_sum.any()
+
+
+def test_memory_estimate_holds_before_building():
+    rig = two_cameras(optics=optics(rows=100, columns=110))
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.0, 2.0, 2.0), voxel_mm=0.05)
+    weights = lfpiv.build_weights(rig, grid)
+    estimate = estimate_memory(rig, grid)
+    assert weights.memory_bytes <= 1.1 * estimate
+    huge = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(900, 900, 900), voxel_mm=0.1)
+    assert estimate_memory(rig, huge) > estimate  # and nothing of that size was allocated
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda w: lfpiv.build_weights(IdealRig(w.cameras), w.grid, method="exact"), "method: expected one of"),
+        (lambda w: w(np.zeros((2, 2, 2))), r"volume: expected shape \(5, 6, 7\)"),
+        (lambda w: w.T({"cam1": np.zeros((400, 480))}), "camera 'cam2' is missing"),
+        (lambda w: w.T({"cam1": np.zeros((4, 4)), "cam2": np.zeros((4, 4))}), r"expected shape \(400, 480\)"),
+        (lambda w: w.image("cam3", (0, 0, 0)), "expected one of cam1, cam2"),
+        (lambda w: w.image("cam1", (0, 0, 9)), "inside the grid"),
+    ],
+)
+def test_wrong_arguments_are_named(small, call, message):
+    with pytest.raises(ValueError, match=message):
+        call(small)
