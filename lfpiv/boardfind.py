@@ -21,7 +21,10 @@ from lfpiv.rig import Optics
 log = logging.getLogger(__name__)
 
 _FIRST_PLANES = 3  # planes in which the lattice is looked for with nothing but the nominal pose
-_FEWEST_DOTS = 4
+FEWEST_DOTS = 4
+"""Dots that make a board."""
+
+_FEWEST_PART = 0.25  # of the dots in the field must be on the lattice
 _MARGIN = 1  # lattice places around the board that tell a wrong name from a right one
 
 
@@ -84,11 +87,14 @@ def find_dots(signals, decoder: LightFieldDecoder, board: DotBoard, nominal_angl
     order = np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
     plan = CameraPose.from_plan(optics, nominal_angle_deg)
 
-    first = [
-        _first_lattice(rectify(signals[p], plan, board.planes_mm[p]), board, plan, p) for p in order[:_FIRST_PLANES]
-    ]
-    points, chief, sign, score = max(first, key=lambda found: found[3])
-    if len(points) < min(_FEWEST_DOTS, board.size):
+    first = []
+    for plane in order[:_FIRST_PLANES]:
+        rectified = rectify(signals[plane], plan, board.planes_mm[plane])
+        first.append(_first_lattice(rectified, board, plan, plane))
+    best = max(found[3] for found in first)
+    points, chief, sign, _ = next(found for found in first if found[3] >= best / 2)  # the nearer to z = 0 the surer
+    visible = max(_in_field(plan, board.points_mm(plane), optics).sum() for plane in order[:_FIRST_PLANES])
+    if len(points) < min(max(FEWEST_DOTS, _FEWEST_PART * visible), board.size):
         raise InputError(
             f"board: expected a lattice of {board.dots[0]} x {board.dots[1]} dots, {board.spacing_mm:g} mm apart, near "
             f"z = {board.planes_mm[order[0]]:g} mm; found {len(points)} dots of it. Check the board images, [board] and "

@@ -1,4 +1,4 @@
-"""Where the dots of a calibration board are: a fitted thin-lens camera, images rectified to the board, lattice matching.
+"""Where the dots of a board are: a fitted thin-lens camera, images rectified to the board, lattice matching.
 
 This camera only finds and names the dots; nothing of it enters the calibration except as a starting point.
 """
@@ -189,6 +189,7 @@ class Rectifier:
         lit = (narrow[1] > 0.1 * np.median(wide[1])) & (wide[1] > 0.3 * np.median(wide[1]))
         response = np.zeros(shape)
         response[lit] = narrow[0][lit] / narrow[1][lit] - wide[0][lit] / wide[1][lit]
+        response *= np.sqrt(narrow[1] / np.median(narrow[1][lit])) if lit.any() else 0  # noise falls with the light
         noise = 1.4826 * np.median(np.abs(response[lit])) if lit.any() else 0.0
         return Rectified(response / max(noise, 1e-12), corner, bin_mm)
 

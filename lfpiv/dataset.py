@@ -259,11 +259,13 @@ def _write(dataset: xr.Dataset, path: Path, attributes: Mapping[str, Any], **whe
 
 
 def _attribute(value: Any) -> Any:
-    """Put a value into the form of a NetCDF attribute: numbers and text as they are, all else as JSON."""
+    """Put a value into the form of a NetCDF attribute: numbers, their lists and text as they are, else JSON."""
     if isinstance(value, (str, int, float, np.number)) and not isinstance(value, bool):
         return value
-    if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiu":
-        return value
+    if isinstance(value, (list, tuple, np.ndarray)) and len(value) > 0:
+        numbers = value if isinstance(value, np.ndarray) else list(value)
+        if all(isinstance(item, (int, float, np.number)) and not isinstance(item, bool) for item in numbers):
+            return np.asarray(numbers)
     return json.dumps(plain(value))
 
 

@@ -166,10 +166,10 @@ class LensIntegral:
         slope = slope_of(theta, self.pupil_radius_mm)
         table = self.table(board_jacobian, tilt, slope)
         state = self._state(pixels, terms, theta, table, None, sign)
-        if np.count_nonzero(state.share > _SEEN_SHARE) < FEWEST_PIXELS:
-            return None
         damping, converged = 1e-3, False
         for _ in range(_ITERATIONS):
+            if np.count_nonzero(state.share > _SEEN_SHARE) < FEWEST_PIXELS:
+                return None  # no dot's light in these pixels, or the fit wandered off them
             moved = np.abs(slope_of(state.theta, self.pupil_radius_mm) - slope).max() * self._pixel_on_pupil
             if moved > _TABLE_AGE * self._reach.min():  # the pixels' blur has changed
                 slope = slope_of(state.theta, self.pupil_radius_mm)
@@ -217,7 +217,7 @@ class LensIntegral:
         return _State(theta, linear, terms, pixels.response, share, along, misfit)
 
     def _linear_start(self, pixels, share, sign):
-        """Base and amplitude by weighted least squares; the amplitude keeps its sign."""
+        """Find base and amplitude by weighted least squares; the amplitude keeps its sign."""
         weight = 1 / (self._noise_variance + self._counts_per_photon * np.maximum(pixels.signal, 0))
         design = pixels.response[:, None] * np.stack([np.ones_like(share), share], 1)
         normal = design.T @ (design * weight[:, None]) + 1e-9 * np.eye(2)

@@ -9,8 +9,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv.boardfind import Detection, DotBoard
-from lfpiv.dotfit import FEWEST_PIXELS, TERMS, DotFit, DotPixels, LensIntegral, lens_offset_mm, ray_terms, slope_of, spread_over_pupil
+from lfpiv.boardfind import FEWEST_DOTS, Detection, DotBoard
+from lfpiv.dotfit import (
+    FEWEST_PIXELS,
+    TERMS,
+    DotFit,
+    DotPixels,
+    LensIntegral,
+    lens_offset_mm,
+    ray_terms,
+    slope_of,
+    spread_over_pupil,
+)
+from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
 
 log = logging.getLogger(__name__)
@@ -76,6 +87,11 @@ def label_by_integral(
     response = decoder.coverage * decoder.shrunk_gain(share) * np.float32(decoder.white_counts)
 
     good = [k for k, fit in enumerate(fits) if fit is not None and fit.converged]
+    if len(good) < min(FEWEST_DOTS, board.size):
+        raise InputError(
+            f"board: {len(dot)} blobs look like dots, but only {len(good)} of them fit a dot of diameter "
+            f"{board.diameter_mm:g} mm. Check the board images and [board]."
+        )
     slopes = np.array([np.trace(slope_of(fits[k].coefficients, radius)) / 2 for k in good])
     chief = np.array([fits[k].coefficients[0] for k in good])
     rounds.pose = pose = detection.pose.fitted(points[good], chief, optics, slopes)
@@ -161,15 +177,15 @@ def _pose_terms(pose, points, pupil_radius_mm):
 
 
 def _spread(fit: DotFit) -> np.ndarray:
-    """Standard errors of the ray model [mm], widened where the fit is poor, shape (TERMS, 2)."""
+    """Return the standard errors of the ray model [mm], wider where the fit is poor, (TERMS, 2)."""
     return np.sqrt(np.diag(fit.covariance) * max(fit.reduced_chi2, 1)).reshape(2, TERMS).T
 
 
 def _noise_and_response(fits, taken, decoder) -> tuple[float, float]:
     """Shot noise of the images [counts], and the part of the white image's scatter that is pixel response.
 
-    Where a dot is bright, light over fit minus 1 follows white over smooth white minus 1 for true response, and does not
-    for noise of the white image; the slope between the two is the best weight for that scatter.
+    Where a dot is bright, light over fit minus 1 follows white over smooth white minus 1 for true response, and does
+    not for noise of the white image; the slope between the two is the best weight for that scatter.
     """
     deviation, relative, expected, miss = [], [], [], []
     for fit, where in zip(fits, taken, strict=True):

@@ -128,7 +128,7 @@ class LightFieldDecoder:
     def sub_aperture(
         self, image: np.ndarray, pupil_mm: tuple[float, float], *, level: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """View through one pupil point: one white-normalised value per microlens (section 3.1 (2), Fig. 5 of the paper).
+        """View through one pupil point: a white-normalised value per microlens (section 3.1 (2), Fig. 5 of the paper).
 
         The image and the white response are read at X = s_l (1 + f_m/s_i) - u f_m/s_i under every lens, each at its own
         sub-pixel phase, and divided.

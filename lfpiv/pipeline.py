@@ -178,9 +178,10 @@ def correlate(
     Raises
     ------
     InputError
-        If the volumes of a pair are missing or belong to other settings.
+        If the calibration, or the volumes of a pair, are missing or belong to other settings.
     """
     with _job(experiment, out, device, progress, pairs) as job:
+        job.load_calibration()
         numbers = job.numbers
         for done, pair in enumerate(numbers):
             job.begin_pair(done, len(numbers))
@@ -207,12 +208,7 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
         If the folder holds no calibration that fits the experiment.
     """
     with _job(experiment, out, None, None) as job:
-        if dataset.stored_hash(job.folder.calibration) != job.calibration_hash:
-            raise InputError(
-                f"{job.folder.calibration}: expected the calibration of this experiment, found none that fits. "
-                "Run `lfpiv calibrate` or `lfpiv run` first."
-            )
-        job.calibrate()
+        job.load_calibration()
         return job.finish(job.finished_pairs(), report=True)
 
 
@@ -385,15 +381,25 @@ class _Job:
 
     # --- steps
 
-    def calibrate(self) -> Calibration:
+    def load_calibration(self) -> Calibration:
+        """Load the calibration in the folder; InputError where there is none that fits the experiment."""
         from lfpiv.calibration import load_calibration
 
         path = self.folder.calibration
+        if dataset.stored_hash(path) != self.calibration_hash:
+            raise InputError(
+                f"{path}: expected the calibration of this experiment, found none that fits. "
+                "Run `lfpiv calibrate` or `lfpiv run` first."
+            )
+        self.note_reused("calibration")
+        self.calibration = load_calibration(path)
+        return self.calibration
+
+    def calibrate(self) -> Calibration:
+        path = self.folder.calibration
         stored = dataset.stored_hash(path)
         if stored == self.calibration_hash:
-            self.note_reused("calibration")
-            self.calibration = load_calibration(path)
-            return self.calibration
+            return self.load_calibration()
         if stored is not None:
             log.info("calibration: settings or images changed, made anew")
         from lfpiv.calibration import calibrate as calibrate_cameras

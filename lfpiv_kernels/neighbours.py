@@ -1,4 +1,4 @@
-"""What the 26 neighbours of each vector of a field say about it: robust predictions for outlier detection and filling."""
+"""What the 26 neighbours of a vector say about it: robust predictions for outlier detection and filling."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ _MIDDLE = 13
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predictions of every vector from its neighbours, shape (z, y, x, 3); NaN where there are none."""
+    """Predictions of vectors from their neighbours, shape (vector, 3); NaN where there are none."""
 
     median: np.ndarray
     """Median of the neighbours."""
@@ -30,7 +30,7 @@ class Prediction:
     highest: np.ndarray
     """Greatest of the neighbours."""
     count: np.ndarray
-    """Number of neighbours, shape (z, y, x)."""
+    """Number of neighbours, shape (vector,)."""
 
 
 @wp.func
@@ -50,7 +50,7 @@ def _median(values: _Cube, count: int):
 def _slope(cube: _Cube, present: int, stride: int):
     """Median difference of adjacent neighbours along the axis whose elements are `stride` apart; 0 without any."""
     differences = _Cube()
-    count = int(0)
+    count = wp.int32(0)
     for i in range(27 - stride):
         if (i // stride) % 3 < 2 and (present >> i) & (present >> (i + stride)) & 1 == 1:
             differences[count] = cube[i + stride] - cube[i]
@@ -75,17 +75,21 @@ def _predict(
     # in
     field: wp.array4d(dtype=float),  # (z, y, x, component)
     keep: wp.array3d(dtype=int),  # 1 where a vector counts as neighbour
-    first_layer: int,
+    points: wp.array(dtype=int),  # linear index of the vectors wanted
+    first_point: int,
     # out
-    prediction_out: wp.array3d(dtype=float),  # (point, component, 6): as in `Prediction`
-    count_out: wp.array(dtype=int),  # neighbours, (point,)
+    prediction_out: wp.array3d(dtype=float),  # (vector, component, 6): as in `Prediction`
+    count_out: wp.array(dtype=int),  # neighbours, (vector,)
 ):
-    layer, y, x, component = wp.tid()
-    z = first_layer + layer
+    index, component = wp.tid()
+    point = first_point + index
+    z = points[point] // (keep.shape[1] * keep.shape[2])
+    y = points[point] // keep.shape[2] % keep.shape[1]
+    x = points[point] % keep.shape[2]
     cube = _Cube()
     values = _Cube()
-    present = int(0)
-    count = int(0)
+    present = wp.int32(0)
+    count = wp.int32(0)
     for i in range(27):
         pz = z + i // 9 - 1
         py = y + (i // 3) % 3 - 1
@@ -97,7 +101,6 @@ def _predict(
                     values[count] = cube[i]
                     present = present | (1 << i)
                     count += 1
-    point = (z * keep.shape[1] + y) * keep.shape[2] + x
     if component == 0:
         count_out[point] = count
     if count == 0:
@@ -110,7 +113,7 @@ def _predict(
         slope_z = _slope(cube, present, 9)
         slope_y = _slope(cube, present, 3)
         slope_x = _slope(cube, present, 1)
-        n = int(0)
+        n = wp.int32(0)
         for i in range(27):
             if (present >> i) & 1 == 1:
                 lowest = wp.min(lowest, cube[i])
@@ -127,44 +130,49 @@ def _predict(
         prediction_out[point, component, 5] = highest
 
 
-def predict(field: np.ndarray, keep: np.ndarray) -> Prediction:
-    """Predict every vector of a field from its neighbours, the vector itself left out.
+def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Prediction:
+    """Predict vectors of a field from their neighbours, the vectors themselves left out.
 
     Parameters
     ----------
     field : ndarray, shape (z, y, x, 3)
-        Vectors; what is not kept may be anything.
+        Vectors; those that are not kept may be anything.
     keep : ndarray of bool, shape (z, y, x)
         Vectors that count as neighbours.
+    wanted : ndarray of bool, shape (z, y, x)
+        Vectors to predict.
 
     Returns
     -------
     Prediction
+        Of the wanted vectors, in C order.
 
     Raises
     ------
     ValueError
         If the shapes do not match.
     """
-    if field.ndim != 4 or field.shape[3] != 3 or keep.shape != field.shape[:3]:
-        raise ValueError(f"keep: expected the shape of the field's grid, {field.shape[:-1]}, got {keep.shape}.")
+    if field.ndim != 4 or field.shape[3] != 3:
+        raise ValueError(f"field: expected shape (z, y, x, 3), got {field.shape}.")
+    for name, flags in (("keep", keep), ("wanted", wanted)):
+        if flags.shape != field.shape[:3]:
+            raise ValueError(f"{name}: expected the shape of the field's grid, {field.shape[:3]}, got {flags.shape}.")
     where = runtime.device()
     wp.load_module(__name__, device=where.warp)  # before threads start: compilation is not thread-safe
-    shape, points = keep.shape, keep.size
-    vectors = wp.array(np.ascontiguousarray(field, np.float32), dtype=float, device=where.warp)
-    kept = wp.array(np.ascontiguousarray(keep, np.int32), dtype=int, device=where.warp)
-    prediction = wp.empty((points, 3, 6), dtype=float, device=where.warp)
-    count = wp.empty(points, dtype=int, device=where.warp)
+    points = np.flatnonzero(wanted).astype(np.int32)
+    arrays = ((field, np.float32, float), (keep, np.int32, int), (points, np.int32, int))
+    inputs = [wp.array(np.ascontiguousarray(a, kind), dtype=t, device=where.warp) for a, kind, t in arrays]
+    prediction = wp.empty((len(points), 3, 6), dtype=float, device=where.warp)
+    count = wp.empty(len(points), dtype=int, device=where.warp)
 
     def part(chunk: int, begin: int, end: int) -> None:
         wp.launch(
             _predict,
-            dim=(end - begin, *shape[1:], 3),
-            inputs=[vectors, kept, begin],
+            dim=(end - begin, 3),
+            inputs=[*inputs, begin],
             outputs=[prediction, count],
             device=where.warp,
         )
 
-    runtime.run_chunks(shape[0], part)
-    parts = np.moveaxis(prediction.numpy().reshape(*shape, 3, 6), -1, 0)
-    return Prediction(*parts, count.numpy().reshape(shape))
+    runtime.run_chunks(len(points), part)
+    return Prediction(*np.moveaxis(prediction.numpy(), -1, 0), count.numpy())

@@ -14,19 +14,20 @@ from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
 from lfpiv.rig import LensLattice, Optics
 
-COUNTS_PER_PHOTON = 4.0
-WHITE_PHOTONS = 250  # per pixel
+COUNTS_PER_PHOTON = 6.0
+WHITE_PHOTONS = 160  # per pixel
 READ_NOISE = 2.0  # counts
 DARK_LEVEL = 30.0  # counts
 
 # All in microlens pitches. Gaussian fits are off by 0.04-0.07, and biased by as much within a lens.
-MEAN_ERROR = 0.012  # photon noise of 6 % per pixel leaves 0.005-0.007 in these scenes; a doubled error fails
+MEAN_ERROR = 0.012  # photon noise of 8 % per pixel leaves 0.006-0.008 in these scenes; a doubled error fails
 DARK_DOT_ERROR = 0.04  # a bright board's photons drown dark dots three times deeper
 BIAS = 0.006  # mean error in any fifth of a lens: a tenth of the peak locking of Gaussian fits
 WRONG_NAME_PITCHES = 2.0  # a dot named wrongly is off by its spacing, at least 4 pitches in these scenes
 SAMPLE_ERROR = 0.005  # measured 0.0026: half of what the mapping needs
 HONEST = (0.5, 2.0)  # true over stated error; small model errors are shared by all labels of a dot
 SHARE_ERROR = 0.1  # scatter of the white image that is response; a tenth changes no weight noticeably
+GRADIENT_ERROR = 0.03  # the gradient has kinks; differences over 2 % of a lens round them off
 F_ERROR = 5 * 0.5 / np.sqrt(40_000)  # five standard deviations of a count of 40,000 rays
 
 
@@ -48,6 +49,7 @@ class Scene:
     spacing_mm: float = 0.8
     diameter_mm: float = 0.1
     planes_mm: tuple = (-1.2, 0.1, 0.9)
+    visible: tuple = (25, 25, 25)  # dots of each plane with most of their light on the sensor
     dark_dots: bool = False
     missing: tuple = ()  # (plane, column, row)
     false_mm: tuple = ()  # (plane, x, y)
@@ -108,17 +110,21 @@ class Renderer:
         self.response = 1 + scene.response_sd * self.random.standard_normal(scene.sensor_shape)
 
     def expected_white(self):
-        """Photons per pixel of an even scene: part of each pixel inside the images of the pupil, 4 x 4 points."""
-        rows, columns = self.scene.sensor_shape
-        widening = 1 + self.optics.sensor_per_pupil
-        tree = cKDTree(self.centres * widening)
-        total = np.zeros((rows, columns))
-        for dy in (np.arange(4) - 1.5) / 4:
-            for dx in (np.arange(4) - 1.5) / 4:
-                row, col = np.mgrid[:rows, :columns]
-                at = self.optics.sensor_mm(np.stack([col + dx, row + dy], -1))
-                total += tree.query(at)[0] < self.optics.pupil_radius_mm * self.optics.sensor_per_pupil
-        return WHITE_PHOTONS * total / 16
+        """Photons per pixel of an even scene: part of each pixel inside the images of the pupil, by 4 x 4 points."""
+        optics, (rows, columns) = self.optics, self.scene.sensor_shape
+        radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
+        steps = np.arange(4 * (int(2 * radius) + 4)) / 4 - 0.375
+        padded = np.zeros((rows + 60, columns + 60))
+        for x, y in optics.sensor_px(self.centres * (1 + optics.sensor_per_pupil)):
+            col, row = round(x - radius - 1.5), round(y - radius - 1.5)
+            area = (
+                (np.hypot(col + steps - x, (row + steps - y)[:, None]) < radius)
+                .reshape(len(steps) // 4, 4, -1, 4)
+                .mean((1, 3))
+            )
+            if -30 <= row < rows + 30 - len(area) and -30 <= col < columns + 30 - len(area):
+                padded[row + 30 :, col + 30 :][: len(area), : len(area)] += area
+        return WHITE_PHOTONS * padded[30:-30, 30:-30]
 
     def dot_photons(self, points):
         """Photons of dots at `points`, counted per pixel; as bright as the white image."""
@@ -186,6 +192,7 @@ SCENES = {
         array_roll_deg=1.0,
         array_offset_mm=(-0.03, 0.01),
         response_sd=0.08,
+        visible=(25, 25, 20),
         seed=2,
     ),
     "dark dots on a bright board": Scene(
@@ -218,7 +225,7 @@ def test_labels_follow_the_true_rays(name):
     planes = len(scene.planes_mm)
     gone = np.bincount([p for p, _, _ in scene.missing], minlength=planes)
     assert np.array_equal(dots.found + gone, dots.expected)
-    assert (dots.expected == np.prod(scene.dots)).all()
+    assert np.array_equal(dots.expected, scene.visible)
     numbers = [p * np.prod(scene.dots) + j * scene.dots[0] + i for p, i, j in scene.missing]
     assert not np.isin(numbers, dots.measured_dot).any()
 
@@ -247,7 +254,7 @@ def test_gaussian_fits_are_biased_to_lens_centres_and_the_integral_is_not():
         dots = measure_board(
             images, decoder, scene.board, nominal_angle_deg=scene.nominal_angle_deg, estimator=estimator
         )
-        assert (dots.found == 25).all()
+        assert np.array_equal(dots.found, scene.visible)
         mean[estimator] = np.hypot(*label_errors(scene, dots).T).mean()
     assert 0.03 < mean["gaussian"] < 0.09  # 0.04-0.07 pitch, widened by half for other foci and foreshortening
     assert mean["lens_integral"] < mean["gaussian"] / 4
@@ -277,8 +284,8 @@ def test_light_of_a_pixel_against_counted_rays(layout):
     tilt = np.zeros((2, 2, 2))
     tilt[0, 0, 0], tilt[1, 0, 1] = 0.06, 0.06
     slope = np.array([[0.02, 0.001], [-0.001, 0.018]])
-    offset = random.uniform(-0.11, 0.11, (200, 2))
-    pupil = random.uniform(-0.7, 0.7, (200, 2))
+    offset = random.uniform(-0.11, 0.11, (80, 2))
+    pupil = random.uniform(-0.7, 0.7, (80, 2))
     share, gradient = model.table(jacobian, tilt, slope)(offset, pupil)
 
     count = 40_000
@@ -291,12 +298,11 @@ def test_light_of_a_pixel_against_counted_rays(layout):
         landed = offset[k] + (dot @ (jacobian + tilt @ pupil[k]).T + pixel @ slope.T) @ inverse.T
         counted = (lattice.nearest(landed) == 0).all(1).mean()
         assert abs(share[k] - counted) < F_ERROR
-    step = 1e-4
+    table, step = model.table(jacobian, tilt, slope), 2e-3
     for axis in (0, 1):
-        ahead, behind = (
-            model.table(jacobian, tilt, slope)(offset + s * step * np.eye(2)[axis], 0 * pupil)[0] for s in (1, -1)
-        )
-        assert np.abs((ahead - behind) / (2 * step) - gradient[:, axis]).max() < 0.05 * np.abs(gradient).max()
+        ahead, behind = (table(offset + sign * step * np.eye(2)[axis], 0 * pupil)[0] for sign in (1, -1))
+        miss = (ahead - behind) / (2 * step) - gradient[:, axis]
+        assert np.sqrt((miss**2).mean()) < GRADIENT_ERROR * np.abs(gradient).max()
 
 
 def test_bad_boards_are_refused():

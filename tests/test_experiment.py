@@ -240,7 +240,9 @@ def vectors(seed=0, shape=(2, 3, 4)):
     variables["valid"] = (("z", "y", "x"), rng.random(shape) > 0.2)
     variables["uncertainty"][1][0, 0, 0] = np.nan
     coordinates = {name: (name, np.arange(n) * 0.4, {"units": "mm"}) for name, n in zip("zyx", shape, strict=True)}
-    return xr.Dataset(variables, coordinates, {"dt_s": 1e-3, "verdict": "most vectors are valid", "passes": [{"window": [8, 8, 8]}]})
+    return xr.Dataset(
+        variables, coordinates, {"dt_s": 1e-3, "verdict": "most vectors are valid", "passes": [{"window": [8, 8, 8]}]}
+    )
 
 
 def volume(seed, residual):
@@ -264,7 +266,9 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
     np.testing.assert_array_equal(condensed["projection_y"].values[1], pair["b"].values.max(1))
     np.testing.assert_array_equal(condensed["residual"].values, [[0.9, 0.5, 0.4], [0.8, 0.6, np.nan]])
     dataset.write_volume(pair["a"], tmp_path / "volume.nc", attributes={"settings_hash": "4567"})
-    xr.testing.assert_equal(dataset.read_volume(tmp_path / "volume.nc"), pair["a"])
+    again = dataset.read_volume(tmp_path / "volume.nc")
+    xr.testing.assert_equal(again, pair["a"])
+    xr.testing.assert_equal(dataset.build_reconstruction({"a": again, "b": pair["b"]}), reconstruction)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["pair_0000.nc", "volume.nc"]
 
 

@@ -128,8 +128,8 @@ def test_background_is_read_between_the_microimages(camera):
 def test_views_are_the_scene_at_the_lens_centres(camera):
     """A scene that changes over the array and over the pupil, divided by an uneven white image."""
     optics, lattice = camera.optics, camera.lattice
-    rows, columns = np.mgrid[: optics.sensor_shape[0], : optics.sensor_shape[1]]
-    uneven = 1 - 0.2 * (columns / 260) ** 2
+    columns = np.arange(optics.sensor_shape[1])
+    uneven = np.broadcast_to(1 - 0.2 * (columns / 260) ** 2, optics.sensor_shape)
     decoder = LightFieldDecoder.from_white(optics, lattice, white_image(optics, lattice, response=uneven))
     lens = lattice.centres_mm(decoder.lens_index)
 
