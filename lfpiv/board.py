@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from lfpiv.boardfind import DotBoard, find_dots
-from lfpiv.dotlabel import Labels, label_by_gaussian, label_by_integral
+from lfpiv.dotgaussian import label_by_gaussian
+from lfpiv.dotlabel import Labels, label_by_integral
 from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
 from lfpiv.rig import Optics
@@ -17,6 +19,9 @@ from lfpiv.rig import Optics
 __all__ = ["ESTIMATORS", "BoardDots", "DotBoard", "measure_board"]
 
 log = logging.getLogger(__name__)
+
+_SATURATED_PIXELS = 10  # so many pixels at the very same highest value are taken for saturated,
+_SATURATED_SIGMA = 20.0  # if they are this far above the dark level
 
 ESTIMATORS = ("lens_integral", "gaussian")
 """The integrated dot model on raw pixels, and the paper's Gaussian fit in sub-aperture views."""
@@ -58,6 +63,10 @@ class BoardDots:
     response_share: float
     """Part of the white image's scatter from pixel to pixel that is pixel response, the rest being its noise; see
     `LightFieldDecoder.shrunk_gain`. nan for the Gaussian estimator."""
+    diameter_mm: float
+    """Diameter of the dots as they look [mm]; the board's for the Gaussian estimator."""
+    blur_px: float
+    """Blur of the sensor and the microlenses, standard deviation [pixel]; nan for the Gaussian estimator."""
 
     def outlines_px(self, optics: Optics, points: int = 48) -> np.ndarray:
         """Outline of each measured dot's light on the sensor as (column, row) [pixel], shape (d, points, 2)."""
@@ -104,16 +113,17 @@ def measure_board(
     if len(images) != len(board.planes_mm):
         raise InputError(f"images: expected one per plane, {len(board.planes_mm)}, got {len(images)}.")
     signals = _Signals(images, decoder)
-    detection = find_dots(signals, decoder, board, nominal_angle_deg)
-    if estimator == "gaussian":
-        labels = label_by_gaussian(signals, decoder, board, detection)
-    else:
-        labels = label_by_integral(signals, signals.noise, decoder, board, detection)
+    with threadpool_limits(1, user_api="blas"):  # on matrices this small threads only get in each other's way
+        detection = find_dots(signals, decoder, board, nominal_angle_deg)
+        if estimator == "gaussian":
+            labels = label_by_gaussian(signals, decoder, board, detection)
+        else:
+            labels = label_by_integral(signals, signals.noise, decoder, board, detection)
     return _collect(labels, board, detection.in_field)
 
 
 class _Signals(Sequence):
-    """The planes' images above their dark levels; only the last one asked for is kept as float."""
+    """The planes' images above their dark levels, nan where saturated; only the last one asked for is kept as float."""
 
     def __init__(self, images: Sequence[np.ndarray], decoder: LightFieldDecoder):
         self._images, self._last = images, (-1, None)
@@ -125,7 +135,7 @@ class _Signals(Sequence):
                     f"got {np.shape(image)}."
                 )
             levels.append(decoder.background(image))
-        self._levels = [level for level, _ in levels]
+        self._levels = levels
         self.noise = float(np.median([sigma for _, sigma in levels]))
 
     def __len__(self) -> int:
@@ -133,7 +143,12 @@ class _Signals(Sequence):
 
     def __getitem__(self, plane: int) -> np.ndarray:
         if plane != self._last[0]:
-            signal = np.asarray(self._images[plane], np.float32) - np.float32(self._levels[plane])
+            image = np.asarray(self._images[plane])
+            level, sigma = self._levels[plane]
+            signal = image.astype(np.float32) - np.float32(level)
+            top = image == image.max()
+            if np.count_nonzero(top) >= _SATURATED_PIXELS and signal[top][0] > _SATURATED_SIGMA * sigma:
+                signal[top] = np.nan
             self._last = plane, signal
         return self._last[1]
 

@@ -97,8 +97,8 @@ def find_dots(signals, decoder: LightFieldDecoder, board: DotBoard, nominal_angl
     if len(points) < min(max(FEWEST_DOTS, _FEWEST_PART * visible), board.size):
         raise InputError(
             f"board: expected a lattice of {board.dots[0]} x {board.dots[1]} dots, {board.spacing_mm:g} mm apart, near "
-            f"z = {board.planes_mm[order[0]]:g} mm; found {len(points)} dots of it. Check the board images, [board] and "
-            f"nominal_angle_deg ({nominal_angle_deg:g})."
+            f"z = {board.planes_mm[order[0]]:g} mm; found {len(points)} dots of it. Check the board images, the "
+            f"board's numbers and the nominal angle ({nominal_angle_deg:g} degrees)."
         )
     pose = plan.fitted(points, chief, optics)
 

@@ -172,7 +172,8 @@ class Rectifier:
         self._cell_mm = optics.microlens_pitch_mm / abs(optics.magnification)
 
     def __call__(self, signal: np.ndarray, pose: CameraPose, z_mm: float) -> Rectified:
-        """Rectify one image, dark level subtracted, and filter it for blobs of the dots' size."""
+        """Rectify one image, dark level subtracted, nan where saturated, and filter it for blobs of the dots' size."""
+        top = np.nanmax(signal)
         bin_mm = _BIN_PITCHES * self._cell_mm
         shape = tuple(int(2 * half / bin_mm) + 1 for half in self._half_width[::-1])
         corner = -np.array(self._half_width)
@@ -180,7 +181,7 @@ class Rectifier:
         at *= np.float32(1 / bin_mm)
         inside = (at > -0.5).all(1) & (at < np.array(shape[::-1], np.float32) - 0.5).all(1)
         element = np.rint(at[inside]).astype(np.intp) @ np.array([1, shape[1]])
-        light = np.bincount(element, signal[self._seen][inside], np.prod(shape)).reshape(shape)
+        light = np.bincount(element, np.nan_to_num(signal[self._seen], nan=top)[inside], np.prod(shape)).reshape(shape)
         white = np.bincount(element, self._response[inside], np.prod(shape)).reshape(shape)
 
         blob = np.hypot(self._diameter / 4, self._cell_mm / 3) / bin_mm

@@ -11,6 +11,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from scipy.spatial import cKDTree
 
 from lfpiv.board import BoardDots, DotBoard, measure_board
 from lfpiv.errors import InputError
@@ -25,8 +26,11 @@ from lfpiv_kernels import mapping
 log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
-OUTLIER = 6.0
-"""A dot whose labels miss the fitted mapping by this many robust standard deviations is left out."""
+OUTLIER, OUTLIER_PITCH = 6.0, 0.1
+"""A dot is left out where its labels disagree with its neighbours by more than this many times the typical
+disagreement, and by more than this fraction of the microlens pitch: wrongly named or damaged."""
+NEIGHBOURS = 16
+"""Neighbouring dots, in space, that a dot is compared with."""
 
 Progress = Callable[[float], None]
 
@@ -86,14 +90,27 @@ class CalibratedCamera:
         rays = 0.0 if self.baseline is None else self.baseline(points, pupil)
         return rays if self.network is None else rays + self.network(np.hstack([points, pupil]))
 
-    def map_fast(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
-        """`map` in single precision, the network on the running device; for many rays."""
+    def map_fan(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+        """Trace a fan of rays from every point, in single precision on the running device.
+
+        Parameters
+        ----------
+        points_mm : ndarray, shape (n, 3)
+            Object points (x, y, z) [mm].
+        pupil_mm : ndarray, shape (k, 2)
+            Pupil points (u, v) [mm], the same for every object point.
+
+        Returns
+        -------
+        ndarray, shape (n, k, 2), float32
+            Where the rays meet the microlens array, (s, t) [mm].
+        """
         if self.network is None:
-            return self.map(points_mm, pupil_mm).astype(np.float32)
-        rays = mapping.evaluate(
-            self.network.to_arrays(), np.ascontiguousarray(np.hstack([points_mm, pupil_mm]), np.float32)
-        )
-        return rays if self.baseline is None else rays + self.baseline(points_mm, pupil_mm).astype(np.float32)
+            every = np.repeat(points_mm, len(pupil_mm), axis=0), np.tile(pupil_mm, (len(points_mm), 1))
+            return self.map(*every).astype(np.float32).reshape(len(points_mm), len(pupil_mm), 2)
+        arrays = self.network.to_arrays() | ({} if self.baseline is None else self.baseline.to_arrays())
+        points, pupil = (np.ascontiguousarray(array, np.float32) for array in (points_mm, pupil_mm))
+        return mapping.evaluate(arrays, points, pupil)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +202,7 @@ def load_calibration(path: str | Path) -> Calibration:
                     f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {version}; calibrate anew."
                 )
             return Calibration({name: _read_camera(file[f"camera/{name}"], name) for name in file.attrs["cameras"]})
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: expected a calibration file, could not read it ({error}); calibrate anew.") from None
@@ -255,7 +272,7 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
 
     points, pupil, array = dots.points_mm, dots.pupil_mm, dots.array_mm
     fitted = fit_thin_lens(points, pupil, array, setup.optics)
-    keep = _agreeing_dots(dots, np.linalg.norm(fitted(points, pupil) - array, axis=1))
+    keep = _agreeing_dots(dots, array - fitted(points, pupil), lattice.pitch_mm)
     baseline = fitted if settings.baseline == "thin_lens" else None
     target = array if baseline is None else array - baseline(points, pupil)
     pitch = lattice.pitch_mm
@@ -304,19 +321,20 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
     return camera
 
 
-def _agreeing_dots(dots: BoardDots, distance: np.ndarray) -> np.ndarray:
-    """Labels of the dots that agree with a smooth mapping: bool, shape (n,).
+def _agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) -> np.ndarray:
+    """Labels of the dots that agree with their neighbours: bool, shape (n,).
 
-    `distance` is each label's distance from a fitted thin lens; real optics depart from that smoothly, so a dot is
-    compared with the typical departure, not with zero.
+    `departure_mm` (n, 2) is each label's distance from a fitted thin lens. Real optics depart from that smoothly, so
+    each dot's mean departure is compared with the median of its neighbours' in space.
     """
-    number, inverse = np.unique(dots.dot, return_inverse=True)
-    mean = np.bincount(inverse, weights=distance) / np.bincount(inverse)
-    typical = np.median(mean)
-    spread = 1.4826 * np.median(np.abs(mean - typical)) + 1e-12
-    bad = mean > typical + OUTLIER * spread + 0.1 * typical
+    number, first, inverse = np.unique(dots.dot, return_index=True, return_inverse=True)
+    count = np.bincount(inverse)
+    mean = np.stack([np.bincount(inverse, weights=column) / count for column in departure_mm.T], axis=1)
+    _, neighbour = cKDTree(dots.points_mm[first]).query(dots.points_mm[first], k=min(NEIGHBOURS + 1, len(number)))
+    misfit = np.linalg.norm(mean - np.median(mean[neighbour[:, 1:]], axis=1), axis=1)
+    bad = misfit > max(OUTLIER * 1.4826 * float(np.median(misfit)), OUTLIER_PITCH * pitch_mm)
     if bad.any():
-        log.info("%d dots disagree with the others and are left out: %s", bad.sum(), number[bad].tolist())
+        log.info("%d dots disagree with their neighbours and are left out: %s", bad.sum(), number[bad].tolist())
     return ~bad[inverse]
 
 

@@ -1,4 +1,4 @@
-"""Label the rays of detected dots: by the lens-integrated dot model, or by Gaussian fits in sub-aperture views."""
+"""Label the rays of detected dots by the dot model integrated over the microlenses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from lfpiv.lightfield import LightFieldDecoder
 
 log = logging.getLogger(__name__)
 
-_PUPIL_PART = 0.92  # labels stay this far inside the pupil's edge, where pixels are wholly lit
+PUPIL_PART = 0.92  # labels stay this far inside the pupil's edge, where pixels are wholly lit
 _FIT_COVERAGE = 0.9  # pixels cut by the edge of a microimage are left out of a fit
 _MARGIN_PITCHES = (0.5, 0.25)  # pixels this far beyond a dot's support are fitted too, first and second round
 _PRIOR_PITCHES = (0.5, 0.3, 0.1)  # first round: loose prior on position, slope and curvature over the pupil [pitch]
@@ -37,6 +37,12 @@ _OUTLIER_LIGHT = 3.0  # dots this many times fainter or brighter than the typica
 _OUTLIER_SIGMA = 6.0  # dots this far off the smooth mapping, in units of its scatter, are none
 _OUTLIER_PITCHES = 0.15  # but closer than this no dot is taken for an outlier
 _NOISE_SHARE = 0.3  # pixels that see at least this part of a dot tell noise and pixel response
+_SIZE_SAMPLE = 48  # dots that tell their diameter and the blur
+_SIZE_ROUNDS = 8
+_SIZE_CHANGE = 0.005  # it is settled when it changes by less than this part
+_SIZE_STEP = 0.25  # and changes at most by this in one round
+_SIZE_PRIOR = (0.3, 0.5)  # how far a diameter is off (logarithm), and how large the square of a blur is [pixel^2]
+_SIZE_NOTABLE = 0.1  # and worth a warning when it is this far off
 _NORMAL_MAD = 1.4826
 _TUKEY = 4.685
 
@@ -57,6 +63,8 @@ class Labels:
     slope: np.ndarray
     reduced_chi2: np.ndarray
     response_share: float
+    diameter_mm: float
+    blur_px: float
 
 
 def label_by_integral(
@@ -78,12 +86,13 @@ def label_by_integral(
     mean = _pose_terms(detection.pose, points, radius)
     mean[:, 0] = detection.chief_mm
     loose = np.tile(1 / (np.take(_PRIOR_PITCHES, _ORDER) * pitch) ** 2, 2)
-    model = LensIntegral(decoder, board.diameter_mm, noise, decoder.counts_per_photon)
     response = decoder.coverage * decoder.smooth_gain * np.float32(decoder.white_counts)
+    diameter, blur = rounds.dot_and_blur(noise, response, dot, mean, loose)
+    model = LensIntegral(decoder, diameter, blur, noise, decoder.counts_per_photon)
     fits, taken = rounds.run(model, response, dot, mean, np.tile(loose, (len(dot), 1)), _MARGIN_PITCHES[0] * pitch)
 
     photon, share = _noise_and_response(fits, taken, decoder)
-    model = LensIntegral(decoder, board.diameter_mm, noise, photon)
+    model = LensIntegral(decoder, diameter, blur, noise, photon)
     response = decoder.coverage * decoder.shrunk_gain(share) * np.float32(decoder.white_counts)
 
     good = [k for k, fit in enumerate(fits) if fit is not None and fit.converged]
@@ -107,7 +116,9 @@ def label_by_integral(
     fits, _ = rounds.run(model, response, candidates, mean, information, _MARGIN_PITCHES[1] * pitch)
 
     trusted = _trusted(fits, candidates // board.size, mean, sigma, pitch, detection.sign)
-    return _integral_labels(fits, candidates, trusted, np.isin(candidates, dot) & ~trusted, decoder, share)
+    return _integral_labels(
+        fits, candidates, trusted, np.isin(candidates, dot) & ~trusted, decoder, share, diameter, blur
+    )
 
 
 class _Rounds:
@@ -130,6 +141,7 @@ class _Rounds:
         fits, taken = [], []
         for k, dot in enumerate(dots):
             where = self._pixels(model, mean[k], jacobians[k], around[k] - chief[k], margin_mm)
+            where = where[~np.isnan(self.signals[dot // self.board.size][tuple(where.T)])]
             fit = None
             if len(where) >= FEWEST_PIXELS:
                 at = (where[:, 0], where[:, 1])
@@ -143,6 +155,39 @@ class _Rounds:
             fits.append(fit)
             taken.append(where)
         return fits, taken
+
+    def dot_and_blur(self, noise, response, dots, mean, information):
+        """Diameter the dots show [mm], and blur of the pixels [pixel]: what a sample of dots fits best.
+
+        A dot drawn too large or too small is fitted in the wrong place wherever its light is cut by a lens's edge. The
+        diameter matters everywhere, the blur grows with the slope of the rays; so focus tells the two apart.
+        """
+        chosen = np.unique(np.linspace(0, len(dots) - 1, _SIZE_SAMPLE).astype(int))
+        prior = np.tile(information, (len(chosen), 1))
+        margin = _MARGIN_PITCHES[0] * self.decoder.optics.microlens_pitch_mm
+        nominal = self.board.diameter_mm
+        size, blur2 = 0.0, 0.0  # log(diameter / nominal), blur^2
+        for _ in range(_SIZE_ROUNDS):
+            model = LensIntegral(
+                self.decoder, nominal * np.exp(size), np.sqrt(blur2), noise, self.decoder.counts_per_photon
+            )
+            fits = self.run(model, response, dots[chosen], mean[chosen], prior, margin)[0]
+            fits = [fit for fit in fits if fit is not None and fit.converged]
+            if not fits:
+                break
+            typical = np.median([fit.reduced_chi2 for fit in fits])
+            fits = [fit for fit in fits if fit.reduced_chi2 <= 2 * typical]
+            total = sum(fit.growth_information for fit in fits) / typical + np.diag(1 / np.square(_SIZE_PRIOR))
+            pull = sum(fit.growth for fit in fits) / typical - np.array([size, blur2]) / np.square(_SIZE_PRIOR)
+            change = np.clip(np.linalg.solve(total, pull), -_SIZE_STEP, _SIZE_STEP)
+            if blur2 + change[1] < 0:  # no blur: the diameter alone
+                change = np.array([np.clip(pull[0] / total[0, 0], -_SIZE_STEP, _SIZE_STEP), -blur2])
+            size, blur2 = size + change[0], blur2 + change[1]
+            if np.abs(change).max() < _SIZE_CHANGE:
+                break
+        if abs(size) > _SIZE_NOTABLE:
+            log.warning("the board's dots look %.3g mm wide, not %.3g mm", nominal * np.exp(size), nominal)
+        return float(nominal * np.exp(size)), float(np.sqrt(blur2))
 
     def _pixels(self, model, theta, board_jacobian, neighbours_mm, margin_mm):
         """Rows and columns of the usable pixels that may see a dot and none of its neighbours, shape (n, 2)."""
@@ -159,7 +204,8 @@ class _Rounds:
         lens = decoder.lattice.centres_mm(decoder.lens_index[at])
         terms = ray_terms(decoder.pupil_mm[at], model.pupil_radius_mm)
         offset, _ = lens_offset_mm(terms, theta, lens, model.pupil_radius_mm)
-        take = (np.abs(offset) < support + margin_mm).all(1)
+        away = np.abs(offset)
+        take = (away[:, 0] < support[0] + margin_mm) & (away[:, 1] < support[1] + margin_mm)
         inverse = np.linalg.inv(np.eye(2) - slope)
         for neighbour in neighbours_mm @ inverse.T:
             if (np.abs(neighbour) < 2 * support + margin_mm).all():
@@ -267,10 +313,10 @@ def _trusted(fits, plane, mean, sigma, pitch, sign) -> np.ndarray:
     return fitted
 
 
-def _integral_labels(fits, dots, trusted, rejected, decoder, share) -> Labels:
+def _integral_labels(fits, dots, trusted, rejected, decoder, share, diameter, blur) -> Labels:
     """Sample the fitted ray models at pupil points near which each dot was seen."""
     optics = decoder.optics
-    views = spread_over_pupil(_PUPIL_PART * optics.pupil_radius_mm)
+    views = spread_over_pupil(PUPIL_PART * optics.pupil_radius_mm)
     terms = ray_terms(views, optics.pupil_radius_mm)
     near = (1.5 * optics.pupil_pixel_mm) ** 2
     pupil, array, std, owner = [], [], [], []
@@ -295,68 +341,6 @@ def _integral_labels(fits, dots, trusted, rejected, decoder, share) -> Labels:
         slope=np.array([slope_of(fit.coefficients, optics.pupil_radius_mm) for fit in kept]).reshape(-1, 2, 2),
         reduced_chi2=np.array([fit.reduced_chi2 for fit in kept]),
         response_share=share,
+        diameter_mm=diameter,
+        blur_px=blur,
     )
-
-
-def label_by_gaussian(
-    signals: Sequence[np.ndarray], decoder: LightFieldDecoder, board: DotBoard, detection: Detection
-) -> Labels:
-    """Fit a Gaussian to the lenses around each dot in each view: their logarithms lie on a paraboloid [34].
-
-    On a square array these are the three-point estimators of the two axes; on a hexagonal one the paraboloid goes
-    through all six neighbours.
-    """
-    optics, lattice = decoder.optics, decoder.lattice
-    steps = np.array([(0, 0)] + [s for s in itertools.product((-1, 0, 1), repeat=2) if any(s)])
-    steps = steps[np.hypot(*(steps @ np.asarray(lattice.basis_mm)).T) < 1.2 * lattice.pitch_mm]
-    a, b = steps.T.astype(float)
-    columns = [np.ones(len(a)), a, b, a * a, b * b] + ([a * b] if len(steps) > 5 else [])
-    solve = np.linalg.pinv(np.stack(columns, axis=1))
-    slope = detection.pose.rays(board.of_dots_mm(detection.dot))[1]
-    views = spread_over_pupil(_PUPIL_PART * optics.pupil_radius_mm)
-    expected = detection.chief_mm[:, None] + slope[:, None, None] * views
-    label = np.full(expected.shape, np.nan)
-    for plane in np.unique(detection.dot // board.size):
-        mine = detection.dot // board.size == plane
-        lens = lattice.nearest(expected[mine])
-        for _ in range(3):  # the last values are those around the brightest lens
-            values = detection.sign * decoder.sample(signals[plane], lens[:, :, None] + steps, views[:, None])
-            lens = lens + steps[np.where(np.isnan(values), -np.inf, values).argmax(-1)]
-        values = detection.sign * decoder.sample(signals[plane], lens[:, :, None] + steps, views[:, None])
-        if detection.sign < 0:  # a dark dot is a dip below the board
-            values = values + np.nanpercentile(-values, 75)
-        label[mine] = lattice.centres_mm(lens) + _gaussian_peak(values, solve) @ np.asarray(lattice.basis_mm)
-
-    miss = label - expected
-    centre = np.nanmedian(np.where(np.isnan(miss).all(1, keepdims=True), 0, miss), axis=1)
-    miss -= centre[:, None]
-    label[np.hypot(miss[..., 0], miss[..., 1]) > lattice.pitch_mm] = np.nan
-    good = ~np.isnan(label[..., 0])
-    trusted = good.sum(1) >= len(views) // 4
-    good &= trusted[:, None]
-    std = np.sqrt(np.nanmean(np.where(good[..., None], miss**2, np.nan)[trusted], axis=(1, 2)))
-    return Labels(
-        pupil_mm=np.broadcast_to(views, label.shape)[good],
-        array_mm=label[good],
-        std_mm=np.repeat(std, good.sum(1)[trusted]),
-        dot=np.repeat(detection.dot, good.sum(1)),
-        rejected_dot=detection.dot[~trusted],
-        measured_dot=detection.dot[trusted],
-        chief_mm=(detection.chief_mm + centre)[trusted],
-        slope=slope[trusted, None, None] * np.eye(2),
-        reduced_chi2=np.full(trusted.sum(), np.nan),
-        response_share=np.nan,
-    )
-
-
-def _gaussian_peak(values: np.ndarray, solve: np.ndarray) -> np.ndarray:
-    """Peak of the paraboloid through the logarithms of the values around a lens [lattice steps]; nan where none is."""
-    peak = values[..., :1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        bright = peak > 0.2 * np.nanmedian(peak)
-        c = np.moveaxis(np.log(np.maximum(values, 0.01 * peak)) @ solve.T, -1, 0)
-        cross = c[5] if len(c) > 5 else np.zeros_like(c[0])
-        determinant = 4 * c[3] * c[4] - cross**2
-        shift = np.stack([cross * c[2] - 2 * c[4] * c[1], cross * c[1] - 2 * c[3] * c[2]], -1) / determinant[..., None]
-        good = bright[..., 0] & (determinant > 0) & (c[3] < 0) & (np.abs(shift) <= 1).all(-1)
-    return np.where(good[..., None], shift, np.nan)

@@ -161,49 +161,56 @@ def projections(reconstruction: xr.Dataset, frame: int = 0) -> bytes:
     return _png(figure)
 
 
-def vector_slices(vectors: xr.Dataset) -> bytes:
-    """Slices of a vector volume at several depths: arrows for u, v, colour for w; invalid vectors hollow."""
-    depths = np.unique(np.linspace(0, vectors.sizes["z"] - 1, min(MOST_SLICES, vectors.sizes["z"])).round().astype(int))
-    columns = min(3, len(depths))
-    rows = -(-len(depths) // columns)
-    x, y = vectors["x"].values, vectors["y"].values
-    aspect = (np.ptp(y) or 1) / (np.ptp(x) or 1)
-    height = 3.2 * rows * float(np.clip(aspect, 0.4, 1.6)) + 0.6
-    figure = _figure(3.3 * columns + 1.0, height, layout="compressed")
-    good = vectors["valid"].values & np.isfinite(vectors["w"].values)
-    speeds = np.hypot(vectors["u"].values, vectors["v"].values)
-    limit = float(np.percentile(np.abs(vectors["w"].values[good]), 99)) if good.any() else 1.0
-    longest = float(np.percentile(speeds[good], 99)) if good.any() else 1.0
-    step = max(-(-max(vectors.sizes["x"], vectors.sizes["y"]) // MOST_ARROWS), 1)
-    cell = float(np.median(np.diff(x))) * step if x.size > 1 else 1.0
+def vector_slices(vectors: xr.Dataset, normal: str = "z", most: int = MOST_SLICES) -> bytes:
+    """Slices of a vector volume: arrows for the components in the slice, colour for the one across it.
+
+    Parameters
+    ----------
+    vectors : Dataset
+        Dims z, y, x; replaced vectors (not ``valid``) are drawn pale.
+    normal : {"z", "y"}
+        Axis across the slices.
+    most : int
+        Largest number of slices, spread evenly; one is taken from the middle.
+    """
+    across, up = ("x", "y") if normal == "z" else ("x", "z")
+    component = {"x": "u", "y": "v", "z": "w"}
+    count = vectors.sizes[normal]
+    places = [count // 2] if most == 1 else np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+    columns = min(3, len(places))
+    rows = -(-len(places) // columns)
+    spans = [float(np.ptp(vectors[axis].values)) + _spacing(vectors[axis].values) for axis in (across, up)]
+    height = 3.2 * rows * float(np.clip(spans[1] / spans[0], 0.4, 1.6)) + 0.6
+    figure = _figure(3.3 * columns + 1.2, height, layout="compressed")
+    good = vectors["valid"].values & np.isfinite(vectors["u"].values)
+    through = np.abs(vectors[component[normal]].values[good])
+    inside = np.hypot(vectors[component[across]].values, vectors[component[up]].values)[good]
+    limit, longest = (float(np.percentile(values, 99)) if values.size else 1.0 for values in (through, inside))
     norm = Normalize(-(limit or 1.0), limit or 1.0)
-    for number, depth in enumerate(depths):
+    step = max(-(-max(vectors.sizes[across], vectors.sizes[up]) // MOST_ARROWS), 1)
+    scale = (longest or 1.0) / (1.3 * step * min(_spacing(vectors[axis].values) for axis in (across, up)))
+    for number, place in enumerate(places):
         axes = figure.add_subplot(rows, columns, number + 1)
-        slab = vectors.isel(z=int(depth))
-        colour = axes.pcolormesh(x, y, slab["w"].values, cmap="RdBu_r", norm=norm, shading="nearest", alpha=0.85)
-        thin = slab.isel(x=slice(None, None, step), y=slice(None, None, step))
-        valid = thin["valid"].values
-        for shown, tint in ((valid, "#101418"), (~valid, "#9aa0a6")):
+        slab = vectors.isel({normal: int(place)}).transpose(up, across)
+        ground = (slab[across].values, slab[up].values, slab[component[normal]].values)
+        colour = axes.pcolormesh(*ground, cmap="RdBu_r", norm=norm, shading="nearest", alpha=0.85)
+        thin = slab.isel({across: slice(None, None, step), up: slice(None, None, step)})
+        for shown, tint in ((thin["valid"].values, "#101418"), (~thin["valid"].values, "#9aa0a6")):
+            arrows = [np.where(shown, thin[component[axis]].values, np.nan) for axis in (across, up)]
             axes.quiver(
-                thin["x"].values,
-                thin["y"].values,
-                np.where(shown, thin["u"].values, np.nan),
-                np.where(shown, thin["v"].values, np.nan),
+                thin[across].values,
+                thin[up].values,
+                *arrows,
                 angles="xy",
                 scale_units="xy",
-                scale=(longest or 1.0) / (1.3 * cell),
+                scale=scale,
                 width=0.006,
                 color=tint,
             )
-        axes.set(
-            aspect="equal",
-            title=f"z = {float(slab['z']):.2f} mm",
-            xlabel="x [mm]" if number >= len(depths) - columns else "",
-            ylabel="y [mm]" if number % columns == 0 else "",
-        )
+        axes.set(aspect="equal", title=f"{normal} = {float(slab[normal]):.2f} mm")
+        axes.set(xlabel=f"{across} [mm]", ylabel=f"{up} [mm]" if number % columns == 0 else "")
         _style(axes)
-    bar = figure.colorbar(colour, ax=figure.axes, shrink=0.7)
-    _style_bar(bar, "w [m/s]")
+    _style_bar(figure.colorbar(colour, ax=figure.axes, shrink=0.7), f"{component[normal]} [m/s]")
     return _png(figure)
 
 
@@ -214,7 +221,8 @@ def displacement_histograms(vectors: xr.Dataset) -> bytes:
     for number, axis in enumerate("xyz"):
         axes = figure.add_subplot(1, 3, number + 1)
         values = vectors[f"displacement_{axis}"].values[valid]
-        axes.hist(values[np.isfinite(values)], 50, color=COLOURS[number], alpha=0.8)
+        values = values[np.isfinite(values)]
+        axes.hist(values, int(np.clip(np.sqrt(values.size), 8, 60)), color=COLOURS[number], alpha=0.8)
         axes.set(xlabel=f"displacement {axis} [voxel]", ylabel="vectors" if number == 0 else "")
         _style(axes)
     return _png(figure)
@@ -240,6 +248,10 @@ def _extent(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, fl
         half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
         edges += [axis[0] - half, axis[-1] + half]
     return tuple(edges)
+
+
+def _spacing(positions: np.ndarray) -> float:
+    return float(np.median(np.diff(positions))) if positions.size > 1 else 1.0
 
 
 def _cycle(count: int) -> list[str]:

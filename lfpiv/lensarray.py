@@ -1,8 +1,8 @@
 """Microlens array from a white image: sub-pixel lattice of the microimages' centres.
 
-The lattice's vectors come from the white image's autocorrelation, its phase from the symmetry of the mean lattice cell.
-Each microimage is then fitted with the mean microimage, moved, scaled and tilted in brightness; an affine lattice through
-the fitted centres, robust against dead lenses and dust, is the result.
+The white image's autocorrelation gives the lattice's vectors, the symmetry of its mean cell the phase. Each microimage
+is then fitted with the mean microimage, moved, scaled and tilted in brightness; the result is an affine lattice through
+the fitted centres, robust against dead lenses and dust.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ from lfpiv.rig import LAYOUTS, LensLattice, Optics
 log = logging.getLogger(__name__)
 
 TILE_PX = 1024
-"""Largest tile of the autocorrelation [pixel]; lags reach half of it, so pitches up to about a third."""
+"""Side of the part of the image that the autocorrelation sees [pixel]; lags reach half of it."""
 PEAK_FRACTION = 0.7
-"""A lag is a lattice vector if its correlation is above this part of the best; between lattice vectors it is far lower."""
+"""A lag is a lattice vector if its correlation is above this part of the best; between lattice vectors it is lower."""
+SIGNIFICANCE = 8
+"""Correlation that is no chance [standard deviations of that of unrelated pixels, one in the root of their number]."""
 NOMINAL_TOLERANCE = 0.2
-"""A nominal pitch narrows the search to this relative distance: twice the error that a data sheet may have."""
+"""Largest relative error of a nominal pitch: twice what a data sheet may be off."""
 CELL_TOLERANCE = 0.03
 """Largest misfit of a neighbour to the layout [pitch]; real arrays stay within 1 %."""
 CANDIDATES = 200
@@ -33,24 +35,26 @@ BLUR_PX = 0.9
 """Gaussian blur of the microimages before the fit [pixel]: removes what the pixels alias, so no locking to pixels."""
 BLUR_REACH_PX = 3
 """Reach of the blur [pixel], over three standard deviations."""
-DERIVATIVE = np.array([1, -8, 0, 8, -1]) / 12
-"""Fourth-order first derivative, negative: what a small shift of +1 pixel adds."""
+SHIFT_DIFFERENCE = np.array([1, -8, 0, 8, -1]) / 12
+"""What a shift adds, per pixel: the negative first derivative to fourth order, as convolution weights."""
 PATCH_BLOCK = 512
 """Microimages cut out at a time, so that they stay in the processor's cache."""
 TEMPLATE_LENSES = 500
 """Microimages whose median is the mean microimage."""
+SAMPLE_LENSES = 1500
+"""Microimages that fix the lattice before all are measured."""
+MIN_LENSES = 12
+"""Fewest measured microimages: four values per unknown of the lattice."""
 MAX_PASSES = 20
 """Most passes of an iteration that usually ends after three to five."""
 PASS_TOLERANCE_PX = 0.01
 """Change of the lattice that ends the first passes [pixel]; the final ones start within it."""
-MEDIAN_DISTANCE = {1: 0.6745, 2: math.sqrt(2 * math.log(2))}
-"""Median distance of normal errors from their mean in one and two dimensions [standard deviations]."""
-SAMPLE_LENSES = 1500
-"""Lenses that fix the lattice before all are measured."""
-MIN_LENSES = 12
-"""Fewest measured lenses: two per unknown of the lattice."""
+LIT_FRACTION = 0.1
+"""A microimage with less than this part of the brightest decile's contrast is dead or dark."""
 OUTLIER_SCALES = 4.685
 """Tukey's biweight constant [standard deviations]: 95 % efficiency on normal errors."""
+MEDIAN_DISTANCE = {1: 0.6745, 2: math.sqrt(2 * math.log(2))}
+"""Median distance of normal errors from their mean in one and two dimensions [standard deviations]."""
 DISTORTION_PX = 0.05
 """Smooth distortion worth a warning [pixel, rms]: what would move a pupil coordinate by a twentieth of a pixel."""
 
@@ -70,8 +74,8 @@ class LensArray:
     origin_px: tuple[float, float]
     """Centre of microimage (0, 0) [pixel]."""
     basis_px: tuple[tuple[float, float], tuple[float, float]]
-    """Vectors to the microimages (1, 0) and (0, 1) [pixel]. Square: along +column and +row. Hexagonal: the vector within
-    [-15, 45) degrees of +column, and the one 60 degrees from it towards +row."""
+    """Vectors to the microimages (1, 0) and (0, 1) [pixel], the first -45 to 45 (hexagonal: -15 to 45) degrees from
+    +column, the second 90 (60) degrees further towards +row."""
     layout: str
     """"square" or "hexagonal"."""
     rms_px: float
@@ -229,17 +233,16 @@ def _checked_pitch(nominal_pitch_px: float | None, shape: tuple[int, int]) -> fl
 def _find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndarray:
     """Lattice vectors, rows (column, row) [pixel], in the standard order of `LensArray.basis_px`."""
     tile = _middle(image)
-    width = nominal or 2 * _lobe(_autocorrelation(_flattened(tile)))
-    best, found = -1.0, {}
+    width, best = nominal or min(tile.shape) / 4, -1.0
     while width >= 3:  # a narrow mean hides unequal lenses, a wide one keeps more signal: the lattice itself decides
-        trial = _autocorrelation(_evened(tile, width))
-        lags = {name: _best_lag(trial, _lobe(trial), name) for name in LAYOUTS}
-        score = max(score for score, _ in lags.values())
+        correlation = _autocorrelation(_evened(tile, width))
+        peaks = _correlation_peaks(correlation)
+        trial = {name: _best_lag(correlation, *peaks, name) for name in LAYOUTS}
+        score = max(score for score, _ in trial.values())
         if score > best:
-            correlation, found, best = trial, lags, score
+            chosen, chosen_peaks, found, best = correlation, peaks, trial, score
         width /= 2
-    lobe = _lobe(correlation)
-    if best <= 0:
+    if best * math.sqrt(tile.size) < SIGNIFICANCE:
         raise InputError(
             "white: no regular array of microimages found. Expected a sharp white image with at least four lenses "
             "across; check file, exposure and dark frame."
@@ -247,26 +250,32 @@ def _find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.nda
     fits = [name for name in LAYOUTS if found[name][0] >= PEAK_FRACTION * best]
     shown = min(fits, key=lambda name: np.hypot(*found[name][1]))  # far lags of one layout resemble the other
     if shown != layout:
-        pitch = np.hypot(*found[shown][1])
         raise InputError(
-            f"layout: expected the layout of the white image, {shown} with a pitch of about {pitch:.1f} px, "
-            f"got {layout!r}. Check the microlens layout."
+            f"layout: expected the layout of the white image, {shown} with a pitch of about "
+            f"{np.hypot(*found[shown][1]):.1f} px, got {layout!r}. Check the microlens layout."
         )
     score, lag = found[layout]
     if nominal and abs(np.hypot(*lag) / nominal - 1) > NOMINAL_TOLERANCE:
-        near, nearest = _best_lag(correlation, lobe, layout, nominal)
-        if near < PEAK_FRACTION * score:
-            raise InputError(
-                f"nominal_pitch_px: expected the pitch of the white image, about {np.hypot(*lag):.2f} px, got "
-                f"{nominal:g}. Check microlens pitch and pixel size, or leave it out."
-            )
-        lag = nearest
-    return _refine_basis(correlation, _standard_basis(lag, layout), lobe)
+        raise InputError(
+            f"nominal_pitch_px: expected the pitch of the white image, about {np.hypot(*lag):.1f} px, got {nominal:g}. "
+            "Check microlens pitch and pixel size, or leave it out."
+        )
+    return _refine_basis(chosen, _standard_basis(lag, layout), chosen_peaks[1])
 
 
 def _middle(image: np.ndarray) -> np.ndarray:
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape]
     return image[start[0] : start[0] + TILE_PX, start[1] : start[1] + TILE_PX]
+
+
+def _evened(tile: np.ndarray, width: float) -> np.ndarray:
+    """Tile less its local mean in units of its local contrast: unequal and dead lenses must not outweigh the gaps."""
+    size = 2 * round(width / 2) + 1
+    mean = ndimage.uniform_filter(tile, size)
+    even = tile / np.maximum(mean, 0.1 * max(mean.max(), 1e-30)) - 1
+    contrast = np.sqrt(np.maximum(ndimage.uniform_filter(even**2, 2 * size + 1), 0))
+    even /= np.maximum(contrast, max(np.median(contrast), 1e-30))
+    return even - even.mean()
 
 
 def _autocorrelation(tile: np.ndarray) -> np.ndarray:
@@ -290,7 +299,7 @@ def _autocorrelation(tile: np.ndarray) -> np.ndarray:
 
 
 def _overlap_sums(tile: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over the tile's part that meets itself at each lag (row >= 0): of the one copy and of the other."""
+    """Sum over the tile's part that meets itself at each lag (row >= 0): of the one copy and of the other."""
     total = np.zeros(np.add(tile.shape, 1))
     total[1:, 1:] = tile.cumsum(0, dtype=float).cumsum(1)
     r = np.arange(reach[0] + 1)[:, None]
@@ -304,72 +313,39 @@ def _overlap_sums(tile: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray,
     return box(0 * r, rows - r, left, right), box(r, rows + 0 * r, left + c, right + c)
 
 
-def _flattened(tile: np.ndarray) -> np.ndarray:
-    """Tile divided by its second-order brightness trend, minus one: vignetting must not outshine the lenses."""
-    rows, columns = (np.linspace(-1, 1, n, dtype=np.float32) for n in tile.shape)
-
-    def trend_terms(row, column):
-        one = np.ones(np.broadcast_shapes(row.shape, column.shape), np.float32)
-        return [one, row * one, column * one, row * column, row**2 * one, column**2 * one]
-
-    step = max(1, min(tile.shape) // 256)
-    sparse = np.stack([t.ravel() for t in trend_terms(rows[::step, None], columns[None, ::step])], axis=1)
-    coefficient = np.linalg.lstsq(sparse, tile[::step, ::step].ravel(), rcond=None)[0].astype(np.float32)
-    trend = sum(c * term for c, term in zip(coefficient, trend_terms(rows[:, None], columns[None, :]), strict=True))
-    flat = tile / np.maximum(trend, 0.1 * max(trend.max(), 1e-30))
-    return flat - flat.mean()
-
-
-def _evened(tile: np.ndarray, width: float) -> np.ndarray:
-    """Tile less its local mean in units of its local contrast: unequal and dead lenses must not outweigh the gaps."""
-    size = 2 * round(width / 2) + 1
-    mean = ndimage.uniform_filter(tile, size)
-    even = tile / np.maximum(mean, 0.1 * max(mean.max(), 1e-30)) - 1
-    contrast = np.sqrt(ndimage.uniform_filter(even**2, 2 * size + 1))
-    even /= np.maximum(contrast, max(np.median(contrast), 1e-30))
-    return even - even.mean()
-
-
-def _lobe(correlation: np.ndarray) -> float:
-    """Radius of the correlation's central lobe [pixel], where its radial mean first rises: about half the pitch."""
+def _correlation_peaks(correlation: np.ndarray) -> tuple[np.ndarray, float]:
+    """Local maxima of a half plane, lags (n, 2) as (column, row), and the radius of the lobe about lag zero [pixel]."""
     middle = np.array(correlation.shape) // 2
     row, column = np.ogrid[-middle[0] : middle[0] + 1, -middle[1] : middle[1] + 1]
-    ring = np.rint(np.hypot(row, column)).astype(int).ravel()
+    radius = np.hypot(row, column)
+    ring = np.rint(radius).astype(int).ravel()
     profile = (np.bincount(ring, correlation.ravel()) / np.bincount(ring))[: middle.min() // 2]
     rises = np.flatnonzero(np.diff(profile[1:]) > 0)
-    return float(1 + rises[0]) if len(rises) else float(len(profile))
+    lobe = 1 + int(rises[0]) if len(rises) else len(profile)
+    top = ndimage.maximum_filter(correlation, 2 * math.ceil(0.4 * lobe) + 1) == correlation
+    top &= ((row > 0) | ((row == 0) & (column > 0))) & (radius > lobe) & (radius < 0.9 * middle.min())
+    return (np.argwhere(top) - middle)[:, ::-1], lobe
 
 
-def _best_lag(
-    correlation: np.ndarray, lobe: float, layout: str, nominal: float | None = None
-) -> tuple[float, np.ndarray]:
+def _best_lag(correlation: np.ndarray, lags: np.ndarray, lobe: float, layout: str) -> tuple[float, np.ndarray]:
     """Shortest lag (column, row) that spans a lattice of high correlation, with the lattice's score.
 
-    The score is the lowest correlation at the neighbours of lag zero. Multiples of the lattice score as high as the true
-    one, so the shortest of the best is taken.
+    The score is the lowest correlation at the neighbours of lag zero. Multiples of the lattice score as high as the
+    true one, so the shortest of the best is taken.
     """
     middle = np.array(correlation.shape) // 2
-    row, column = np.ogrid[-middle[0] : middle[0] + 1, -middle[1] : middle[1] + 1]
-    top = ndimage.maximum_filter(correlation, 2 * math.ceil(0.4 * lobe) + 1) == correlation
-    top &= ((row > 0) | ((row == 0) & (column > 0))) & (np.hypot(row, column) > lobe)
-    lags = (np.argwhere(top) - middle)[:, ::-1]
-    length = np.hypot(*lags.T)
-    kept = length < 0.9 * middle.min()
-    if nominal:
-        kept &= np.abs(length / nominal - 1) <= NOMINAL_TOLERANCE
     height = correlation[tuple((lags[:, ::-1] + middle).T)]
-    kept &= height > 0.5 * PEAK_FRACTION * height[kept].max(initial=0)
-    order = np.argsort(length[kept], kind="stable")[:CANDIDATES]
+    lags = lags[height > 0.5 * PEAK_FRACTION * height.max(initial=0)]
     best = [(0.0, np.zeros(2))]
-    for lag in lags[kept][order]:
+    for lag in lags[np.argsort(np.hypot(*lags.T), kind="stable")[:CANDIDATES]]:
         first, second = _standard_basis(lag, layout)
-        nodes = np.rint([first, second, second - first] if layout == "hexagonal" else [first, second]).astype(int)
+        nodes = np.array([first, second, second - first] if layout == "hexagonal" else [first, second])
         slack = math.ceil(min(CELL_TOLERANCE * np.hypot(*lag), lobe / 2))
-        heights = [
-            correlation[max(0, r - slack) : r + slack + 1, max(0, c - slack) : c + slack + 1].max()
-            for c, r in nodes + middle[::-1]
+        around = [
+            correlation[r - slack : r + slack + 1, c - slack : c + slack + 1]
+            for c, r in np.rint(nodes).astype(int) + middle[::-1]
         ]
-        best.append((float(min(heights)), lag))
+        best.append((min((float(part.max()) for part in around if part.size), default=0.0), lag))
     highest = max(score for score, _ in best)
     return next((score, lag) for score, lag in best if score >= PEAK_FRACTION * highest)
 
@@ -418,7 +394,7 @@ def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np
 
 
 def _indices_inside(origin: np.ndarray, basis: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Indices (i, j) of all lattice nodes with low <= node < high, row after row, shape (node, 2)."""
+    """List the indices (i, j) of all lattice nodes with low <= node < high, row after row, shape (node, 2)."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
     reach = (corners - origin) @ np.linalg.inv(basis)
@@ -438,7 +414,6 @@ def _find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray
     The mean cell looks the same after a quarter (sixth) turn about a lens centre. In a square array also about the
     gaps between four lenses, which are darker.
     """
-    start = [max(0, (n - TILE_PX) // 2) for n in image.shape]
     pitch = _pitch(basis, layout)
     crop = _evened(_middle(image), pitch)
     bins = 2 * int(np.clip(pitch / 2, 3, 16))
@@ -455,7 +430,8 @@ def _find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray
         disc = (np.hypot(*(inner @ basis / bins).T) <= 0.3 * np.hypot(*basis[0])).T
         brightness = [(cell.ravel()[disc[:, c[0] * bins + c[1]]]).mean() for c in (centre, (centre + bins // 2) % bins)]
         centre = centre if brightness[0] >= brightness[1] else (centre + bins // 2) % bins
-    return centre / bins @ basis + start[::-1]
+    start = [max(0, (n - TILE_PX) // 2) for n in image.shape[::-1]]
+    return centre / bins @ basis + start
 
 
 def _mean_cell(crop: np.ndarray, basis: np.ndarray, bins: int) -> np.ndarray:
@@ -486,37 +462,46 @@ def _fit_lattice(
         index = _whole_microimages(image.shape, origin, basis, half)
         index = index[:: math.ceil(len(index) / SAMPLE_LENSES)]
         nodes = origin + index @ basis
-        shift, microimage = _measure(_patches(image, nodes, half), nodes, basis)
-        origin, basis, _ = _robust_lattice(index, nodes + shift, origin, basis)
+        shift, lit, microimage = _measure(_patches(image, nodes, half), nodes, basis)
+        origin, basis, _ = _robust_lattice(index[lit], (nodes + shift)[lit], origin, basis)
         if np.abs(origin + index @ basis - nodes).max() < PASS_TOLERANCE_PX:
             break
 
     index = _whole_microimages(image.shape, origin, basis, half)
     centres = origin + index @ basis
     for _ in range(2):  # the second time from its own centre, where the linear fit is exact
-        centres = centres + _measure(_patches(image, centres, half), centres, basis, microimage)[0]
+        shift, lit, _ = _measure(_patches(image, centres, half), centres, basis, microimage)
+        centres = centres + shift
+    if lit.mean() < 0.5:
+        log.warning("lens array: only %d of %d microimages are lit; the others are extrapolated.", lit.sum(), len(lit))
+    index, centres = index[lit], centres[lit]
     origin, basis, kept = _robust_lattice(index, centres, origin, basis)
     residual = centres - origin - index @ basis
     rms = math.sqrt((residual[kept] ** 2).sum(1).mean())
     if kept.mean() < 0.5 or rms > 0.1 * pitch:
         raise InputError(
-            f"white: no regular array of microimages: only {kept.sum()} of {len(kept)} microimages lie on one {layout} "
-            f"lattice of pitch {pitch:.2f} px, with {rms:.2f} px rms. Check the file, layout and nominal pitch."
+            f"white: no regular array of microimages found: {kept.sum()} of {len(kept)} lit places on a {layout} "
+            f"lattice of pitch {pitch:.2f} px agree with it, to {rms:.2f} px. Expected most of them, to a tenth of the "
+            "pitch. Check the file, the layout and the exposure."
         )
     _warn_of_distortion(index[kept] @ basis, residual[kept])
     return origin, basis, rms, int(kept.sum())
 
 
 def _whole_microimages(shape: tuple[int, int], origin: np.ndarray, basis: np.ndarray, half: int) -> np.ndarray:
-    """Indices (i, j) of the microimages that lie in the image with all their patch and the blur's reach."""
+    """List the indices (i, j) of the microimages whose patch lies in the image, the blur's reach included."""
     margin = half + BLUR_REACH_PX + 1
     index = _indices_inside(origin, basis, (margin, margin), (shape[1] - 1 - margin, shape[0] - 1 - margin))
+    _check_count(index, basis)
+    return index
+
+
+def _check_count(index: np.ndarray, basis: np.ndarray) -> None:
     if len(index) < MIN_LENSES or (np.ptp(index, axis=0) < 2).any():
         raise InputError(
-            f"white: expected at least {MIN_LENSES} whole microimages, three along each direction, got {len(index)} in "
-            f"{shape[1]} x {shape[0]} px at a pitch of about {np.hypot(*basis[0]):.1f} px. Use an uncropped image."
+            f"white: expected at least {MIN_LENSES} whole and lit microimages, three along each direction, got "
+            f"{len(index)} at a pitch of about {np.hypot(*basis[0]):.1f} px. Use an uncropped, evenly lit image."
         )
-    return index
 
 
 def _patches(image: np.ndarray, centres: np.ndarray, half: int) -> np.ndarray:
@@ -543,18 +528,19 @@ def _patches(image: np.ndarray, centres: np.ndarray, half: int) -> np.ndarray:
 
 def _measure(
     patches: np.ndarray, places: np.ndarray, basis: np.ndarray, microimage: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Shift of each microimage from its patch's middle [pixel], shape (lens, 2), and the mean microimage T.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shift of each microimage from its patch's middle [pixel], shape (lens, 2), which are lit, the mean microimage T.
 
-    Least squares of brightness * T(x - shift) * (1 + slope . x) + background, linear in shift and slope. The slope, a
-    smooth field over the sensor, keeps vignetting from moving the centres. T is made symmetric about its middle: that
-    defines the centre.
+    Least squares of brightness * T(x - shift) * (1 + slope . x) + background, linear in shift and slope. T is made
+    symmetric about its middle: that defines the centre. Vignetting may act on pixels, so that brightness slopes within
+    a microimage, or on whole lenses, so that neighbours that overlap it differ; the slope, a smooth field over the
+    sensor, is their share, and keeps either from moving the centres.
     """
     half = patches.shape[1] // 2
     row, column = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
     window = _cell_window(column, row, basis)
-    brightness = np.tensordot(patches, window, 2) / window.sum()
-    usual = np.median(brightness)
+    brightness = np.tensordot(patches, window.astype(np.float32), 2) / window.sum()
+    usual = max(np.percentile(brightness, 90), 1e-30)  # a part of the sensor may be dark
     brightness = np.maximum(brightness / usual, 0.1)
     patches = patches / (usual * brightness)[:, None, None].astype(np.float32)
     if microimage is None:
@@ -562,35 +548,45 @@ def _measure(
         microimage = np.median(patches[bright[:: math.ceil(len(bright) / TEMPLATE_LENSES)]], axis=0)
         microimage = (microimage + microimage[::-1, ::-1]) / 2
 
-    moved = [ndimage.convolve1d(microimage, DERIVATIVE, axis=axis, mode="nearest") for axis in (1, 0)]
-    terms = [microimage, np.ones_like(row), *moved, column * microimage, row * microimage]
+    moved = [ndimage.convolve1d(microimage, SHIFT_DIFFERENCE, axis=axis, mode="nearest") for axis in (1, 0)]
+    overlap = _neighbours_light(microimage, column, row, basis)
+    terms = [microimage, np.ones_like(row), *moved, column * microimage - overlap[0], row * microimage - overlap[1]]
     design = np.stack([term.ravel() for term in terms], axis=1)
     weighted = design * window.reshape(-1, 1)
     normal, moments = weighted.T @ design, patches.reshape(len(patches), -1) @ weighted.astype(np.float32)
 
-    slope = _slope_field(moments @ np.linalg.pinv(normal), places, brightness)
-    moments = moments[:, :4] - (moments[:, :1] / normal[0, 0]) * slope @ normal[4:, :4]
-    solution = moments @ np.linalg.inv(normal[:4, :4])
+    size = np.ptp(places, axis=0).max()
+    x, y = ((places - places.mean(0)) / size).T
+    field = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    c = _robust_fit(field, np.log(brightness)[:, None])[0][:, 0]
+    gradient = np.stack([c[1] + 2 * c[3] * x + c[4] * y, c[2] + c[4] * x + 2 * c[5] * y], axis=1) / size
+    moments = moments - gradient @ (overlap.reshape(2, -1) @ weighted)
+
+    free = moments @ np.linalg.pinv(normal)
+    slopes = free[:, 4:] / np.maximum(free[:, :1], 0.1)
+    coefficients, kept = _robust_fit(field, slopes)
+    smooth = field @ coefficients
+    noise = ((slopes - smooth)[kept] ** 2).mean() * field.shape[1] / len(field)
+    signal = (gradient**2).mean()  # bounds the slope where blurred microimages hardly tell it from a shift
+    moments = moments - smooth * (signal / max(signal + noise, 1e-30)) @ normal[4:]
+    solution = moments[:, :4] @ np.linalg.pinv(normal[:4, :4])
     limit = 0.25 * math.sqrt(abs(np.linalg.det(basis)))
-    return np.clip(solution[:, 2:4] / np.maximum(solution[:, :1], 0.1), -limit, limit), microimage
+    shift = np.clip(solution[:, 2:] / np.maximum(solution[:, :1], 0.1), -limit, limit)
+    contrast = brightness * solution[:, 0]
+    lit = contrast > LIT_FRACTION * np.percentile(contrast, 90)
+    return shift, lit, microimage
 
 
-def _slope_field(solution: np.ndarray, places: np.ndarray, brightness: np.ndarray) -> np.ndarray:
-    """Relative brightness slope within each microimage [1/pixel], shape (lens, 2): a second-order field over the sensor.
+def _neighbours_light(microimage: np.ndarray, column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Light of the nearest neighbour where microimages overlap, times the neighbour's offset [pixel], shape (2, ...).
 
-    Where blurred microimages leave slope and shift hard to tell apart, the field shrinks towards zero; what it may
-    reach is the vignetting between lenses.
+    One microimage alone is nowhere brighter than at its heart; what is brighter overlaps.
     """
-    x, y = ((places - places.mean(0)) / np.ptp(places, axis=0).max()).T
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    slopes = solution[:, 4:] / np.maximum(solution[:, :1], 0.1)
-    field, kept = _robust_fit(terms, slopes)
-    smooth = terms @ field
-    noise = ((slopes - smooth)[kept] ** 2).mean() * len(field) / len(places)
-    c = _robust_fit(terms, np.log(brightness)[:, None])[0][:, 0]
-    gradient = np.stack([c[1] + 2 * c[3] * x + c[4] * y, c[2] + c[4] * x + 2 * c[5] * y]) / np.ptp(places, axis=0).max()
-    expected = (gradient**2).mean()
-    return smooth * (expected / max(expected + noise, 1e-30))
+    heart = np.hypot(column, row) < 0.3 * np.hypot(*basis[0])
+    light = np.where(heart, 0, np.maximum(microimage - microimage[heart].max(), 0))
+    offsets = np.array([i * basis[0] + j * basis[1] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
+    distance = (column - offsets[:, 0, None, None]) ** 2 + (row - offsets[:, 1, None, None]) ** 2
+    return light * offsets[distance.argmin(0)].transpose(2, 0, 1)
 
 
 def _cell_window(column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:
@@ -607,13 +603,14 @@ def _robust_lattice(
     index: np.ndarray, centres: np.ndarray, origin: np.ndarray, basis: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lattice through centres: origin, basis and which centres counted."""
+    _check_count(index, basis)
     design = np.column_stack([np.ones(len(index)), index])
     change, kept = _robust_fit(design, centres - origin - index @ basis)
     return origin + change[0], basis + change[1:], kept
 
 
 def _robust_fit(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Iterated least squares with Tukey's weights, values of shape (row, axis): solution and which rows counted."""
+    """Fit values (row, axis) by iterated least squares with Tukey's weights: solution and which rows counted."""
     solution = np.zeros((design.shape[1], values.shape[1]))
     offset = np.median(values, axis=0)
     residual = values - offset

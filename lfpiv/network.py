@@ -262,7 +262,7 @@ def train(
     trainer: Callable[..., Fit] = levenberg_marquardt,
     epochs: int = 200,
     patience: int = 15,
-    tolerance: float = 2e-3,
+    tolerance: float = 1e-3,
     split: tuple[float, float, float] = (0.70, 0.15, 0.15),
     groups: np.ndarray | None = None,
     std: np.ndarray | None = None,

@@ -18,7 +18,7 @@ def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
     Parameters
     ----------
     camera : CalibratedCamera
-        Its ``map_fast(points, pupil)`` is evaluated at the points of `RINGS`.
+        Its ``map_fan(points, pupil)`` is evaluated at the points of `RINGS`.
     points_mm : ndarray, shape (point, 3)
         Object points (x, y, z) [mm].
     degree : {2, 3}
@@ -37,9 +37,8 @@ def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
     pupil = (unit * radius).astype(np.float32)
     out = np.empty((len(points_mm), 2, len(powers)), np.float32)
     for first in range(0, len(points_mm), CHUNK_POINTS):
-        part = np.asarray(points_mm[first : first + CHUNK_POINTS], np.float32)
-        rays = camera.map_fast(np.repeat(part, len(pupil), axis=0), np.tile(pupil, (len(part), 1)))
-        rays = rays.reshape(len(part), len(pupil), 2)
+        part = points_mm[first : first + CHUNK_POINTS]
+        rays = camera.map_fan(part, pupil)
         middle = rays[:, :1].copy()  # differences keep single precision where it matters
         out[first : first + len(part)] = np.einsum("kp,npc->nck", solve.astype(np.float32), rays - middle)
         out[first : first + len(part), :, 0] += middle[:, 0]

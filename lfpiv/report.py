@@ -292,6 +292,10 @@ def _vector_section(vectors: Mapping[int, Path], summary: Mapping[str, Any]) -> 
                 "replaced after validation.",
             ),
             _figure(
+                lambda: figures.vector_slices(first, normal="y", most=1),
+                f"Pair {pair}: the middle of the volume from the side. Arrows show u and w, colour shows v.",
+            ),
+            _figure(
                 lambda: figures.displacement_histograms(first),
                 f"Pair {pair}: displacements of the valid vectors. Peaks at whole numbers would be peak locking.",
             ),

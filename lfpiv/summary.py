@@ -39,7 +39,7 @@ def build(
     """Put together the figures of everything a folder holds.
 
     ``timings_s`` says what the results in the folder took, read from the files themselves, so also where this
-    invocation found them finished. ``total`` is the time of this invocation.
+    invocation found them finished; the peak memory likewise. ``total`` is the time of this invocation.
 
     Parameters
     ----------

@@ -24,6 +24,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 BLOCK_BYTES = 1 << 20
 """Memory of one block of Jacobian rows: large enough for BLAS, small enough to stay in the cache."""
+LEAST_ROWS = 512
+"""Samples in a block at least, so that adding products up costs little beside making them."""
 RANGES = 8
 """Ranges of samples that are summed separately. Fixed, so that results do not depend on the number of threads."""
 LEAST_DAMPING, FIRST_DAMPING, LAST_DAMPING = 1e-15, 1e-3, 1e12
@@ -103,7 +105,7 @@ def _sum_of_squares(layers, samples):
         return (np.vdot(residual, residual).reshape(1),)
 
     widest = max(layer.shape[1] for layer in layers)
-    return float(_add_up(squares, len(samples.inputs), max(1, BLOCK_BYTES // (8 * 2 * widest)))[0][0])
+    return float(_add_up(squares, len(samples.inputs), max(LEAST_ROWS, BLOCK_BYTES // (8 * 2 * widest)))[0][0])
 
 
 def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.ndarray, np.ndarray, float]:
@@ -155,7 +157,7 @@ def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.nda
             sums.append(np.stack([deep[:, output].T @ shared for output in range(outputs)]))
         return tuple(sums)
 
-    rows = max(16, BLOCK_BYTES // (8 * (shared_size + outputs * deep_size)))
+    rows = max(LEAST_ROWS, BLOCK_BYTES // (8 * (shared_size + outputs * deep_size)))
     squares, shared, shared_gradient, *rest = _add_up(products, len(samples.inputs), rows)
 
     # Unfold the shared products: parameter (i, j) of the last hidden layer, parameter (k, o) of the output layer.
@@ -211,7 +213,7 @@ def _bending(layers, steps, samples):
         return (np.concatenate(gradient),)
 
     widest = max(layer.shape[1] for layer in layers)
-    return _add_up(products, len(samples.inputs), max(16, BLOCK_BYTES // (8 * 4 * widest)))[0]
+    return _add_up(products, len(samples.inputs), max(LEAST_ROWS, BLOCK_BYTES // (8 * 4 * widest)))[0]
 
 
 def levenberg_marquardt(

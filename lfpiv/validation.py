@@ -1,7 +1,7 @@
 """Vector validation: the normalised median test of Westerweel & Scarano (2005) [1]_, replacement and filling.
 
-Fields are arrays (z, y, x, 3) of displacements [voxel]; neighbours are the 26 grid points around one. A vector passes if
-it agrees with their median, or with their median after each was moved along the local gradient: in a steep gradient,
+Fields are arrays (z, y, x, 3) of displacements [voxel]; neighbours are the 26 grid points around one. A vector passes
+if it agrees with their median, or with their median after each was moved along the local gradient: in a steep gradient,
 and at the edges of the grid where neighbours lie on one side only, the first alone makes outliers of good vectors.
 
 References
@@ -21,6 +21,9 @@ THRESHOLD = 2.0
 """Largest normalised residual of a good vector, the value of [1]_."""
 NOISE_VOXEL = 0.1
 """Displacement noise that is no outlier wherever the neighbours agree perfectly (epsilon of [1]_) [voxel]."""
+LARGEST_PART = 0.5
+"""Largest accepted difference from the neighbours, as a part of the search range. Peaks of noise lie anywhere in that
+range: neighbours that scatter like them prove nothing."""
 MIN_NEIGHBOURS = 3
 """A vector with fewer good neighbours cannot be judged and is rejected, unless the grid itself has no more."""
 
@@ -28,7 +31,9 @@ _ROUNDS = 5
 _CUBE = np.ones((3, 3, 3), bool)
 
 
-def validate(first: np.ndarray, second: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def validate(
+    first: np.ndarray, second: np.ndarray, measured: np.ndarray, search: tuple[float, float, float]
+) -> tuple[np.ndarray, np.ndarray]:
     """Test the displacement of the highest peaks, try the second peak where it fails, fill what remains.
 
     Parameters
@@ -37,6 +42,8 @@ def validate(first: np.ndarray, second: np.ndarray, measured: np.ndarray) -> tup
         Displacement of the highest and of the second peak [voxel]; NaN where there is none.
     measured : ndarray of bool, shape (z, y, x)
         Where `first` may be trusted at all.
+    search : tuple of float
+        Largest lag at which peaks were searched, order (z, y, x) [voxel].
 
     Returns
     -------
@@ -54,8 +61,8 @@ def validate(first: np.ndarray, second: np.ndarray, measured: np.ndarray) -> tup
         prediction = predict(first, valid, todo)
         judged = prediction.count >= needed[todo]
         passed = valid.copy()
-        passed[todo] = measured[todo] & judged & (_agrees(first[todo], prediction) | (needed[todo] == 0))
-        second_agrees[todo] = judged & _agrees(second[todo], prediction)
+        passed[todo] = measured[todo] & judged & (_agrees(first[todo], prediction, search) | (needed[todo] == 0))
+        second_agrees[todo] = judged & _agrees(second[todo], prediction, search)
         changed = passed != valid
         if not changed.any():
             break
@@ -65,13 +72,14 @@ def validate(first: np.ndarray, second: np.ndarray, measured: np.ndarray) -> tup
     return fill(np.where(rescued[..., None], second, first), valid | rescued), valid | rescued
 
 
-def _agrees(field: np.ndarray, prediction: Prediction) -> np.ndarray:
+def _agrees(field: np.ndarray, prediction: Prediction, search: tuple[float, float, float]) -> np.ndarray:
     """Whether vectors (vector, 3) are within the threshold of one of the two predictions, in every component."""
     agrees = np.zeros(len(field), bool)
     pairs = ((prediction.median, prediction.scatter), (prediction.level, prediction.level_scatter))
     for median, scatter in pairs:
         with np.errstate(invalid="ignore"):
-            agrees |= (np.abs(field - median) <= THRESHOLD * (scatter + NOISE_VOXEL)).all(-1)
+            limit = np.minimum(THRESHOLD * (scatter + NOISE_VOXEL), LARGEST_PART * np.asarray(search))
+            agrees |= (np.abs(field - median) <= limit).all(-1)
     return agrees
 
 

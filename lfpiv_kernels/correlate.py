@@ -47,8 +47,8 @@ class WindowPeaks:
     """The same for the second peak; NaN where there is none."""
     correlation: np.ndarray
     """Correlation coefficient at the highest peak, -1..1."""
-    second_correlation: np.ndarray
-    """Correlation coefficient at the second peak; 0 where there is none."""
+    rival: np.ndarray
+    """Highest coefficient more than two lags away from the highest peak, a peak of its own or not; at least 0."""
     measured: np.ndarray
     """True where the window holds signal and its highest peak lies inside the search range, not on its border."""
 
@@ -276,7 +276,7 @@ def correlate_windows(
         displacement=displacement[:, 0].reshape(*plan.count, 3),
         second_displacement=displacement[:, 1].reshape(*plan.count, 3),
         correlation=correlation[:, 0].reshape(plan.count),
-        second_correlation=correlation[:, 1].reshape(plan.count),
+        rival=correlation[:, 1].reshape(plan.count),
         measured=found[:, 0].reshape(plan.count) > 0,
     )
 
@@ -345,8 +345,9 @@ def _window_statistics(
     deviation = box_sum(volume * volume, window, keep)
     deviation -= mean * mean / voxels
     mean /= voxels
-    typical = voxels * float(volume.var(dtype=float))
-    floor = SIGNAL_FLOOR * typical + np.finfo(np.float32).tiny
+    flat = volume.ravel()
+    variance = float(np.dot(flat, flat)) / flat.size - float(flat.mean()) ** 2
+    floor = np.float32(SIGNAL_FLOOR * voxels * variance + np.finfo(np.float32).tiny)
     scale = np.zeros_like(deviation)
     np.divide(1, np.sqrt(np.maximum(deviation, floor)), where=deviation > floor, out=scale)
     return mean, scale

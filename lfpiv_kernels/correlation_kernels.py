@@ -211,7 +211,7 @@ def _find_peaks(
     first_window: int,
     # out
     displacement_out: wp.array2d(dtype=wp.vec3),  # (window, 2): first and second peak
-    correlation_out: wp.array2d(dtype=float),  # (window, 2)
+    correlation_out: wp.array2d(dtype=float),  # (window, 2): highest peak, highest more than 2 lags away from it
     found_out: wp.array2d(dtype=int),  # (window, 2): 1 where the peak exists and is not on the border
 ):
     w = first_window + wp.tid()
@@ -224,25 +224,31 @@ def _find_peaks(
                 if score[w, z, y, x] > best:
                     best = score[w, z, y, x]
                     lag = wp.vec3i(z, y, x)
+    rival = wp.float32(0.0)
     second = wp.float32(0.0)
     second_lag = wp.vec3i(0, 0, 0)
-    for z in range(1, top[0]):
-        for y in range(1, top[1]):
-            for x in range(1, top[2]):
+    for z in range(top[0] + 1):
+        for y in range(top[1] + 1):
+            for x in range(top[2] + 1):
                 value = score[w, z, y, x]
-                if value > second and wp.max(wp.max(wp.abs(z - lag[0]), wp.abs(y - lag[1])), wp.abs(x - lag[2])) > 1:
-                    if (
-                        value >= score[w, z - 1, y, x]
-                        and value >= score[w, z + 1, y, x]
-                        and value >= score[w, z, y - 1, x]
-                        and value >= score[w, z, y + 1, x]
-                        and value >= score[w, z, y, x - 1]
-                        and value >= score[w, z, y, x + 1]
-                    ):
-                        second = value
-                        second_lag = wp.vec3i(z, y, x)
+                if value > wp.min(rival, second):
+                    distance = wp.max(wp.max(wp.abs(z - lag[0]), wp.abs(y - lag[1])), wp.abs(x - lag[2]))
+                    if distance > 2:
+                        rival = wp.max(rival, value)
+                    inner = z > 0 and y > 0 and x > 0 and z < top[0] and y < top[1] and x < top[2]
+                    if inner and distance > 1 and value > second:
+                        if (
+                            value >= score[w, z - 1, y, x]
+                            and value >= score[w, z + 1, y, x]
+                            and value >= score[w, z, y - 1, x]
+                            and value >= score[w, z, y + 1, x]
+                            and value >= score[w, z, y, x - 1]
+                            and value >= score[w, z, y, x + 1]
+                        ):
+                            second = value
+                            second_lag = wp.vec3i(z, y, x)
     correlation_out[w, 0] = best
-    correlation_out[w, 1] = second
+    correlation_out[w, 1] = rival
     inside = wp.min(wp.min(lag[0], lag[1]), lag[2]) > 0
     inside = inside and lag[0] < top[0] and lag[1] < top[1] and lag[2] < top[2]
     found_out[w, 0] = 0

@@ -2,10 +2,10 @@
 
 The first volume is sampled at ``x - d/2``, the second at ``x + d/2``, so that particles displaced by d meet at x.
 
-Interpolation moves a particle a little towards or away from the nearest voxel, by an error E sin(2 pi p) of the sampling
-phase p. With x on the voxels the phases are -d/2 and d/2, the two errors add up to 2 E sin(pi d), and no iteration
-removes that bias (0.017 voxel for cubic splines and particles of 0.7 voxel standard deviation). With x a quarter of a
-voxel beside them the phases are 1/4 -+ d/2, both errors are E cos(pi d), and the bias is gone.
+Interpolation moves a particle a little towards or away from the nearest voxel, by an error E sin(2 pi p) of the
+sampling phase p. With x on the voxels the phases are -d/2 and d/2, the two errors add up to 2 E sin(pi d), and no
+iteration removes that bias (0.017 voxel for cubic splines and particles of 0.7 voxel standard deviation). With x a
+quarter of a voxel beside them the phases are 1/4 -+ d/2, both errors are E cos(pi d), and the bias is gone.
 """
 
 import numpy as np

@@ -42,7 +42,7 @@ def displacement_deviation(
     Returns
     -------
     ndarray, shape (*count, 3)
-        Standard deviation of the displacement, order (z, y, x) [voxel]; NaN where the correlation has no peak.
+        Standard deviation of the displacement, order (z, y, x) [voxel]; NaN where the correlation has no peak at lag 0.
     """
     keep = tuple(slice(o, o + (c - 1) * s + 1, s) for o, c, s in zip(origin, count, step, strict=True))
     voxels = math.prod(window)
@@ -61,11 +61,12 @@ def displacement_deviation(
         plus, minus = first * ahead[1], ahead[0] * second
         side = 0.5 * (window_sum(plus) + window_sum(minus)) - mean_product
         difference = plus - minus
-        variance = _variance_of_sum(difference, window_sum)
-        variance -= window_sum(difference) ** 2 * REACH**3 / voxels  # the terms scatter about their mean
+        about_zero = _variance_of_sum(difference, window_sum)
+        about_mean = about_zero - window_sum(difference) ** 2 * REACH**3 / voxels
+        variance = np.maximum(about_mean, 0.5 * about_zero)  # small windows: the mean takes too much with it
         with np.errstate(divide="ignore", invalid="ignore"):
             sharpness = np.log(np.maximum(peak / side, _FLATTEST))
-            sigma = np.sqrt(np.maximum(variance, 0)) / (4 * side * sharpness)
+            sigma = np.sqrt(variance) / (4 * side * sharpness)
         deviation[..., axis] = np.where((side > 0) & (peak > 0), sigma, np.nan)
     return deviation
 

@@ -61,8 +61,9 @@ class IdealCamera:
         st[:, 1] += self.coma * 2 * unit[:, 0] * unit[:, 1] / 3
         return st
 
-    def map_fast(self, points, pupil):
-        return self.map(points, pupil).astype(np.float32)
+    def map_fan(self, points, pupil):
+        every = np.repeat(points, len(pupil), axis=0), np.tile(pupil, (len(points), 1))
+        return self.map(*every).reshape(len(points), len(pupil), 2).astype(np.float32)
 
 
 @dataclass

@@ -124,8 +124,8 @@ def test_the_report_holds_its_pictures(finished):
     page = (out / "report.html").read_text("utf-8")
     pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
     assert (
-        len(pictures) == 2 * 2 + 5
-    )  # lens centres and dots of each camera; errors, projections, residuals, vectors twice
+        len(pictures) == 2 * 2 + 6
+    )  # lens centres and dots of each camera; errors, projections, residuals, three of the vectors
     for picture in pictures:
         assert np.ptp(imread(io.BytesIO(base64.b64decode(picture)))) > 0.5
     assert not re.search(r'(src|href)="(?!data:)', page), "the page refers to something outside itself"
