@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ SCHEMA_VERSION = 1
 OUTLIER, OUTLIER_PITCH = 6.0, 0.1
 """A dot is left out where its labels disagree with its neighbours by more than this many times the typical
 disagreement, and by more than this fraction of the microlens pitch: wrongly named or damaged."""
+MODEL_ERROR_PITCH = 0.002
+"""Error of a dot's labels that they share and their standard errors do not hold [microlens pitch]."""
 NEIGHBOURS = 16
 """Neighbouring dots, in space, that a dot is compared with."""
 
@@ -57,10 +60,14 @@ class CalibratedCamera:
     test_errors: np.ndarray | None = None
     """Error of each held-out label [microlens pitch], shape (n,)."""
 
-    @property
+    @cached_property
     def gain(self) -> np.ndarray:
-        """White-image gain of every pixel, shape (rows, columns), float32."""
-        return self.decoder.gain
+        """White-image gain of every pixel, shape (rows, columns), float32.
+
+        The board's dots tell how much of the white image's scatter from pixel to pixel is response and how much is
+        noise; without them it is taken as noise.
+        """
+        return self.decoder.shrunk_gain(0.0 if self.dots is None else self.dots.response_share)
 
     def map(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
         """Trace rays to the microlens array (Eqs. 6-7).
@@ -180,7 +187,9 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
             optics=setup.optics,
             lattice=lattice,
             decoder=decoder,
-            baseline=thin_lens_model(setup.optics, angle + np.copysign(angle_error_deg, angle) if angle else angle_error_deg),
+            baseline=thin_lens_model(
+                setup.optics, angle + np.copysign(angle_error_deg, angle) if angle else angle_error_deg
+            ),
             report=report,
         )
     return Calibration(cameras)
@@ -208,21 +217,36 @@ def load_calibration(path: str | Path) -> Calibration:
         raise InputError(f"{path}: expected a calibration file, could not read it ({error}); calibrate anew.") from None
 
 
-def outside_region(camera: CalibratedCamera, grid: Grid) -> tuple[float, float]:
-    """Fraction of a grid's voxels outside the calibrated region, and the largest distance from it [mm].
+def warn_outside(calibration: Calibration, grid: Grid) -> None:
+    """Log a warning for every camera whose calibrated region does not hold all voxels of a grid.
 
     The region is the box that the board's dots spanned, widened by half a voxel.
     """
-    if camera.region_mm is None:
-        return 0.0, 0.0
-    inside, distance = 1.0, 0.0
-    for axis in range(3):
-        centres = grid.axis_mm(2 - axis)
-        low, high = camera.region_mm[:, axis]
-        over = np.maximum(np.maximum(low - centres, centres - high) - grid.voxel_mm / 2, 0.0)
-        inside *= float((over <= 1e-9).mean())
-        distance = float(np.hypot(distance, over.max()))
-    return 1.0 - inside, distance
+    for camera in calibration.cameras.values():
+        if camera.region_mm is None:
+            continue
+        inside, distance = 1.0, 0.0
+        for axis in range(3):
+            centres = grid.axis_mm(2 - axis)
+            low, high = camera.region_mm[:, axis]
+            over = np.maximum(np.maximum(low - centres, centres - high) - grid.voxel_mm / 2, 0.0)
+            inside *= float((over <= 1e-9).mean())
+            distance = float(np.hypot(distance, over.max()))
+        if inside == 1:
+            continue
+        low, high = camera.region_mm
+        box = ", ".join(f"{name} {a:g} to {b:g}" for name, a, b in zip("xyz", low, high, strict=True))
+        mend = "shrink the volume or use a larger board or more planes"
+        if camera.baseline is None:
+            mend += ', or set network.baseline = "thin_lens": a network alone extrapolates badly'
+        log.warning(
+            "%s: %.0f %% of the volume lies outside the calibrated region (%s mm), by up to %.2f mm: %s.",
+            camera.name,
+            100 * (1 - inside),
+            box,
+            distance,
+            mend,
+        )
 
 
 def _decode(experiment: Experiment, setup: CameraSetup) -> tuple[LensLattice, LightFieldDecoder, dict[str, Any]]:
@@ -271,24 +295,26 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
     step(0.75)
 
     points, pupil, array = dots.points_mm, dots.pupil_mm, dots.array_mm
-    fitted = fit_thin_lens(points, pupil, array, setup.optics)
-    keep = _agreeing_dots(dots, array - fitted(points, pupil), lattice.pitch_mm)
-    baseline = fitted if settings.baseline == "thin_lens" else None
-    target = array if baseline is None else array - baseline(points, pupil)
     pitch = lattice.pitch_mm
+    std = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch)
     try:
+        fitted = fit_thin_lens(points, pupil, array, setup.optics, std=std)
+        keep = _agreeing_dots(dots, array - fitted(points, pupil), pitch)
+        baseline = fitted if settings.baseline == "thin_lens" else None
+        target = array if baseline is None else array - baseline(points, pupil)
         training = train(
             np.hstack([points, pupil])[keep],
             target[keep],
             hidden=settings.hidden,
             epochs=settings.epochs,
             groups=dots.dot[keep],
-            std=dots.std_mm[keep],
+            std=std[keep],
+            shrink=baseline is not None,
             seed=settings.seed,
             unit=pitch,
         )
     except ValueError as error:
-        raise InputError(f"{experiment.path}: [network], camera {setup.name!r}: {error}") from None
+        raise InputError(f"{experiment.path}: labels of camera {setup.name!r}: {error}") from None
     step(0.95)
     found, expected = int(dots.found.sum()), int(dots.expected.sum())
     report |= {
@@ -302,6 +328,10 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
         "epochs": training.epochs,
         "stop": training.stop.value,
         "training_s": training.seconds,
+        "network_share": training.shrinkage,
+        "dot_diameter_mm": dots.diameter_mm,
+        "blur_px": dots.blur_px,
+        "response_share": dots.response_share,
     }
     camera = CalibratedCamera(
         name=setup.name,
@@ -315,8 +345,10 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
         dots=dots,
         test_errors=training.test_errors,
     )
-    _warn(camera, experiment)
-    log.info("%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots", setup.name, found, expected, training.sigma_nor)
+    _warn(camera)
+    log.info(
+        "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots", setup.name, found, expected, training.sigma_nor
+    )
     step(1.0)
     return camera
 
@@ -338,19 +370,9 @@ def _agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) -
     return ~bad[inverse]
 
 
-def _warn(camera: CalibratedCamera, experiment: Experiment) -> None:
+def _warn(camera: CalibratedCamera) -> None:
     """Put what a user must know into the report's warnings, and log it."""
     report, warnings = camera.report, camera.report["warnings"]
-    outside, distance = outside_region(camera, experiment.grid)
-    report["volume_outside_calibration"] = outside
-    if outside > 0:
-        low, high = camera.region_mm
-        box = ", ".join(f"{name} {a:g} to {b:g}" for name, a, b in zip("xyz", low, high, strict=True))
-        warnings.append(
-            f"{camera.name}: {100 * outside:.0f} % of the volume lies outside the calibrated region ({box} mm), by up to "
-            f"{distance:.2f} mm. A network extrapolates badly: shrink the volume, use a larger board or more planes, or "
-            'set network.baseline = "thin_lens".'
-        )
     if report["dots_found"] < 0.9 * report["dots_expected"]:
         warnings.append(
             f"{camera.name}: only {report['dots_found']} of {report['dots_expected']} board dots in the field were found; "
@@ -424,4 +446,3 @@ def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
         dots=BoardDots(**arrays("dots")) if "dots" in group else None,
         test_errors=group["test_errors"][()] if "test_errors" in group else None,
     )
-

@@ -286,12 +286,20 @@ class Job:
 
     def build_weights(self, calibration: Calibration) -> Weights:
         """Build the weights of the grid."""
-        from lfpiv.weights import build_weights
+        from lfpiv.calibration import warn_outside
+        from lfpiv.weights import build_weights, compare_with_count
 
         method = self.experiment.compute.weights
+        warn_outside(calibration, self.experiment.grid)
         with self.timed("weights"):
             weights = build_weights(calibration, self.experiment.grid, method=method, progress=self.step("weights"))
         self.weights_report = {"method": method, "memory_mib": weights.memory_bytes / memory.MIB}
+        if method == "footprint":
+            errors = [error for camera in compare_with_count(weights).values() for error in camera]
+            self.weights_report["count_check_l2"] = [round(error, 4) for error in errors]
+            log.info(
+                "weights differ from counted rays by %.1f %% (mean of %d voxels)", 100 * np.mean(errors), len(errors)
+            )
         return weights
 
     def reconstruct(self, calibration: Calibration, weights: Weights, pair: int, *, keep: bool) -> list[xr.DataArray]:
@@ -423,7 +431,6 @@ def _calibration_hash(experiment: Experiment) -> str:
         cameras=cameras,
         board=experiment.board.model_dump(),
         network=experiment.network.model_dump(),
-        grid=dataclasses.asdict(experiment.grid),  # the calibration says how much of the volume it covers
         images=dataset.content_hash(experiment.calibration_paths()),
     )
 

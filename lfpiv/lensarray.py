@@ -254,7 +254,7 @@ def _find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.nda
             f"layout: expected the layout of the white image, {shown} with a pitch of about "
             f"{np.hypot(*found[shown][1]):.1f} px, got {layout!r}. Check the microlens layout."
         )
-    score, lag = found[layout]
+    lag = found[layout][1]
     if nominal and abs(np.hypot(*lag) / nominal - 1) > NOMINAL_TOLERANCE:
         raise InputError(
             f"nominal_pitch_px: expected the pitch of the white image, about {np.hypot(*lag):.1f} px, got {nominal:g}. "

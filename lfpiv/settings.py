@@ -35,7 +35,7 @@ class Smart(Table):
     """Relaxation mu of Eq. 5. Values near 3 diverge."""
     normalisation: Literal["column", "paper"] = "column"
     """Exponent divided by the voxel's column sum, or Eq. 5 as printed with weights scaled to a maximum of 1."""
-    smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.5
+    smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
     """Standard deviation of the Gaussian smoothing after each iteration [voxel]; 0 switches it off."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
     """Stop when an iteration lowers the image residual by less than this fraction; 0 runs all iterations."""
@@ -50,8 +50,10 @@ class Correlation(Table):
     """Fraction by which neighbouring windows overlap."""
     max_displacement_voxel: Positive | None = None
     """Largest displacement the first pass looks for [voxel]; absent: a quarter of its window."""
-    smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
+    smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.5
     """Standard deviation of a Gaussian applied to the volumes before correlation [voxel]; 0 switches it off."""
+    intensity_power: Annotated[float, Field(strict=True, gt=0, le=2)] = 0.5
+    """Power of the volumes' intensities that is correlated, after smoothing; 1 takes them as they are."""
 
 
 class Network(Table):
@@ -59,14 +61,15 @@ class Network(Table):
 
     hidden: tuple[Count, ...] = (20,)
     """Nodes of each hidden layer."""
-    epochs: Count = 200
+    epochs: Count = 300
     """Largest number of training epochs; early stopping usually ends sooner."""
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
     """Seed of the random split and of the starting weights."""
     estimator: Literal["lens_integral", "gaussian"] = "lens_integral"
     """Dot centres: a dot integrated over the microlenses, or the Gaussian fit of the paper."""
-    baseline: Literal["none", "thin_lens"] = "none"
-    """Mapping the network corrects: nothing, or a thin lens fitted to the same dots (safer outside the board)."""
+    baseline: Literal["none", "thin_lens"] = "thin_lens"
+    """Mapping the network corrects: nothing, as in the paper, or a thin lens fitted to the same dots, whose pose comes
+    out of the fit: better between the dots, and far better outside the board."""
 
 
 class Compute(Table):

@@ -59,6 +59,7 @@ def correlate(
     voxel_mm: float | None = None,
     max_displacement_voxel: float | None = None,
     smoothing_voxel: float = 0.0,
+    intensity_power: float = 1.0,
 ) -> xr.Dataset:
     """Measure the displacement of the particles between two volumes.
 
@@ -87,6 +88,10 @@ def correlate(
         Standard deviation of a Gaussian applied to both volumes first [voxel]; 0: none. For particles that are single
         bright voxels, about 0.5; it widens larger ones, so that more ghosts meet (blobs of 0.7 voxel: a quarter more
         error).
+    intensity_power : float
+        Power of the smoothed intensities that is correlated, negative ones taken as 0; 1: as they are. Below 1 a few
+        bright particles, and the ghosts they cast, no longer outweigh the others: 0.5 lowered the error of
+        reconstructed volumes by a fifth on every flow tried (docs/accuracy.md).
 
     Returns
     -------
@@ -118,10 +123,14 @@ def correlate(
         raise ValueError(f"overlap: expected 0 <= overlap < 1, got {overlap}.")
     if not (math.isfinite(smoothing_voxel) and smoothing_voxel >= 0):
         raise ValueError(f"smoothing_voxel: expected a value >= 0, got {smoothing_voxel}.")
+    if not (math.isfinite(intensity_power) and intensity_power > 0):
+        raise ValueError(f"intensity_power: expected a value > 0, got {intensity_power}.")
     schedule = _check_windows(windows, first.shape)
     search = _first_search(max_displacement_voxel, schedule[0], first.shape)
     if smoothing_voxel > 0:
         first, second = (scipy.ndimage.gaussian_filter(v, smoothing_voxel, mode="constant") for v in (first, second))
+    if intensity_power != 1:
+        first, second = (np.maximum(v, 0) ** np.float32(intensity_power) for v in (first, second))
     multi_pass = _MultiPass(first, second, symmetric=len(schedule) > 1)
     for window in schedule:
         multi_pass.run(window, tuple(max(1, round(edge * (1 - overlap))) for edge in window), search)
@@ -131,6 +140,7 @@ def correlate(
         "overlap": overlap,
         "max_displacement_voxel": max_displacement_voxel,
         "smoothing_voxel": smoothing_voxel,
+        "intensity_power": intensity_power,
     }
     return _dataset(multi_pass, axes_mm, spacing_mm, dt_s, settings)
 

@@ -15,7 +15,9 @@ def position(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
 def slope(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
     """K = d(s, t)/d(u, v) at one pupil point, shape (2, 2)."""
     u, v = pupil
-    return np.array([[c[1] + 2 * c[3] * u + c[4] * v, c[2] + c[4] * u + 2 * c[5] * v] for c in (model[:6], model[6:12])])
+    return np.array(
+        [[c[1] + 2 * c[3] * u + c[4] * v, c[2] + c[4] * u + 2 * c[5] * v] for c in (model[:6], model[6:12])]
+    )
 
 
 def smeared_step(x, widths):
@@ -83,7 +85,9 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
                 k_slope = slope(model, points[k] if local else at)
                 jacobian = np.linalg.inv(np.eye(2) - k_slope)
                 turn = np.asarray(frame) @ jacobian
-                edges = [model[12 + 2 * a : 14 + 2 * a] + model[18 + 4 * a : 22 + 4 * a].reshape(2, 2) @ at for a in range(3)]
+                edges = [
+                    model[12 + 2 * a : 14 + 2 * a] + model[18 + 4 * a : 22 + 4 * a].reshape(2, 2) @ at for a in range(3)
+                ]
                 smear = np.stack([turn @ edge for edge in edges] + list((turn @ k_slope * width).T), axis=1)
                 widths = [two_widths(smear[0]), two_widths(smear[1])]
                 g = jacobian @ offset[k]

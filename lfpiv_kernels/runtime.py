@@ -7,7 +7,7 @@ import contextlib
 import io
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -70,7 +70,8 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR  # no banner, no compilation notes on the user's terminal
-    wp.init()
+    with _quiet_stderr():  # where there is no CUDA driver, Warp's native code says so whatever the log level
+        wp.init()
     if request == "cuda" and not wp.is_cuda_available():
         raise RuntimeError("device: 'cuda' was requested but none is visible; use 'auto' to allow the CPU.")
     kind = "cuda" if request != "cpu" and wp.is_cuda_available() else "cpu"
@@ -92,6 +93,19 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
     if reason:
         log.info("kernels run on the CPU (%d threads): %s", count, reason)
     return _device
+
+
+@contextlib.contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """Send what native code writes to standard error to nowhere."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def device() -> Device:
