@@ -208,7 +208,8 @@ def load_calibration(path: str | Path) -> Calibration:
             version = file.attrs.get("schema_version")
             if version != SCHEMA_VERSION:
                 raise InputError(
-                    f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {version}; calibrate anew."
+                    f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {version}; "
+                    "calibrate anew."
                 )
             return Calibration({name: _read_camera(file[f"camera/{name}"], name) for name in file.attrs["cameras"]})
     except (OSError, KeyError, TypeError, ValueError) as error:
@@ -375,13 +376,13 @@ def _warn(camera: CalibratedCamera) -> None:
     report, warnings = camera.report, camera.report["warnings"]
     if report["dots_found"] < 0.9 * report["dots_expected"]:
         warnings.append(
-            f"{camera.name}: only {report['dots_found']} of {report['dots_expected']} board dots in the field were found; "
-            "check focus, exposure and the planes listed in the report."
+            f"{camera.name}: only {report['dots_found']} of {report['dots_expected']} board dots in the field were "
+            "found; check focus, exposure and the planes listed in the report."
         )
     if report["lens_array_rms_px"] > 0.25:
         warnings.append(
-            f"{camera.name}: microimages lie {report['lens_array_rms_px']:.2f} px (rms) off a regular lattice; check the "
-            "white image."
+            f"{camera.name}: microimages lie {report['lens_array_rms_px']:.2f} px (rms) off a regular lattice; check "
+            "the white image."
         )
     for text in warnings:
         log.warning("%s", text)

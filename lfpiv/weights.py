@@ -1,8 +1,8 @@
 """`build_weights`: calibrated mapping x grid -> the weights of Eq. 10 as a linear operator.
 
 ``weights(volume)`` projects a volume to images, ``weights.T(images)`` is its adjoint. Two methods give the weights:
-"footprint" integrates them over voxel, pupil pixel and microlens in closed form; "count" traces rays and counts them, as
-the paper does, and is the judge of the other. Both are stored alike, as 8-bit blocks of pixels with a scale per voxel.
+"footprint" integrates them over voxel, pupil pixel and microlens in closed form; "count" traces rays and counts them,
+as the paper does, and judges the other. Both are stored alike, as 8-bit blocks of pixels with a scale per voxel.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -127,7 +128,7 @@ class Weights:
         return images
 
     @property
-    def T(self) -> Adjoint:  # noqa: N802 - the field's name for it
+    def T(self) -> Adjoint:
         """The adjoint operator: ``weights.T(images)`` sums weight * image over each voxel's pixels."""
         return Adjoint(self)
 
@@ -193,7 +194,8 @@ class Weights:
     # -- storage -----------------------------------------------------------------------------------------------------
 
     @property
-    def storage_shape(self):
+    def storage_shape(self) -> tuple[int, int, int]:
+        """Voxel counts in the order of the stored weights, outermost axis first."""
         return tuple(self.grid.shape[axis] for axis in self._order)
 
     def to_storage(self, volume) -> np.ndarray:
@@ -390,7 +392,7 @@ def _footprint_blocks(weights: Weights, camera, pack: _CameraKernels, progress: 
     """Compute the blocks of one camera: count them, allocate once, fill chunk by chunk."""
     shape, size = weights.storage_shape, weights.grid.size
     edges = list(range(0, size, CHUNK_VOXELS)) + [size]
-    chunks = list(zip(edges[:-1], edges[1:], strict=True))
+    chunks = list(pairwise(edges))
     first_block, first_row = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
     bend = 0.0
     models = []

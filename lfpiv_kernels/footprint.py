@@ -1,11 +1,11 @@
 """Taichi: area-integrated weights of voxels, written as 8-bit blocks of sensor pixels.
 
-The weight of a pixel is the fraction of the rays of a voxel (uniform in the voxel, uniform over the pupil) that reach it
-(Eq. 10), integrated in closed form instead of counted. Per voxel the mapping is a second-order polynomial of the pupil
-point, (s, t)(P) with P = (u, v); K = d(s, t)/dP. A pixel at X under the lens centred at c looks through the centre of
+The weight of a pixel is the fraction of a voxel's rays, uniform in the voxel and over the pupil, that reach it, Eq. 10,
+integrated in closed form instead of counted. Per voxel the mapping is a second-order polynomial of the pupil point,
+(s, t)(P) with P = (u, v); K = d(s, t)/dP. A pixel at X under the lens centred at c looks through the centre of
 its lens at P = -(X - c (1 + r)) / r, r = f_m/s_i (Eq. 9 solved for u). Then
 
-- the ray's offset from the lens centre is g = (I - K)^-1 ((s, t)(P) - c), because moving it by g moves the pupil point too;
+- the ray's offset from the lens centre is g = (I - K)^-1 ((s, t)(P) - c): moving it by g moves the pupil point too;
 - the pixel's cell on the pupil has the area h^2 |det (I - K)^-1|, h the pixel's width on the pupil;
 - g is smeared by the voxel's three projected edges and by the pixel's cell: boxes, of which along each lattice axis the
   widest stays a box and the others become one box of the same variance. The axes are taken as independent: the
@@ -84,7 +84,7 @@ def _cumulative(x, wide, narrow):
 
 @ti.func
 def _two_widths(a, b, c, d, e):
-    """The widest of five smears, and one box with the variance of the other four."""
+    """Return the widest of five smears, and one box with the variance of the other four."""
     widest = ti.max(ti.max(ti.abs(a), ti.abs(b)), ti.max(ti.max(ti.abs(c), ti.abs(d)), ti.abs(e)))
     rest = ti.sqrt(ti.max(a * a + b * b + c * c + d * d + e * e - widest * widest, 0.0))
     return ti.Vector([ti.max(widest, rest, NARROWEST), ti.max(ti.min(widest, rest), NARROWEST)])
@@ -93,24 +93,26 @@ def _two_widths(a, b, c, d, e):
 @ti.func
 def _position(model: ti.template(), v, p):
     """(s, t) of the ray of voxel v through the pupil point p [mm]."""
-    uu, uv, vv = p[0] * p[0], p[0] * p[1], p[1] * p[1]
-    return ti.Vector(
-        [
-            model[v, 0] + model[v, 1] * p[0] + model[v, 2] * p[1] + model[v, 3] * uu + model[v, 4] * uv + model[v, 5] * vv,
-            model[v, 6] + model[v, 7] * p[0] + model[v, 8] * p[1] + model[v, 9] * uu + model[v, 10] * uv + model[v, 11] * vv,
-        ]
-    )  # fmt: skip
+    st = ti.Vector([0.0, 0.0])
+    for axis in ti.static(range(2)):
+        c = 6 * axis
+        st[axis] = (
+            model[v, c]
+            + p[0] * (model[v, c + 1] + p[0] * model[v, c + 3] + p[1] * model[v, c + 4])
+            + p[1] * (model[v, c + 2] + p[1] * model[v, c + 5])
+        )
+    return st
 
 
 @ti.func
 def _slope(model: ti.template(), v, p):
     """K = d(s, t)/d(u, v) at the pupil point p."""
-    return ti.Matrix(
-        [
-            [model[v, 1] + 2 * model[v, 3] * p[0] + model[v, 4] * p[1], model[v, 2] + model[v, 4] * p[0] + 2 * model[v, 5] * p[1]],
-            [model[v, 7] + 2 * model[v, 9] * p[0] + model[v, 10] * p[1], model[v, 8] + model[v, 10] * p[0] + 2 * model[v, 11] * p[1]],
-        ]
-    )  # fmt: skip
+    k = ti.Matrix([[0.0, 0.0], [0.0, 0.0]])
+    for axis in ti.static(range(2)):
+        c = 6 * axis
+        k[axis, 0] = model[v, c + 1] + 2.0 * model[v, c + 3] * p[0] + model[v, c + 4] * p[1]
+        k[axis, 1] = model[v, c + 2] + model[v, c + 4] * p[0] + 2.0 * model[v, c + 5] * p[1]
+    return k
 
 
 @ti.func

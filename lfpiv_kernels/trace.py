@@ -1,4 +1,4 @@
-"""Taichi: trace rays from points in voxels through the pupil and the microlens array, and count them per pixel (Eq. 10).
+"""Taichi: trace rays from points in voxels through the pupil and the microlens array, count them per pixel (Eq. 10).
 
 Per point the mapping is a third-order polynomial of the pupil point, fitted to the calibrated mapping: it is smooth, so
 that evaluating the network per ray would buy nothing. Twin: ``reference.count``.

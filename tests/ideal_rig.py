@@ -38,7 +38,7 @@ def lattice(layout="square", roll_deg=0.0, origin_mm=(0.031, -0.022), pitch_mm=0
 
 @dataclass
 class IdealCamera:
-    """What `build_weights` asks of a camera; `coma` adds second-order terms of the pupil point to s [mm at the edge]."""
+    """What `build_weights` asks of a camera; `coma` adds second-order terms of the pupil point [mm at its edge]."""
 
     name: str
     pose: np.ndarray
