@@ -12,25 +12,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from lfpiv.errors import InputError
+from lfpiv.lensbasis import cell_angle_deg, find_basis, find_phase, indices_inside, lattice_pitch
 from lfpiv.rig import LAYOUTS, LensLattice, Optics
 
 log = logging.getLogger(__name__)
 
-TILE_PX = 1024
-"""Side of the part of the image that the autocorrelation sees [pixel]; lags reach half of it."""
-PEAK_FRACTION = 0.7
-"""A lag is a lattice vector if its correlation is above this part of the best; between lattice vectors it is lower."""
-SIGNIFICANCE = 8
-"""Correlation that is no chance [standard deviations of that of unrelated pixels, one in the root of their number]."""
-NOMINAL_TOLERANCE = 0.2
-"""Largest relative error of a nominal pitch: twice what a data sheet may be off."""
-CELL_TOLERANCE = 0.03
-"""Largest misfit of a neighbour to the layout [pitch]; real arrays stay within 1 %."""
-CANDIDATES = 200
-"""Shortest lags tried as lattice vector."""
 BLUR_PX = 0.9
 """Gaussian blur of the microimages before the fit [pixel]: removes what the pixels alias, so no locking to pixels."""
 BLUR_REACH_PX = 3
@@ -88,13 +77,13 @@ class LensArray:
     @property
     def pitch_px(self) -> float:
         """Distance between neighbouring centres, from the area of the lattice's cell [pixel]."""
-        return _pitch(np.asarray(self.basis_px), self.layout)
+        return lattice_pitch(np.asarray(self.basis_px), self.layout)
 
     @property
     def rotation_deg(self) -> float:
         """Angle from +column towards +row of basis[0], mean over both lattice vectors [degree]."""
         first, second = (math.degrees(math.atan2(row, column)) for column, row in self.basis_px)
-        return (first + second - _cell_angle_deg(self.layout)) / 2
+        return (first + second - cell_angle_deg(self.layout)) / 2
 
     def lattice(self, optics: Optics) -> LensLattice:
         """Lens centres in the microlens plane, s_l = X_c / (1 + f_m/s_i), the optical axis at the sensor's centre.
@@ -147,12 +136,12 @@ def find_lens_array(
         raise InputError(f"layout: expected one of {LAYOUTS}, got {layout!r}.")
     nominal = _checked_pitch(nominal_pitch_px, image.shape)
 
-    basis = _find_basis(image, nominal, layout)
-    origin = _find_phase(image, basis, layout)
+    basis = find_basis(image, nominal, layout)
+    origin = find_phase(image, basis, layout)
     origin, basis, rms, measured = _fit_lattice(image, origin, basis, layout)
 
     rows, columns = image.shape
-    index = _indices_inside(origin, basis, (-0.5, -0.5), (columns - 0.5, rows - 0.5))
+    index = indices_inside(origin, basis, (-0.5, -0.5), (columns - 0.5, rows - 0.5))
     centres = origin + index @ basis
     middle = np.argmin(((centres - ((columns - 1) / 2, (rows - 1) / 2)) ** 2).sum(1))
     origin, index = centres[middle], index - index[middle]
@@ -227,228 +216,6 @@ def _checked_pitch(nominal_pitch_px: float | None, shape: tuple[int, int]) -> fl
     return nominal
 
 
-# Lattice vectors from the autocorrelation ----------------------------------------------------------------------------
-
-
-def _find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndarray:
-    """Lattice vectors, rows (column, row) [pixel], in the standard order of `LensArray.basis_px`."""
-    tile = _middle(image)
-    width, best = nominal or min(tile.shape) / 4, -1.0
-    while width >= 3:  # a narrow mean hides unequal lenses, a wide one keeps more signal: the lattice itself decides
-        correlation = _autocorrelation(_evened(tile, width))
-        peaks = _correlation_peaks(correlation)
-        trial = {name: _best_lag(correlation, *peaks, name) for name in LAYOUTS}
-        score = max(score for score, _ in trial.values())
-        if score > best:
-            chosen, chosen_peaks, found, best = correlation, peaks, trial, score
-        width /= 2
-    if best * math.sqrt(tile.size) < SIGNIFICANCE:
-        raise InputError(
-            "white: no regular array of microimages found. Expected a sharp white image with at least four lenses "
-            "across; check file, exposure and dark frame."
-        )
-    fits = [name for name in LAYOUTS if found[name][0] >= PEAK_FRACTION * best]
-    shown = min(fits, key=lambda name: np.hypot(*found[name][1]))  # far lags of one layout resemble the other
-    if shown != layout:
-        raise InputError(
-            f"layout: expected the layout of the white image, {shown} with a pitch of about "
-            f"{np.hypot(*found[shown][1]):.1f} px, got {layout!r}. Check the microlens layout."
-        )
-    lag = found[layout][1]
-    if nominal and abs(np.hypot(*lag) / nominal - 1) > NOMINAL_TOLERANCE:
-        raise InputError(
-            f"nominal_pitch_px: expected the pitch of the white image, about {np.hypot(*lag):.1f} px, got {nominal:g}. "
-            "Check microlens pitch and pixel size, or leave it out."
-        )
-    return _refine_basis(chosen, _standard_basis(lag, layout), chosen_peaks[1])
-
-
-def _middle(image: np.ndarray) -> np.ndarray:
-    start = [max(0, (n - TILE_PX) // 2) for n in image.shape]
-    return image[start[0] : start[0] + TILE_PX, start[1] : start[1] + TILE_PX]
-
-
-def _evened(tile: np.ndarray, width: float) -> np.ndarray:
-    """Tile less its local mean in units of its local contrast: unequal and dead lenses must not outweigh the gaps."""
-    size = 2 * round(width / 2) + 1
-    mean = ndimage.uniform_filter(tile, size)
-    even = tile / np.maximum(mean, 0.1 * max(mean.max(), 1e-30)) - 1
-    contrast = np.sqrt(np.maximum(ndimage.uniform_filter(even**2, 2 * size + 1), 0))
-    even /= np.maximum(contrast, max(np.median(contrast), 1e-30))
-    return even - even.mean()
-
-
-def _autocorrelation(tile: np.ndarray) -> np.ndarray:
-    """Correlation coefficient of the tile with itself over the overlap at each lag up to half of it.
-
-    Lag zero lies in the middle and holds the mean of its neighbours, so pixel noise leaves no spike.
-    """
-    rows, columns = tile.shape
-    reach = rows // 2, columns // 2
-    padded = [fft.next_fast_len(size + lag, real=True) for size, lag in zip((rows, columns), reach, strict=True)]
-    lag_row, lag_column = np.arange(reach[0] + 1), np.arange(-reach[1], reach[1] + 1)
-    pairs = np.multiply.outer(rows - lag_row, columns - np.abs(lag_column))
-    power = np.abs(fft.rfft2(tile, padded, workers=-1)) ** 2
-    product = fft.irfft2(power, padded, workers=-1)[np.ix_(lag_row, lag_column)]
-    (sum_a, sum_b), (square_a, square_b) = _overlap_sums(tile, reach), _overlap_sums(tile**2, reach)
-    variances = (square_a - sum_a**2 / pairs) * (square_b - sum_b**2 / pairs)
-    half = (product - sum_a * sum_b / pairs) / np.sqrt(np.maximum(variances, 1e-12 * max(variances.max(), 1e-30)))
-    correlation = np.vstack([half[:0:-1, ::-1], half])
-    correlation[reach] = correlation[reach[0] - 1 : reach[0] + 2, reach[1]][::2].mean()
-    return correlation
-
-
-def _overlap_sums(tile: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Sum over the tile's part that meets itself at each lag (row >= 0): of the one copy and of the other."""
-    total = np.zeros(np.add(tile.shape, 1))
-    total[1:, 1:] = tile.cumsum(0, dtype=float).cumsum(1)
-    r = np.arange(reach[0] + 1)[:, None]
-    c = np.arange(-reach[1], reach[1] + 1)[None]
-    rows, columns = tile.shape
-    left, right = np.maximum(-c, 0), columns - np.maximum(c, 0)  # columns that have a partner at column + c
-
-    def box(top, bottom, first, last):
-        return total[bottom, last] - total[top, last] - total[bottom, first] + total[top, first]
-
-    return box(0 * r, rows - r, left, right), box(r, rows + 0 * r, left + c, right + c)
-
-
-def _correlation_peaks(correlation: np.ndarray) -> tuple[np.ndarray, float]:
-    """Local maxima of a half plane, lags (n, 2) as (column, row), and the radius of the lobe about lag zero [pixel]."""
-    middle = np.array(correlation.shape) // 2
-    row, column = np.ogrid[-middle[0] : middle[0] + 1, -middle[1] : middle[1] + 1]
-    radius = np.hypot(row, column)
-    ring = np.rint(radius).astype(int).ravel()
-    profile = (np.bincount(ring, correlation.ravel()) / np.bincount(ring))[: middle.min() // 2]
-    rises = np.flatnonzero(np.diff(profile[1:]) > 0)
-    lobe = 1 + int(rises[0]) if len(rises) else len(profile)
-    top = ndimage.maximum_filter(correlation, 2 * math.ceil(0.4 * lobe) + 1) == correlation
-    top &= ((row > 0) | ((row == 0) & (column > 0))) & (radius > lobe) & (radius < 0.9 * middle.min())
-    return (np.argwhere(top) - middle)[:, ::-1], lobe
-
-
-def _best_lag(correlation: np.ndarray, lags: np.ndarray, lobe: float, layout: str) -> tuple[float, np.ndarray]:
-    """Shortest lag (column, row) that spans a lattice of high correlation, with the lattice's score.
-
-    The score is the lowest correlation at the neighbours of lag zero. Multiples of the lattice score as high as the
-    true one, so the shortest of the best is taken.
-    """
-    middle = np.array(correlation.shape) // 2
-    height = correlation[tuple((lags[:, ::-1] + middle).T)]
-    lags = lags[height > 0.5 * PEAK_FRACTION * height.max(initial=0)]
-    best = [(0.0, np.zeros(2))]
-    for lag in lags[np.argsort(np.hypot(*lags.T), kind="stable")[:CANDIDATES]]:
-        first, second = _standard_basis(lag, layout)
-        nodes = np.array([first, second, second - first] if layout == "hexagonal" else [first, second])
-        slack = math.ceil(min(CELL_TOLERANCE * np.hypot(*lag), lobe / 2))
-        around = [
-            correlation[r - slack : r + slack + 1, c - slack : c + slack + 1]
-            for c, r in np.rint(nodes).astype(int) + middle[::-1]
-        ]
-        best.append((min((float(part.max()) for part in around if part.size), default=0.0), lag))
-    highest = max(score for score, _ in best)
-    return next((score, lag) for score, lag in best if score >= PEAK_FRACTION * highest)
-
-
-def _cell_angle_deg(layout: str) -> float:
-    return 60.0 if layout == "hexagonal" else 90.0
-
-
-def _pitch(basis: np.ndarray, layout: str) -> float:
-    return math.sqrt(abs(np.linalg.det(basis)) / math.sin(math.radians(_cell_angle_deg(layout))))
-
-
-def _standard_basis(lag: np.ndarray, layout: str) -> np.ndarray:
-    """Lattice vectors, ordered and signed as `LensArray.basis_px` says, of the lattice that one of them spans."""
-    turn, lowest = (60.0, -15.0) if layout == "hexagonal" else (90.0, -45.0)
-    angle = math.degrees(math.atan2(lag[1], lag[0]))
-    angle = np.radians(lowest + (angle - lowest) % turn + np.array([0, turn]))
-    return np.hypot(*lag) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np.ndarray:
-    """Lattice vectors through the correlation's peaks at lags of doubling length, each predicted by the last fit."""
-    middle = np.array(correlation.shape)[::-1] // 2
-    half = max(1, int(lobe / 4))
-    offset = np.arange(-half, half + 1)
-    row, column = (a.ravel() for a in np.meshgrid(offset, offset, indexing="ij"))
-    paraboloid = np.linalg.pinv(np.stack([np.ones_like(row), column, row, column**2, row * column, row**2], 1) + 0.0)
-    limit = middle - half - 1
-    reach = 1.5 * np.hypot(*basis[0])
-    while True:
-        index = _indices_inside(np.zeros(2), basis, -limit, limit)
-        near = np.hypot(*(index @ basis).T) <= reach
-        index = index[near & (index != 0).any(1)]
-        lag = np.rint(index @ basis).astype(int)
-        patch = correlation[middle[1] + lag[:, 1, None] + row, middle[0] + lag[:, 0, None] + column]
-        _, dx, dy, xx, xy, yy = (patch @ paraboloid.T).T
-        hessian = 4 * xx * yy - xy**2
-        peak = (xx < 0) & (hessian > 0)
-        shift = np.stack([xy * dy - 2 * yy * dx, xy * dx - 2 * xx * dy], 1)[peak] / hessian[peak, None]
-        kept = (np.abs(shift) <= half + 1).all(1)
-        if np.linalg.matrix_rank(index[peak][kept]) == 2:
-            basis = np.linalg.lstsq(index[peak][kept], lag[peak][kept] + shift[kept], rcond=None)[0]
-        if reach > np.hypot(*limit):
-            return basis
-        reach *= 2
-
-
-def _indices_inside(origin: np.ndarray, basis: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """List the indices (i, j) of all lattice nodes with low <= node < high, row after row, shape (node, 2)."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
-    reach = (corners - origin) @ np.linalg.inv(basis)
-    first, last = np.floor(reach.min(0)).astype(int), np.ceil(reach.max(0)).astype(int)
-    j, i = (a.ravel() for a in np.mgrid[first[1] : last[1] + 1, first[0] : last[0] + 1])
-    index = np.stack([i, j], axis=1)
-    node = origin + index @ basis
-    return index[((node >= low) & (node < high)).all(1)]
-
-
-# Phase from the symmetry of the mean cell ----------------------------------------------------------------------------
-
-
-def _find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
-    """Place of a lens centre (column, row) [pixel] near the image's middle, good to about a pixel.
-
-    The mean cell looks the same after a quarter (sixth) turn about a lens centre. In a square array also about the
-    gaps between four lenses, which are darker.
-    """
-    pitch = _pitch(basis, layout)
-    crop = _evened(_middle(image), pitch)
-    bins = 2 * int(np.clip(pitch / 2, 3, 16))
-    cell = _mean_cell(crop, basis, bins)
-
-    turn = np.array([[0, -1], [1, 1]]) if layout == "hexagonal" else np.array([[0, -1], [1, 0]])
-    place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 2)
-    offset = place[:, None] - place[None]  # (point, centre, 2): lattice coordinates about every possible centre
-    turned = (place[None] + offset @ turn.T) % bins
-    symmetry = (cell.reshape(-1, 1) * cell[turned[..., 0], turned[..., 1]]).sum(0)
-    centre = place[np.argmax(symmetry)]
-    if layout == "square":
-        inner = (offset + bins // 2) % bins - bins // 2
-        disc = (np.hypot(*(inner @ basis / bins).T) <= 0.3 * np.hypot(*basis[0])).T
-        brightness = [(cell.ravel()[disc[:, c[0] * bins + c[1]]]).mean() for c in (centre, (centre + bins // 2) % bins)]
-        centre = centre if brightness[0] >= brightness[1] else (centre + bins // 2) % bins
-    start = [max(0, (n - TILE_PX) // 2) for n in image.shape[::-1]]
-    return centre / bins @ basis + start
-
-
-def _mean_cell(crop: np.ndarray, basis: np.ndarray, bins: int) -> np.ndarray:
-    """Crop folded into one lattice cell of bins x bins (i, j), each pixel shared by the four nearest bins."""
-    inverse = np.linalg.inv(basis) * bins
-    row, column = np.ogrid[: crop.shape[0], : crop.shape[1]]
-    i, j = (column * inverse[0, k] + row * inverse[1, k] for k in (0, 1))
-    i0, j0 = np.floor(i).astype(int), np.floor(j).astype(int)
-    fi, fj = i - i0, j - j0
-    total, weight = np.zeros(bins * bins), np.zeros(bins * bins)
-    for di, dj, share in ((0, 0, (1 - fi) * (1 - fj)), (1, 0, fi * (1 - fj)), (0, 1, (1 - fi) * fj), (1, 1, fi * fj)):
-        bin_number = ((i0 + di) % bins * bins + (j0 + dj) % bins).ravel()
-        total += np.bincount(bin_number, (share * crop).ravel(), bins * bins)
-        weight += np.bincount(bin_number, share.ravel(), bins * bins)
-    return (total / np.maximum(weight, 1e-12)).reshape(bins, bins)
-
-
 # Centres and lattice -------------------------------------------------------------------------------------------------
 
 
@@ -456,7 +223,7 @@ def _fit_lattice(
     image: np.ndarray, origin: np.ndarray, basis: np.ndarray, layout: str
 ) -> tuple[np.ndarray, np.ndarray, float, int]:
     """Measure the microimages and put a lattice through their centres: origin, basis, rms [pixel], number measured."""
-    pitch = _pitch(basis, layout)
+    pitch = lattice_pitch(basis, layout)
     half = math.ceil(pitch * min(0.5 * np.abs(basis).sum(0).max() / pitch, 0.71))  # of a square that holds a cell
     for _ in range(MAX_PASSES):
         index = _whole_microimages(image.shape, origin, basis, half)
@@ -491,7 +258,7 @@ def _fit_lattice(
 def _whole_microimages(shape: tuple[int, int], origin: np.ndarray, basis: np.ndarray, half: int) -> np.ndarray:
     """List the indices (i, j) of the microimages whose patch lies in the image, the blur's reach included."""
     margin = half + BLUR_REACH_PX + 1
-    index = _indices_inside(origin, basis, (margin, margin), (shape[1] - 1 - margin, shape[0] - 1 - margin))
+    index = indices_inside(origin, basis, (margin, margin), (shape[1] - 1 - margin, shape[0] - 1 - margin))
     _check_count(index, basis)
     return index
 

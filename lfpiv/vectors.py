@@ -97,7 +97,7 @@ def correlate(
     -------
     Dataset
         Dims z, y, x: window centres [mm]. ``u``, ``v``, ``w`` [m/s] and ``displacement_x``, ``_y``, ``_z`` [voxel]:
-        means over the window, finite everywhere; ``valid``: true where the vector was measured
+        means over the window, finite unless no vector at all is valid; ``valid``: true where the vector was measured
         and passed validation, false where it was replaced; ``peak_ratio``: highest correlation over the highest
         more than two lags away from it;
         ``correlation``: coefficient at the peak; ``uncertainty`` [voxel]: standard deviation of the displacement
@@ -151,7 +151,7 @@ class _MultiPass:
     def __init__(self, first: np.ndarray, second: np.ndarray, *, symmetric: bool):
         self.volumes, self.symmetric = (first, second), symmetric
         self.coefficients = None
-        self.field = self.valid = self.peaks = None
+        self.field = self.guess = self.valid = self.peaks = None
         self.centres: list[np.ndarray] = []
         self.passes: list[dict] = []
 
@@ -164,7 +164,7 @@ class _MultiPass:
         if self.passes:
             if self.coefficients is None:
                 self.coefficients = [deform.spline_coefficients(volume) for volume in self.volumes]
-            predictor = _Predictor(self.field, self.centres, shape)
+            predictor = _Predictor(self.guess, self.centres, shape)
             first, second = deform.deform_pair(*self.coefficients, predictor.field, predictor.spacing)
             predicted = predictor.window_means(origin, step, count, window)
             centres = [centre + deform.OFFSET for centre in centres]
@@ -177,8 +177,8 @@ class _MultiPass:
             self.peaks.measured,
             search,
         )
-        if not self.valid.any():  # nothing to go by: what was known before is the best guess
-            self.field = np.broadcast_to(predicted, self.field.shape).copy()
+        # without any valid vector what was known before is the best guess
+        self.guess = self.field if self.valid.any() else np.broadcast_to(predicted, self.field.shape)
         self.centres, self.deformed, self.layout = centres, (first, second), (window, origin, step, count)
         left = np.linalg.norm((self.field - predicted)[self.valid], axis=-1)
         self.passes.append(

@@ -1,0 +1,479 @@
+"""Benchmark cases as data, and the operations they name: how to prepare one, what a run does, what a right result is.
+
+A rig is two cameras of Table 2 at +-45 degrees, each a thin lens with a small network on top, as a calibration gives
+them; the sensor is just large enough for the volume.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage, optimize, sparse
+
+import lfpiv
+from lfpiv.calibration import CalibratedCamera, Calibration
+from lfpiv.network import Network, train
+from lfpiv.rig import Grid, LensLattice, Optics
+from lfpiv.thinlens import thin_lens_model
+from lfpiv.weights import COUNT_SAMPLES_ONE, compare_with_count, count_voxels
+from lfpiv_kernels import correlate, deform, mapping, runtime
+
+SCALES = {
+    "small": {"voxels": 32, "sensor": (720, 1000), "rays": 4_000_000, "volume": (48, 64, 64), "samples": 8_000},
+    "medium": {"voxels": 64, "sensor": (1360, 1880), "rays": 20_000_000, "volume": (70, 140, 140), "samples": 40_000},
+    "paper": {"voxels": 100, "sensor": (2048, 2800), "rays": 40_000_000, "volume": (100, 100, 100), "samples": 197_570},
+}
+"""Cubic grid of 0.1 mm voxels, sensor (rows, columns), rays through the mapping, particle volumes of the correlation
+(z, y, x), training samples. "paper": the published case, 3e9 weights."""
+
+OPERATIONS = {
+    "mapping": {},
+    "count": {"voxels": 4},
+    "footprint": {"bent_mm": 0.0},
+    "footprint_bent": {"bent_mm": 0.03},
+    "project": {"forward": True},
+    "back_project": {"forward": False},
+    "smart": {"iterations": 10},
+    "correlate_8": {"window": 8, "search": 4},
+    "correlate_16": {"window": 16, "search": 8},
+    "deform": {},
+    "vectors": {},
+    "train": {"epochs": 10},
+}
+CASES = {f"{op}_{scale}": {"op": op, "scale": scale, **more} for scale in SCALES for op, more in OPERATIONS.items()}
+CASES["demo"] = {"op": "demo", "scale": "small"}
+
+PEER_VOXELS = 32
+"""Largest volume edge whose weights are also written as an explicit sparse matrix."""
+NEAR = 2e-4
+"""Error of the single-precision mapping [microlens pitch]."""
+FOOTPRINT = 0.025
+"""Mean relative L2 difference of footprint from counted weights: the goal of 0.02, and the noise of the count."""
+ADJOINT = 1e-5
+"""Float32 sums of positive terms, added in vector lanes and eight chunks."""
+BIAS_VOXEL = {8: 0.02, 16: 0.01}
+"""Largest bias of the displacement by window edge: the project's goals [voxel]."""
+SHIFT = np.array([0.7, -0.4, 0.3])
+"""Displacement of the particles (z, y, x) [voxel]."""
+LABEL_NOISE = 0.04
+"""Noise of the training labels per axis [microlens pitch]."""
+DEMO_VOXEL = 0.5
+"""Largest mean displacement error of the demo [voxel]."""
+
+
+class WrongResult(Exception):
+    """The result is wrong, so its time means nothing."""
+
+
+@dataclass
+class Work:
+    """A case ready to run: one sample of it is one call of `run`."""
+
+    run: Callable[[], object]
+    check: Callable[[object], dict[str, float]]  # raises WrongResult, or returns figures of quality
+    amounts: dict[str, float]  # units of work in one run
+    read_bytes: float = 0  # memory that a run cannot help streaming: its hardware limit is this over the bandwidth,
+    flops: float = 0  # or this over the floating-point rate, whichever takes longer
+    peers: dict[str, Callable[[], object]] = field(default_factory=dict)  # the same work by other software
+    peer_check: Callable[[object], dict[str, float]] | None = None  # default: check
+    peer_share: float = 1.0  # of the work that a peer's run does
+
+
+def prepare(name: str) -> Work:
+    """Set a case up: everything that is not timed."""
+    case = dict(CASES[name])
+    return MAKERS[case.pop("op")](SCALES[case.pop("scale")], **case)
+
+
+def require(good: bool, message: str) -> None:
+    """Raise `WrongResult` unless the result is right."""
+    if not good:
+        raise WrongResult(message)
+
+
+class _Camera(CalibratedCamera):
+    @cached_property
+    def gain(self):
+        return np.ones(self.optics.sensor_shape, np.float32)
+
+
+def rig(sensor: tuple[int, int], bent_mm: float = 0.0) -> Calibration:
+    """Two calibrated cameras; `bent_mm` scales the network's part, of which about a third is of second order."""
+    optics = Optics(
+        focal_length_mm=100.0, magnification=-1.0, f_number=4.0, microlens_pitch_mm=0.1, pixel_mm=0.0055,
+        microlens_focal_length_mm=0.8, sensor_shape=sensor,
+    )  # fmt: skip
+    cameras = {}
+    for name, angle, roll, origin in (("cam1", 44.2, 0.05, (0.031, -0.022)), ("cam2", -45.9, -0.08, (-0.02, 0.04))):
+        rng, turn = np.random.default_rng(abs(int(angle))), np.radians(roll)
+        x, y = 0.1 * np.cos(turn), 0.1 * np.sin(turn)
+        network = Network(
+            weights=(rng.normal(0, 0.3, (5, 20)), rng.normal(0, 0.3, (20, 2))),
+            biases=(rng.normal(0, 0.5, 20), np.zeros(2)),
+            input_centre=np.zeros(5),
+            input_scale=np.array([7.0, 7.0, 7.0, optics.pupil_radius_mm, optics.pupil_radius_mm]),
+            output_centre=np.zeros(2),
+            output_scale=np.full(2, max(bent_mm, 1e-3)),
+        )
+        cameras[name] = _Camera(
+            name=name,
+            optics=optics,
+            lattice=LensLattice(origin_mm=origin, basis_mm=((x, -y), (y, x))),
+            decoder=None,
+            network=network,
+            baseline=thin_lens_model(optics, angle),
+        )
+    return Calibration(cameras)
+
+
+def grid(scale: dict) -> Grid:
+    return Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.1 * scale["voxels"],) * 3, voxel_mm=0.1)
+
+
+def nonzeros(weights) -> int:
+    """Weights above zero, counted without a copy of all of them."""
+    values = (projector.blocks.value for projector in weights._projectors.values())
+    return sum(
+        int(np.count_nonzero(value[a : a + (1 << 20)])) for value in values for a in range(0, len(value), 1 << 20)
+    )
+
+
+def particles(shape: tuple[int, int, int], shift=0.0, seed: int = 0) -> np.ndarray:
+    """Gaussian particles of 0.7 voxel standard deviation, 0.012 per voxel, moved by `shift`."""
+    rng = np.random.default_rng(seed)
+    at = rng.random((int(0.012 * np.prod(shape)), 3)) * shape + shift
+    stencil = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    voxel = np.rint(at).astype(int)[:, None] + stencil
+    light = np.exp(-((voxel - at[:, None]) ** 2).sum(-1) / (2 * 0.7**2))
+    inside = ((voxel >= 0) & (voxel < shape)).all(-1)
+    flat = np.ravel_multi_index(tuple(voxel[inside].T), shape)
+    return np.bincount(flat, light[inside], np.prod(shape)).reshape(shape).astype(np.float32)
+
+
+def _mapping(scale) -> Work:
+    camera = rig(scale["sensor"]).cameras["cam1"]
+    rng, fan = np.random.default_rng(1), 19
+    pupil = rng.uniform(-8, 8, (fan, 2)).astype(np.float32)
+    points = rng.uniform(-5, 5, (scale["rays"] // fan, 3)).astype(np.float32)
+    arrays, out = camera.network.to_arrays() | camera.baseline.to_arrays(), np.empty((len(points), fan, 2), np.float32)
+
+    def check(rays):
+        exact = camera.map(np.repeat(points[:500], fan, 0), np.tile(pupil, (500, 1)))
+        error = float(np.abs(rays[:500].reshape(-1, 2) - exact).max() / camera.lattice.pitch_mm)
+        require(error < NEAR, f"rays are off by {error:.1e} pitch")
+        return {"largest_error_pitch": error}
+
+    count = len(points) * fan  # multiply-adds of a 5-20-2 network, and an exponential of eleven operations per node
+    run = lambda: mapping.evaluate(arrays, points, pupil, out=out)  # noqa: E731
+    return Work(run, check, {"rays": count}, read_bytes=8 * count, flops=count * (2 * 140 + 20 * 14))
+
+
+def _count(scale, voxels) -> Work:
+    camera = rig(scale["sensor"]).cameras["cam1"]
+    centres = np.random.default_rng(2).uniform(-0.04, 0.04, (voxels, 3)) * scale["voxels"]
+
+    def check(result):
+        count, total, _ = result
+        share = float(count.sum() / total.sum())
+        disc = float(total.sum() / (voxels * 512 * COUNT_SAMPLES_ONE**2))
+        require(abs(share - 1) < 1e-3 and abs(disc - np.pi / 4) < 2e-3, f"{share:.4f} of the rays were counted")
+        return {"counted_share": share}
+
+    rays = voxels * 512 * COUNT_SAMPLES_ONE**2 * np.pi / 4
+    run = lambda: count_voxels(camera, centres, 0.1, samples=COUNT_SAMPLES_ONE)  # noqa: E731
+    return Work(run, check, {"rays": rays}, flops=50 * rays)
+
+
+def _footprint(scale, bent_mm) -> Work:
+    calibration, voxels = rig(scale["sensor"], bent_mm), grid(scale)
+    amounts: dict[str, float] = {"voxel_camera": 2 * voxels.size}
+    work = Work(lambda: lfpiv.build_weights(calibration, voxels), lambda _: {}, amounts)
+
+    def check(weights):
+        sums = np.abs(weights.column_sum / 2 - 1)
+        require(float(np.median(sums)) < 0.01, f"a voxel's weights sum to 1 +- {np.median(sums):.3f} per camera")
+        error = float(np.mean(sum(compare_with_count(weights, voxels=4).values(), [])))
+        require(error < FOOTPRINT, f"footprint differs from counted rays by {error:.3f}")
+        amounts["weights"] = nonzeros(weights)
+        work.read_bytes = weights.memory_bytes
+        return {"difference_from_count": error, "stored_bytes": weights.memory_bytes}
+
+    work.check = check
+    return work
+
+
+def _projection(scale, forward) -> Work:
+    weights = lfpiv.build_weights(rig(scale["sensor"]), grid(scale))
+    rng, names = np.random.default_rng(3), list(weights.cameras)
+    volume = rng.random(weights.grid.size, np.float32)
+    images = {name: weights.pad(name, rng.random(weights.cameras[name].gain.shape, np.float32)) for name in names}
+    target = {name: np.empty_like(images[name]) for name in names}
+
+    def project():
+        return {name: weights.project_padded(name, volume, target[name]) for name in names}
+
+    def back_project():
+        out = np.zeros_like(volume)
+        for name in names:
+            weights.back_project_padded(name, images[name], out)
+        return out
+
+    def check(_):
+        forth, back = project(), back_project()
+        left = sum(float(np.dot(forth[name].astype(float), images[name])) for name in names)
+        gap = abs(left / float(np.dot(back.astype(float), volume)) - 1)
+        require(gap < ADJOINT, f"projection and back projection are not adjoint: {gap:.1e}")
+        return {"adjoint_gap": gap}
+
+    count, peers = nonzeros(weights), {}
+    if scale["voxels"] <= PEER_VOXELS:
+        back = {name: explicit(weights, name) for name in names}
+        fore = {name: matrix.T.tocsr() for name, matrix in back.items()}
+        peers["scipy_csr"] = (
+            (lambda: {name: fore[name] @ volume for name in names})
+            if forward
+            else (lambda: sum(back[name] @ images[name] for name in names))
+        )
+    return Work(
+        project if forward else back_project,
+        check,
+        {"voxel_camera": 2 * weights.grid.size, "weights": count},
+        read_bytes=weights.memory_bytes,
+        flops=2 * count,
+        peers=peers,
+    )
+
+
+def explicit(weights, name: str) -> sparse.csr_array:
+    """One camera's weights as an explicit matrix (voxel, padded pixel), float32, int32 indices."""
+    blocks = weights._projectors[name].blocks
+    ends = np.cumsum(blocks.height)
+    line = np.arange(ends[-1]) - np.repeat(ends - blocks.height, blocks.height)
+    start = (np.repeat(blocks.pixel, blocks.height) + line * blocks.shape[1]).astype(np.int32)
+    lit = np.flatnonzero(blocks.value.ravel())
+    row, lane = np.divmod(lit, blocks.value.shape[1])
+    index, first = (start[row] + lane).astype(np.int32), np.searchsorted(row, blocks.first_row)
+    data = blocks.value.ravel()[lit] * np.repeat(blocks.scale, np.diff(first))
+    shape = (len(blocks.scale), blocks.shape[0] * blocks.shape[1])
+    return sparse.csr_array((data.astype(np.float32), index, first.astype(np.int32)), shape=shape)
+
+
+def _smart(scale, iterations) -> Work:
+    weights = lfpiv.build_weights(rig(scale["sensor"]), grid(scale))
+    truth = 1e4 * particles(weights.grid.shape)
+    images = {name: np.round(image) for name, image in weights(truth).items()}
+    first = np.full(weights.grid.shape, float(truth.mean()), np.float32)
+    assert weights.column_sum.all()  # every voxel active, and the column sums in place
+
+    def run():
+        return lfpiv.reconstruct(weights, images, iterations, first=first)
+
+    def check(volume):
+        misfit = np.array(volume.attrs["misfit"])
+        require(len(misfit) == iterations + 1 and (np.diff(misfit) < 0).all(), "the misfit does not fall")
+        return {"residual": volume.attrs["residual"][-1]}
+
+    count = nonzeros(weights) if scale["voxels"] <= PEER_VOXELS else 0
+    work = Work(
+        run,
+        check,
+        {"iterations": iterations, "voxel_camera": 2 * weights.grid.size * iterations},
+        read_bytes=(2 * iterations + 1) * weights.memory_bytes,
+    )
+    if count:
+        ours = weights.to_storage(run())
+        work.peers["scipy_csr"] = _smart_peer(weights, images, first, iterations)
+        work.peer_check = lambda volume: _agree(volume, ours)
+    return work
+
+
+def _smart_peer(weights, images, first, iterations):
+    """SMART with explicit matrices both ways round, the fastest form in SciPy: CSR for each direction."""
+    back = {name: explicit(weights, name) for name in weights.cameras}
+    fore = {name: matrix.T.tocsr() for name, matrix in back.items()}
+    image = {name: weights.pad(name, images[name]) for name in back}
+    step = 1 / weights.to_storage(weights.column_sum)
+
+    def run():
+        volume = weights.to_storage(first).copy()
+        for _ in range(iterations):
+            exponent = sum(b @ np.log((image[n] + 1) / (fore[n] @ volume + 1)) for n, b in back.items())
+            volume *= np.exp(step * exponent)
+        return volume
+
+    return run
+
+
+def _agree(volume, ours):
+    difference = float(np.linalg.norm(volume - ours) / np.linalg.norm(ours))
+    require(difference < 1e-3, f"differs from the explicit matrix by {difference:.1e}")
+    return {"difference": difference}
+
+
+def _correlate(scale, window, search) -> Work:
+    first, second = particles(scale["volume"]), particles(scale["volume"], SHIFT)
+    cube = (window,) * 3
+
+    def run():
+        peaks = correlate.correlate_windows(first, second, window=cube, step=(window // 2,) * 3, search=(search,) * 3)
+        return peaks.displacement
+
+    def bias(displacement):
+        vectors = displacement.reshape(-1, 3)
+        found = vectors[np.linalg.norm(vectors - SHIFT, axis=1) < 1]  # spurious vectors are another matter
+        require(len(found) > 0.8 * len(vectors), f"only {len(found)} of {len(vectors)} vectors are right")
+        return {"bias_voxel": float(np.abs(found.mean(0) - SHIFT).max()), "right": len(found) / len(vectors)}
+
+    def check(displacement):
+        figures = bias(displacement)
+        require(figures["bias_voxel"] < BIAS_VOXEL[window], f"bias of {figures['bias_voxel']:.3f} voxel")
+        return figures
+
+    count = correlate.window_grid(first.shape, cube, (window // 2,) * 3)[1]
+    work = Work(run, check, {"vectors": int(np.prod(count))}, peer_check=bias)
+    try:
+        from openpiv.pyprocess3D import extended_search_area_piv3D
+    except ImportError:
+        return work
+    low = tuple(slice(0, min(n, 4 * window)) for n in first.shape)  # its time per vector does not depend on the volume
+    part = [volume[low] for volume in (first, second)]
+    size = correlate.window_grid(part[0].shape, cube, (window // 2,) * 3)[1]
+    work.peer_share = np.prod(size) / np.prod(count)
+
+    def openpiv():
+        x, y, z, *_ = extended_search_area_piv3D(
+            *part, window_size=cube, overlap=(window // 2,) * 3, search_area_size=cube, dt=(1, 1, 1)
+        )
+        return np.stack([-np.asarray(y), np.asarray(x), -np.asarray(z)], -1)  # its names and signs, our axes
+
+    work.peers["openpiv"] = openpiv
+    return work
+
+
+def _deform(scale) -> Work:
+    volumes = particles(scale["volume"]), particles(scale["volume"], SHIFT)
+    coefficients = [deform.spline_coefficients(volume) for volume in volumes]
+    shape, spacing = scale["volume"], (4.0,) * 3
+    nodes = np.stack(np.meshgrid(*[4.0 * np.arange(-(-n // 4) + 1) for n in shape], indexing="ij"), -1)
+    displacement = (SHIFT + 0.01 * (nodes - nodes.mean((0, 1, 2)))).astype(np.float32)  # linear: exact between nodes
+
+    def at(indices, sign):
+        place = indices + deform.OFFSET
+        return place + sign * 0.5 * (SHIFT + 0.01 * (place - nodes.mean((0, 1, 2)))) + deform.MARGIN
+
+    def sampled(indices):
+        pairs = zip(coefficients, (-1, 1), strict=True)
+        return [
+            ndimage.map_coordinates(c, at(indices, s).T, order=3, prefilter=False, mode="nearest") for c, s in pairs
+        ]
+
+    def check(result):
+        indices = np.random.default_rng(4).integers(8, np.array(shape) - 8, (20_000, 3))
+        error = max(float(np.abs(a[tuple(indices.T)] - b).max()) for a, b in zip(result, sampled(indices), strict=True))
+        require(error < 1e-3, f"differs from SciPy's spline by {error:.1e}")
+        return {"largest_difference": error}
+
+    every = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
+    return Work(
+        lambda: deform.deform_pair(*coefficients, displacement, spacing),
+        check,
+        {"voxels": 2 * np.prod(shape)},
+        read_bytes=16 * np.prod(shape),
+        flops=2 * np.prod(shape) * 200,
+        peers={"scipy_map_coordinates": lambda: sampled(every)},
+        peer_check=lambda _: {},
+    )
+
+
+def _vectors(scale) -> Work:
+    volumes = particles(scale["volume"]), particles(scale["volume"], SHIFT)
+
+    def check(vectors):
+        found = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)[1:-1, 1:-1, 1:-1]
+        error = float(np.linalg.norm(found - SHIFT, axis=-1).mean())
+        require(error < 0.1, f"mean displacement error of {error:.3f} voxel")
+        return {"mean_error_voxel": error, "vectors": int(vectors["valid"].size)}
+
+    return Work(lambda: lfpiv.correlate(*volumes, dt_s=1.0, voxel_mm=0.1), check, {"pairs": 1})
+
+
+def _train(scale, epochs) -> Work:
+    camera, rng, count = rig(scale["sensor"], 0.1).cameras["cam1"], np.random.default_rng(5), scale["samples"]
+    inputs = rng.uniform(-1, 1, (count, 5)) * [3, 3, 3, 8, 8]
+    outputs = camera.map(inputs[:, :3], inputs[:, 3:]) + rng.normal(0, 0.1 * LABEL_NOISE, (count, 2))
+
+    def run(epochs=epochs):
+        return train(inputs, outputs, epochs=epochs, patience=epochs, unit=camera.lattice.pitch_mm)
+
+    def check(training):
+        require(training.epochs == epochs, f"stopped after {training.epochs} epochs")
+        whole, floor = run(200), LABEL_NOISE * np.sqrt(np.pi / 2)  # mean length of the labels' noise
+        require(whole.sigma_nor < 1.1 * floor, f"sigma_nor {whole.sigma_nor:.4f}, the labels' noise is {floor:.4f}")
+        return {"sigma_nor": whole.sigma_nor, "whole_training_s": whole.seconds, "whole_training_epochs": whole.epochs}
+
+    scaled, aim = np.hstack([inputs / [3, 3, 3, 8, 8], np.ones((count, 1))]), outputs / np.abs(outputs).max()
+    first = np.concatenate([layer.ravel() for layer in run(1).network.layers()])
+
+    def parts(theta):
+        hidden = np.tanh(scaled @ theta[:120].reshape(6, 20))
+        return hidden, np.hstack([hidden, scaled[:, 5:]]), theta[120:].reshape(21, 2)
+
+    def residual(theta):
+        return np.subtract(parts(theta)[1] @ parts(theta)[2], aim).T.ravel()
+
+    def jacobian(theta):
+        hidden, output_inputs, second = parts(theta)
+        matrix = np.zeros((2, count, 162))
+        for o in range(2):
+            inner = (1 - hidden**2) * second[:20, o]
+            matrix[o, :, :120] = (scaled[:, :, None] * inner[:, None]).reshape(count, 120)
+            matrix[o, :, 120 + o :: 2] = output_inputs
+        return matrix.reshape(-1, 162)
+
+    def evaluations(fit):
+        work.peer_share = fit.njev / epochs / 0.7  # it takes all samples, ours trains on 70 % and looks at 15 % more
+        return {"peer_epochs": fit.njev}
+
+    def peer():
+        return optimize.least_squares(residual, first, jacobian, method="trf", x_scale="jac", max_nfev=epochs)
+
+    work = Work(run, check, {"epochs": epochs, "samples": epochs * count}, flops=epochs * 0.7 * count * 2 * 162**2)
+    work.peers, work.peer_check = {"scipy_least_squares": peer} if count < 20_000 else {}, evaluations
+    return work
+
+
+def _demo(_) -> Work:
+    from lfpiv import demo
+
+    def run():
+        with tempfile.TemporaryDirectory() as folder:
+            return demo.run(folder, device=runtime.device().kind)
+
+    def check(summary):
+        error = summary["demo"]["mean_error_voxel"]
+        require(error < DEMO_VOXEL, f"mean displacement error of {error:.3f} voxel")
+        return {"mean_error_voxel": error}
+
+    return Work(run, check, {"jobs": 1})
+
+
+MAKERS = {
+    "mapping": _mapping,
+    "count": _count,
+    "footprint": _footprint,
+    "footprint_bent": _footprint,
+    "project": _projection,
+    "back_project": _projection,
+    "smart": _smart,
+    "correlate_8": _correlate,
+    "correlate_16": _correlate,
+    "deform": _deform,
+    "vectors": _vectors,
+    "train": _train,
+    "demo": _demo,
+}
+"""Operation -> the function that prepares it."""

@@ -1,0 +1,223 @@
+"""Run benchmark cases, one JSON line per metric, or compare two checkouts by interleaved runs.
+
+    python perf/run.py [--case NAME ...] [--small | --all] [--paper] [--device auto]
+    python perf/run.py --against COMMIT [--case NAME ...]
+
+Each case runs in a process of its own, so that peak memory is its own. Times are 10th percentiles after a warm-up, CPU
+time of all threads beside wall time. A case with a wrong result prints why and no time, and the exit status is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+os.environ["ENABLE_TAICHI_HEADER_PRINT"] = "0"  # before the first import of Taichi: standard output is for JSON
+ROOT = Path(__file__).resolve().parents[1]
+PERCENTILE = 10
+SECONDS, FEWEST, MOST = 6.0, 3, 30
+"""Time spent on a case's samples, and how many there are at least and at most; a sample above a minute is taken once."""
+ROUNDS, BLOCKS, LEAST_BAND = 30, 5, 0.03
+"""Samples per side of a comparison, the blocks they are cut into, and the narrowest band of a verdict."""
+COMPARED = ("mapping", "count", "footprint", "project", "back_project", "smart", "correlate_8", "deform", "train")
+
+
+def sample(run) -> tuple[object, float, float]:
+    """Result, wall time and CPU time of one run [s]."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = run()
+    return result, time.perf_counter() - wall, time.process_time() - cpu
+
+
+def low(run) -> tuple[object, float, float, int]:
+    """Result of the warm-up; low percentiles of wall and CPU time [s] of the samples after it, and their number."""
+    result, first, cpu = sample(run)
+    times = [(first, cpu)] if first > 60 else []
+    while not (times and first > 60) and len(times) < MOST:
+        times.append(sample(run)[1:])
+        if len(times) >= FEWEST and sum(wall for wall, _ in times) > SECONDS:
+            break
+    return result, *np.percentile(times, PERCENTILE, axis=0), len(times)
+
+
+def limits() -> dict[str, float]:
+    """What the machine gives on all its cores now: streaming reads [byte/s], float32 matrix products [flop/s]."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    parts, matrix = [np.ones(1 << 24, np.uint64) for _ in range(cores)], np.ones((2048, 2048), np.float32)
+    with ThreadPoolExecutor(cores) as pool:
+        read = min(sample(lambda: list(pool.map(np.add.reduce, parts)))[1] for _ in range(4))
+    product = min(sample(lambda: matrix @ matrix)[1] for _ in range(4))
+    return {"bytes": 8 * cores * (1 << 24) / read, "flops": 2 * 2048**3 / product}
+
+
+def measure(name: str) -> bool:
+    """Print the metrics of one case; false if its result is wrong."""
+    import cases
+
+    from lfpiv.memory import peak_mib
+
+    def emit(metric, value, unit="1", **more):
+        print(json.dumps({"case": name, "metric": metric, "value": value, "unit": unit, **more}), flush=True)
+
+    began = peak_mib()
+    work = cases.prepare(name)
+    try:
+        result, wall, cpu, count = low(work.run)
+        peak = peak_mib()
+        quality = work.check(result)
+    except cases.WrongResult as wrong:
+        emit("wrong", str(wrong))
+        return False
+    del result
+    emit("wall", wall, "s", samples=count)
+    emit("cpu", cpu, "s")
+    emit("peak_memory", peak, "MiB", before=began)
+    for unit, amount in work.amounts.items():
+        emit(f"{unit}_per_second", amount / wall, f"{unit}/s", per_cpu_second=amount / cpu, in_one_run=amount)
+    for metric, value in quality.items():
+        emit(metric, value)
+    if work.read_bytes or work.flops:
+        machine = limits()
+        seconds = {"bytes": work.read_bytes / machine["bytes"], "flops": work.flops / machine["flops"]}
+        by = max(seconds, key=seconds.get)
+        emit("times_hardware_limit", wall / seconds[by], by=by, limit_s=seconds[by], machine_per_second=machine[by])
+    for peer, run in work.peers.items():
+        try:
+            done, peer_wall, peer_cpu, _ = low(run)
+            quality = (work.peer_check or work.check)(done)
+        except cases.WrongResult as wrong:
+            emit("peer_wrong", str(wrong), peer=peer)
+            continue
+        share = work.peer_share
+        emit("faster_than_peer", peer_wall / share / wall, peer=peer, peer_s=peer_wall / share, **quality)
+        emit("less_cpu_than_peer", peer_cpu / share / cpu, peer=peer)
+    return True
+
+
+def serve(name: str) -> None:
+    """Prepare a case and time one run per line read: what `compare` talks to."""
+    import cases
+
+    import lfpiv
+
+    work = cases.prepare(name)
+    work.check(work.run())
+    print("READY", Path(lfpiv.__file__).resolve().parents[1], flush=True)
+    for _ in sys.stdin:
+        print("TIME", *sample(work.run)[1:], flush=True)
+
+
+def compare(name: str, base: Path, device: str) -> None:
+    """Print the ratio of this checkout to another, from interleaved samples of three processes: theirs, ours, theirs.
+
+    How far the two processes of the same checkout differ, block by block, is the band inside which a ratio says nothing.
+    """
+    with contextlib.ExitStack() as stack:
+        sides = []
+        for tree in (base, ROOT, base):
+            command = [sys.executable, __file__, "--serve", name, "--device", device]
+            environment = os.environ | {"PYTHONPATH": str(tree)}
+            side = subprocess.Popen(command, env=environment, stdin=-1, stdout=-1, text=True)
+            stack.callback(side.kill)
+            told = next((line.split(maxsplit=1)[1].strip() for line in side.stdout if line.startswith("READY")), None)
+            if told != str(tree.resolve()):
+                print(json.dumps({"case": name, "metric": "wrong", "value": f"{tree}: no right result from {told}"}))
+                return
+            sides.append(side)
+        times = np.empty((ROUNDS, 3, 2))
+        for turn in range(ROUNDS):
+            for place in np.roll([0, 1, 2], turn):
+                sides[place].stdin.write("go\n")
+                sides[place].stdin.flush()
+                answer = next(line for line in sides[place].stdout if line.startswith("TIME"))
+                times[turn, place] = [float(value) for value in answer.split()[1:]]
+    wall, cpu = np.percentile(times, PERCENTILE, axis=0).T
+    again = [np.divide(*np.percentile(block[:, ::2, 0], PERCENTILE, axis=0)) for block in np.split(times, BLOCKS)]
+    band = max(LEAST_BAND, *(abs(ratio - 1) for ratio in again))
+    ratio = wall[1] / wall[::2].mean()
+    verdict = "slower" if ratio > 1 + band else "faster" if ratio < 1 / (1 + band) else "no difference"
+    cpu_ratio = cpu[1] / cpu[::2].mean()
+    line = {"case": name, "metric": "ratio", "value": ratio, "band": band, "cpu_ratio": cpu_ratio, "verdict": verdict}
+    print(json.dumps(line), flush=True)
+
+
+def machine() -> dict:
+    """Return what figures depend on."""
+    model = platform.processor()
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return {
+        "case": "machine",
+        "cpu": model,
+        "cores": cores,
+        "load": load,
+        "python": platform.python_version(),
+        "commit": commit,
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", action="append", help="case by name, e.g. smart_small; may be repeated")
+    parser.add_argument("--small", action="store_true", help="the small cases and the demo; the default")
+    parser.add_argument("--all", action="store_true", help="the small and the medium cases, and the demo")
+    parser.add_argument("--paper", action="store_true", help="the cases of the published size: about 9 GiB of memory")
+    parser.add_argument("--against", metavar="COMMIT", help="compare this checkout with another commit")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="cpu")
+    parser.add_argument("--serve", help=argparse.SUPPRESS)
+    parser.add_argument("--measure", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.serve or given.measure:
+        from lfpiv_kernels import runtime
+
+        runtime.start(given.device)
+        return serve(given.serve) or 0 if given.serve else 1 - measure(given.measure)
+
+    from cases import CASES
+
+    scales = ["paper"] if given.paper and not (given.small or given.all) else ["small"]
+    scales += ["medium"] * given.all + ["paper"] * (given.paper and scales != ["paper"])
+    names = given.case or [name for scale in scales for name in CASES if name.endswith(f"_{scale}")]
+    unknown = [name for name in names if name not in CASES]
+    if unknown:
+        parser.error(f"--case: unknown {', '.join(unknown)}; there are {', '.join(CASES)}")
+    print(json.dumps(machine()), flush=True)
+    if given.against:
+        names = given.case or [f"{op}_small" for op in COMPARED]
+        with tempfile.TemporaryDirectory() as folder:
+            tree = Path(folder) / "base"
+            subprocess.run(
+                ["git", "-C", str(ROOT), "worktree", "add", "--detach", str(tree), given.against], check=True
+            )
+            try:
+                for name in names:
+                    compare(name, tree, given.device)
+            finally:
+                subprocess.run(["git", "-C", str(ROOT), "worktree", "remove", "--force", str(tree)], check=True)
+        return 0
+    names += ["demo"] if not given.case and not given.paper else []
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
+    }
+    command = [sys.executable, __file__, "--device", given.device, "--measure"]
+    return int(any([subprocess.run([*command, name], env=environment).returncode for name in names]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

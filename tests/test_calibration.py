@@ -1,0 +1,190 @@
+"""Calibration as a whole: the mapping against true rays, files that come back the same, warnings where they are due."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+from ideal_rig import rotation
+
+import lfpiv
+from lfpiv.calibration import _agreeing_dots, warn_outside
+from lfpiv.flows import KINDS, window_mean
+from lfpiv.scene import true_mapping
+from lfpiv.simulate import simulate
+
+MAPPING_PITCH = 0.015  # the project's limit for the mean error over the board's volume
+MAPPING_AIM_PITCH = 0.006  # its aim, reached on clean images
+INTERIOR_VOXEL = 0.45  # the project's limit for the mean displacement error of interior vectors
+FINITE = 0.95  # the project's limit for the part of grid points with a finite vector
+ROUND_TRIP_MM = 1e-9  # a calibration read back is the same to rounding
+
+SCENE = """
+name = "rig"
+seed = 9
+dt_s = 1e-3
+[board]
+dots = [5, 5]
+spacing_mm = 0.5
+dot_diameter_mm = 0.1
+planes_mm = [-0.8, -0.4, 0.0, 0.4, 0.8]
+[volume]
+size_mm = [2.0, 2.0, 1.2]
+voxel_mm = 0.1
+[particles]
+count = 40
+pairs = 1
+[flow]
+kind = "uniform"
+displacement_mm = [0.05, 0.0, 0.0]
+
+[[camera]]
+name = "only"
+focal_length_mm = 100.0
+magnification = -1.0
+f_number = 4.0
+microlens_pitch_mm = 0.1
+microlens_focal_length_mm = 0.8
+pixel_um = 8.0
+sensor_width_px = 420
+sensor_height_px = 400
+nominal_angle_deg = -30.0
+true_yaw_deg = -33.0
+true_pitch_deg = 0.8
+true_roll_deg = -1.1
+true_offset_mm = [0.05, -0.04, 0.1]
+true_array_roll_deg = 0.4
+true_array_offset_mm = [0.02, 0.03]
+"""
+
+
+def rays_in(low, high, count=50_000, radius=12.5, seed=0):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(low, high, (count, 3))
+    length, angle = radius * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    return points, np.stack([length * np.cos(angle), length * np.sin(angle)], axis=1)
+
+
+def mean_error_pitch(camera, spec, low, high):
+    points, pupil = rays_in(low, high)
+    return np.linalg.norm(camera.map(points, pupil) - true_mapping(spec)(points, pupil), axis=1).mean() / 0.1
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory, device):
+    """A misaligned camera's experiment, its true description and its calibration."""
+    folder = tmp_path_factory.mktemp("calibration")
+    (folder / "scene.toml").write_text(SCENE)
+    experiment = lfpiv.open_experiment(simulate(folder / "scene.toml", folder / "data"))
+    spec = json.loads((folder / "data" / "truth" / "spec.json").read_text())["camera"][0]
+    return experiment, spec, lfpiv.calibrate(experiment)
+
+
+def test_the_mapping_meets_the_true_rays(rig):
+    experiment, spec, calibration = rig
+    camera = calibration.cameras["only"]
+    error = mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8])
+    assert error <= MAPPING_AIM_PITCH
+    report = camera.report
+    assert report["dots_found"] == report["dots_expected"] == 125
+    assert error / 3 < report["sigma_nor_test"] < 10 * error  # the figure users see tells the order of the error
+    ideal = lfpiv.thin_lens(experiment).cameras["only"]
+    assert mean_error_pitch(ideal, spec, [-1, -1, -0.8], [1, 1, 0.8]) > 10 * MAPPING_PITCH  # it knows no misalignment
+
+
+def test_a_calibration_read_back_is_the_same(rig, tmp_path):
+    _, _, calibration = rig
+    calibration.save(tmp_path / "calibration.h5")
+    again = lfpiv.load_calibration(tmp_path / "calibration.h5").cameras["only"]
+    camera = calibration.cameras["only"]
+    points, pupil = rays_in([-1, -1, -1], [1, 1, 1], count=100)
+    assert np.abs(again.map(points, pupil) - camera.map(points, pupil)).max() <= ROUND_TRIP_MM
+    assert again.optics == camera.optics
+    assert again.lattice == camera.lattice
+    assert again.report == json.loads(json.dumps(camera.report))
+    assert again.gain.tobytes() == camera.gain.tobytes()
+    image = np.full(camera.optics.sensor_shape, 40.0)
+    assert again.decoder.background(image) == camera.decoder.background(image)
+
+
+def test_a_fan_of_rays_is_the_mapping(rig):
+    _, _, calibration = rig
+    camera = calibration.cameras["only"]
+    points, pupil = rays_in([-1, -1, -1], [1, 1, 1], count=20)
+    fan = camera.map_fan(points, pupil[:5])
+    assert fan.shape == (20, 5, 2)
+    for k in range(5):
+        single = camera.map(points, np.repeat(pupil[k : k + 1], 20, axis=0))
+        assert np.abs(fan[:, k] - single).max() <= 1e-5  # float32 of positions up to 2 mm, some sums deep
+
+
+def test_thin_lens_is_direct_ray_tracing_at_the_nominal_angle(rig):
+    experiment, _, _ = rig
+    points, pupil = rays_in([-1, -1, -1], [1, 1, 1], count=200)
+    for error, angle in ((0.0, -30.0), (1.0, -31.0)):  # Eqs. 11-12: every angle's magnitude is overestimated
+        camera = lfpiv.thin_lens(experiment, angle_error_deg=error).cameras["only"]
+        seen = points @ rotation(angle).T
+        m = 200 / (200 - seen[:, 2:])
+        expected = (1 - 200 / 100 + m) * pupil - m * seen[:, :2]
+        assert np.abs(camera.map(points, pupil) - expected).max() <= ROUND_TRIP_MM
+
+
+def test_a_volume_outside_the_board_is_warned_of_with_numbers(rig, caplog):
+    _, _, calibration = rig
+    with caplog.at_level(logging.WARNING):
+        warn_outside(calibration, lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2, 2, 1.6), voxel_mm=0.1))
+        assert not caplog.records
+        warn_outside(calibration, lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(4, 2, 1.6), voxel_mm=0.1))
+    # 40 columns of voxels at -1.95 ... 1.95 mm; the board spans -1 ... 1 and half a voxel more, which holds 22 of them
+    assert "only: 45 % of the volume lies outside" in caplog.text
+    assert "by up to 0.90 mm" in caplog.text
+
+
+def test_a_wrongly_named_dot_is_left_out(rig):
+    _, _, calibration = rig
+    dots = calibration.cameras["only"].dots
+    rng = np.random.default_rng(0)
+    departure = 0.0003 * rng.normal(size=dots.array_mm.shape) + 0.02 * dots.points_mm[:, :2] ** 2  # smooth distortion
+    assert _agreeing_dots(dots, departure, 0.1).all()
+    wrong = dots.dot == dots.measured_dot[37]
+    departure[wrong] += 0.5
+    assert (_agreeing_dots(dots, departure, 0.1) == ~wrong).all()
+
+
+def test_wrong_arguments_are_named(rig, tmp_path):
+    _, _, calibration = rig
+    with pytest.raises(ValueError, match=r"expected shapes \(n, 3\) and \(n, 2\)"):
+        calibration.cameras["only"].map(np.zeros((3, 2)), np.zeros((3, 2)))
+    with pytest.raises(lfpiv.InputError, match="could not read it"):
+        lfpiv.load_calibration(tmp_path / "missing.h5")
+    (tmp_path / "damaged.h5").write_bytes(b"no calibration")
+    with pytest.raises(lfpiv.InputError, match="could not read it"):
+        lfpiv.load_calibration(tmp_path / "damaged.h5")
+
+
+@pytest.mark.sample_data
+def test_the_sample_experiment_reaches_the_projects_figures(sample_data, tmp_path, device):
+    """The main job on the sample data: mapping against the true rays, vectors against the true flow."""
+    import xarray as xr
+
+    folder = sample_data / "ring-vortex-2cam"
+    summary = lfpiv.run(folder / "experiment.toml", tmp_path, pairs=(0, 1), device=device.kind)
+    spec = json.loads((folder / "truth" / "spec.json").read_text())
+    calibration = lfpiv.load_calibration(tmp_path / "calibration.h5")
+    for truth in spec["camera"]:
+        error = mean_error_pitch(calibration.cameras[truth["name"]], truth, [-3, -3, -2], [3, 3, 2])
+        assert error <= MAPPING_AIM_PITCH
+        assert summary["calibration"][truth["name"]]["sigma_nor_test"] <= 0.03
+    vectors = xr.open_dataset(tmp_path / "vectors" / "pair_0000.nc")
+    flow = KINDS["ring"](**{key: value for key, value in spec["flow"].items() if key != "kind"})
+    z, y, x = np.meshgrid(vectors.z, vectors.y, vectors.x, indexing="ij")
+    window_mm = 0.1 * json.loads(vectors.attrs["settings"])["windows"][-1][0]
+    expected = window_mean(flow, np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1), window_mm) / 0.1
+    measured = np.stack([vectors[f"displacement_{axis}"].values.ravel() for axis in "xyz"], axis=1)
+    error = np.linalg.norm(measured - expected, axis=1).reshape(z.shape)
+    assert np.isfinite(measured).all(1).mean() >= FINITE
+    assert error[1:-1, 1:-1, 1:-1].mean() <= INTERIOR_VOXEL
+    for name, axis in (("u", "x"), ("v", "y"), ("w", "z")):
+        metres = vectors[f"displacement_{axis}"].values * 0.1e-3 / spec["dt_s"]
+        assert np.allclose(vectors[name].values, metres, rtol=1e-5)
+        assert vectors[name].attrs["units"] == "m/s"
