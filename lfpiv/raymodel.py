@@ -40,7 +40,7 @@ def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
         part = points_mm[first : first + CHUNK_POINTS]
         rays = camera.map_fan(part, pupil)
         middle = rays[:, :1].copy()  # differences keep single precision where it matters
-        out[first : first + len(part)] = np.einsum("kp,npc->nck", solve.astype(np.float32), rays - middle)
+        out[first : first + len(part)] = np.tensordot(rays - middle, solve.astype(np.float32), axes=((1,), (1,)))
         out[first : first + len(part), :, 0] += middle[:, 0]
     return out
 

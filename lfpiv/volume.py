@@ -104,16 +104,16 @@ def reconstruct(
         raise ValueError(f"floor: expected a number >= 0, got {floor}.")
     cameras = [_prepare(weights, images, name) for name in weights.cameras]
 
-    column_sum = weights.to_storage(weights.column_sum)
+    column_sum = weights.stored.store(weights.column_sum)
     lit = column_sum > 1e-6 * column_sum.max()
     if normalisation == "column":
         step = np.divide(relaxation, column_sum, out=np.zeros_like(column_sum), where=lit)
     else:
-        pixels = weights.to_storage(weights.affected_pixels)
+        pixels = weights.stored.store(weights.affected_pixels)
         step = np.divide(relaxation / weights.largest, pixels, out=np.zeros_like(column_sum), where=lit & (pixels > 0))
 
     if first is not None:
-        volume = weights.to_storage(first) * lit
+        volume = weights.stored.store(first) * lit
     else:
         volume = _first_guess(weights, cameras, floors, column_sum, lit)
 
@@ -126,14 +126,14 @@ def reconstruct(
         exponent[:] = 0.0
         squares = divergence = 0.0
         for camera in cameras:
-            weights.project_padded(camera.name, volume, camera.projected)
+            weights.projector(camera.name).project(volume, camera.projected)
             project.log_ratio(camera.image, camera.gain, floors[camera.name], camera.projected, camera.ratio)
             np.multiply(camera.projected, camera.gain, out=camera.projected)
             difference = camera.image - camera.projected
             squares += float(np.dot(difference, difference))
             divergence += _divergence(camera, floors[camera.name], difference)
             if iteration < iterations:
-                weights.back_project_padded(camera.name, camera.ratio, exponent)
+                weights.projector(camera.name).back_project(camera.ratio, exponent)
         residual.append(float(np.sqrt(squares)) / light)
         misfit.append(divergence)
         if progress is not None:
@@ -148,7 +148,7 @@ def reconstruct(
             break
         project.update(volume, exponent, step)
         if smoothing_voxel > 0 and iteration + 1 < iterations:
-            shape = weights.storage_shape
+            shape = weights.stored.shape
             volume = ndimage.gaussian_filter(
                 volume.reshape(shape), smoothing_voxel, mode="nearest", truncate=3.0
             ).ravel()
@@ -157,7 +157,7 @@ def reconstruct(
         log.warning("SMART: %s", stop.value)
     grid = weights.grid
     return xr.DataArray(
-        weights.from_storage(volume),
+        weights.stored.restore(volume),
         dims=("z", "y", "x"),
         coords={name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")},
         name="intensity",
@@ -197,12 +197,12 @@ def _first_guess(weights, cameras, floors, column_sum, lit) -> np.ndarray:
     logarithm = np.zeros_like(column_sum)
     for camera in cameras:
         floor = max(floors[camera.name], 1e-3 * float(camera.image.max()))
-        weights.back_project_padded(camera.name, camera.gain * np.log1p(camera.image / floor), logarithm)
+        weights.projector(camera.name).back_project(camera.gain * np.log1p(camera.image / floor), logarithm)
     guess = np.expm1(np.divide(logarithm, column_sum, out=np.zeros_like(column_sum), where=lit))
     guess = np.where(lit, np.maximum(guess, 1e-6 * guess.max()), 0.0).astype(np.float32)
     seen = light = 0.0
     for camera in cameras:
-        weights.project_padded(camera.name, guess, camera.projected)
+        weights.projector(camera.name).project(guess, camera.projected)
         modelled = camera.gain * camera.projected
         seen += float(camera.image[modelled > 0].sum(dtype=np.float64))
         light += float(modelled.sum(dtype=np.float64))

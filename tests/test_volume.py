@@ -8,6 +8,7 @@ from ideal_rig import two_cameras
 from scipy.optimize import minimize
 
 import lfpiv
+from lfpiv.weightblocks import StoredGrid
 from lfpiv.weights import Weights
 from lfpiv_kernels import footprint, reference, runtime
 from lfpiv_kernels.project import Blocks, Projector
@@ -23,8 +24,8 @@ def random_system(seed, voxels=(3, 4, 5), rows=4, lit=0.4):
     rng = np.random.default_rng(seed)
     grid = lfpiv.Grid(shape=voxels, voxel_mm=1.0, first_centre_mm=(0.0, 0.0, 0.0))
     weights = Weights.__new__(Weights)
-    weights.grid, weights.method, weights._order, weights._column_sum = grid, "footprint", (1, 0, 2), None
-    weights.cameras, weights._packs, weights._projectors = {}, {}, {}
+    weights.grid, weights.method, weights._column_sum = grid, "footprint", None
+    weights.stored, weights.cameras, weights._projectors = StoredGrid(grid, (1, 0, 2)), {}, {}
     for name in ("one", "two"):
         value = rng.integers(1, 256, (grid.size * rows, 8)) * (rng.random((grid.size * rows, 8)) < lit)
         value[::rows, 0] = 100  # every voxel lights something
@@ -39,14 +40,13 @@ def random_system(seed, voxels=(3, 4, 5), rows=4, lit=0.4):
         )
         optics = SimpleNamespace(sensor_shape=(rows, 8))
         weights.cameras[name] = SimpleNamespace(optics=optics, gain=np.ones((rows, 8), np.float32))
-        weights._packs[name] = SimpleNamespace(stride=24)
         weights._projectors[name] = Projector(blocks)
     return weights
 
 
 def matrix_of(weights):
     """Dense matrix of all cameras on voxels in (z, y, x) order, padding left out."""
-    order = weights.from_storage(np.arange(weights.grid.size)).ravel()
+    order = weights.stored.restore(np.arange(weights.grid.size)).ravel()
     parts = []
     for name, projector in weights._projectors.items():
         rows, stride = projector.blocks.shape

@@ -8,7 +8,8 @@ from ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_came
 
 import lfpiv
 from lfpiv.raymodel import ray_models
-from lfpiv.weights import count_voxels, estimate_memory
+from lfpiv.weightblocks import count_voxels
+from lfpiv.weights import estimate_memory
 from lfpiv_kernels import footprint, reference, runtime, trace
 from lfpiv_kernels.lattice import pack_lattice
 
@@ -154,7 +155,7 @@ def test_operator_is_the_stored_matrix(small):
     images = small(volume)
     for name, projector in small._projectors.items():
         matrix = reference.dense(projector.blocks)
-        twin = (matrix @ small.to_storage(volume)).reshape(projector.blocks.shape)
+        twin = (matrix @ small.stored.store(volume)).reshape(projector.blocks.shape)
         camera = small.cameras[name]
         expected = twin[:, : camera.optics.sensor_shape[1]] * camera.gain
         assert np.abs(images[name] - expected).max() <= 1e-5 * np.abs(expected).max()  # float32 sums of <= 210 terms
