@@ -46,7 +46,7 @@ def reconstruct(
     iterations: int = 10,
     relaxation: float = 1.0,
     *,
-    floor: float | Mapping[str, float] = 1.0,
+    floor: float | Mapping[str, float] | None = None,
     normalisation: str = "column",
     smoothing_voxel: float = 0.0,
     tolerance: float = 0.0,
@@ -72,9 +72,10 @@ def reconstruct(
         Number of iterations, >= 0.
     relaxation : float
         Relaxation parameter mu, > 0; 1 is safe, 3 diverges.
-    floor : float or mapping of str to float
-        Noise floor b [counts] added to images and projections alike: one dark pixel must not kill a voxel. Take the
-        noise of the background.
+    floor : float or mapping of str to float, optional
+        Noise floor b [counts] added to images and projections alike: one dark pixel must not kill a voxel. Default: the
+        noise of each image's background, the root mean square of its negative counts, and at least 1e-4 of its
+        brightest count.
     normalisation : {"column", "paper"}
         See above.
     smoothing_voxel : float
@@ -99,10 +100,8 @@ def reconstruct(
         If an argument is out of its range, or an image is missing, has the wrong shape or holds no finite light.
     """
     _check(iterations, relaxation, normalisation, smoothing_voxel, first, weights)
-    floors = {name: floor[name] if isinstance(floor, Mapping) else floor for name in weights.cameras}
-    if any(not value >= 0 for value in floors.values()):
-        raise ValueError(f"floor: expected a number >= 0, got {floor}.")
     cameras = [_prepare(weights, images, name) for name in weights.cameras]
+    floors = _floors(floor, weights, images)
 
     column_sum = weights.stored.store(weights.column_sum)
     lit = column_sum > 1e-6 * column_sum.max()
@@ -174,6 +173,25 @@ def reconstruct(
             "smoothing_voxel": smoothing_voxel,
         },
     )
+
+
+def _floors(floor, weights: Weights, images: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Noise floor of every camera [counts]."""
+    if floor is None:
+        floors = {}
+        for name in weights.cameras:
+            image = np.asarray(images[name], np.float32)
+            below = image[image < 0]
+            noise = float(np.sqrt(np.mean(below**2))) if below.size else 0.0
+            floors[name] = max(noise, 1e-4 * float(image.max()))
+        return floors
+    missing = [name for name in weights.cameras if isinstance(floor, Mapping) and name not in floor]
+    if missing:
+        raise ValueError(f"floor: camera {missing[0]!r} is missing; found {', '.join(floor) or 'none'}.")
+    floors = {name: floor[name] if isinstance(floor, Mapping) else floor for name in weights.cameras}
+    if any(not value >= 0 for value in floors.values()):
+        raise ValueError(f"floor: expected a number >= 0, got {floor}.")
+    return floors
 
 
 def _prepare(weights: Weights, images: Mapping[str, np.ndarray], name: str) -> _Camera:

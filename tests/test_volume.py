@@ -150,6 +150,17 @@ def test_truth_is_a_fixed_point():
     assert volume.residual[-1] <= TOLERANCE_F32
 
 
+def test_the_floor_is_the_noise_of_the_background_by_default():
+    weights = random_system(8)
+    rng = np.random.default_rng(8)
+    noise = {name: rng.normal(0, 0.2, (4, 8)) for name in weights.cameras}
+    image = images_of(weights, matrix_of(weights) @ rng.random(weights.grid.size) ** 8)
+    image = {name: np.where(np.arange(8) < 3, 0, image[name]) + noise[name] for name in image}  # three dark columns
+    floor = {name: float(np.sqrt((image[name][image[name] < 0] ** 2).mean())) for name in image}
+    given = lfpiv.reconstruct(weights, image, floor=floor)
+    assert np.allclose(lfpiv.reconstruct(weights, image).values, given.values, rtol=TOLERANCE_F32)
+
+
 def test_verdicts():
     weights = random_system(7)
     image = images_of(weights, matrix_of(weights) @ np.random.default_rng(7).random(weights.grid.size))
@@ -198,6 +209,7 @@ def test_light_outside_the_volume_and_dead_pixels_do_not_break_it():
         ({"normalisation": "rows"}, "normalisation: expected one of"),
         ({"smoothing_voxel": -0.1}, "smoothing_voxel: expected"),
         ({"floor": float("nan")}, "floor: expected"),
+        ({"floor": {"one": 1.0}}, "floor: camera 'two' is missing"),
         ({"first": np.zeros((3, 4, 5))}, "first: expected positive values"),
     ],
 )
