@@ -287,12 +287,14 @@ def _grid(path: Path, volume: Volume) -> Grid:
 
 def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
     for window in correlation.windows or ():
-        edges = window if isinstance(window, tuple) else (window,) * 3
-        for axis, edge, n in zip("zyx", edges, grid.shape, strict=True):
+        if not isinstance(window, tuple):
+            continue  # a single edge is cut to the volume
+        for axis, edge, n in zip("zyx", window, grid.shape, strict=True):
             if edge > n:
                 raise InputError(
                     f"{path}: correlation.windows: expected windows inside the volume, found {edge} voxels "
-                    f"along {axis} where the volume has {n}. Use a smaller window, or one edge per axis, [z, y, x]."
+                    f"along {axis} where the volume has {n}. Use a smaller window, or a single edge, which is cut to "
+                    "the volume."
                 )
 
 

@@ -24,6 +24,9 @@ from lfpiv_kernels.uncertainty import displacement_deviation
 
 log = logging.getLogger(__name__)
 
+COARSE_OVERLAP = 0.75
+"""Overlap of all passes but the last: large windows that overlap by half lie too far apart for their neighbours to
+judge them in a curved field."""
 DEFAULT_WINDOWS = (32, 16, 12, 12)
 """Window edges [voxel] of the passes where none are given, cut to the volume along each axis."""
 REFINE_SEARCH = 3
@@ -76,7 +79,8 @@ def correlate(
     dt_s : float
         Time between the two [s].
     windows : sequence, optional
-        Window of each pass [voxel], one edge or (z, y, x). The last one sets the vector grid; name it twice to iterate.
+        Window of each pass [voxel], one edge, cut to the volume where it is larger, or (z, y, x). The last one sets the
+        vector grid, all others overlap by at least `COARSE_OVERLAP`; name one twice to iterate.
         Default: `DEFAULT_WINDOWS`, cut to the volume.
     overlap : float
         Part of a window shared with its neighbour, 0 <= overlap < 1.
@@ -132,8 +136,9 @@ def correlate(
     if intensity_power != 1:
         first, second = (np.maximum(v, 0) ** np.float32(intensity_power) for v in (first, second))
     multi_pass = _MultiPass(first, second, symmetric=len(schedule) > 1)
-    for window in schedule:
-        multi_pass.run(window, tuple(max(1, round(edge * (1 - overlap))) for edge in window), search)
+    for number, window in enumerate(schedule):
+        shared = overlap if number == len(schedule) - 1 else max(overlap, COARSE_OVERLAP)
+        multi_pass.run(window, tuple(max(1, round(edge * (1 - shared))) for edge in window), search)
         search = (REFINE_SEARCH,) * 3
     settings = {
         "windows": [list(window) for window in schedule],
@@ -311,12 +316,16 @@ def _check_windows(windows, shape: tuple[int, int, int]) -> list[tuple[int, int,
         if len(edges) != 3 or any(int(edge) != edge or edge < 4 for edge in edges):
             raise ValueError(f"windows: expected edges of whole voxels >= 4, one or (z, y, x) per pass, got {window}.")
         edges = tuple(int(edge) for edge in edges)
-        for axis, edge, n in zip(_AXES, edges, shape, strict=True):
-            if edge > n:
-                raise ValueError(
-                    f"windows: expected edges within the volume, got {edge} along {axis}, which has {n} voxels. "
-                    "Use a smaller window, or give each axis its own edge, (z, y, x)."
-                )
+        too_large = [(axis, edge, n) for axis, edge, n in zip(_AXES, edges, shape, strict=True) if edge > n]
+        if too_large and np.ndim(window):
+            axis, edge, n = too_large[0]
+            raise ValueError(
+                f"windows: expected edges within the volume, got {edge} along {axis}, which has {n} voxels. "
+                "Use a smaller window, or a single edge, which is cut to the volume."
+            )
+        if too_large:
+            log.info("window %d is cut to the volume %s", edges[0], shape)
+            edges = tuple(min(edge, n) for edge, n in zip(edges, shape, strict=True))
         schedule.append(edges)
     if not schedule:
         raise ValueError("windows: expected at least one pass, got none.")

@@ -149,8 +149,8 @@ def footprint_blocks(stored: StoredGrid, camera, progress: Progress) -> Blocks:
     log.info(
         "%s: rays bend by %.3f pitch over the pupil: %s slopes", camera.name, bend, "local" if bends else "constant"
     )
-    pixel, height = np.empty(first_block[-1], np.int32), np.empty(first_block[-1], np.int32)
-    value = np.empty((first_row[-1], footprint.LANES), np.uint8)
+    pixel, height = np.zeros(first_block[-1], np.int32), np.zeros(first_block[-1], np.int32)
+    value = np.zeros((first_row[-1], footprint.LANES), np.uint8)
     scale = np.zeros(size, np.float32)
     for number, (a, b) in enumerate(chunks):
         block, row = slice(first_block[a], first_block[b]), slice(first_row[a], first_row[b])

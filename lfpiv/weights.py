@@ -123,9 +123,11 @@ class Weights:
         self._build()
         total = np.zeros(self.grid.size, np.int64)
         for projector in self._projectors.values():
-            lit = np.add.reduce(projector.blocks.value > 0, axis=1, dtype=np.int64)
-            sums = np.concatenate([[0], np.cumsum(lit)])
-            total += np.diff(sums[projector.blocks.first_row])
+            value, first_row = projector.blocks.value, projector.blocks.first_row
+            for a in range(0, self.grid.size, CHUNK_VOXELS):
+                edges = first_row[a : a + CHUNK_VOXELS + 1]
+                lit = np.count_nonzero(value[edges[0] : edges[-1]], axis=1)
+                total[a : a + CHUNK_VOXELS] += np.diff(np.concatenate([[0], np.cumsum(lit)])[edges - edges[0]])
         return self.stored.restore(total)
 
     @property

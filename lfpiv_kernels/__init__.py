@@ -1,1 +1,5 @@
 """Kernels of lfpiv: arrays in, arrays out. Taichi traces rays and builds weights, Warp projects and correlates."""
+
+import os
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # Taichi prints a banner on import otherwise

@@ -314,13 +314,18 @@ def _fill_blocks(
     for v in range(model.shape[0]):
         block = ti.cast(first_block[v] - first_block[0], ti.i32)
         row = ti.cast(first_row[v] - first_row[0], ti.i32)
+        last_block = ti.cast(first_block[v + 1] - first_block[0], ti.i32)
+        last_row = ti.cast(first_row[v + 1] - first_row[0], ti.i32)
         lens = _lens_range(model, v, camera, lattice, cell, pupil_pixel)
         to_level = ti.f32(0.0)  # 255 / upper bound of the voxel's weights
         for j in range(lens[2], lens[3] + 1):
             for i in range(lens[0], lens[1] + 1):
                 centre = lens_centre(lattice, i, j)
                 box, middle = _pixel_box(model, v, camera, centre, cell, pupil_pixel)
-                if box[0] <= box[1] and box[2] <= box[3]:
+                # rounding may differ from that of _measure_blocks, compiled apart: never write past what it counted
+                tiles = (box[1] - box[0] + LANES) // LANES
+                fits = block + tiles <= last_block and row + tiles * (box[3] - box[2] + 1) <= last_row
+                if box[0] <= box[1] and box[2] <= box[3] and fits:
                     slope = _slope(model, v, middle)
                     jacobian = _inverse(identity - slope)
                     turn = frame @ jacobian
@@ -455,7 +460,8 @@ def fill_blocks(
     first_block, first_row : ndarray, shape (voxel + 1,), int64
         Where each voxel's blocks and rows begin; the first entries are those of `pixel` and `value`.
     pixel, height : ndarray, shape (block,), int32
-        Filled with the index of each block's first pixel in the padded image, and its number of rows.
+        Zeros; filled with the index of each block's first pixel in the padded image, and its number of rows. A block
+        that was counted but is not needed stays without rows.
     value : ndarray, shape (row, LANES), uint8
         Filled with the weights in units of the voxel's `scale`.
     scale : ndarray, shape (voxel,), float32

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 log = logging.getLogger(__name__)
 
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # Taichi prints a banner on import otherwise
 
 CHUNKS = 8
 """Parts into which a CPU launch is cut. Fixed, so that results do not depend on the number of threads."""

@@ -23,11 +23,14 @@ from pathlib import Path
 
 import numpy as np
 
-os.environ["ENABLE_TAICHI_HEADER_PRINT"] = "0"  # before the first import of Taichi: standard output is for JSON
+os.environ.update(
+    ENABLE_TAICHI_HEADER_PRINT="0", TQDM_DISABLE="1"
+)  # before the first import of Taichi: standard output is for JSON
 ROOT = Path(__file__).resolve().parents[1]
 PERCENTILE = 10
-SECONDS, FEWEST, MOST = 6.0, 3, 30
-"""Time spent on a case's samples, and how many there are at least and at most; a sample above a minute is taken once."""
+SECONDS, FEWEST, MOST, ENOUGH = 4.0, 3, 30, 20.0
+"""Time spent on a case's samples, and how many there are at least and at most; a run that takes longer than
+`ENOUGH` is timed once, without a warm-up [s]."""
 ROUNDS, BLOCKS, LEAST_BAND = 30, 5, 0.03
 """Samples per side of a comparison, the blocks they are cut into, and the narrowest band of a verdict."""
 COMPARED = ("mapping", "count", "footprint", "project", "back_project", "smart", "correlate_8", "deform", "train")
@@ -43,8 +46,8 @@ def sample(run) -> tuple[object, float, float]:
 def low(run) -> tuple[object, float, float, int]:
     """Result of the warm-up; low percentiles of wall and CPU time [s] of the samples after it, and their number."""
     result, first, cpu = sample(run)
-    times = [(first, cpu)] if first > 60 else []
-    while not (times and first > 60) and len(times) < MOST:
+    times = [(first, cpu)] if first > ENOUGH else []
+    while first <= ENOUGH and len(times) < MOST:
         times.append(sample(run)[1:])
         if len(times) >= FEWEST and sum(wall for wall, _ in times) > SECONDS:
             break
@@ -68,7 +71,8 @@ def measure(name: str) -> bool:
     from lfpiv.memory import peak_mib
 
     def emit(metric, value, unit="1", **more):
-        print(json.dumps({"case": name, "metric": metric, "value": value, "unit": unit, **more}), flush=True)
+        line = {"case": name, "metric": metric, "value": value, "unit": unit, **more}
+        print(json.dumps(line, default=float), flush=True)
 
     began = peak_mib()
     work = cases.prepare(name)
@@ -121,7 +125,7 @@ def serve(name: str) -> None:
 def compare(name: str, base: Path, device: str) -> None:
     """Print the ratio of this checkout to another, from interleaved samples of three processes: theirs, ours, theirs.
 
-    How far the two processes of the same checkout differ, block by block, is the band inside which a ratio says nothing.
+    How far the two processes of one checkout differ, block by block, is the band inside which a ratio says nothing.
     """
     with contextlib.ExitStack() as stack:
         sides = []
@@ -203,7 +207,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             tree = Path(folder) / "base"
             subprocess.run(
-                ["git", "-C", str(ROOT), "worktree", "add", "--detach", str(tree), given.against], check=True
+                ["git", "-C", str(ROOT), "worktree", "add", "--quiet", "--detach", str(tree), given.against], check=True
             )
             try:
                 for name in names:

@@ -94,7 +94,11 @@ BAD_KEYS = {
     "bad field format": ("{pair:04d}", "{pair:04q}", ["particles.images", "{pair}"]),
     "one frame": ("pairs = 2", 'pairs = 2\nframes = ["a", "a"]', ["particles.frames", "different"]),
     "no pairs": ("pairs = 2", "pairs = 0", ["particles.pairs", "1 or more"]),
-    "big window": ("pairs = 2", "pairs = 2\n[correlation]\nwindows = [16]", ["correlation.windows", "16", "along z"]),
+    "big window": (
+        "pairs = 2",
+        "pairs = 2\n[correlation]\nwindows = [[16, 16, 16]]",
+        ["correlation.windows", "16", "along z"],
+    ),
     "no TOML": ("pairs = 2", "pairs = = 2", ["TOML", "line"]),
     "pixel unit": ("pixel_um = 10.0", "pixel_um = 0.01", ["microlens_pitch_mm", "pixel_um"]),
 }

@@ -1,0 +1,124 @@
+"""Gates that need no clock: kernel launches, compilations, bytes and iterations of the benchmark's operations.
+
+A budget is a count of what the code does today; it fails when a change launches, compiles or stores more. Lower it when
+a change needs less.
+"""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+import warp as wp
+from ideal_rig import two_cameras
+
+import lfpiv
+from lfpiv.network import train
+from lfpiv_kernels import correlate, deform, footprint, runtime
+
+GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.2, 1.0, 0.8), voxel_mm=0.1)
+CAMERAS = 2
+STORED_BYTES_PER_WEIGHT = 2.0
+"""One byte per weight, and what rows of eight lanes and blocks' heads add to it: 1.8 on this rig."""
+SMART_IMAGES, SMART_VOLUMES = 12, 12
+"""Sensor images and volumes that SMART may allocate at once for both cameras; it holds 11 images here."""
+EPOCHS = 10
+"""Epochs that Levenberg-Marquardt may take to come within a tenth of the samples' noise; it takes 5."""
+
+
+@pytest.fixture(scope="module")
+def chunks():
+    """Launches per operation: the CPU cuts them for its threads, CUDA does not."""
+    return runtime.CHUNKS if runtime.device().kind == "cpu" else 1
+
+
+@pytest.fixture(scope="module")
+def weights(device):
+    return lfpiv.build_weights(two_cameras(), GRID)
+
+
+@pytest.fixture
+def launches(monkeypatch):
+    """Names of the Warp kernels launched so far."""
+    names, launch = [], wp.launch
+
+    def counted(kernel, *arguments, **keywords):
+        names.append(kernel.key)
+        return launch(kernel, *arguments, **keywords)
+
+    monkeypatch.setattr(wp, "launch", counted)
+    return names
+
+
+def compilations():
+    return sum(len(kernel._primal.compiled_kernels) for kernel in (footprint._measure_blocks, footprint._fill_blocks))
+
+
+def test_projection_launches_once_per_camera_and_chunk(weights, launches, chunks):
+    volume = np.ones(GRID.shape, np.float32)
+    images = weights(volume)
+    assert len(launches) == CAMERAS * chunks
+    weights.T(images)
+    assert len(launches) == 2 * CAMERAS * chunks
+
+
+def test_smart_launches_and_allocates_the_same_in_every_iteration(weights, launches, chunks):
+    images = weights(np.ones(GRID.shape, np.float32))
+    first, counts, peaks = np.full(GRID.shape, 0.5, np.float32), [], []
+    lfpiv.reconstruct(weights, images, 1, first=first)  # column sums and modules, once
+    for iterations in (2, 5):
+        launches.clear()
+        tracemalloc.start()
+        volume = lfpiv.reconstruct(weights, images, iterations, first=first)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        counts.append(len(launches))
+        assert volume.attrs["iterations"] == iterations
+    # per camera a projection, a log ratio and a back projection, and one update of the volume; then a last misfit
+    assert counts[1] - counts[0] == 3 * (3 * CAMERAS + 1) * chunks
+    assert counts[0] == (2 * (3 * CAMERAS + 1) + 2 * CAMERAS) * chunks
+    pixels = np.prod(next(iter(images.values())).shape)
+    budget = 4 * (SMART_IMAGES * pixels + SMART_VOLUMES * GRID.size)
+    assert max(peaks) < budget
+    assert peaks[1] - peaks[0] < 4 * pixels  # nothing grows with the iterations
+
+
+def test_weights_are_stored_in_their_budget_and_compiled_once(weights):
+    lit = int(weights.affected_pixels.sum())
+    assert lit < weights.memory_bytes < STORED_BYTES_PER_WEIGHT * lit
+    before = compilations()
+    other = lfpiv.Grid.from_extent(centre_mm=(0.2, 0, 0.3), size_mm=(0.7, 0.9, 0.5), voxel_mm=0.05)
+    lfpiv.build_weights(two_cameras(), other)  # another grid, another voxel: the same kernels
+    assert compilations() == before
+
+
+def test_blocks_are_as_many_and_as_high_as_measured(weights):
+    for name in weights.cameras:
+        blocks = weights.projector(name).blocks
+        rows = np.concatenate([[0], np.cumsum(blocks.height, dtype=np.int64)])[blocks.first_block]
+        assert blocks.height.min() >= 0 and (np.diff(rows) <= np.diff(blocks.first_row)).all()
+        last = blocks.pixel.astype(np.int64) + (blocks.height.astype(np.int64) - 1) * blocks.shape[1]
+        assert blocks.pixel.min() >= 0 and (last + footprint.LANES <= blocks.shape[0] * blocks.shape[1]).all()
+
+
+def test_correlation_and_deformation_launch_once_per_slab(device, launches, chunks):
+    rng = np.random.default_rng(0)
+    first, second = rng.random((2, 40, 40, 40), np.float32)
+    arguments = {"window": (16,) * 3, "step": (8,) * 3, "search": (4,) * 3}
+    correlate.correlate_windows(first, second, method="direct", **arguments)
+    names = [name for name in launches if not name.startswith("_box_sum")]  # window statistics have their own number
+    assert sorted(set(names)) == ["_correlate_blocks", "_find_peaks", "_normalise"]
+    assert len(names) <= 3 * chunks
+    launches.clear()
+    coefficients = [deform.spline_coefficients(volume) for volume in (first, second)]
+    deform.deform_pair(*coefficients, np.zeros((11, 11, 11, 3), np.float32), (4.0, 4.0, 4.0))
+    assert len(launches) <= chunks
+
+
+def test_training_needs_few_epochs():
+    rng = np.random.default_rng(0)
+    inputs = rng.uniform(-1, 1, (3000, 5))
+    truth = np.stack([inputs[:, 0] + 0.3 * inputs[:, 1] * inputs[:, 3], inputs[:, 1] - 0.2 * inputs[:, 4] ** 2], 1)
+    noise = 0.01
+    result = train(inputs, truth + rng.normal(0, noise, truth.shape), epochs=200)
+    best = int(np.argmax(result.validation_rms < 1.1 * noise))
+    assert 0 < best <= EPOCHS
