@@ -122,6 +122,17 @@ def _make_writable(path: Path) -> list[Path]:
             f"{path}: expected an output folder that can be written, found: {(error.strerror or str(error)).lower()}. "
             "Choose another one with --out."
         ) from None
+    folder = Folder(path)
+    for place in (folder.vectors(0).parent, folder.volume(0, 0).parent):
+        if place.exists() and not place.is_dir():
+            raise InputError(
+                f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
+            )
+    for place in (folder.calibration, folder.summary, folder.report):
+        if place.is_dir():
+            raise InputError(
+                f"{place}: expected a place for a file, found a folder. Remove it or choose another --out."
+            )
     return made
 
 

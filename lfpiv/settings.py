@@ -77,7 +77,7 @@ class Compute(Table):
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device of the kernels; "auto" takes CUDA where there is one."""
-    threads: Count | None = None
+    threads: Annotated[int, Field(strict=True, ge=1, le=1024)] | None = None
     """CPU threads; absent: the cores this process may use."""
     weights: Literal["footprint", "count"] = "footprint"
     """Weights integrated over voxel, microlens and pixel, or counted rays (Eq. 10 as printed)."""

@@ -60,6 +60,7 @@ SPOILERS = {
     "too little memory": (lambda e: edit(e, "voxel_mm = 0.05", "voxel_mm = 1e-5"), "GiB"),
     "more than any memory": (lambda e: edit(e, "size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e6, 1e6, 1e6]"), "GiB"),
     "no such pair": (lambda e: None, "pairs"),
+    "a million threads": (lambda e: edit(e, "pairs = 2", "pairs = 2\n[compute]\nthreads = 1000000"), "compute.threads"),
 }
 
 
@@ -83,6 +84,19 @@ def test_every_step_refuses_a_folder_it_cannot_write(tiny_experiment, tmp_path, 
     status = cli.call([command, str(tiny_experiment), "--out", str(tmp_path / "file" / "out")])
     said = capfd.readouterr().err
     assert status == 2 and said.count("\n") == 1 and str(tmp_path / "file" / "out") in said
+
+
+@pytest.mark.parametrize(("name", "make"), [("vectors", "file"), ("volumes", "file"), ("calibration.h5", "folder")])
+def test_a_place_for_results_that_is_taken_is_refused_before_work(tiny_experiment, tmp_path, capfd, name, make):
+    place = tmp_path / "out" / name
+    place.parent.mkdir()
+    if make == "file":
+        place.write_text("not a folder")
+    else:
+        place.mkdir()
+    status = cli.call(["run", str(tiny_experiment), "--out", str(place.parent)])
+    said = capfd.readouterr().err
+    assert status == 2 and said.count("\n") == 1 and str(place) in said and "expected a" in said
 
 
 @pytest.mark.parametrize(

@@ -416,13 +416,37 @@ def test_unrelated_and_empty_volumes_say_so():
     assert empty.attrs["verdict"] == vectors.Verdict.FAILED.value
 
 
+def test_a_single_edge_is_cut_to_the_volume():
+    first, second = volumes()
+    whole, given = max(first.shape), tuple(first.shape)
+    cut = lfpiv.correlate(first, second, dt_s=1.0, windows=(whole, 12))
+    same = lfpiv.correlate(first, second, dt_s=1.0, windows=(given, 12))
+    assert cut["displacement_x"].values.tobytes() == same["displacement_x"].values.tobytes()
+
+
+def test_intensity_power_is_taken_of_the_smoothed_volumes():
+    pair = volumes()
+    ours = lfpiv.correlate(*pair, dt_s=1.0, windows=(12, 8), smoothing_voxel=0.5, intensity_power=0.5)
+    roots = [
+        volume.copy(data=np.sqrt(np.maximum(scipy.ndimage.gaussian_filter(volume.values, 0.5, mode="constant"), 0)))
+        for volume in pair
+    ]
+    by_hand = lfpiv.correlate(*roots, dt_s=1.0, windows=(12, 8))
+    for axis in "xyz":
+        difference = ours[f"displacement_{axis}"].values - by_hand[f"displacement_{axis}"].values
+        assert np.abs(difference).max() <= 1e-3  # the volumes are scaled before or after: rounding only
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"volume_b": np.zeros((20, 24, 27))}, r"volume_b: expected the shape of volume_a, \(20, 24, 28\), got"),
         ({"volume_a": np.full((20, 24, 28), np.nan)}, "volume_a: expected finite intensities, found 13440"),
         ({"volume_a": np.zeros((20, 24)), "volume_b": np.zeros((20, 24))}, "volume_a: expected a volume"),
-        ({"windows": (16, 32)}, "windows: expected edges within the volume, got 32 along z, which has 20 voxels"),
+        (
+            {"windows": (16, (32, 16, 16))},
+            "windows: expected edges within the volume, got 32 along z, which has 20 voxels",
+        ),
         ({"windows": ()}, "windows: expected at least one pass"),
         ({"windows": 16}, "windows: expected a sequence"),
         ({"windows": (16, 2)}, "windows: expected edges of whole voxels >= 4"),
@@ -432,6 +456,7 @@ def test_unrelated_and_empty_volumes_say_so():
         ({"voxel_mm": None}, "voxel_mm: expected the voxel edge"),
         ({"voxel_mm": -0.1}, "voxel_mm: expected the voxel edge"),
         ({"smoothing_voxel": -1.0}, "smoothing_voxel: expected a value >= 0"),
+        ({"intensity_power": 0.0}, "intensity_power: expected a value > 0"),
         ({"max_displacement_voxel": 40.0}, "max_displacement_voxel: expected a value > 0 and within the volume"),
     ],
 )
