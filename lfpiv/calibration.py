@@ -30,6 +30,10 @@ SCHEMA_VERSION = 1
 OUTLIER, OUTLIER_PITCH = 6.0, 0.1
 """A dot is left out where its labels disagree with its neighbours by more than this many times the typical
 disagreement, and by more than this fraction of the microlens pitch: wrongly named or damaged."""
+PUPIL_SCALE, PUPIL_SCALE_INCOMPLETE = 0.3, 0.1
+"""Largest departure of the fitted pupil from the stated one, and the same where over a tenth of the dots are missing.
+Good boards fit within 0.01 and are complete; planes in the wrong order, a wrong angle's sign, an unnoticed mirror gave
+0.17 to 1.2 and lost a quarter of the dots or more, because depth and defocus then disagree."""
 MODEL_ERROR_PITCH = 0.002
 """Error of a dot's labels that they share and their standard errors do not hold [microlens pitch]."""
 NEIGHBOURS = 16
@@ -300,6 +304,14 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
     std = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch)
     try:
         fitted = fit_thin_lens(points, pupil, array, setup.optics, std=std)
+        complete = dots.found.sum() >= 0.9 * dots.expected.sum()
+        if not abs(fitted.pupil_scale - 1) <= (PUPIL_SCALE if complete else PUPIL_SCALE_INCOMPLETE):
+            raise InputError(
+                f"{experiment.path}: camera {setup.name!r}: expected dots that a camera of the stated optics can see, "
+                f"found {dots.found.sum()} of {dots.expected.sum()} dots that would need its pupil scaled by "
+                f"{fitted.pupil_scale:.2f}. Check the sign of nominal_angle_deg, image_flip, and the order and sign of "
+                "board.planes_mm."
+            )
         keep = _agreeing_dots(dots, array - fitted(points, pupil), pitch)
         baseline = fitted if settings.baseline == "thin_lens" else None
         target = array if baseline is None else array - baseline(points, pupil)
@@ -314,6 +326,8 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
             seed=settings.seed,
             unit=pitch,
         )
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{experiment.path}: labels of camera {setup.name!r}: {error}") from None
     step(0.95)

@@ -302,6 +302,10 @@ class Job:
 
         method = self.experiment.compute.weights
         warn_outside(calibration, self.experiment.grid)
+        if len(calibration.cameras) == 1:
+            log.warning(
+                "one camera hardly sees depth: w and displacement_z are not to be trusted, nor is their validation"
+            )
         with self.timed("weights"):
             weights = build_weights(calibration, self.experiment.grid, method=method, progress=self.step("weights"))
         self.weights_report = {"method": method, "memory_mib": weights.memory_bytes / memory.MIB}

@@ -1,5 +1,6 @@
 """Calibration as a whole: the mapping against true rays, files that come back the same, warnings where they are due."""
 
+import dataclasses
 import json
 import logging
 
@@ -149,6 +150,19 @@ def test_a_wrongly_named_dot_is_left_out(rig):
     wrong = dots.dot == dots.measured_dot[37]
     departure[wrong] += 0.5
     assert (_agreeing_dots(dots, departure, 0.1) == ~wrong).all()
+
+
+@pytest.mark.parametrize("mistake", ["planes", "angle"])
+def test_a_board_that_no_such_camera_can_see_is_refused(rig, mistake):
+    experiment, _, _ = rig
+    if mistake == "planes":
+        board = experiment.board.model_copy(update={"planes_mm": tuple(-z for z in experiment.board.planes_mm)})
+        wrong = dataclasses.replace(experiment, board=board)
+    else:
+        camera = dataclasses.replace(experiment.cameras[0], nominal_angle_deg=-experiment.cameras[0].nominal_angle_deg)
+        wrong = dataclasses.replace(experiment, cameras=(camera,))
+    with pytest.raises(lfpiv.InputError, match="image_flip"):
+        lfpiv.calibrate(wrong)
 
 
 def test_wrong_arguments_are_named(rig, tmp_path):
