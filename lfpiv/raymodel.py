@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from lfpiv_kernels.trace import POWERS
+
 RINGS = ((0.0, 1), (0.5, 6), (0.97, 12))
 """Pupil points at which the mapping is evaluated: (radius / pupil radius, points on the ring)."""
-POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
-"""Exponents of u and v in the polynomial's terms, as ``lfpiv_kernels.trace.POWERS``."""
 CHUNK_POINTS = 100_000
 """Object points per evaluation: bounds the scratch memory."""
 
