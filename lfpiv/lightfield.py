@@ -232,18 +232,18 @@ def _cover(optics: Optics, lattice: LensLattice, offset_mm: np.ndarray) -> tuple
     """Fraction of each pixel inside the pupil images around it, and which pixels lie clear of all of them."""
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
     offset = offset_mm / np.float32(optics.pixel_mm)
-    coverage, distance = _disc_fraction(offset, radius)
+    coverage, distance = disc_fraction(offset, radius)
     widening = (1 + optics.sensor_per_pupil) / optics.pixel_mm
     for vector in _neighbours(lattice) * widening:
         if np.hypot(*vector) / 2 < radius + 1:  # this neighbour's microimage can reach into pixels of a lens
             near = offset @ vector.astype(np.float32) > np.float32(vector @ vector / 2 - np.hypot(*vector) * 2)
-            more, far = _disc_fraction(offset[near] - vector.astype(np.float32), radius)
+            more, far = disc_fraction(offset[near] - vector.astype(np.float32), radius)
             coverage[near] += more
             distance[near] = np.minimum(distance[near], far)
     return coverage, distance > _GAP_MARGIN_PX
 
 
-def _disc_fraction(offset: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def disc_fraction(offset: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Fraction of unit pixels centred at `offset` inside a disc around 0, and their distance to its edge [pixel].
 
     The edge is taken as straight within a pixel, moved by its mean curvature; exact to (1/radius)^2 / 50.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 
 from lfpiv_kernels.trace import POWERS
@@ -46,7 +48,7 @@ def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
 
 
 def ray_models(camera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
-    """Ray models of voxels for the footprint kernels, see ``lfpiv_kernels.footprint.MODEL_SIZE``.
+    """Ray models of voxels for the footprint kernels, see ``lfpiv_kernels.raymodel.MODEL_SIZE``.
 
     The projected edges are differences of the mapping between opposite faces of the voxel.
 
@@ -62,4 +64,57 @@ def ray_models(camera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
         edge = fit_rays(camera, centres_mm + face, degree=2) - fit_rays(camera, centres_mm - face, degree=2)
         model[:, 12 + 2 * axis : 14 + 2 * axis] = edge[:, :, 0]
         model[:, 18 + 4 * axis : 22 + 4 * axis] = edge[:, :, 1:3].reshape(-1, 4)
-    return np.nan_to_num(model, nan=1e9, posinf=1e9, neginf=-1e9)  # a voxel in the lens's own plane: far off the sensor
+    return _finite(model)
+
+
+def grid_models(
+    camera, shape: tuple[int, int, int], centres_mm: Callable[[np.ndarray], np.ndarray], axes: tuple[int, int, int]
+) -> Iterator[np.ndarray]:
+    """Ray models of a grid's voxels, plane by plane of its outermost axis.
+
+    The projected edges are half the differences of the mapping between a voxel's neighbours: one fit per voxel instead
+    of seven.
+
+    Parameters
+    ----------
+    camera : CalibratedCamera
+        As for `fit_rays`.
+    shape : tuple of int
+        Voxels along the three axes, outermost first.
+    centres_mm : callable
+        Takes indices along the three axes, shape (point, 3), also one outside the grid; returns (x, y, z) [mm].
+    axes : tuple of int
+        Which of x, y, z (0, 1, 2) each axis of the grid is.
+
+    Yields
+    ------
+    ndarray, shape (voxels of a plane, 30), float32
+        See ``lfpiv_kernels.raymodel.MODEL_SIZE``.
+    """
+    outer, rows, columns = shape
+    inner = np.stack(np.meshgrid(np.arange(-1, rows + 1), np.arange(-1, columns + 1), indexing="ij"), -1).reshape(-1, 2)
+
+    def fits(plane):
+        index = np.column_stack([np.full(len(inner), plane), inner])
+        return fit_rays(camera, centres_mm(index), degree=2).reshape(rows + 2, columns + 2, 2, 6)
+
+    before, here = fits(-1), fits(0)
+    for plane in range(outer):
+        after = fits(plane + 1)
+        model = np.empty((rows, columns, 30), np.float32)
+        model[..., :12] = here[1:-1, 1:-1].reshape(rows, columns, 12)
+        differences = (
+            after[1:-1, 1:-1] - before[1:-1, 1:-1],
+            here[2:, 1:-1] - here[:-2, 1:-1],
+            here[1:-1, 2:] - here[1:-1, :-2],
+        )
+        for axis, difference in zip(axes, differences, strict=True):
+            model[..., 12 + 2 * axis : 14 + 2 * axis] = 0.5 * difference[..., 0]
+            model[..., 18 + 4 * axis : 22 + 4 * axis] = 0.5 * difference[..., 1:3].reshape(rows, columns, 4)
+        yield _finite(model.reshape(-1, 30))
+        before, here = here, after
+
+
+def _finite(model: np.ndarray) -> np.ndarray:
+    """Send a voxel in the lens's own plane far off the sensor."""
+    return np.nan_to_num(model, copy=False, nan=1e9, posinf=1e9, neginf=-1e9)

@@ -132,7 +132,7 @@ def reconstruct(
             squares += float(np.dot(difference, difference))
             divergence += _divergence(camera, floors[camera.name], difference)
             if iteration < iterations:
-                weights.projector(camera.name).back_project(camera.ratio, exponent)
+                weights.projector(camera.name).back_project(camera.ratio, exponent, active=volume)
         residual.append(float(np.sqrt(squares)) / light)
         misfit.append(divergence)
         if progress is not None:
@@ -206,8 +206,8 @@ def _prepare(weights: Weights, images: Mapping[str, np.ndarray], name: str) -> _
     image = np.where(camera.gain > 0, np.maximum(image, 0.0), 0.0)
     if not image.any():
         raise ValueError(f"images[{name!r}]: expected some light, got no positive count; check the background.")
-    padded = weights.pad(name, image)
-    return _Camera(name, padded, weights.pad(name, camera.gain), np.empty_like(padded), np.empty_like(padded))
+    flat, gain = image.reshape(-1), np.ascontiguousarray(camera.gain, np.float32).reshape(-1)
+    return _Camera(name, flat, gain, np.empty_like(flat), np.empty_like(flat))
 
 
 def _first_guess(weights, cameras, floors, column_sum, lit) -> np.ndarray:

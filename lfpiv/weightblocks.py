@@ -6,15 +6,18 @@ import logging
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
 
 import numpy as np
 
-from lfpiv.raymodel import fit_rays, ray_models
+from lfpiv.microimages import lay_out, microimage_edge, plain
+from lfpiv.raymodel import fit_rays, grid_models
 from lfpiv.rig import Grid
 from lfpiv_kernels import footprint, runtime
 from lfpiv_kernels.lattice import pack_lattice
+from lfpiv_kernels.microimages import Microimages
 from lfpiv_kernels.project import Blocks
+from lfpiv_kernels.raymodel import LANES, LEVELS
 from lfpiv_kernels.trace import count_rays
 
 log = logging.getLogger(__name__)
@@ -63,9 +66,13 @@ class StoredGrid:
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
         """Centres (x, y, z) [mm] of voxels by their stored index, shape (voxel, 3)."""
-        centres = np.empty((len(index), 3))
-        for axis, steps in zip(self.order, np.unravel_index(index, self.shape), strict=True):
-            centres[:, 2 - axis] = self.grid.first_centre_mm[axis] + steps * self.grid.voxel_mm
+        return self.positions_mm(np.stack(np.unravel_index(index, self.shape), axis=1))
+
+    def positions_mm(self, steps: np.ndarray) -> np.ndarray:
+        """Centres (x, y, z) [mm] of voxels by their indices along the stored axes, shape (voxel, 3)."""
+        centres = np.empty((len(steps), 3))
+        for column, axis in enumerate(self.order):
+            centres[:, 2 - axis] = self.grid.first_centre_mm[axis] + steps[:, column] * self.grid.voxel_mm
         return centres
 
     def place(self, voxel: tuple[int, int, int]) -> int:
@@ -90,35 +97,39 @@ class StoredGrid:
         return np.ascontiguousarray(flat.reshape(self.shape).transpose(np.argsort(self.order)))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class CameraKernels:
     """One camera's constants as the kernels take them."""
 
-    stride: int
+    setup: object
     camera: object
     lattice: object
     cell_mm: float
     frame: np.ndarray
     rectangles: np.ndarray
 
+    @cached_property
+    def microimages(self) -> Microimages:
+        """How the rays lie in memory."""
+        return lay_out(self.setup.optics, self.setup.lattice)
+
 
 def pack_camera(camera) -> CameraKernels:
     """Pack a camera for the kernels."""
     optics, lattice = camera.optics, camera.lattice
     basis = np.asarray(lattice.basis_mm)
-    stride = optics.sensor_shape[1] + 2 * footprint.LANES
     if lattice.layout == "square":
         cell = 0.5 * np.abs(basis).sum(0).max()
     else:
         cell = lattice.pitch_mm / math.sqrt(3)
     return CameraKernels(
-        stride=stride,
+        setup=camera,
         camera=footprint.pack_camera(
             sensor_per_pupil=optics.sensor_per_pupil,
             pixel_mm=optics.pixel_mm,
             sensor_shape=optics.sensor_shape,
             pupil_radius_mm=optics.pupil_radius_mm,
-            stride=stride,
+            edge=microimage_edge(optics),
         ),
         lattice=pack_lattice(lattice.origin_mm, lattice.basis_mm),
         cell_mm=float(cell),
@@ -127,59 +138,80 @@ def pack_camera(camera) -> CameraKernels:
     )
 
 
-def footprint_blocks(stored: StoredGrid, camera, progress: Progress) -> Blocks:
+def bends(model: np.ndarray, camera) -> bool:
+    """Whether the rays of voxels bend over the pupil so much that slopes must be followed pixel by pixel."""
+    quadratic = np.abs(model[:, [3, 4, 5, 9, 10, 11]]).sum(1).mean() * camera.optics.pupil_radius_mm**2
+    return bool(quadratic / camera.lattice.pitch_mm > BEND_PITCH)
+
+
+def footprint_blocks(stored: StoredGrid, camera, form: str, progress: Progress) -> Blocks:
     """Compute the blocks of one camera: count them, allocate once, fill chunk by chunk."""
-    pack, size, voxel_mm = pack_camera(camera), stored.grid.size, stored.grid.voxel_mm
-    edges = list(range(0, size, CHUNK_VOXELS)) + [size]
-    chunks = list(pairwise(edges))
+    pack, size = pack_camera(camera), stored.grid.size
+    plane = size // stored.shape[0]
     first_block, first_row = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
-    bend = 0.0
-    models = []
-    for number, (a, b) in enumerate(chunks):
-        model = ray_models(camera, stored.centres_mm(np.arange(a, b)), voxel_mm)
+    models, bent = [], False
+    axes = tuple(2 - axis for axis in stored.order)
+    for model in grid_models(camera, stored.shape, stored.positions_mm, axes):
         models.append(model)
-        quadratic = np.abs(model[:, [3, 4, 5, 9, 10, 11]]).sum(1).mean() * camera.optics.pupil_radius_mm**2
-        bend = max(bend, float(quadratic) / camera.lattice.pitch_mm)
-        blocks, rows = footprint.measure_blocks(model, pack.camera, pack.lattice, pack.cell_mm)
-        first_block[a + 1 : b + 1], first_row[a + 1 : b + 1] = blocks, rows
-        progress(0.4 * (number + 1) / len(chunks))
+        bent = bent or bends(model, camera)
+        progress(0.3 * len(models) / stored.shape[0])
+    step = max(1, CHUNK_VOXELS // plane)
+    chunks = [(a, np.concatenate(models[a : a + step])) for a in range(0, len(models), step)]
+    del models
+    for a, model in chunks:
+        part = slice(a * plane + 1, a * plane + len(model) + 1)
+        first_block[part], first_row[part] = measure(pack, model, bent, form)
     np.cumsum(first_block, out=first_block)
     np.cumsum(first_row, out=first_row)
-    bends = bend > BEND_PITCH
-    log.info(
-        "%s: rays bend by %.3f pitch over the pupil: %s slopes", camera.name, bend, "local" if bends else "constant"
-    )
-    pixel, height = np.zeros(first_block[-1], np.int32), np.zeros(first_block[-1], np.int32)
-    value = np.zeros((first_row[-1], footprint.LANES), np.uint8)
-    scale = np.zeros(size, np.float32)
-    for number, (a, b) in enumerate(chunks):
-        block, row = slice(first_block[a], first_block[b]), slice(first_row[a], first_row[b])
-        if block.start < block.stop:
-            footprint.fill_blocks(
-                models[number],
-                pack.camera,
-                pack.lattice,
-                pack.cell_mm,
-                frame=pack.frame,
-                rectangles=pack.rectangles,
-                bends=bends,
-                first_block=first_block[a : b + 1],
-                first_row=first_row[a : b + 1],
-                pixel=pixel[block],
-                height=height[block],
-                value=value[row],
-                scale=scale[a:b],
-            )
-        models[number] = None
-        progress(0.4 + 0.6 * (number + 1) / len(chunks))
-    return Blocks(
+    blocks = Blocks(
+        form=form,
         first_block=first_block.astype(np.int32),
         first_row=first_row,
-        pixel=pixel,
-        height=height,
-        value=value,
-        scale=scale,
-        shape=(camera.optics.sensor_shape[0], pack.stride),
+        ray=np.zeros(first_block[-1], np.int32),
+        height=np.zeros(first_block[-1], np.uint16),
+        value=np.zeros((first_row[-1], LANES), np.uint8),
+        scale=np.zeros(size, np.float32),
+        microimages=pack.microimages,
+    )
+    for number in range(len(chunks)):
+        a, model = chunks[number]
+        chunks[number] = None
+        fill(pack, model, bent, blocks, a * plane, first_block)
+        progress(0.4 + 0.6 * (number + 1) / len(chunks))
+    return blocks
+
+
+def measure(pack: CameraKernels, model: np.ndarray, bent: bool, form: str) -> tuple[np.ndarray, np.ndarray]:
+    """Blocks and rows of each voxel."""
+    return footprint.measure_blocks(
+        model, pack.camera, pack.lattice, pack.cell_mm, pack.microimages, bends=bent, form=form
+    )
+
+
+def fill(pack: CameraKernels, model: np.ndarray, bent: bool, blocks: Blocks, first: int, first_block) -> None:
+    """Fill the blocks of the voxels from `first` on."""
+    voxels = slice(first, first + len(model))
+    edges = slice(first, first + len(model) + 1)
+    block = slice(first_block[first], first_block[voxels.stop])
+    row = slice(blocks.first_row[first], blocks.first_row[voxels.stop])
+    if block.start == block.stop:
+        return
+    footprint.fill_blocks(
+        model,
+        pack.camera,
+        pack.lattice,
+        pack.cell_mm,
+        pack.microimages,
+        frame=pack.frame,
+        rectangles=pack.rectangles,
+        bends=bent,
+        form=blocks.form,
+        first_block=first_block[edges],
+        first_row=blocks.first_row[edges],
+        ray=blocks.ray[block],
+        height=blocks.height[block],
+        value=blocks.value[row],
+        scale=blocks.scale[voxels],
     )
 
 
@@ -242,7 +274,7 @@ def count_voxels(camera, centres_mm: np.ndarray, voxel_mm: float, *, samples: in
 
 def count_blocks(stored: StoredGrid, camera, progress: Progress) -> Blocks:
     """Count the rays of every voxel and pack the counts into blocks."""
-    pack, size = pack_camera(camera), stored.grid.size
+    rays, size = plain(camera.optics.sensor_shape), stored.grid.size
     log.warning("%s: counting rays for %d voxels; 'footprint' is about a thousand times faster", camera.name, size)
     parts = []
     for first in range(0, size, COUNT_CHUNK):
@@ -250,33 +282,34 @@ def count_blocks(stored: StoredGrid, camera, progress: Progress) -> Blocks:
         counts, total, corner = count_voxels(
             camera, stored.centres_mm(np.arange(first, last)), stored.grid.voxel_mm, samples=COUNT_SAMPLES, seed=first
         )
-        parts.append(_pack_windows(counts / total[:, None, None], corner, camera.optics.sensor_shape, pack.stride))
+        parts.append(_pack_windows(counts / total[:, None, None], corner, camera.optics.sensor_shape, rays.edge))
         progress(last / size)
     blocks, rows = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     return Blocks(
+        form="pixels",
         first_block=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
         first_row=np.concatenate([[0], np.cumsum(rows)]).astype(np.int64),
-        pixel=np.concatenate([part[2] for part in parts]),
+        ray=np.concatenate([part[2] for part in parts]),
         height=np.concatenate([part[3] for part in parts]),
         value=np.concatenate([part[4] for part in parts]),
         scale=np.concatenate([part[5] for part in parts]),
-        shape=(camera.optics.sensor_shape[0], pack.stride),
+        microimages=rays,
     )
 
 
 def _pack_windows(windows: np.ndarray, corner: np.ndarray, sensor_shape, stride: int):
     """Pack windows of weights, shape (voxel, rows, columns), into blocks of one column of tiles each.
 
-    Returns blocks and rows per voxel, and the arrays pixel, height, value, scale of `Blocks`.
+    Returns blocks and rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
     """
-    lanes = footprint.LANES
+    lanes = LANES
     row = corner[:, 1, None] + np.arange(windows.shape[1])
     column = corner[:, 0, None] + np.arange(windows.shape[2])
     seen = ((row >= 0) & (row < sensor_shape[0]))[:, :, None] & ((column >= 0) & (column < sensor_shape[1]))[:, None]
     windows = np.where(seen, windows, 0.0)
     windows = np.pad(windows, ((0, 0), (0, 0), (0, -windows.shape[2] % lanes)))
     tiles = windows.reshape(*windows.shape[:2], -1, lanes).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
-    scale = tiles.max((1, 2, 3)) / footprint.LEVELS
+    scale = tiles.max((1, 2, 3)) / LEVELS
     lit = tiles.any(-1)
     starts = np.argwhere(lit & ~np.pad(lit, ((0, 0), (0, 0), (1, 0)))[:, :, :-1])
     ends = np.argwhere(lit & ~np.pad(lit, ((0, 0), (0, 0), (0, 1)))[:, :, 1:])
@@ -296,7 +329,7 @@ def _pack_windows(windows: np.ndarray, corner: np.ndarray, sensor_shape, stride:
         np.bincount(voxel, minlength=len(windows)),
         np.bincount(voxel, weights=ends[:, 2] - first + 1, minlength=len(windows)).astype(np.int64),
         pixel.astype(np.int32),
-        (ends[:, 2] - first + 1).astype(np.int32),
+        (ends[:, 2] - first + 1).astype(np.uint16),
         value,
         scale.astype(np.float32),
     )

@@ -2,7 +2,8 @@
 
 ``weights(volume)`` projects a volume to images, ``weights.T(images)`` is its adjoint. Two methods give the weights:
 "footprint" integrates them over voxel, pupil pixel and microlens in closed form; "count" traces rays and counts them,
-as the paper does, and judges the other. Both are stored alike, as 8-bit blocks of pixels with a scale per voxel.
+as the paper does, and judges the other. Both are stored as 8-bit blocks with a scale per voxel; the footprint in one of
+two forms, chosen for each camera by a few counted voxels: products of profiles, or one value per pixel.
 """
 
 from __future__ import annotations
@@ -14,13 +15,25 @@ import numpy as np
 
 from lfpiv.raymodel import ray_models
 from lfpiv.rig import Grid
-from lfpiv.weightblocks import CHUNK_VOXELS, StoredGrid, count_blocks, count_voxels, footprint_blocks, pack_camera
+from lfpiv.weightblocks import (
+    CHUNK_VOXELS,
+    StoredGrid,
+    bends,
+    count_blocks,
+    count_voxels,
+    footprint_blocks,
+    measure,
+    pack_camera,
+)
+from lfpiv.weightcheck import CountedVoxels, add_entries, profiles_serve
 from lfpiv_kernels import footprint, runtime
-from lfpiv_kernels.project import Blocks, Projector
+from lfpiv_kernels.project import Projector
+from lfpiv_kernels.raymodel import LANES, LEVELS, MODEL_SIZE
 
 log = logging.getLogger(__name__)
 
 METHODS = ("footprint", "count")
+FORMS = ("auto", *footprint.FORMS)
 COUNT_SAMPLES_ONE = 144
 """Pupil points per axis for one voxel's image: the paper's 0.05 degrees."""
 SAMPLED_VOXELS = 4096
@@ -36,11 +49,24 @@ class Weights:
     Made by `build_weights`. ``weights(volume)`` returns a dict camera -> image, ``weights.T(images)`` a volume.
     """
 
-    def __init__(self, cameras: Mapping[str, object], grid: Grid, method: str, progress: Progress | None = None):
+    def __init__(
+        self,
+        cameras: Mapping[str, object],
+        grid: Grid,
+        method: str,
+        form: str = "auto",
+        progress: Progress | None = None,
+    ):
         self.cameras = dict(cameras)
         self.grid = grid
         self.method = method
         self.stored = StoredGrid.for_cameras(grid, self.cameras.values())
+        self.forms: dict[str, str] = {}
+        """Camera name -> form in which its weights are stored."""
+        self.profile_errors: dict[str, list[float]] = {}
+        """Camera name -> difference of profiles from counted rays, where these decided the form."""
+        self._asked = form
+        self._counted: dict[str, CountedVoxels] = {}
         self._projectors: dict[str, Projector] = {}
         self._column_sum: np.ndarray | None = None
         if method == "footprint":  # counting a whole grid takes long: it waits until the operator is applied
@@ -72,9 +98,11 @@ class Weights:
         images = {}
         for name, camera in self.cameras.items():
             projector = self.projector(name)
-            padded = projector.project(flat, np.empty(projector.blocks.shape, np.float32).ravel())
-            target = None if out is None else _checked_image(out, name, camera)
-            images[name] = np.multiply(self.crop(name, padded), camera.gain, out=target)
+            target = (
+                np.empty(camera.optics.sensor_shape, np.float32) if out is None else _checked_out(out, name, camera)
+            )
+            projector.project(flat, target.reshape(-1))
+            images[name] = np.multiply(target, camera.gain, out=target)
         return images
 
     @property
@@ -106,7 +134,7 @@ class Weights:
             counts, total, corner = count_voxels(setup, centre, self.grid.voxel_mm, samples=COUNT_SAMPLES_ONE)
             _add_window(image, counts[0] / max(int(total[0]), 1), corner[0])
         else:
-            _add_blocks(image, self.projector(camera).blocks, index)
+            add_entries(image, self.projector(camera).blocks, index)
         return image * setup.gain
 
     @property
@@ -119,46 +147,42 @@ class Weights:
 
     @property
     def affected_pixels(self) -> np.ndarray:
-        """Number of pixels that each voxel lights, N_i of Eq. 5, over all cameras, shape (z, y, x), int64."""
+        """Number of pixels that each voxel lights, N_i of Eq. 5, over all cameras, shape (z, y, x), int64.
+
+        A pixel that a voxel reaches through two lenses counts twice.
+        """
         self._build()
         total = np.zeros(self.grid.size, np.int64)
         for projector in self._projectors.values():
-            value, first_row = projector.blocks.value, projector.blocks.first_row
-            for a in range(0, self.grid.size, CHUNK_VOXELS):
-                edges = first_row[a : a + CHUNK_VOXELS + 1]
-                lit = np.count_nonzero(value[edges[0] : edges[-1]], axis=1)
-                total[a : a + CHUNK_VOXELS] += np.diff(np.concatenate([[0], np.cumsum(lit)])[edges - edges[0]])
+            total += projector.count_lit()
         return self.stored.restore(total)
 
     @property
     def largest(self) -> float:
         """Largest weight of all (Eq. 5 is scaled by it)."""
         self._build()
-        return max(float(projector.blocks.scale.max()) * footprint.LEVELS for projector in self._projectors.values())
+        return max(
+            float(blocks.scale.max()) * LEVELS ** (2 if blocks.form == "profiles" else 1)
+            for blocks in (projector.blocks for projector in self._projectors.values())
+        )
 
     @property
     def memory_bytes(self) -> int:
         """Memory of the stored weights [byte]."""
         return sum(projector.blocks.nbytes for projector in self._projectors.values())
 
-    # -- what reconstruction works on: voxels in stored order, images padded and flat ---------------------------------
+    # -- what reconstruction works on: voxels in stored order ---------------------------------------------------------
 
     def projector(self, name: str) -> Projector:
         """One camera's stored weights, white-image gain left out; built where they are not yet."""
         self._build()
         return self._projectors[name]
 
-    def pad(self, name: str, image: np.ndarray) -> np.ndarray:
-        """Copy a sensor image into the padded flat form of the projectors."""
-        rows, stride = self.projector(name).blocks.shape
-        padded = np.zeros((rows, stride), np.float32)
-        padded[:, : self.cameras[name].optics.sensor_shape[1]] = image
-        return padded.ravel()
-
-    def crop(self, name: str, padded: np.ndarray) -> np.ndarray:
-        """View the sensor's part of a padded flat image."""
-        shape = self.projector(name).blocks.shape
-        return padded.reshape(shape)[:, : self.cameras[name].optics.sensor_shape[1]]
+    def counted(self, name: str) -> CountedVoxels:
+        """Return a few voxels of a camera, counted."""
+        if name not in self._counted:
+            self._counted[name] = CountedVoxels(self.stored, self.cameras[name])
+        return self._counted[name]
 
     def _camera(self, name: str):
         if name not in self.cameras:
@@ -169,14 +193,38 @@ class Weights:
         if len(self._projectors) == len(self.cameras):
             return
         runtime.device()
-        fill = footprint_blocks if self.method == "footprint" else count_blocks
         for number, (name, camera) in enumerate(self.cameras.items()):
 
             def step(fraction, number=number):
                 if progress is not None:
                     progress((number + fraction) / len(self.cameras))
 
-            self._projectors[name] = Projector(fill(self.stored, camera, step))
+            if self.method == "footprint":
+                self.forms[name] = self._choose(name, camera)
+                blocks = footprint_blocks(self.stored, camera, self.forms[name], step)
+            else:
+                blocks = count_blocks(self.stored, camera, step)
+            self._projectors[name] = Projector(blocks)
+
+    def _choose(self, name: str, camera) -> str:
+        """Form of a camera's weights: profiles where counted rays say that they serve."""
+        if self._asked != "auto":
+            return self._asked
+        if camera.lattice.layout != "square":
+            log.info("%s: weights pixel by pixel: profiles need a square microlens layout", name)
+            return "pixels"
+        errors = self.counted(name).errors_of_form("profiles", self.grid.voxel_mm)
+        self.profile_errors[name] = errors
+        form = "profiles" if profiles_serve(errors) else "pixels"
+        if errors:
+            log.info(
+                "%s: profiles differ from counted rays by %.1f %% (worst voxel %.1f %%): weights %s",
+                name,
+                100 * np.mean(errors),
+                100 * max(errors),
+                "as products of profiles" if form == "profiles" else "pixel by pixel",
+            )
+        return form
 
 
 class Adjoint:
@@ -207,8 +255,8 @@ class Adjoint:
         weights = self.T
         flat = np.zeros(weights.grid.size, np.float32)
         for name, camera in weights.cameras.items():
-            image = _checked_image(images, name, camera)
-            weights.projector(name).back_project(weights.pad(name, image * camera.gain), flat)
+            image = np.multiply(_checked_image(images, name, camera), camera.gain, dtype=np.float32)
+            weights.projector(name).back_project(image.reshape(-1), flat)
         volume = weights.stored.restore(flat)
         if out is None:
             return volume
@@ -218,7 +266,9 @@ class Adjoint:
         return out
 
 
-def build_weights(calibration, grid: Grid, method: str = "footprint", progress: Progress | None = None) -> Weights:
+def build_weights(
+    calibration, grid: Grid, method: str = "footprint", *, form: str = "auto", progress: Progress | None = None
+) -> Weights:
     """Weights of every voxel of a grid on every pixel of every camera (Eq. 10).
 
     Parameters
@@ -230,6 +280,10 @@ def build_weights(calibration, grid: Grid, method: str = "footprint", progress: 
     method : {"footprint", "count"}
         Area-integrated weights, or counted rays: slow on a whole grid, where nothing is computed before the operator or
         `Weights.image` is called.
+    form : {"auto", "profiles", "pixels"}
+        How footprints are stored. "profiles": products of a profile along the sensor's columns and one along its rows
+        for every voxel and lens (rank 1), small and fast, for straight rays and square microlenses. "pixels": one value
+        per pixel, for any optics. "auto": profiles for each camera where they agree with counted rays.
     progress : callable, optional
         Called with the finished fraction.
 
@@ -240,11 +294,13 @@ def build_weights(calibration, grid: Grid, method: str = "footprint", progress: 
     Raises
     ------
     ValueError
-        If `method` is unknown.
+        If `method` or `form` is unknown, or profiles are asked for a hexagonal microlens layout.
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}.")
-    weights = Weights(calibration.cameras, grid, method, progress)
+    if form not in FORMS:
+        raise ValueError(f"form: expected one of {', '.join(FORMS)}, got {form!r}.")
+    weights = Weights(calibration.cameras, grid, method, form, progress)
     if method == "footprint":
         log.info(
             "weights of %d voxels on %d cameras: %.0f MiB",
@@ -255,8 +311,11 @@ def build_weights(calibration, grid: Grid, method: str = "footprint", progress: 
     return weights
 
 
-def estimate_memory(calibration, grid: Grid) -> int:
-    """Memory that the weights of a grid will need [byte], from a sample of its voxels; nothing large is allocated."""
+def estimate_memory(calibration, grid: Grid, form: str = "auto") -> int:
+    """Memory that the weights of a grid will need [byte], from a sample of its voxels; nothing large is allocated.
+
+    With the form "auto" that of profiles where the microlens layout allows them: what will do for straight rays.
+    """
     runtime.device()
     total = 0.0
     sample = np.unique(np.linspace(0, grid.size - 1, SAMPLED_VOXELS).astype(np.int64))
@@ -264,36 +323,20 @@ def estimate_memory(calibration, grid: Grid) -> int:
     for camera in calibration.cameras.values():
         pack = pack_camera(camera)
         model = ray_models(camera, centres, grid.voxel_mm)
-        blocks, rows = footprint.measure_blocks(model, pack.camera, pack.lattice, pack.cell_mm)
-        per_voxel = 8 * blocks.mean() + footprint.LANES * rows.mean() + 16
-        model_bytes = 4 * footprint.MODEL_SIZE * CHUNK_VOXELS
-        images = 4 * (3 + runtime.CHUNKS) * camera.optics.sensor_shape[0] * pack.stride
-        total += per_voxel * grid.size + model_bytes + images
+        chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
+        blocks, rows = measure(pack, model, bends(model, camera), chosen)
+        per_voxel = 6 * blocks.mean() + LANES * rows.mean() + 16 + 4 * MODEL_SIZE
+        rays = 4 * (5 + 2) * pack.microimages.size + 24 * runtime.CHUNKS
+        total += per_voxel * grid.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
     return int(total)
 
 
-def compare_with_count(weights: Weights, voxels: int = 6, seed: int = 0) -> dict[str, list[float]]:
+def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     """Relative L2 difference of stored weights from counted rays, for a few random voxels of every camera.
 
-    Returns camera name -> one figure per voxel that the camera sees; the count's own noise (about 0.5 %) is included.
+    Returns camera name -> one figure per voxel that the camera sees; the count's own noise is subtracted.
     """
-    rng = np.random.default_rng(seed)
-    indices = rng.choice(weights.grid.size, min(voxels, weights.grid.size), replace=False)
-    centres = weights.stored.centres_mm(indices)
-    errors: dict[str, list[float]] = {}
-    for name, camera in weights.cameras.items():
-        counts, total, corner = count_voxels(
-            camera, centres, weights.grid.voxel_mm, samples=COUNT_SAMPLES_ONE, seed=seed
-        )
-        errors[name] = []
-        for index, window, rays, at in zip(indices, counts, total, corner, strict=True):
-            stored, counted = (np.zeros(camera.optics.sensor_shape, np.float32) for _ in range(2))
-            _add_blocks(stored, weights.projector(name).blocks, int(index))
-            _add_window(counted, window / rays, at)
-            if counted.any():
-                difference = np.linalg.norm((stored - counted) * camera.gain)
-                errors[name].append(float(difference / np.linalg.norm(counted * camera.gain)))
-    return errors
+    return {name: weights.counted(name).errors(weights.projector(name).blocks) for name in weights.cameras}
 
 
 def _add_window(image: np.ndarray, window: np.ndarray, corner: np.ndarray) -> None:
@@ -307,23 +350,17 @@ def _add_window(image: np.ndarray, window: np.ndarray, corner: np.ndarray) -> No
         ]
 
 
-def _add_blocks(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
-    """Add one voxel's stored weights to a sensor image, in place."""
-    stride = blocks.shape[1]
-    padded = np.zeros(blocks.shape[0] * stride, np.float32)
-    row = int(blocks.first_row[voxel])
-    for block in range(blocks.first_block[voxel], blocks.first_block[voxel + 1]):
-        for y in range(blocks.height[block]):
-            at = blocks.pixel[block] + y * stride
-            padded[at : at + footprint.LANES] += blocks.value[row] * blocks.scale[voxel]
-            row += 1
-    image += padded.reshape(blocks.shape)[:, : image.shape[1]]
-
-
 def _checked_image(images: Mapping[str, np.ndarray], name: str, camera) -> np.ndarray:
     if name not in images:
         raise ValueError(f"images: camera {name!r} is missing; found {', '.join(images) or 'none'}.")
     image = np.asarray(images[name])
     if image.shape != camera.optics.sensor_shape:
         raise ValueError(f"images[{name!r}]: expected shape {camera.optics.sensor_shape}, got {image.shape}.")
+    return image
+
+
+def _checked_out(images: Mapping[str, np.ndarray], name: str, camera) -> np.ndarray:
+    image = _checked_image(images, name, camera)
+    if image is not images[name] or image.dtype != np.float32 or not image.flags.c_contiguous:
+        raise ValueError(f"out[{name!r}]: expected a C-contiguous float32 array to write into.")
     return image

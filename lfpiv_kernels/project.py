@@ -1,9 +1,10 @@
-"""Warp: forward projection, its adjoint and SMART's pointwise steps on weights stored as 8-bit blocks of pixels.
+"""Warp: forward projection, its adjoint and SMART's pointwise steps on weights stored as 8-bit blocks of rays.
 
-A block is LANES pixels wide and some rows high; its row is one vector load from the padded image, read as overlapping
-vectors. The backward pass gathers per voxel. The forward pass scatters: on the CPU every chunk of voxels adds into an
-image of its own and the images are summed in a fixed order, so results do not depend on the number of threads; on CUDA
-it adds atomically. Twins: ``reference.project`` and ``reference.back_project``.
+A block is LANES rays wide and some rows high; its row is one vector. It holds one value per ray, or a profile along the
+columns and one along the rows, whose products are the values. The backward pass gathers per voxel. The forward pass
+scatters: on the CPU every chunk of voxels adds into rays of its own, which are summed in a fixed order, so results do
+not depend on the number of threads; on CUDA it adds atomically. The innermost loops are C++: as Warp's vectors they
+take two to three times as long on the CPU. Twin: ``reference.dense``.
 """
 
 import sys
@@ -13,149 +14,294 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.footprint import LANES
+from lfpiv_kernels.microimages import Microimages, RayMap
+from lfpiv_kernels.raymodel import LANES
 
-# The default compiler flags stay: without SLP vectorisation a row of a block becomes scalar code.
-wp.set_module_options({"enable_backward": False, "max_unroll": 8})
-
-Row = wp.types.vector(length=LANES, dtype=float)
-LevelRow = wp.types.vector(length=LANES, dtype=wp.uint8)
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """Weights of all voxels for one camera; twin of a sparse matrix with 8-bit values and a scale per column."""
+    """Weights of all voxels for one camera; twin of a sparse matrix with 8-bit values and a scale per column.
 
+    In the form "pixels" a block of n rows has n rows of values. In the form "profiles" it has a row of column values A
+    and ceil(n / LANES) rows of row values B; the value of column c and row k is A[c] B[k].
+    """
+
+    form: str
+    """"profiles" or "pixels"."""
     first_block: np.ndarray
     """Index of each voxel's first block, shape (voxel + 1,), int32."""
     first_row: np.ndarray
     """Index of each voxel's first row of values, shape (voxel + 1,), int64."""
-    pixel: np.ndarray
-    """Index of each block's first pixel in the padded image, shape (block,), int32."""
+    ray: np.ndarray
+    """Index of each block's first ray, shape (block,), int32."""
     height: np.ndarray
-    """Rows of each block, shape (block,), int32."""
+    """Rows of rays of each block, shape (block,), uint16."""
     value: np.ndarray
     """Weights in levels, shape (row, LANES), uint8."""
     scale: np.ndarray
     """Weight of one level, shape (voxel,), float32."""
-    shape: tuple[int, int]
-    """Rows and columns of the padded image: the sensor's columns and at least LANES more."""
+    microimages: Microimages
+    """How the rays lie in memory."""
 
     @property
     def nbytes(self) -> int:
         """Memory of all arrays [byte]."""
         return sum(
-            getattr(self, name).nbytes for name in ("first_block", "first_row", "pixel", "height", "value", "scale")
+            getattr(self, name).nbytes for name in ("first_block", "first_row", "ray", "height", "value", "scale")
         )
 
+    def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
+        """Rays of one voxel and their weights, shapes (entry,): a ray may occur twice."""
+        row, lane = int(self.first_row[voxel]), np.arange(LANES)
+        rays, weights = [], []
+        for block in range(self.first_block[voxel], self.first_block[voxel + 1]):
+            rows = int(self.height[block])
+            rays.append(self.ray[block] + np.arange(rows)[:, None] * self.microimages.edge + lane)
+            if self.form == "profiles":
+                tall = 1 + -(-rows // LANES)
+                down = self.value[row + 1 : row + tall].ravel()[:rows]
+                weights.append(down[:, None] * self.value[row].astype(np.float64))
+            else:
+                tall = rows
+                weights.append(self.value[row : row + rows].astype(np.float64))
+            row += tall
+        if not rays:
+            return np.zeros(0, np.int64), np.zeros(0)
+        return np.concatenate(rays, axis=None), np.concatenate(weights, axis=None) * float(self.scale[voxel])
 
-@wp.func
-def _levels(value: LevelRow):
-    return Row(
-        float(value[0]), float(value[1]), float(value[2]), float(value[3]),
-        float(value[4]), float(value[5]), float(value[6]), float(value[7]),
-    )  # fmt: skip
+
+@wp.struct
+class Matrix:
+    """The arrays of `Blocks` on the device."""
+
+    first_block: wp.array(dtype=int)
+    first_row: wp.array(dtype=wp.int64)
+    ray: wp.array(dtype=int)
+    height: wp.array(dtype=wp.uint16)
+    level: wp.array2d(dtype=wp.uint8)
+    scale: wp.array(dtype=float)
+    stride: int
+    profiles: bool
+
+
+# A row of 8 floats or bytes in C++: a vector of the compiler on the CPU, a plain loop on a GPU.
+_ROWS = """
+#if defined(__CUDA_ARCH__)
+    struct row { float x[8]; };
+    auto zero = []() { row r; for (int i = 0; i < 8; ++i) r.x[i] = 0.0f; return r; };
+    auto load = [](const float* p) { row r; for (int i = 0; i < 8; ++i) r.x[i] = p[i]; return r; };
+    auto levels = [](const unsigned char* p) { row r; for (int i = 0; i < 8; ++i) r.x[i] = p[i]; return r; };
+    auto add = [](row a, row b, float c) { for (int i = 0; i < 8; ++i) a.x[i] += b.x[i] * c; return a; };
+    auto add_product = [](row a, row b, row c) { for (int i = 0; i < 8; ++i) a.x[i] += b.x[i] * c.x[i]; return a; };
+    auto sum = [](row a) {
+        return ((a.x[0] + a.x[4]) + (a.x[1] + a.x[5])) + ((a.x[2] + a.x[6]) + (a.x[3] + a.x[7]));
+    };
+#else
+    typedef float row __attribute__((vector_size(32), aligned(4)));
+    typedef unsigned char bytes __attribute__((vector_size(8), aligned(1)));
+    auto zero = []() { return row{0, 0, 0, 0, 0, 0, 0, 0}; };
+    auto load = [](const float* p) { return *(const row*)p; };
+    auto levels = [](const unsigned char* p) { return __builtin_convertvector(*(const bytes*)p, row); };
+    auto add = [](row a, row b, float c) { return a + b * c; };
+    auto add_product = [](row a, row b, row c) { return a + b * c; };
+    auto sum = [](row a) { return ((a[0] + a[4]) + (a[1] + a[5])) + ((a[2] + a[6]) + (a[3] + a[7])); };
+#endif
+"""
+
+_GATHER = (
+    _ROWS
+    + """
+    const unsigned char* level = levels_in.data + 8 * (size_t)first_row;
+    row even = zero(), odd = zero();
+    for (int block = first; block < last; ++block) {
+        const float* at = rays.data + ray.data[block];
+        const int rows = height.data[block];
+        int k = 0;
+        if (profiles) {
+            const row across = levels(level);
+            row column = zero();
+            level += 8;
+            for (; k < rows; ++k, at += stride) column = add(column, load(at), (float)level[k]);
+            even = add_product(even, column, across);
+            level += (rows + 7) / 8 * 8;
+        } else {
+            for (; k + 1 < rows; k += 2, at += 2 * stride, level += 16) {
+                even = add_product(even, load(at), levels(level));
+                odd = add_product(odd, load(at + stride), levels(level + 8));
+            }
+            if (k < rows) {
+                even = add_product(even, load(at), levels(level));
+                level += 8;
+            }
+        }
+    }
+    return sum(add(even, odd, 1.0f));
+"""
+)
+
+_SCATTER = (
+    _ROWS
+    + """
+#if !defined(__CUDA_ARCH__)  // rays of its own: not for two threads at once
+    const unsigned char* level = levels_in.data + 8 * (size_t)first_row;
+    for (int block = first; block < last; ++block) {
+        float* at = rays_out.data + ray.data[block];
+        const int rows = height.data[block];
+        int k = 0;
+        if (profiles) {
+            const row across = levels(level) * intensity;
+            level += 8;
+            for (; k + 1 < rows; k += 2, at += 2 * stride) {  // load two rows, then store two
+                const row even = add(load(at), across, (float)level[k]);
+                const row odd = add(load(at + stride), across, (float)level[k + 1]);
+                *(row*)at = even;
+                *(row*)(at + stride) = odd;
+            }
+            if (k < rows) *(row*)at = add(load(at), across, (float)level[k]);
+            level += (rows + 7) / 8 * 8;
+        } else {
+            for (; k + 1 < rows; k += 2, at += 2 * stride, level += 16) {
+                const row even = add(load(at), levels(level), intensity);
+                const row odd = add(load(at + stride), levels(level + 8), intensity);
+                *(row*)at = even;
+                *(row*)(at + stride) = odd;
+            }
+            if (k < rows) {
+                *(row*)at = add(load(at), levels(level), intensity);
+                level += 8;
+            }
+        }
+    }
+#endif
+"""
+)
+
+
+@wp.func_native(_GATHER)
+def _gather(
+    first: int,
+    last: int,
+    first_row: wp.int64,
+    ray: wp.array(dtype=int),
+    height: wp.array(dtype=wp.uint16),
+    levels_in: wp.array2d(dtype=wp.uint8),
+    stride: int,
+    profiles: bool,
+    rays: wp.array(dtype=float),
+) -> float: ...
+
+
+@wp.func_native(_SCATTER)
+def _scatter(
+    first: int,
+    last: int,
+    first_row: wp.int64,
+    ray: wp.array(dtype=int),
+    height: wp.array(dtype=wp.uint16),
+    levels_in: wp.array2d(dtype=wp.uint8),
+    stride: int,
+    profiles: bool,
+    intensity: float,
+    rays_out: wp.array(dtype=float),
+): ...
 
 
 @wp.kernel
 def _back_project(
     # in
     first_voxel: int,
-    first_block: wp.array(dtype=int),
-    first_row: wp.array(dtype=wp.int64),
-    pixel: wp.array(dtype=int),
-    height: wp.array(dtype=int),
-    value: wp.array(dtype=LevelRow),
-    scale: wp.array(dtype=float),
-    stride: int,
-    image: wp.array(dtype=Row),
+    matrix: Matrix,
+    rays: wp.array(dtype=float),
+    active: wp.array(dtype=float),
     # out
     volume_out: wp.array(dtype=float),
 ):
     voxel = first_voxel + wp.tid()
-    row = int(first_row[voxel])
-    even = Row()
-    odd = Row()
-    for block in range(first_block[voxel], first_block[voxel + 1]):
-        at = pixel[block]
-        left = height[block]
-        while left > 1:
-            even += wp.cw_mul(image[at], _levels(value[row]))
-            odd += wp.cw_mul(image[at + stride], _levels(value[row + 1]))
-            at += 2 * stride
-            row += 2
-            left -= 2
-        if left > 0:
-            even += wp.cw_mul(image[at], _levels(value[row]))
-            row += 1
-    even += odd
-    total = ((even[0] + even[4]) + (even[1] + even[5])) + ((even[2] + even[6]) + (even[3] + even[7]))
-    volume_out[voxel] = volume_out[voxel] + scale[voxel] * total
+    if active[voxel] == 0.0:
+        return
+    total = _gather(
+        matrix.first_block[voxel], matrix.first_block[voxel + 1], matrix.first_row[voxel],
+        matrix.ray, matrix.height, matrix.level, matrix.stride, matrix.profiles, rays,
+    )  # fmt: skip
+    volume_out[voxel] = volume_out[voxel] + matrix.scale[voxel] * total
 
 
 @wp.kernel
 def _project(
     # in
     first_voxel: int,
-    first_block: wp.array(dtype=int),
-    first_row: wp.array(dtype=wp.int64),
-    pixel: wp.array(dtype=int),
-    height: wp.array(dtype=int),
-    value: wp.array(dtype=LevelRow),
-    scale: wp.array(dtype=float),
-    stride: int,
+    matrix: Matrix,
     volume: wp.array(dtype=float),
     # out
-    image_out: wp.array(dtype=Row),
+    rays_out: wp.array(dtype=float),
 ):
     voxel = first_voxel + wp.tid()
-    intensity = volume[voxel] * scale[voxel]
-    if intensity == 0.0:
-        return
-    row = int(first_row[voxel])
-    for block in range(first_block[voxel], first_block[voxel + 1]):
-        at = pixel[block]
-        left = height[block]
-        while left > 1:  # load two rows, then store two: twice as fast as adding in place
-            even = image_out[at] + intensity * _levels(value[row])
-            odd = image_out[at + stride] + intensity * _levels(value[row + 1])
-            image_out[at] = even
-            image_out[at + stride] = odd
-            at += 2 * stride
-            row += 2
-            left -= 2
-        if left > 0:
-            last = image_out[at] + intensity * _levels(value[row])
-            image_out[at] = last
-            row += 1
+    intensity = volume[voxel] * matrix.scale[voxel]
+    if intensity != 0.0:
+        _scatter(
+            matrix.first_block[voxel], matrix.first_block[voxel + 1], matrix.first_row[voxel],
+            matrix.ray, matrix.height, matrix.level, matrix.stride, matrix.profiles, intensity, rays_out,
+        )  # fmt: skip
+
+
+@wp.func
+def _level(matrix: Matrix, row: int, k: int, lane: int):
+    """Level of the block's ray in row k and column `lane`; its values begin at `row`."""
+    if matrix.profiles:
+        return float(matrix.level[row, lane]) * float(matrix.level[row + 1 + k / LANES, k % LANES])
+    return float(matrix.level[row + k, lane])
+
+
+@wp.func
+def _rows_of_values(matrix: Matrix, rows: int):
+    if matrix.profiles:
+        return 1 + (rows + LANES - 1) / LANES
+    return rows
 
 
 @wp.kernel
 def _project_atomic(
     # in
-    first_block: wp.array(dtype=int),
-    first_row: wp.array(dtype=wp.int64),
-    pixel: wp.array(dtype=int),
-    height: wp.array(dtype=int),
-    value: wp.array(dtype=LevelRow),
-    scale: wp.array(dtype=float),
-    stride: int,
+    matrix: Matrix,
     volume: wp.array(dtype=float),
     # out
-    image_out: wp.array(dtype=float),
+    rays_out: wp.array(dtype=float),
 ):
     voxel = wp.tid()
-    intensity = volume[voxel] * scale[voxel]
+    intensity = volume[voxel] * matrix.scale[voxel]
     if intensity == 0.0:
         return
-    row = int(first_row[voxel])
-    for block in range(first_block[voxel], first_block[voxel + 1]):
-        for y in range(height[block]):
-            levels = _levels(value[row])
+    row = int(matrix.first_row[voxel])
+    for block in range(matrix.first_block[voxel], matrix.first_block[voxel + 1]):
+        rows = int(matrix.height[block])
+        for k in range(rows):
             for lane in range(LANES):
-                if levels[lane] > 0.0:
-                    wp.atomic_add(image_out, pixel[block] + y * stride + lane, intensity * levels[lane])
-            row += 1
+                level = _level(matrix, row, k, lane)
+                if level > 0.0:
+                    wp.atomic_add(rays_out, matrix.ray[block] + k * matrix.stride + lane, intensity * level)
+        row += _rows_of_values(matrix, rows)
+
+
+@wp.kernel
+def _count_lit(
+    # in
+    first_voxel: int,
+    matrix: Matrix,
+    share: wp.array(dtype=float),
+    # out
+    count_out: wp.array(dtype=int),
+):
+    voxel = first_voxel + wp.tid()
+    row = int(matrix.first_row[voxel])
+    for block in range(matrix.first_block[voxel], matrix.first_block[voxel + 1]):
+        rows = int(matrix.height[block])
+        for k in range(rows):
+            for lane in range(LANES):
+                if share[matrix.ray[block] + k * matrix.stride + lane] > 0.0 and _level(matrix, row, k, lane) > 0.0:
+                    count_out[voxel] = count_out[voxel] + 1
+        row += _rows_of_values(matrix, rows)
 
 
 @wp.kernel
@@ -191,7 +337,7 @@ def _update(
 
 
 class Projector:
-    """The linear map of one camera's weights on the running device: voxels to pixels of the padded image, and back.
+    """The linear map of one camera's weights on the running device: voxels to sensor pixels, and back.
 
     Arrays in and out are float32, C-contiguous and flat; on the CPU they are used in place.
     """
@@ -199,16 +345,17 @@ class Projector:
     def __init__(self, blocks: Blocks):
         self.blocks = blocks
         self._device = runtime.device()
-        self._stride = blocks.shape[1]
-        self._pixels = blocks.shape[0] * blocks.shape[1]
-        self._matrix = [
-            self._put(blocks.first_block, int),
-            self._put(blocks.first_row, wp.int64),
-            self._put(blocks.pixel, int),
-            self._put(blocks.height, int),
-            self._put(blocks.value, LevelRow),
-            self._put(blocks.scale, float),
-        ]
+        self._map = RayMap(blocks.microimages)
+        self._matrix = Matrix()
+        self._matrix.first_block = self._put(blocks.first_block, int)
+        self._matrix.first_row = self._put(blocks.first_row, wp.int64)
+        self._matrix.ray = self._put(blocks.ray, int)
+        self._matrix.height = self._put(blocks.height, wp.uint16)
+        self._matrix.level = self._put(blocks.value, wp.uint8)
+        self._matrix.scale = self._put(blocks.scale, float)
+        self._matrix.stride = blocks.microimages.edge
+        self._matrix.profiles = blocks.form == "profiles"
+        self._rays = wp.zeros(blocks.microimages.size, dtype=float, device=self._device.warp)
         wp.load_module(sys.modules[__name__], device=self._device.warp)  # before threads use it
         self._spans = [self._span(part) for part in range(runtime.CHUNKS)] if self._device.kind == "cpu" else []
         self._parts: list[np.ndarray] = []
@@ -216,36 +363,29 @@ class Projector:
     def _put(self, array, dtype):
         return wp.array(array, dtype=dtype, device=self._device.warp, copy=False)
 
-    def _rows(self, flat):
-        """View a flat padded image as overlapping rows of LANES pixels."""
-        return wp.array(
-            ptr=flat.ptr,
-            dtype=Row,
-            shape=(self._pixels - LANES + 1,),
-            strides=(4,),
-            device=self._device.warp,
-            copy=False,
-        )
-
     def _span(self, part):
-        """First and last pixel that a chunk of voxels touches."""
+        """First and last ray that a chunk of voxels touches."""
         voxels = len(self.blocks.scale)
         a, b = (self.blocks.first_block[voxels * k // runtime.CHUNKS] for k in (part, part + 1))
         if a == b:
             return 0, 0
-        pixel = self.blocks.pixel[a:b]
-        return int(pixel.min()), int((pixel + (self.blocks.height[a:b] - 1) * self._stride).max()) + LANES
+        ray, height = self.blocks.ray[a:b], np.maximum(self.blocks.height[a:b].astype(np.int32), 1)
+        return int(ray.min()), int((ray + (height - 1) * self.blocks.microimages.edge).max()) + LANES
 
-    def back_project(self, image: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Add the weighted sum of `image` over each voxel's pixels to `out`, shape (voxel,); returns `out`."""
-        flat, volume = self._put(image, float), self._put(out, float)
-        rows = self._rows(flat)
+    def back_project(self, image: np.ndarray, out: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
+        """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
+
+        Voxels whose `active` is zero are left out. Returns `out`.
+        """
+        volume = self._put(out, float)
+        mask = self._put(np.ones_like(out) if active is None else active, float)
+        self._map.spread(self._put(image, float), self._rays)
 
         def launch(_, first, last):
             wp.launch(
                 _back_project,
                 dim=last - first,
-                inputs=[first, *self._matrix, self._stride, rows],
+                inputs=[first, self._matrix, self._rays, mask],
                 outputs=[volume],
                 device=self._device.warp,
             )
@@ -256,18 +396,18 @@ class Projector:
         return out
 
     def project(self, volume: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Write the image of `volume`, shape (voxel,), into `out`, shape (padded pixels,); returns `out`."""
-        voxels = self._put(volume, float)
-        out[:] = 0.0
+        """Write the image of `volume`, shape (voxel,), into `out`, shape (pixel,); returns `out`."""
+        voxels, image = self._put(volume, float), self._put(out, float)
+        self._rays.zero_()
         if self._device.kind == "cuda":
-            image = self._put(out, float)
             wp.launch(
                 _project_atomic,
                 dim=len(volume),
-                inputs=[*self._matrix, self._stride, voxels],
-                outputs=[image],
+                inputs=[self._matrix, voxels],
+                outputs=[self._rays],
                 device=self._device.warp,
             )
+            self._map.collect(self._rays, image)
             out[:] = image.numpy()
             return out
         if not self._parts:
@@ -279,21 +419,32 @@ class Projector:
                 return
             scratch = self._parts[part]
             scratch[:] = 0.0
-            rows = wp.array(
-                ptr=scratch.ctypes.data - 4 * start, dtype=Row, shape=(stop,), strides=(4,), device="cpu", copy=False
-            )
-            wp.launch(
-                _project,
-                dim=last - first,
-                inputs=[first, *self._matrix, self._stride, voxels],
-                outputs=[rows],
-                device="cpu",
-            )
+            rays = wp.array(ptr=scratch.ctypes.data - 4 * start, dtype=float, shape=(stop,), device="cpu", copy=False)
+            wp.launch(_project, dim=last - first, inputs=[first, self._matrix, voxels], outputs=[rays], device="cpu")
 
         runtime.run_chunks(len(volume), launch)
+        rays = self._rays.numpy()
         for (start, stop), scratch in zip(self._spans, self._parts, strict=True):
-            out[start:stop] += scratch
+            rays[start:stop] += scratch
+        self._map.collect(self._rays, image)
         return out
+
+    def count_lit(self) -> np.ndarray:
+        """Count the rays that each voxel lights, shape (voxel,), int32."""
+        count = wp.zeros(len(self.blocks.scale), dtype=int, device=self._device.warp)
+        share = self._put(self.blocks.microimages.share, float)
+
+        def launch(_, first, last):
+            wp.launch(
+                _count_lit,
+                dim=last - first,
+                inputs=[first, self._matrix, share],
+                outputs=[count],
+                device=self._device.warp,
+            )
+
+        runtime.run_chunks(len(count), launch)
+        return count.numpy()
 
 
 def log_ratio(image, gain, floor, projected, out):

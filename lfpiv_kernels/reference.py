@@ -97,10 +97,10 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
                     * (smeared_step(q[3] - b, widths[1]) - smeared_step(q[2] - b, widths[1]))
                     for q in np.asarray(rectangles, float)
                 )
-                true_pupil = points[k] + g
-                distance = np.linalg.norm(true_pupil)
-                normal = np.sort(np.abs(true_pupil) / max(distance, 1e-9))[::-1]
-                covered = smeared_step((radius - distance) / width, np.maximum(normal, 1e-4))
+                distance = np.linalg.norm(points[k])
+                normal = np.sort(np.abs(points[k]) / max(distance, 1e-9))[::-1]
+                bent = width / (24 * radius)  # the pupil's edge, straight within a pixel, moved by its mean curvature
+                covered = smeared_step((radius - distance) / width - bent, np.maximum(normal, 1e-4))
                 weight[k] = covered * inside * width**2 / (np.pi * radius**2) * abs(np.linalg.det(jacobian))
             image[near] += weight
     return image
@@ -131,15 +131,25 @@ def count(rays, shift, window, first_pixel, *, optics, lattice, samples, shape):
 
 
 def dense(blocks) -> np.ndarray:
-    """Matrix of a ``project.Blocks``, shape (padded pixel, voxel), float64."""
-    matrix = np.zeros((blocks.shape[0] * blocks.shape[1], len(blocks.scale)))
+    """Matrix of a ``project.Blocks``, shape (sensor pixel, voxel), float64: every ray's weight times its share."""
+    rays = blocks.microimages
+    matrix = np.zeros((rays.sensor_shape[0] * rays.sensor_shape[1], len(blocks.scale)))
     for voxel in range(len(blocks.scale)):
         row = blocks.first_row[voxel]
         for block in range(blocks.first_block[voxel], blocks.first_block[voxel + 1]):
-            for y in range(blocks.height[block]):
-                at = blocks.pixel[block] + y * blocks.shape[1]
-                matrix[at : at + blocks.value.shape[1], voxel] += blocks.value[row] * float(blocks.scale[voxel])
+            values = row
+            if blocks.form == "profiles":
                 row += 1
+            for y in range(blocks.height[block]):
+                for x in range(blocks.value.shape[1]):
+                    if blocks.form == "profiles":
+                        level = float(blocks.value[values, x]) * float(blocks.value[row + y // 8, y % 8])
+                    else:
+                        level = float(blocks.value[row + y, x])
+                    ray = blocks.ray[block] + y * rays.edge + x
+                    if rays.share[ray] > 0:
+                        matrix[rays.pixel[ray], voxel] += level * blocks.scale[voxel] * rays.share[ray]
+            row += -(-int(blocks.height[block]) // 8) if blocks.form == "profiles" else int(blocks.height[block])
     return matrix
 
 

@@ -13,12 +13,13 @@ from ideal_rig import two_cameras
 
 import lfpiv
 from lfpiv.network import train
-from lfpiv_kernels import correlate, deform, footprint, runtime
+from lfpiv_kernels import correlate, deform, footprint, raymodel, runtime
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.2, 1.0, 0.8), voxel_mm=0.1)
 CAMERAS = 2
-STORED_BYTES_PER_WEIGHT = 2.0
-"""One byte per weight, and what rows of eight lanes and blocks' heads add to it: 1.8 on this rig."""
+STORED_BYTES_PER_WEIGHT = {"pixels": 2.0, "profiles": 0.5}
+"""By form: one byte per weight, and what rows of eight lanes and blocks' heads add to it, 1.9 on this rig; or two
+profiles per block, 0.4."""
 SMART_IMAGES, SMART_VOLUMES = 12, 12
 """Sensor images and volumes that SMART may allocate at once for both cameras; it holds 11 images here."""
 EPOCHS = 10
@@ -56,9 +57,9 @@ def compilations():
 def test_projection_launches_once_per_camera_and_chunk(weights, launches, chunks):
     volume = np.ones(GRID.shape, np.float32)
     images = weights(volume)
-    assert len(launches) == CAMERAS * chunks
+    assert len(launches) == 2 * CAMERAS * chunks  # voxels to rays, rays to pixels
     weights.T(images)
-    assert len(launches) == 2 * CAMERAS * chunks
+    assert len(launches) == 4 * CAMERAS * chunks
 
 
 def test_smart_launches_and_allocates_the_same_in_every_iteration(weights, launches, chunks):
@@ -73,31 +74,37 @@ def test_smart_launches_and_allocates_the_same_in_every_iteration(weights, launc
         tracemalloc.stop()
         counts.append(len(launches))
         assert volume.attrs["iterations"] == iterations
-    # per camera a projection, a log ratio and a back projection, and one update of the volume; then a last misfit
-    assert counts[1] - counts[0] == 3 * (3 * CAMERAS + 1) * chunks
-    assert counts[0] == (2 * (3 * CAMERAS + 1) + 2 * CAMERAS) * chunks
+    # per camera projection (2), log ratio and back projection (2), and one update of the volume; then a last misfit
+    assert counts[1] - counts[0] == 3 * (5 * CAMERAS + 1) * chunks
+    assert counts[0] == (2 * (5 * CAMERAS + 1) + 3 * CAMERAS) * chunks
     pixels = np.prod(next(iter(images.values())).shape)
     budget = 4 * (SMART_IMAGES * pixels + SMART_VOLUMES * GRID.size)
     assert max(peaks) < budget
     assert peaks[1] - peaks[0] < 4 * pixels  # nothing grows with the iterations
 
 
-def test_weights_are_stored_in_their_budget_and_compiled_once(weights):
+@pytest.mark.parametrize("form", STORED_BYTES_PER_WEIGHT)
+def test_weights_are_stored_in_their_budget_and_compiled_once(form, device):
+    weights = lfpiv.build_weights(two_cameras(), GRID, form=form)
     lit = int(weights.affected_pixels.sum())
-    assert lit < weights.memory_bytes < STORED_BYTES_PER_WEIGHT * lit
+    assert weights.memory_bytes < STORED_BYTES_PER_WEIGHT[form] * lit
     before = compilations()
     other = lfpiv.Grid.from_extent(centre_mm=(0.2, 0, 0.3), size_mm=(0.7, 0.9, 0.5), voxel_mm=0.05)
-    lfpiv.build_weights(two_cameras(), other)  # another grid, another voxel: the same kernels
+    lfpiv.build_weights(two_cameras(), other, form=form)  # another grid, another voxel: the same kernels
     assert compilations() == before
 
 
-def test_blocks_are_as_many_and_as_high_as_measured(weights):
+@pytest.mark.parametrize("form", STORED_BYTES_PER_WEIGHT)
+def test_blocks_are_as_many_and_as_high_as_measured(form, device):
+    weights = lfpiv.build_weights(two_cameras(), GRID, form=form)
     for name in weights.cameras:
         blocks = weights.projector(name).blocks
-        rows = np.concatenate([[0], np.cumsum(blocks.height, dtype=np.int64)])[blocks.first_block]
-        assert blocks.height.min() >= 0 and (np.diff(rows) <= np.diff(blocks.first_row)).all()
-        last = blocks.pixel.astype(np.int64) + (blocks.height.astype(np.int64) - 1) * blocks.shape[1]
-        assert blocks.pixel.min() >= 0 and (last + footprint.LANES <= blocks.shape[0] * blocks.shape[1]).all()
+        height = blocks.height.astype(np.int64)
+        tall = 1 + -(-height // raymodel.LANES) if form == "profiles" else height
+        rows = np.concatenate([[0], np.cumsum(tall)])[blocks.first_block]
+        assert height.min() > 0 and (rows == blocks.first_row).all()  # the two kernels round alike
+        assert blocks.ray.min() >= 0
+        assert (blocks.ray + (height - 1) * blocks.microimages.edge + raymodel.LANES <= blocks.microimages.size).all()
 
 
 def test_correlation_and_deformation_launch_once_per_slab(device, launches, chunks):

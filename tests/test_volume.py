@@ -8,9 +8,10 @@ from ideal_rig import two_cameras
 from scipy.optimize import minimize
 
 import lfpiv
+from lfpiv.microimages import plain
 from lfpiv.weightblocks import StoredGrid
 from lfpiv.weights import Weights
-from lfpiv_kernels import footprint, reference, runtime
+from lfpiv_kernels import raymodel, reference, runtime
 from lfpiv_kernels.project import Blocks, Projector
 
 TOLERANCE_F32 = 2e-4  # 50 iterations of float32 steps whose sums have <= 60 terms: 50 * 60 * 6e-8
@@ -30,13 +31,14 @@ def random_system(seed, voxels=(3, 4, 5), rows=4, lit=0.4):
         value = rng.integers(1, 256, (grid.size * rows, 8)) * (rng.random((grid.size * rows, 8)) < lit)
         value[::rows, 0] = 100  # every voxel lights something
         blocks = Blocks(
+            form="pixels",
             first_block=np.arange(grid.size + 1, dtype=np.int32),
             first_row=np.arange(grid.size + 1, dtype=np.int64) * rows,
-            pixel=np.zeros(grid.size, np.int32),
-            height=np.full(grid.size, rows, np.int32),
+            ray=np.zeros(grid.size, np.int32),
+            height=np.full(grid.size, rows, np.uint16),
             value=value.astype(np.uint8),
-            scale=rng.uniform(0.5, 1.5, grid.size).astype(np.float32) / footprint.LEVELS,
-            shape=(rows, 24),
+            scale=rng.uniform(0.5, 1.5, grid.size).astype(np.float32) / raymodel.LEVELS,
+            microimages=plain((rows, 8)),
         )
         optics = SimpleNamespace(sensor_shape=(rows, 8))
         weights.cameras[name] = SimpleNamespace(optics=optics, gain=np.ones((rows, 8), np.float32))
@@ -48,10 +50,8 @@ def matrix_of(weights):
     """Dense matrix of all cameras on voxels in (z, y, x) order, padding left out."""
     order = weights.stored.restore(np.arange(weights.grid.size)).ravel()
     parts = []
-    for name, projector in weights._projectors.items():
-        rows, stride = projector.blocks.shape
-        dense = reference.dense(projector.blocks).reshape(rows, stride, -1)[:, : weights.cameras[name].gain.shape[1]]
-        parts.append(dense.reshape(-1, weights.grid.size)[:, order])
+    for projector in weights._projectors.values():
+        parts.append(reference.dense(projector.blocks)[:, order])
     return np.concatenate(parts)
 
 
@@ -110,7 +110,7 @@ def test_smart_equals_its_dense_twin(normalisation, floor):
         first=first.reshape(weights.grid.shape),
     )
     # "paper" scales the weights to a largest one of 1: the twin works on the scaled system
-    unit = footprint.LEVELS * max(float(p.blocks.scale.max()) for p in weights._projectors.values())
+    unit = raymodel.LEVELS * max(float(p.blocks.scale.max()) for p in weights._projectors.values())
     scale = unit / matrix.max() if normalisation == "paper" else 1.0
     twin = reference.smart(
         matrix, image, first, iterations=50, relaxation=0.9 / scale, floor=floor, paper=normalisation == "paper"

@@ -1,0 +1,78 @@
+"""Where a camera's microimages lie on its sensor, as the projector takes them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lfpiv.lightfield import disc_fraction
+from lfpiv.rig import LensLattice, Optics
+from lfpiv_kernels.footprint import LANES
+from lfpiv_kernels.microimages import Microimages
+
+
+def microimage_edge(optics: Optics) -> int:
+    """Pixels along each side of the square around a microimage, wherever its centre lies in a pixel."""
+    return math.floor(2 * optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm) + 2
+
+
+def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
+    """Lay a sensor's pixels out as the rays of its lenses.
+
+    The microimage of the lens at s_l is centred at s_l (1 + f_m/s_i) on the sensor (Eq. 9) and as wide as the pupil's
+    image; every lens whose microimage meets the sensor has a block.
+    """
+    widening = (1 + optics.sensor_per_pupil) / optics.pixel_mm
+    radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
+    edge = microimage_edge(optics)
+    rows, columns = optics.sensor_shape
+    half = np.array([columns, rows]) / 2
+    reach = (half + radius + 1) / widening
+    corners = (np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * reach - lattice.origin_mm) @ np.linalg.inv(
+        np.asarray(lattice.basis_mm)
+    )
+    first, last = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
+    index = np.stack(
+        np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True))), axis=-1
+    )  # (j, i, 2)
+    centre = lattice.centres_mm(index) * widening + half  # [pixel], pixel n spans n to n + 1
+    corner = np.floor(centre - radius).astype(np.int32)
+    count = index[..., 0].size * edge**2
+    pixel, share = np.full(count + LANES, -1, np.int32), np.zeros(count + LANES, np.float32)
+    step = np.arange(edge, dtype=np.int32)
+    pixel_rows, share_rows = (array[:count].reshape(len(index), -1, edge, edge) for array in (pixel, share))
+    for j in range(len(index)):  # row by row of lenses: bounds the scratch memory
+        column = corner[j, :, None, None, 0] + step
+        row = corner[j, :, None, None, 1] + step[:, None]
+        seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        if not seen.any():
+            continue
+        offset = np.empty((*seen.shape, 2), np.float32)
+        offset[..., 0] = column + 0.5 - centre[j, :, None, None, 0]
+        offset[..., 1] = row + 0.5 - centre[j, :, None, None, 1]
+        share_rows[j] = np.where(seen, disc_fraction(offset, radius)[0], 0.0)
+        pixel_rows[j] = np.where(seen, row * columns + column, -1)
+    return Microimages(
+        first_lens=(int(first[0]), int(first[1])),
+        corner=corner,
+        edge=edge,
+        pixel=pixel,
+        share=share,
+        sensor_shape=(rows, columns),
+    )
+
+
+def plain(sensor_shape: tuple[int, int]) -> Microimages:
+    """Every pixel as one ray, in rows padded by LANES: for weights that were counted pixel by pixel."""
+    rows, columns = sensor_shape
+    pixel = np.full((rows, columns + LANES), -1, np.int32)
+    pixel[:, :columns] = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    return Microimages(
+        first_lens=(0, 0),
+        corner=np.zeros((1, 1, 2), np.int32),
+        edge=columns + LANES,
+        pixel=pixel.ravel(),
+        share=(pixel.ravel() >= 0).astype(np.float32),
+        sensor_shape=(rows, columns),
+    )
