@@ -8,7 +8,7 @@ import numpy as np
 
 from lfpiv.lightfield import disc_fraction
 from lfpiv.rig import LensLattice, Optics
-from lfpiv_kernels.footprint import LANES
+from lfpiv_kernels.footprint import LANES, LAYER_FALL, LAYERS, SIDE_LAYERS
 from lfpiv_kernels.microimages import Microimages
 
 
@@ -21,7 +21,9 @@ def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
     """Lay a sensor's pixels out as the rays of its lenses.
 
     The microimage of the lens at s_l is centred at s_l (1 + f_m/s_i) on the sensor (Eq. 9) and as wide as the pupil's
-    image; every lens whose microimage meets the sensor has a block.
+    image; every lens whose microimage meets the sensor has a block. A pixel at the edge shows the part of its cell
+    inside the pupil, whose middle lies inwards of its own: so a lens has more versions of its block, with shares for
+    weights that fall or rise outwards.
     """
     widening = (1 + optics.sensor_per_pupil) / optics.pixel_mm
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
@@ -38,10 +40,10 @@ def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
     )  # (j, i, 2)
     centre = lattice.centres_mm(index) * widening + half  # [pixel], pixel n spans n to n + 1
     corner = np.floor(centre - radius).astype(np.int32)
-    count = index[..., 0].size * edge**2
+    count = LAYERS * index[..., 0].size * edge**2
     pixel, share = np.full(count + LANES, -1, np.int32), np.zeros(count + LANES, np.float32)
     step = np.arange(edge, dtype=np.int32)
-    pixel_rows, share_rows = (array[:count].reshape(len(index), -1, edge, edge) for array in (pixel, share))
+    pixel_rows, share_rows = (array[:count].reshape(len(index), LAYERS, -1, edge, edge) for array in (pixel, share))
     for j in range(len(index)):  # row by row of lenses: bounds the scratch memory
         column = corner[j, :, None, None, 0] + step
         row = corner[j, :, None, None, 1] + step[:, None]
@@ -51,7 +53,10 @@ def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
         offset = np.empty((*seen.shape, 2), np.float32)
         offset[..., 0] = column + 0.5 - centre[j, :, None, None, 0]
         offset[..., 1] = row + 0.5 - centre[j, :, None, None, 1]
-        share_rows[j] = np.where(seen, disc_fraction(offset, radius)[0], 0.0)
+        inside = np.where(seen, disc_fraction(offset, radius)[0], 0.0)
+        for layer in range(LAYERS):  # the middle of the part inside lies (1 - inside) / 2 inwards of the pixel's
+            fall = LAYER_FALL * (layer - SIDE_LAYERS)
+            share_rows[j, layer] = inside * (1 + fall * (1 - inside) / 2)
         pixel_rows[j] = np.where(seen, row * columns + column, -1)
     return Microimages(
         first_lens=(int(first[0]), int(first[1])),

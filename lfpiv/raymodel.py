@@ -37,13 +37,18 @@ def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
     terms = np.stack([unit[:, 0] ** a * unit[:, 1] ** b for a, b in powers], axis=1)
     solve = np.linalg.pinv(terms) / np.array([radius ** (a + b) for a, b in powers])[:, None]
     pupil = (unit * radius).astype(np.float32)
+    both = np.zeros((len(unit), 2, 2, len(powers)), np.float32)  # one product for s and t: their rays lie side by side
+    both[:, 0, 0], both[:, 1, 1] = solve.T, solve.T
+    both = both.reshape(2 * len(unit), -1)
     out = np.empty((len(points_mm), 2, len(powers)), np.float32)
     for first in range(0, len(points_mm), CHUNK_POINTS):
         part = points_mm[first : first + CHUNK_POINTS]
-        rays = camera.map_fan(part, pupil)
-        middle = rays[:, :1].copy()  # differences keep single precision where it matters
-        out[first : first + len(part)] = np.tensordot(rays - middle, solve.astype(np.float32), axes=((1,), (1,)))
-        out[first : first + len(part), :, 0] += middle[:, 0]
+        rays = camera.map_fan(part, pupil).reshape(len(part), -1)  # s and t by turns
+        middle = rays[:, :2].copy()
+        for axis in range(2):  # differences keep single precision where it matters
+            rays[:, axis::2] -= middle[:, axis, None]
+        out[first : first + len(part)] = (rays @ both).reshape(-1, 2, len(powers))
+        out[first : first + len(part), :, 0] += middle
     return out
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from lfpiv.microimages import lay_out, microimage_edge, plain
 from lfpiv.raymodel import fit_rays, grid_models
@@ -26,8 +27,6 @@ Progress = Callable[[float], None]
 
 CHUNK_VOXELS = 32768
 """Voxels per kernel launch: keeps every index below 2^31 and the scratch memory small."""
-BEND_PITCH = 0.03
-"""Second-order terms of the rays [pitch, at the pupil's edge] above which slopes are followed pixel by pixel."""
 COUNT_POINTS = 8
 """Object points per voxel edge: 512 per voxel, the paper has 500."""
 COUNT_SAMPLES = 36
@@ -138,29 +137,23 @@ def pack_camera(camera) -> CameraKernels:
     )
 
 
-def bends(model: np.ndarray, camera) -> bool:
-    """Whether the rays of voxels bend over the pupil so much that slopes must be followed pixel by pixel."""
-    quadratic = np.abs(model[:, [3, 4, 5, 9, 10, 11]]).sum(1).mean() * camera.optics.pupil_radius_mm**2
-    return bool(quadratic / camera.lattice.pitch_mm > BEND_PITCH)
-
-
 def footprint_blocks(stored: StoredGrid, camera, form: str, progress: Progress) -> Blocks:
     """Compute the blocks of one camera: count them, allocate once, fill chunk by chunk."""
     pack, size = pack_camera(camera), stored.grid.size
     plane = size // stored.shape[0]
     first_block, first_row = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
-    models, bent = [], False
+    models = []
     axes = tuple(2 - axis for axis in stored.order)
-    for model in grid_models(camera, stored.shape, stored.positions_mm, axes):
-        models.append(model)
-        bent = bent or bends(model, camera)
-        progress(0.3 * len(models) / stored.shape[0])
+    with threadpool_limits(1, "blas"):  # products of a plane each: BLAS's own threads cost more than they bring
+        for model in grid_models(camera, stored.shape, stored.positions_mm, axes):
+            models.append(model)
+            progress(0.3 * len(models) / stored.shape[0])
     step = max(1, CHUNK_VOXELS // plane)
     chunks = [(a, np.concatenate(models[a : a + step])) for a in range(0, len(models), step)]
     del models
     for a, model in chunks:
         part = slice(a * plane + 1, a * plane + len(model) + 1)
-        first_block[part], first_row[part] = measure(pack, model, bent, form)
+        first_block[part], first_row[part] = measure(pack, model, form)
     np.cumsum(first_block, out=first_block)
     np.cumsum(first_row, out=first_row)
     blocks = Blocks(
@@ -176,19 +169,17 @@ def footprint_blocks(stored: StoredGrid, camera, form: str, progress: Progress) 
     for number in range(len(chunks)):
         a, model = chunks[number]
         chunks[number] = None
-        fill(pack, model, bent, blocks, a * plane, first_block)
+        fill(pack, model, blocks, a * plane, first_block)
         progress(0.4 + 0.6 * (number + 1) / len(chunks))
     return blocks
 
 
-def measure(pack: CameraKernels, model: np.ndarray, bent: bool, form: str) -> tuple[np.ndarray, np.ndarray]:
+def measure(pack: CameraKernels, model: np.ndarray, form: str) -> tuple[np.ndarray, np.ndarray]:
     """Blocks and rows of each voxel."""
-    return footprint.measure_blocks(
-        model, pack.camera, pack.lattice, pack.cell_mm, pack.microimages, bends=bent, form=form
-    )
+    return footprint.measure_blocks(model, pack.camera, pack.lattice, pack.cell_mm, pack.microimages, form=form)
 
 
-def fill(pack: CameraKernels, model: np.ndarray, bent: bool, blocks: Blocks, first: int, first_block) -> None:
+def fill(pack: CameraKernels, model: np.ndarray, blocks: Blocks, first: int, first_block) -> None:
     """Fill the blocks of the voxels from `first` on."""
     voxels = slice(first, first + len(model))
     edges = slice(first, first + len(model) + 1)
@@ -204,7 +195,6 @@ def fill(pack: CameraKernels, model: np.ndarray, bent: bool, blocks: Blocks, fir
         pack.microimages,
         frame=pack.frame,
         rectangles=pack.rectangles,
-        bends=bent,
         form=blocks.form,
         first_block=first_block[edges],
         first_row=blocks.first_row[edges],

@@ -18,7 +18,6 @@ from lfpiv.rig import Grid
 from lfpiv.weightblocks import (
     CHUNK_VOXELS,
     StoredGrid,
-    bends,
     count_blocks,
     count_voxels,
     footprint_blocks,
@@ -324,7 +323,7 @@ def estimate_memory(calibration, grid: Grid, form: str = "auto") -> int:
         pack = pack_camera(camera)
         model = ray_models(camera, centres, grid.voxel_mm)
         chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
-        blocks, rows = measure(pack, model, bends(model, camera), chosen)
+        blocks, rows = measure(pack, model, chosen)
         per_voxel = 6 * blocks.mean() + LANES * rows.mean() + 16 + 4 * MODEL_SIZE
         rays = 4 * (5 + 2) * pack.microimages.size + 24 * runtime.CHUNKS
         total += per_voxel * grid.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays

@@ -43,6 +43,13 @@ from lfpiv_kernels.raymodel import (
 
 FORMS = ("profiles", "pixels")
 """Rank-1 blocks, or one value per ray."""
+SIDE_LAYERS = 1
+"""Versions of a microimage to either side of the plain one, for weights that fall or rise outwards at its edge."""
+LAYERS = 2 * SIDE_LAYERS + 1
+LAYER_FALL = 0.6
+"""Relative fall of the weight per pixel, outwards at the pupil's edge, between one version and the next."""
+BATCH = 2
+"""Rows of a block that are computed side by side."""
 HEADROOM = 1.04
 """Largest value that a profile or weight can take, over that at the pupil's centre."""
 
@@ -88,7 +95,6 @@ def _measure_blocks(
     cell: ti.f32,
     first_lens: Lenses,
     corner: ti.types.ndarray(dtype=ti.i32, ndim=3),
-    bends: ti.template(),
     profiles: ti.template(),
     # out
     blocks_out: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -105,7 +111,17 @@ def _measure_blocks(
                     [corner[j - first_lens[1], i - first_lens[0], 0], corner[j - first_lens[1], i - first_lens[0], 1]]
                 )
                 box, _ = pixel_box(
-                    model, v, chief, back, half, camera, lens_centre(lattice, i, j), first, cell, pupil_pixel, bends
+                    model,
+                    v,
+                    chief,
+                    back,
+                    half,
+                    camera,
+                    lens_centre(lattice, i, j),
+                    first,
+                    cell,
+                    pupil_pixel,
+                    not profiles,
                 )
                 if box[0] <= box[1] and box[2] <= box[3]:
                     across = (box[1] - box[0] + LANES) // LANES
@@ -134,14 +150,58 @@ def _in_cell(rectangles: ti.template(), a, b, wide_a, wide_b):
 
 
 @ti.func
-def _profile(x, width):
-    """Probability that a position x [pitch], smeared by the widths, lies within half a pitch of the lens's centre."""
+def _adjugate(m):
+    """Adjugate of a 2x2 matrix: its inverse times its determinant."""
+    return ti.Matrix([[m[1, 1], -m[0, 1]], [-m[1, 0], m[0, 0]]])
+
+
+@ti.func
+def _trapezium(x, width):
+    """Widest smear times the probability that a position x [pitch], smeared by the widths, lies within half a pitch."""
     away = ti.abs(x)
     outer, inner = 0.5 * (1.0 + width[0]), 0.5 * ti.abs(1.0 - width[0])
-    return (
-        ti.max(ramp(outer - away, width[1]) - ramp(inner - away, width[1]) - ramp(-inner - away, width[1]), 0.0)
-        / width[0]
-    )
+    return ti.max(ramp(outer - away, width[1]) - ramp(inner - away, width[1]) - ramp(-inner - away, width[1]), 0.0)
+
+
+@ti.func
+def _profile(x, width):
+    """Probability that a position x [pitch], smeared by the widths, lies within half a pitch of the lens's centre."""
+    return _trapezium(x, width) / width[0]
+
+
+@ti.func
+def _layer(
+    model: ti.template(), v, centre, p0, tile, columns, rows, radius, pupil_pixel, frame, jacobian, wide_a, wide_b
+):
+    """Layer of the microimage for a block at the pupil's edge, from how its weights fall outwards there.
+
+    Where only a part of a pixel lies inside the pupil, the weight that counts is that of the part's middle.
+    """
+    width = ti.min(LANES, columns - LANES * tile)
+    middle = p0 - ti.Vector([LANES * tile + 0.5 * (width - 1), 0.5 * (rows - 1)]) * pupil_pixel
+    away = middle.norm()
+    half = 0.5 * pupil_pixel * ti.Vector([width, rows])
+    layer = 0
+    if (ti.abs(middle) + half).norm() > radius - 0.25 * pupil_pixel and away > 0.3 * radius:
+        normal = middle / away
+        inner, outer = (radius - 0.25 * pupil_pixel) * normal, (radius + 0.25 * pupil_pixel) * normal
+        at_in = frame @ (jacobian @ (position(model, v, inner) - centre))
+        at_out = frame @ (jacobian @ (position(model, v, outer) - centre))
+        w_in = _trapezium(at_in[0], wide_a) * _trapezium(at_in[1], wide_b)
+        w_out = _trapezium(at_out[0], wide_a) * _trapezium(at_out[1], wide_b)
+        fall = 4.0 * (w_in - w_out) / ti.max(w_in + w_out, 1e-9)
+        layer = ti.min(ti.max(ti.cast(ti.round(fall / LAYER_FALL), ti.i32), -SIDE_LAYERS), SIDE_LAYERS)
+    return layer + SIDE_LAYERS
+
+
+@ti.func
+def _write_profile(value: ti.template(), row, at, step, middle, first, count, width, to_level):
+    """Write a row of a profile, pixels `first` and on of `count`; `at` is the position of their middle [pitch]."""
+    levels = ti.Vector.zero(ti.f32, LANES)
+    for lane in range(LANES):  # on local values only: the compiler makes it vectors
+        levels[lane] = ti.min(_trapezium(at - (first + lane - middle) * step, width) * to_level + 0.5, LEVELS)
+    for lane in ti.static(range(LANES)):
+        value[row, lane] = ti.cast(ti.select(first + lane < count, levels[lane], 0.0), ti.u8)
 
 
 @ti.func
@@ -167,7 +227,7 @@ def _fill_blocks(
     rectangles: ti.types.ndarray(dtype=ti.f32, ndim=2),
     first_block: ti.types.ndarray(dtype=ti.i64, ndim=1),
     first_row: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    bends: ti.template(),
+    square: ti.template(),
     profiles: ti.template(),
     # out
     ray_out: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -203,7 +263,9 @@ def _fill_blocks(
                 first = ti.Vector(
                     [corner[j - first_lens[1], i - first_lens[0], 0], corner[j - first_lens[1], i - first_lens[0], 1]]
                 )
-                box, middle = pixel_box(model, v, chief, back, half, camera, centre, first, cell, pupil_pixel, bends)
+                box, middle = pixel_box(
+                    model, v, chief, back, half, camera, centre, first, cell, pupil_pixel, not profiles
+                )
                 columns, rows = box[1] - box[0] + 1, box[3] - box[2] + 1
                 tiles = (columns + LANES - 1) // LANES
                 high = rows
@@ -222,51 +284,114 @@ def _fill_blocks(
                         (1.0 + r) * centre
                         - (ti.Vector([box[0], box[2]]) + 0.5 - ti.Vector([camera[2], camera[3]])) * pixel
                     ) / r
-                    lens_block = (j - first_lens[1]) * corner.shape[1] + i - first_lens[0]
-                    ray = (lens_block * stride + box[2] - first[1]) * stride + box[0] - first[0]
+                    lens_row = (j - first_lens[1]) * LAYERS
+                    along = (box[2] - first[1]) * stride + box[0] - first[0]
                     if ti.static(profiles):
                         middle_px = 0.5 * ti.Vector([columns - 1, rows - 1])
                         ab = turn @ (position(model, v, p0 - middle_px * pupil_pixel) - centre)
-                        to_a, to_b = LEVELS * area / (top_a * top_area), LEVELS / top_b
+                        to_a, to_b = LEVELS * area / (top_a * top_area * wide_a[0]), LEVELS / (top_b * wide_b[0])
                         for tile in range(tiles):
-                            ray_out[block] = ray + LANES * tile
+                            layer = _layer(
+                                model,
+                                v,
+                                centre,
+                                p0,
+                                tile,
+                                columns,
+                                rows,
+                                radius,
+                                pupil_pixel,
+                                frame,
+                                jacobian,
+                                wide_a,
+                                wide_b,
+                            )
+                            lens_block = (lens_row + layer) * corner.shape[1] + i - first_lens[0]
+                            ray_out[block] = lens_block * stride * stride + along + LANES * tile
                             height_out[block] = ti.cast(rows, ti.u16)
                             block += 1
-                            for lane in ti.static(range(LANES)):
-                                column = LANES * tile + lane
-                                level = _profile(ab[0] - (column - middle_px[0]) * step[0, 0], wide_a) * to_a
-                                level = ti.select(column < columns, level, 0.0)
-                                value_out[row, lane] = ti.cast(ti.min(level + 0.5, LEVELS), ti.u8)
+                            _write_profile(
+                                value_out, row, ab[0], step[0, 0], middle_px[0], LANES * tile, columns, wide_a, to_a
+                            )
                             row += 1
                             for part in range((rows + LANES - 1) // LANES):
-                                for lane in ti.static(range(LANES)):
-                                    n = LANES * part + lane
-                                    level = _profile(ab[1] - (n - middle_px[1]) * step[1, 1], wide_b) * to_b
-                                    level = ti.select(n < rows, level, 0.0)
-                                    value_out[row, lane] = ti.cast(ti.min(level + 0.5, LEVELS), ti.u8)
+                                _write_profile(
+                                    value_out, row, ab[1], step[1, 1], middle_px[1], LANES * part, rows, wide_b, to_b
+                                )
                                 row += 1
                     else:
+                        middle_px = 0.5 * ti.Vector([columns - 1, rows - 1])
+                        p = p0 - middle_px * pupil_pixel
+                        k = slope(model, v, p)
+                        # slopes are linear in the pixel offset (x, y), the offset from the lens centre is quadratic
+                        q = (
+                            pupil_pixel
+                            * pupil_pixel
+                            * ti.Matrix(
+                                [
+                                    [model[v, 3], model[v, 4], model[v, 5]],
+                                    [model[v, 9], model[v, 10], model[v, 11]],
+                                ]
+                            )
+                        )  # xx, xy, yy
+                        d0, dx, dy = position(model, v, p) - centre, -pupil_pixel * k[:, 0], -pupil_pixel * k[:, 1]
+                        kx = ti.Matrix([[2.0 * q[0, 0], q[0, 1]], [2.0 * q[1, 0], q[1, 1]]]) / -pupil_pixel
+                        ky = ti.Matrix([[q[0, 1], 2.0 * q[0, 2]], [q[1, 1], 2.0 * q[1, 2]]]) / -pupil_pixel
+                        turn0, turnx, turny = (
+                            frame @ _adjugate(identity - k),
+                            frame @ _adjugate(-kx),
+                            frame @ _adjugate(-ky),
+                        )
+                        inverse_a, inverse_b = 1.0 / wide_a[0], 1.0 / wide_b[0]
                         to_level = LEVELS / (top_a * top_b * top_area)
+                        if ti.static(square):
+                            to_level *= inverse_a * inverse_b
                         for tile in range(tiles):
-                            ray_out[block] = ray + LANES * tile
+                            layer = _layer(
+                                model,
+                                v,
+                                centre,
+                                p0,
+                                tile,
+                                columns,
+                                rows,
+                                radius,
+                                pupil_pixel,
+                                frame,
+                                jacobian,
+                                wide_a,
+                                wide_b,
+                            )
+                            lens_block = (lens_row + layer) * corner.shape[1] + i - first_lens[0]
+                            ray_out[block] = lens_block * stride * stride + along + LANES * tile
                             height_out[block] = ti.cast(rows, ti.u16)
                             block += 1
-                            for n in range(rows):
-                                for lane in range(LANES):
-                                    column = LANES * tile + lane
+                            for part in range((rows + BATCH - 1) // BATCH):
+                                levels = ti.Vector.zero(ti.f32, BATCH * LANES)
+                                for n in range(BATCH * LANES):  # on local values only: the compiler makes it vectors
+                                    x = LANES * tile + n % LANES - middle_px[0]
+                                    y = BATCH * part + n // LANES - middle_px[1]
+                                    d = d0 + x * (dx + x * q[:, 0] + y * q[:, 1]) + y * (dy + y * q[:, 2])
+                                    t = turn0 + x * turnx + y * turny
+                                    kk = k + x * kx + y * ky
+                                    area = 1.0 / ti.abs((1.0 - kk[0, 0]) * (1.0 - kk[1, 1]) - kk[0, 1] * kk[1, 0])
                                     level = ti.f32(0.0)
-                                    if column < columns:
-                                        p = p0 - ti.Vector([column, n]) * pupil_pixel
-                                        if ti.static(bends):
-                                            jacobian = inverse(identity - slope(model, v, p))
-                                            area = ti.abs(jacobian.determinant())
-                                        ab = frame @ (jacobian @ (position(model, v, p) - centre))
-                                        level = area * ti.max(_in_cell(rectangles, ab[0], ab[1], wide_a, wide_b), 0.0)
-                                    value_out[row, lane] = ti.cast(ti.min(level * to_level + 0.5, LEVELS), ti.u8)
-                                row += 1
+                                    a = (t[0, 0] * d[0] + t[0, 1] * d[1]) * area
+                                    b = (t[1, 0] * d[0] + t[1, 1] * d[1]) * area
+                                    if ti.static(square):
+                                        level = area * _trapezium(a, wide_a) * _trapezium(b, wide_b)
+                                    else:
+                                        level = area * ti.max(_in_cell(rectangles, a, b, wide_a, wide_b), 0.0)
+                                    level = ti.select(LANES * tile + n % LANES < columns, level * to_level, 0.0)
+                                    levels[n] = ti.min(level + 0.5, LEVELS)
+                                for n in ti.static(range(BATCH)):
+                                    if BATCH * part + n < rows:
+                                        for lane in ti.static(range(LANES)):
+                                            value_out[row, lane] = ti.cast(levels[LANES * n + lane], ti.u8)
+                                        row += 1
 
 
-def measure_blocks(model, camera, lattice, cell_mm, microimages, *, bends, form):
+def measure_blocks(model, camera, lattice, cell_mm, microimages, *, form):
     """Count the blocks and the rows of each voxel.
 
     Parameters
@@ -279,8 +404,6 @@ def measure_blocks(model, camera, lattice, cell_mm, microimages, *, bends, form)
         Half extent of a lens's cell along s and t [mm].
     microimages : Microimages
         How the rays lie in memory.
-    bends : bool
-        Whether the slopes change over the pupil; False takes them as constant under a lens.
     form : {"profiles", "pixels"}
         See `FORMS`.
 
@@ -292,7 +415,7 @@ def measure_blocks(model, camera, lattice, cell_mm, microimages, *, bends, form)
     blocks, rows = np.empty(len(model), np.int32), np.empty(len(model), np.int32)
     _measure_blocks(
         model, camera, lattice, cell_mm, Lenses(*microimages.first_lens), microimages.corner,
-        bool(bends), form == "profiles", blocks, rows,
+        form == "profiles", blocks, rows,
     )  # fmt: skip
     ti.sync()
     return blocks, rows
@@ -300,13 +423,13 @@ def measure_blocks(model, camera, lattice, cell_mm, microimages, *, bends, form)
 
 def fill_blocks(
     model, camera, lattice, cell_mm, microimages, *,
-    frame, rectangles, bends, form, first_block, first_row, ray, height, value, scale,
+    frame, rectangles, form, first_block, first_row, ray, height, value, scale,
 ):  # fmt: skip
     """Compute the weights of consecutive voxels into blocks.
 
     Parameters
     ----------
-    model, camera, lattice, cell_mm, microimages, bends, form
+    model, camera, lattice, cell_mm, microimages, form
         As for `measure_blocks`.
     frame, rectangles
         The lens's cell, from `cell_frame` and `cell_rectangles`; profiles need a single rectangle.
@@ -332,7 +455,7 @@ def fill_blocks(
     runtime.device()
     _fill_blocks(
         model, camera, lattice, cell_mm, Lenses(*microimages.first_lens), microimages.corner,
-        ti.Matrix(np.asarray(frame, np.float32).tolist()), rectangles, first_block, first_row, bool(bends),
+        ti.Matrix(np.asarray(frame, np.float32).tolist()), rectangles, first_block, first_row, len(rectangles) == 1,
         form == "profiles", ray, height, value, scale,
     )  # fmt: skip
     ti.sync()

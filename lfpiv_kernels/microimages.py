@@ -19,7 +19,10 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 @dataclass(frozen=True, kw_only=True)
 class Microimages:
-    """How the rays of a camera's lenses lie in memory: one block of edge x edge pixels per lens, row by row."""
+    """How the rays of a camera's lenses lie in memory: blocks of edge x edge pixels, row by row.
+
+    Every row of lenses comes in layers, of which each holds a block per lens, see ``footprint.LAYERS``.
+    """
 
     first_lens: tuple[int, int]
     """Lattice indices (i, j) of the first lens; i runs fastest."""

@@ -82,7 +82,17 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
             at = points[seen].mean(0)
             at *= min(1.0, radius / max(np.linalg.norm(at), 1e-9))
             for k in np.flatnonzero(seen):
-                k_slope = slope(model, points[k] if local else at)
+                distance = np.linalg.norm(points[k])
+                normal = np.sort(np.abs(points[k]) / max(distance, 1e-9))[::-1]
+                bent = width / (24 * radius)  # the pupil's edge, straight within a pixel, moved by its mean curvature
+                covered = float(
+                    np.clip(smeared_step((radius - distance) / width - bent, np.maximum(normal, 1e-4)), 0, 1)
+                )
+                if covered <= 0:
+                    continue
+                # the middle of the part of the pixel inside the pupil
+                seen_at = points[k] * (1 - (1 - covered) / 2 * width / max(distance, width))
+                k_slope = slope(model, seen_at if local else at)
                 jacobian = np.linalg.inv(np.eye(2) - k_slope)
                 turn = np.asarray(frame) @ jacobian
                 edges = [
@@ -90,17 +100,12 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
                 ]
                 smear = np.stack([turn @ edge for edge in edges] + list((turn @ k_slope * width).T), axis=1)
                 widths = [two_widths(smear[0]), two_widths(smear[1])]
-                g = jacobian @ offset[k]
-                a, b = np.asarray(frame) @ g
+                a, b = np.asarray(frame) @ jacobian @ (position(model, seen_at) - centre)
                 inside = sum(
                     (smeared_step(q[1] - a, widths[0]) - smeared_step(q[0] - a, widths[0]))
                     * (smeared_step(q[3] - b, widths[1]) - smeared_step(q[2] - b, widths[1]))
                     for q in np.asarray(rectangles, float)
                 )
-                distance = np.linalg.norm(points[k])
-                normal = np.sort(np.abs(points[k]) / max(distance, 1e-9))[::-1]
-                bent = width / (24 * radius)  # the pupil's edge, straight within a pixel, moved by its mean curvature
-                covered = smeared_step((radius - distance) / width - bent, np.maximum(normal, 1e-4))
                 weight[k] = covered * inside * width**2 / (np.pi * radius**2) * abs(np.linalg.det(jacobian))
             image[near] += weight
     return image

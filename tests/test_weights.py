@@ -7,6 +7,7 @@ import pytest
 from ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
+from lfpiv.microimages import lay_out
 from lfpiv.raymodel import ray_models
 from lfpiv.weightblocks import count_voxels
 from lfpiv.weights import estimate_memory
@@ -17,6 +18,7 @@ VOXEL_MM = 0.1
 LEVEL = 0.5 / raymodel.LEVELS * 1.1  # rounding to 8 bits, in units of the largest weight; the bound is 4-10 % above it
 TOLERANCE_TWIN = 2e-3  # float32 polynomials against float64, of the largest weight
 TOLERANCE_ADJOINT = 1e-5  # the issue's figure; float32 sums of about 1e5 terms with random signs
+TOLERANCE_EDGE = 0.012  # relative L2: at the pupil's edge the kernels know how weights fall in steps of LAYER_FALL
 FOOTPRINT_MEAN, FOOTPRINT_WORST = 0.02, 0.035  # relative L2 against a converged count: the project's goal
 SAMPLES = 100  # pupil points per axis: counting noise of about 1 %, subtracted by the two halves' difference
 
@@ -78,11 +80,14 @@ def test_footprint_kernel_equals_its_twin(name, form):
         lattice=camera.lattice,
         frame=footprint.cell_frame(camera.lattice.basis_mm, camera.lattice.layout),
         rectangles=footprint.cell_rectangles(camera.lattice.layout),
-        local=name == "mild coma",
+        local=form == "pixels",
     )
+    rays = lay_out(camera.optics, camera.lattice)
+    whole = np.ones(camera.optics.sensor_shape, bool)  # pixels that lie inside the pupil altogether
+    whole.ravel()[rays.pixel[(rays.share > 0) & (rays.share < 1)]] = False
     levels = (1 if form == "pixels" else 2) * LEVEL  # a product of two rounded profiles
-    assert np.abs(image - twin).max() <= (levels + TOLERANCE_TWIN) * twin.max()
-    assert np.linalg.norm(image - twin) <= 0.01 * np.linalg.norm(twin)
+    assert np.abs(image - twin)[whole].max() <= (levels + TOLERANCE_TWIN) * twin.max()
+    assert np.linalg.norm(image - twin) <= TOLERANCE_EDGE * np.linalg.norm(twin)
 
 
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
