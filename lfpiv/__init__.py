@@ -29,6 +29,9 @@ _MODULES = {
     "write_report": "lfpiv.report",
 }
 
+_SUBMODULES = ("metrics",)
+"""Modules that are public as a whole: `lfpiv.metrics`."""
+
 __all__ = [
     "Calibration",
     "Experiment",
@@ -52,6 +55,8 @@ __all__ = [
 
 def __getattr__(name: str):
     """Load the module of a public name on first use."""
+    if name in _SUBMODULES:
+        return importlib.import_module(f"lfpiv.{name}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(_MODULES[name]), name)
@@ -60,4 +65,4 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*globals(), *_SUBMODULES, *__all__])
