@@ -17,6 +17,8 @@ from scipy.spatial import cKDTree
 
 from lfpiv.errors import InputError
 from lfpiv.settings import Flag, Number, Positive, Table
+from lfpiv.swirl import injector_profiles
+from lfpiv.turbulence import TurbulentFlow
 
 Point = tuple[Number, Number, Number]
 Axis = Literal["x", "y", "z"]
@@ -134,6 +136,64 @@ class Swirl(Table):
         return displacement
 
 
+class SwirlingJet(Table):
+    """Mean flow of a low-swirl injector: a jet that turns and spreads, free of divergence.
+
+    At the outlet it has the profiles of `lfpiv.swirl.injector_profiles`. Stream surfaces are r / delta = constant with
+    delta^2 = 1 + (spreading y / R)^2, y the distance from the outlet; along them the axial velocity falls as
+    1 / delta^2, volume flow and circulation are kept, and the radial velocity is r delta' / delta times the axial one.
+    The defaults are the paper's injector: S = 0.55, D = 34 mm, central channel of 12 mm radius; 37 degree vanes give
+    that swirl number with a mass ratio of 0.42 (Eq. 17).
+    """
+
+    kind: Literal["swirling_jet"] = "swirling_jet"
+    bulk_mm: Number
+    """Displacement at the bulk velocity, volume flow over the nozzle's area [mm]; negative: against the axis."""
+    swirl_number: Number = 0.55
+    """Swirl number S at the outlet; positive: right-handed about the axis."""
+    nozzle_radius_mm: Positive = 17.0
+    """Radius R of the nozzle [mm]."""
+    radius_ratio: Annotated[float, Field(strict=True, gt=0.05, lt=0.95)] = 12 / 17
+    """Radius of the central channel over the nozzle's."""
+    mass_ratio: Annotated[float, Field(strict=True, ge=0, le=20)] = 0.42
+    """Mass flow of the central channel over that of the swirled annulus."""
+    shear_layer_mm: Positive = 1.7
+    """Half thickness of the tanh-shaped shear layers [mm]."""
+    spreading: Annotated[float, Field(strict=True, ge=0, le=2)] = 0.5
+    """Tangent of the half angle at which the jet's edge spreads, far from the outlet."""
+    axis: Axis = "y"
+    """Direction of the jet's axis."""
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    """Centre of the outlet (x, y, z) [mm]."""
+
+    @model_validator(mode="after")
+    def _layers_thin(self) -> SwirlingJet:
+        if not 0.01 <= self.shear_layer_mm / self.nozzle_radius_mm <= 0.5:
+            raise ValueError("shear_layer_mm between 1 and 50 % of nozzle_radius_mm")
+        return self
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) at points (n, 3) [mm]."""
+        radius, axis = self.nozzle_radius_mm, "xyz".index(self.axis)
+        arm = (_points(points_mm) - self.centre_mm) / radius
+        along = np.eye(3)[axis]
+        height = arm[:, axis].copy()
+        arm[:, axis] = 0
+        spread = 1 + (self.spreading * height) ** 2  # delta squared
+        axial, spin = injector_profiles(
+            (arm**2).sum(1) / spread,
+            self.radius_ratio,
+            self.mass_ratio,
+            self.shear_layer_mm / radius,
+            self.swirl_number,
+        )
+        outward = axial / spread * self.spreading**2 * height / spread  # radial velocity over radius
+        turning = spin / spread  # azimuthal velocity over radius: circulation is kept
+        displacement = outward[:, None] * arm + turning[:, None] * np.cross(along, arm)
+        displacement[:, axis] = axial / spread
+        return self.bulk_mm * displacement
+
+
 class Tracers(Table):
     """Flow given by tracers followed from one instant to another, mapped into a box of the volume.
 
@@ -190,8 +250,8 @@ class Tracers(Table):
         return self.size_mm, self.centre_mm, self.box, self.peak_mm
 
 
-Flow = Uniform | Shear | Ring | Swirl | Tracers
-KINDS = {model.model_fields["kind"].default: model for model in (Uniform, Shear, Ring, Swirl, Tracers)}
+Flow = Uniform | Shear | Ring | Swirl | SwirlingJet | Tracers
+KINDS = {model.model_fields["kind"].default: model for model in (Uniform, Shear, Ring, Swirl, SwirlingJet, Tracers)}
 """The flows by the ``kind`` a scene file names."""
 
 
@@ -261,14 +321,14 @@ def _window(window_mm: float | tuple[float, float, float]) -> np.ndarray:
 
 
 def window_mean(
-    flow: Flow, centres_mm: np.ndarray, window_mm: float | tuple[float, float, float], *, order: int = 6
+    flow: Flow | TurbulentFlow, centres_mm: np.ndarray, window_mm: float | tuple[float, float, float], *, order: int = 6
 ) -> np.ndarray:
     """Mean displacement of a flow over interrogation windows: what an ideal correlation would measure.
 
     Parameters
     ----------
     flow : callable
-        Points (n, 3) to displacements (n, 3) [mm].
+        Points (n, 3) to displacements (n, 3) [mm]. The fluctuating part of a `TurbulentFlow` is averaged exactly.
     centres_mm : ndarray, shape (n, 3)
         Window centres (x, y, z) [mm].
     window_mm : float or tuple of float
@@ -282,6 +342,9 @@ def window_mean(
         Mean displacement (x, y, z) [mm].
     """
     centres_mm, window = _points(centres_mm), _window(window_mm)
+    if isinstance(flow, TurbulentFlow):
+        turbulent = flow.fluctuation.window_mean(centres_mm, tuple(window))
+        return window_mean(flow.mean, centres_mm, tuple(window), order=order) + turbulent
     node, weight = np.polynomial.legendre.leggauss(order)
     nodes = np.stack(np.meshgrid(node, node, node, indexing="ij"), -1).reshape(-1, 3) * window / 2
     weights = np.einsum("i,j,k->ijk", weight, weight, weight).ravel() / 8

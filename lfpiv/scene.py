@@ -1,103 +1,21 @@
-"""Scene files of the simulator: what the cameras, the board, the particles and the flow truly are, as frozen models."""
+"""Scene files of the simulator: what cameras, board, particles and flow truly are, as frozen models."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from lfpiv.flows import KINDS, Flow, Tracers
-from lfpiv.rig import LensLattice, Optics
+from lfpiv.scenecamera import Aberrations, NonNegative, Point, SceneCamera, Windows, true_mapping
 from lfpiv.settings import Compute, Correlation, Count, Flag, Network, Number, Positive, Smart, Table
 from lfpiv.toml import read_toml
+from lfpiv.turbulence import Turbulence, TurbulentFlow
 
-NonNegative = Annotated[float, Field(strict=True, ge=0)]
-Pair = tuple[Number, Number]
-Point = tuple[Number, Number, Number]
-
-
-class SceneCamera(Table):
-    """Table ``[[camera]]``: nominal optics, which the user is told, and what is true, which the user is not."""
-
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
-    focal_length_mm: Positive
-    magnification: Number
-    f_number: Positive
-    microlens_pitch_mm: Positive
-    microlens_focal_length_mm: Positive
-    pixel_um: Positive
-    sensor_width_px: Count
-    sensor_height_px: Count
-    microlens_layout: Literal["square", "hexagonal"] = "square"
-    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
-    true_yaw_deg: Number | None = None
-    """True camera angle about y [degree]; absent: the nominal one."""
-    true_pitch_deg: Number = 0.0
-    true_roll_deg: Number = 0.0
-    """Right-handed rotations about the camera's x and z axis, after the yaw [degree]."""
-    true_offset_mm: Point = (0.0, 0.0, 0.0)
-    """World point that lies on the camera's axis and in focus (x, y, z) [mm]."""
-    true_array_roll_deg: Number = 0.0
-    """Rotation of the microlens array on the sensor [degree]."""
-    true_array_offset_mm: Pair = (0.0, 0.0)
-    """Centre (s, t) of a lens, relative to the sensor's centre [mm]."""
-    true_microlens_pitch_mm: Positive | None = None
-    """True pitch of the array [mm]; absent: the nominal one."""
-    blur_px: NonNegative = 0.4
-    """Standard deviation of the sensor's Gaussian point spread [pixel]."""
-    vignetting: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
-    """Fraction of the light lost in the sensor's corners; the loss grows with the square of the distance."""
-    lens_gain_sd: Annotated[float, Field(strict=True, ge=0, lt=0.5)] = 0.0
-    """Standard deviation of the microlenses' transmission."""
-    dark_image: Flag = False
-    """Whether a dark image is recorded."""
-    image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
-    """How the recorded images are mirrored."""
-
-    @field_validator("magnification")
-    @classmethod
-    def _not_zero(cls, value: float) -> float:
-        if value == 0:
-            raise ValueError("a number other than 0")
-        return value
-
-    @property
-    def optics(self) -> Optics:
-        """Nominal optics."""
-        return Optics(
-            focal_length_mm=self.focal_length_mm,
-            magnification=self.magnification,
-            f_number=self.f_number,
-            microlens_pitch_mm=self.microlens_pitch_mm,
-            microlens_focal_length_mm=self.microlens_focal_length_mm,
-            pixel_mm=self.pixel_um / 1000,
-            sensor_shape=(self.sensor_height_px, self.sensor_width_px),
-            layout=self.microlens_layout,
-        )
-
-    @property
-    def rotation(self) -> np.ndarray:
-        """World to camera, Rz Rx Ry with Ry the rotation of Eqs. 1-3, shape (3, 3)."""
-        yaw = self.nominal_angle_deg if self.true_yaw_deg is None else self.true_yaw_deg
-        (cy, sy), (cx, sx), (cz, sz) = (
-            (np.cos(angle), np.sin(angle)) for angle in np.radians([yaw, self.true_pitch_deg, self.true_roll_deg])
-        )
-        about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
-        about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-        about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        return about_z @ about_x @ about_y
-
-    @property
-    def lattice(self) -> LensLattice:
-        """The true microlens array in its own plane."""
-        pitch = self.true_microlens_pitch_mm or self.microlens_pitch_mm
-        roll = np.radians(self.true_array_roll_deg)
-        second = np.radians(60 if self.microlens_layout == "hexagonal" else 90)
-        basis = [(pitch * np.cos(angle + roll), pitch * np.sin(angle + roll)) for angle in (0.0, second)]
-        return LensLattice(origin_mm=self.true_array_offset_mm, basis_mm=tuple(basis), layout=self.microlens_layout)
+__all__ = ["Aberrations", "Scene", "SceneCamera", "Windows", "open_scene", "true_mapping"]
 
 
 class SceneBoard(Table):
@@ -197,10 +115,17 @@ class Scene(Table):
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
     dt_s: Positive
     camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1)]
+    window: Windows = ()
+    """Windows of the cameras that name none of their own."""
+    aberrations: Aberrations | None = None
+    """Aberrations of the cameras that name none of their own."""
     board: SceneBoard
     volume: SceneVolume
     particles: SceneParticles
     flow: Annotated[Flow, Field(discriminator="kind")]
+    """Displacement between the two frames, the same for every pair: with turbulence, its mean."""
+    turbulence: Turbulence | None = None
+    """Fluctuation added to the flow, another one for every pair."""
     exposure: Exposure = Exposure()
     noise: Noise = Noise()
     quality: Quality = Quality()
@@ -216,6 +141,30 @@ class Scene(Table):
             raise ValueError("a different name for each camera")
         return cameras
 
+    @field_validator("window", "aberrations")
+    @classmethod
+    def _suit_every_camera(cls, value: Any, info: ValidationInfo) -> Any:
+        optics = {"window": (), "aberrations": None} | {info.field_name: value}
+        try:
+            for camera in info.data.get("camera", ()):
+                camera.with_optics(**optics)
+        except ValidationError as error:
+            raise error.errors()[0]["ctx"]["error"] from None
+        return value
+
+    @field_validator("turbulence")
+    @classmethod
+    def _not_on_given_tracers(cls, turbulence: Turbulence | None, info: ValidationInfo) -> Turbulence | None:
+        if turbulence is not None and getattr(info.data.get("flow"), "as_given", False):
+            raise ValueError("no turbulence on top of tracers that move as_given")
+        return turbulence
+
+    @model_validator(mode="after")
+    def _hand_optics_to_cameras(self) -> Scene:
+        cameras = tuple(camera.with_optics(self.window, self.aberrations) for camera in self.camera)
+        object.__setattr__(self, "camera", cameras)
+        return self
+
     @field_validator("flow", mode="before")
     @classmethod
     def _known_flow(cls, table: Any) -> Any:
@@ -228,6 +177,12 @@ class Scene(Table):
             if unknown:
                 raise ValueError(f"for kind {kind!r} only the keys {', '.join(known)} (not {unknown[0]!r})")
         return table
+
+    def flow_of(self, pair: int) -> Flow | TurbulentFlow:
+        """Return the flow of one pair, mean and turbulence: points (n, 3) to displacements (n, 3) [mm]."""
+        if self.turbulence is None:
+            return self.flow
+        return TurbulentFlow(self.flow, self.turbulence.realisation(seed=(self.seed, 7, pair)))
 
 
 def open_scene(path: str | Path) -> Scene:
@@ -254,29 +209,3 @@ def open_scene(path: str | Path) -> Scene:
         flow.tracers()  # a missing or unsuitable file is refused here, before any work
         scene = scene.model_copy(update={"flow": flow})
     return scene
-
-
-def true_mapping(camera: SceneCamera | Mapping[str, Any]) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the true mapping of a simulated camera from points and pupil coordinates to the microlens array.
-
-    Parameters
-    ----------
-    camera : SceneCamera or mapping
-        A camera of a scene, or its table in ``truth/spec.json``.
-
-    Returns
-    -------
-    callable
-        ``(points_mm (n, 3), pupil_mm (n, 2)) -> (s, t) (n, 2)`` [mm], origin at the sensor's centre: s = k u - m x_c.
-    """
-    if not isinstance(camera, SceneCamera):
-        camera = SceneCamera.model_validate(camera)
-    optics, rotation, offset = camera.optics, camera.rotation, np.asarray(camera.true_offset_mm)
-
-    def mapping(points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
-        seen = (np.asarray(points_mm, float) - offset) @ rotation.T
-        m = optics.image_distance_mm / (optics.object_distance_mm - seen[..., 2:])
-        k = m * seen[..., 2:] / optics.object_distance_mm
-        return k * np.asarray(pupil_mm, float) - m * seen[..., :2]
-
-    return mapping

@@ -1,7 +1,8 @@
 """Simulated experiments: a scene file to white, board and particle images with their truth, in the contract's form.
 
-The model is thin lens, microlens array and sensor with a misaligned camera (Eqs. 1-3 and 9), rendered by rays, then
-blurred, exposed and read out with noise to 12 bits.
+The model is main lens, microlens array and sensor of a misaligned camera (Eqs. 1-3 and 9), with windows in front of it
+and third-order aberrations where the scene has them, rendered by rays, then blurred, exposed and read out with noise to
+12 bits.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from scipy.ndimage import gaussian_filter
 from lfpiv.errors import InputError
 from lfpiv.flows import Tracers
 from lfpiv.scene import Noise, Scene, SceneCamera, open_scene, true_mapping
-from lfpiv_kernels import render
+from lfpiv_kernels import collect, raytrace, render
 
 __all__ = ["DEMO_SCENE", "open_scene", "place_particles", "render_camera", "simulate", "true_mapping"]
 
@@ -39,6 +40,9 @@ DEMO_SCENE = Path(__file__).with_name("demo_scene.toml")
 
 FULL_SCALE = 4095
 """Largest count of the simulated 12-bit cameras."""
+
+AREA_STEP_MM = 1e-3
+"""Step of the differences that give the area of a dot's image."""
 
 LEAST_INTENSITY = 0.3
 """Particles scatter at least this much of the mean, however wide their intensities spread."""
@@ -63,13 +67,30 @@ def render_camera(camera: SceneCamera, *, seed: int | list[int] = 0) -> render.R
         pixel_mm=optics.pixel_mm,
         sensor_shape=optics.sensor_shape,
         rotation=camera.rotation,
-        offset_mm=np.asarray(camera.true_offset_mm, float),
+        offset_mm=camera.axis_point_mm,
         origin_mm=np.asarray(lattice.origin_mm, float),
         basis_mm=np.asarray(lattice.basis_mm, float),
         hexagonal=lattice.layout == "hexagonal",
         lens_gain=gain * np.maximum(0, 1 + camera.lens_gain_sd * spread),
         first_lens=(int(first[0]), int(first[1])),
+        plates=camera.plates,
+        aberrations=camera.seidel,
     )
+
+
+def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
+    """Area on the array per area of a plane of constant z, at points (n, 3) [mm], mean over the pupil, shape (n,)."""
+    optics, points_mm = camera.optics, np.asarray(points_mm, float)
+    if not camera.window and camera.aberrations is None:
+        seen = (points_mm - camera.axis_point_mm) @ camera.rotation.T
+        return abs(camera.rotation[2, 2]) * (optics.image_distance_mm / (optics.object_distance_mm - seen[:, 2])) ** 2
+    ring, angle = np.meshgrid(np.sqrt((np.arange(4) + 0.5) / 4), 2 * np.pi * np.arange(8) / 8)
+    pupil = optics.pupil_radius_mm * np.stack([ring * np.cos(angle), ring * np.sin(angle)], -1).reshape(-1, 2)
+    mapping, step = true_mapping(camera), AREA_STEP_MM * np.eye(3)[:2]
+    at, pupil = np.repeat(points_mm, len(pupil), axis=0), np.tile(pupil, (len(points_mm), 1))
+    along_x, along_y = ((mapping(at + h, pupil) - mapping(at - h, pupil)) / (2 * AREA_STEP_MM) for h in step)
+    area = np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0])
+    return area.reshape(len(points_mm), -1).mean(axis=1)
 
 
 def place_particles(scene: Scene, pair: int) -> Placed:
@@ -116,7 +137,7 @@ def place_particles(scene: Scene, pair: int) -> Placed:
         position, displacement = position[chosen], displacement[chosen]
     else:
         position = np.asarray(volume.centre_mm) + rng.uniform(-0.5, 0.5, (count, 3)) * size
-        displacement = scene.flow(position)
+        displacement = scene.flow_of(pair)(position)
     intensity = np.maximum(LEAST_INTENSITY, 1 + particles.intensity_sd * rng.standard_normal(len(position)))
     return position, displacement, intensity
 
@@ -174,7 +195,8 @@ def _check_view(scene: Scene, camera: SceneCamera, pairs: list[Placed]) -> None:
     ends = [position + sign * displacement for position, displacement, _ in pairs for sign in (-0.5, 0.5)]
     groups = (("board.planes_mm", "the dots", dots), ("volume.size_mm", "the particles", np.concatenate(ends)))
     for what, label, points in groups:
-        nearest = ((points - camera.true_offset_mm) @ camera.rotation.T)[:, 2].max()
+        _check_windows(camera, label, points)
+        nearest = ((points - camera.axis_point_mm) @ camera.rotation.T)[:, 2].max()
         if not nearest < optics.object_distance_mm / 2:
             raise InputError(
                 f"{what}: expected everything within {optics.object_distance_mm / 2:g} mm of the plane camera "
@@ -184,6 +206,33 @@ def _check_view(scene: Scene, camera: SceneCamera, pairs: list[Placed]) -> None:
         seen = float((np.abs(chief) <= half).all(1).mean())
         level = logging.INFO if seen > 0.5 else logging.WARNING
         log.log(level, "camera %s sees %.1f %% of %s", camera.name, 100 * seen, label)
+
+
+def _check_windows(camera: SceneCamera, label: str, points: np.ndarray) -> None:
+    """Refuse windows that do not stand between the points and the lens, or that rays only graze."""
+    so, radius = camera.optics.object_distance_mm, camera.optics.pupil_radius_mm
+    try:
+        seen = (points - camera.axis_point_mm) @ camera.rotation.T
+    except ValueError as error:  # windows so thick or so far out that nothing is in focus through them
+        raise InputError(f"camera {camera.name!r}: {error}") from None
+    edge = radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    pupil = np.column_stack([edge, np.full(len(edge), so)])
+    for number, (normal, level, thickness) in enumerate((p[:3], p[3], p[4]) for p in camera.plates):
+        where = f"camera {camera.name!r}, window[{number}]"
+        inside, beyond = (seen @ normal).max() - level, level + thickness - (pupil @ normal).min()
+        if inside >= 0 or beyond >= 0:
+            what, over = (label, inside) if inside >= 0 else ("the lens's pupil", beyond)
+            raise InputError(
+                f"{where}: expected a plate between {label} and the lens, found {what} {over:.3g} mm on the wrong side "
+                "of it. Check point_mm (a point of the surface nearer to the particles), normal and thickness_mm."
+            )
+        ray = pupil[:, None] - seen
+        steepest = ((ray @ normal) / np.linalg.norm(ray, axis=-1)).min()
+        if steepest < raytrace.STEEPEST:
+            raise InputError(
+                f"{where}: expected rays that enter it, found an angle of incidence of "
+                f"{np.degrees(np.arccos(steepest)):.0f} degrees. Turn its normal towards the camera."
+            )
 
 
 def _write(scene: Scene, pairs: list[Placed], folder: Path, progress: Progress) -> None:
@@ -201,6 +250,7 @@ def _write(scene: Scene, pairs: list[Placed], folder: Path, progress: Progress) 
     for pair, (position, displacement, intensity) in enumerate(pairs):
         truth[f"pair_{pair:04d}_positions_mm"] = position
         truth[f"pair_{pair:04d}_displacement_mm"] = displacement
+        truth[f"pair_{pair:04d}_velocity_m_s"] = displacement / scene.dt_s / 1000
         truth[f"pair_{pair:04d}_intensity"] = intensity
     np.savez_compressed(folder / "truth" / "particles.npz", **truth)
     spec = scene.model_dump(mode="json", exclude={"smart", "correlation", "network", "compute"}, exclude_none=True)
@@ -217,14 +267,14 @@ def _images(scene: Scene, number: int, pairs: list[Placed]) -> Iterator[tuple[st
         yield f"dark/{camera.name}.tif", np.zeros(eye.sensor_shape)
     yield (
         f"white/{camera.name}.tif",
-        exposure.white_counts * render.render_white(eye, samples=quality.pixel_rays, seed=seed),
+        exposure.white_counts * collect.render_white(eye, samples=quality.pixel_rays, seed=seed),
     )
 
     rays = render.ray_table(quality.dot_rays, "disc", seed)
     for plane, depth in enumerate(scene.board.planes_mm):
         path = f"board/{camera.name}/plane_{plane:02d}.tif"
         if scene.board.inverted:
-            image = render.render_board(
+            image = collect.render_board(
                 eye,
                 depth,
                 dots=scene.board.dots,
@@ -238,9 +288,8 @@ def _images(scene: Scene, number: int, pairs: list[Placed]) -> Iterator[tuple[st
             yield path, exposure.dot_counts * image
             continue
         dots = scene.board.dots_mm(depth)
-        m = eye.image_distance_mm / (eye.object_distance_mm - ((dots - eye.offset_mm) @ eye.rotation.T)[:, 2])
         # microlenses the image of a dot covers; a covered lens lights its whole microimage
-        lenses = np.pi / 4 * scene.board.dot_diameter_mm**2 * abs(eye.rotation[2, 2]) * m**2
+        lenses = np.pi / 4 * scene.board.dot_diameter_mm**2 * image_area(camera, dots)
         lenses /= abs(np.linalg.det(eye.basis_mm))
         rng = np.random.default_rng([scene.seed, 5, number, plane])
         counts = exposure.dot_counts * eye.microimage_px * lenses

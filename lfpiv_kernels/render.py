@@ -1,21 +1,20 @@
 """Taichi: render raw plenoptic images by sending rays through the main lens and the microlens array (Eqs. 1-3 and 9).
 
-Forward, from small bright sources, every ray adds its energy to the pixel it meets. Backward, from the sensor, every
-pixel collects what its rays see: the open pupil, or a calibration board.
+Forward, from small bright sources, every ray adds its energy to the pixel it meets; `collect` goes the other way.
 
 Sums are kept in 64-bit integers of `FIXED` units per count, so an image does not depend on the order in which threads
 add: it is the same on every run and for any number of threads.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import taichi as ti
 from scipy import stats
 from scipy.stats import qmc
 
-from lfpiv_kernels import runtime
+from lfpiv_kernels import raytrace, runtime
 from lfpiv_kernels.lattice import Lattice, lens_centre, nearest_lens, pack_lattice
 
 FIXED = 1 << 20
@@ -29,10 +28,7 @@ SOURCES = ("ball", "gaussian", "disc")
 
 Optics = ti.types.vector(8, ti.f32)
 """Object distance, image distance, pupil radius [mm], f_m/s_i, pixel [mm], rows, columns, microlens pitch [mm]."""
-Board = ti.types.vector(7, ti.f32)
-"""Plane z [mm], dots along x and y, spacing, dot radius [mm], light of a dot and between dots."""
 Matrix = ti.types.matrix(3, 3, ti.f32)
-Vector = ti.types.vector(3, ti.f32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +61,15 @@ class RenderCamera:
     """Transmission of each lens, shape (i, j); no light passes outside the table."""
     first_lens: tuple[int, int]
     """Lattice index (i, j) of ``lens_gain[0, 0]``."""
+    plates: np.ndarray = field(default_factory=lambda: np.empty((0, 7)))
+    """Windows between the particles and the lens, the one next to the particles first: `raytrace.pack_plates`."""
+    aberrations: np.ndarray = field(default_factory=lambda: np.zeros(9))
+    """Third-order aberrations of the main lens: `raytrace.Aberrations`."""
+
+    @property
+    def ideal(self) -> bool:
+        """Whether rays are those of a thin lens: no windows, no aberrations."""
+        return len(self.plates) == 0 and not np.any(self.aberrations[4:])
 
     @property
     def pitch_mm(self) -> float:
@@ -76,8 +81,8 @@ class RenderCamera:
         """Area of a fully lit microimage [pixel]."""
         return math.pi * (self.pupil_radius_mm * self.sensor_per_pupil / self.pixel_mm) ** 2
 
-    def _arguments(self) -> tuple:
-        """Give what both kernels take, in their order: rotation, optics, lattice, lens_gain, first_i, first_j."""
+    def arguments(self) -> tuple:
+        """Give what both kernels take, in their order: rotation to aberrations."""
         scale = (self.object_distance_mm, self.image_distance_mm, self.pupil_radius_mm, self.sensor_per_pupil)
         return (
             Matrix(np.asarray(self.rotation, float).tolist()),
@@ -85,6 +90,8 @@ class RenderCamera:
             pack_lattice(self.origin_mm, self.basis_mm),
             np.ascontiguousarray(self.lens_gain, np.float32),
             *map(int, self.first_lens),
+            np.ascontiguousarray(self.plates if len(self.plates) else raytrace.NO_PLATE, np.float32),
+            raytrace.Aberrations(*np.asarray(self.aberrations, float)),
         )
 
 
@@ -142,7 +149,11 @@ def _trace_sources(
     lens_gain: ti.types.ndarray(dtype=ti.f32, ndim=2),
     first_i: ti.i32,
     first_j: ti.i32,
+    plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `raytrace.pack_plates`
+    aberrations: raytrace.Aberrations,
     per_task: ti.i32,
+    glass: ti.template(),  # whether there are windows
+    aberrated: ti.template(),  # whether there are aberrations
     hexagonal: ti.template(),
     # out
     image_out: ti.types.ndarray(dtype=ti.i64, ndim=2),  # [1/FIXED count], added to
@@ -155,6 +166,7 @@ def _trace_sources(
         turn_c, turn_s = spin[source, 0], spin[source, 1]
         roll_c, roll_s = spin[source, 2], spin[source, 3]
         size = extent[source]
+        shift = ti.Vector([0.0, 0.0, 0.0])
         for ray in range(task * per_task, ti.min(rays.shape[0], (task + 1) * per_task)):
             a, b = rays[ray, 0], rays[ray, 1]
             u, v = radius * (turn_c * a - turn_s * b), radius * (turn_s * a + turn_c * b)
@@ -162,16 +174,24 @@ def _trace_sources(
             place = middle + rotation @ (
                 size * ti.Vector([roll_c * a - roll_s * b, roll_s * a + roll_c * b, rays[ray, 4]])
             )
+            if ti.static(glass):
+                shift = raytrace.apparent_shift(place, shift, u, v, so, plates)
+                place += shift
             m = si / (so - place[2])
             k = m * place[2] / so  # 1 - si/f + si/d without its cancellation
             s, t = k * u - m * place[0], k * v - m * place[1]
+            passes = True
+            if ti.static(aberrated):
+                passes = (s * s + t * t) * aberrations[3] ** 2 < raytrace.FIELD_STOP**2
+                error = raytrace.aberration(s, t, u, v, aberrations)
+                s, t = s + error[0], t + error[1]
             lens = nearest_lens(lattice, s, t, hexagonal)
             centre_st = lens_centre(lattice, lens[0], lens[1])
             i, j = ti.cast(lens[0], ti.i32) - first_i, ti.cast(lens[1], ti.i32) - first_j
             column = ti.cast(ti.floor((centre_st[0] + scale * (s - u)) / pixel + 0.5 * columns), ti.i32)
             row = ti.cast(ti.floor((centre_st[1] + scale * (t - v)) / pixel + 0.5 * rows), ti.i32)
             on_sensor = row >= 0 and row < rows and column >= 0 and column < columns
-            if on_sensor and i >= 0 and i < lens_gain.shape[0] and j >= 0 and j < lens_gain.shape[1]:
+            if passes and on_sensor and i >= 0 and i < lens_gain.shape[0] and j >= 0 and j < lens_gain.shape[1]:
                 ti.atomic_add(
                     image_out[row, column], ti.cast(ti.round(energy[source] * lens_gain[i, j] * FIXED), ti.i64)
                 )
@@ -229,175 +249,12 @@ def render_sources(
             np.ascontiguousarray(np.broadcast_to(extent_mm, count), np.float32),
             np.ascontiguousarray(np.broadcast_to(counts, count) / len(rays), np.float32),
             np.ascontiguousarray(rays, np.float32),
-            *camera._arguments(),
+            *camera.arguments(),
             RAYS_PER_TASK,
+            len(camera.plates) > 0,
+            bool(np.any(camera.aberrations[4:])),
             bool(camera.hexagonal),
             image,
         )
         ti.sync()
     return image / FIXED
-
-
-@ti.func
-def _dot_distance(s, t, u, v, so, si, rotation, offset, board):
-    """Distance of the point a ray comes from to the nearest dot's centre, on the board [mm]; and the ray's slant."""
-    start = ti.Vector([-s * so / si, -t * so / si, 0.0])
-    slope = ti.Vector([u / so + s / si, v / so + t / si, 1.0])
-    normal = ti.Vector([rotation[0, 2], rotation[1, 2], rotation[2, 2]])  # the world's z axis seen by the camera
-    level = rotation @ (ti.Vector([0.0, 0.0, board[0]]) - offset)
-    slant = normal.dot(slope)
-    depth = normal.dot(level - start) / slant
-    place = rotation.transpose() @ (start + depth * slope) + offset
-    x = place[0] / board[3] + 0.5 * (board[1] - 1)
-    y = place[1] / board[3] + 0.5 * (board[2] - 1)
-    i = ti.min(ti.max(ti.round(x), 0.0), board[1] - 1)
-    j = ti.min(ti.max(ti.round(y), 0.0), board[2] - 1)
-    return ti.Vector([board[3] * ti.sqrt((x - i) ** 2 + (y - j) ** 2), ti.abs(slant), depth])
-
-
-@ti.kernel
-def _collect_pixels(
-    # in
-    samples: ti.types.ndarray(dtype=ti.f32, ndim=2),  # place in the pixel (2) and in the lens's cell (2), -1/2 to 1/2
-    rotation: Matrix,  # world to camera
-    optics: Optics,
-    lattice: Lattice,
-    lens_gain: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    first_i: ti.i32,
-    first_j: ti.i32,
-    offset: Vector,
-    reach: ti.i32,  # lenses to each side whose light may reach a pixel
-    board: Board,
-    has_board: ti.template(),  # whether the rays end on a board or in uniform light
-    hexagonal: ti.template(),
-    # out
-    image_out: ti.types.ndarray(dtype=ti.f32, ndim=2),  # light relative to a fully lit pixel
-):
-    so, si, radius, scale, pixel = optics[0], optics[1], optics[2], optics[3], optics[4]
-    rows, columns, pitch = optics[5], optics[6], optics[7]
-    count = samples.shape[0]
-    half_pixel = 0.7072 * pixel
-    half_lens = 0.7072 * pitch
-    inner = radius * scale - half_pixel - half_lens * scale  # all rays of a pixel pass the pupil, or none
-    outer = radius * scale + half_pixel + half_lens * scale
-    for row, column in image_out:
-        x = (column + 0.5 - 0.5 * columns) * pixel
-        y = (row + 0.5 - 0.5 * rows) * pixel
-        home = nearest_lens(lattice, x / (1 + scale), y / (1 + scale), hexagonal)
-        total = 0.0
-        for a, b in ti.ndrange((-reach, reach + 1), (-reach, reach + 1)):
-            i, j = ti.cast(home[0], ti.i32) + a - first_i, ti.cast(home[1], ti.i32) + b - first_j
-            middle = lens_centre(lattice, home[0] + a, home[1] + b)
-            distance = ti.sqrt((x - middle[0] * (1 + scale)) ** 2 + (y - middle[1] * (1 + scale)) ** 2)
-            on_array = i >= 0 and i < lens_gain.shape[0] and j >= 0 and j < lens_gain.shape[1]
-            if on_array and distance < outer:
-                light, even = 1.0, True  # what the pixel's rays end on, where it is the same for all of them
-                if ti.static(has_board):
-                    u, v = middle[0] - (x - middle[0]) / scale, middle[1] - (y - middle[1]) / scale
-                    hit = _dot_distance(middle[0], middle[1], u, v, so, si, rotation, offset, board)
-                    spread = half_lens * (so - hit[2]) / si + half_pixel / scale * ti.abs(hit[2]) / so
-                    even = ti.abs(hit[0] - board[4]) > 1.2 * spread / hit[1]  # 20 % for the slant's change
-                    light = board[5] if hit[0] < board[4] else board[6]
-                seen = light
-                if distance > inner or not even:
-                    seen = 0.0
-                    for n in range(count):
-                        px, py = x + samples[n, 0] * pixel, y + samples[n, 1] * pixel
-                        p, q = samples[n, 2], samples[n, 3]  # a cell of the lattice: same area, same centre
-                        s = middle[0] + p * lattice[2] + q * lattice[4]
-                        t = middle[1] + p * lattice[3] + q * lattice[5]
-                        if ti.static(hexagonal):  # fold the corners of the rhombus into the lens's own hexagon
-                            own = nearest_lens(lattice, s, t, True)
-                            folded = lens_centre(lattice, own[0], own[1])
-                            s, t = s - folded[0] + middle[0], t - folded[1] + middle[1]
-                        u, v = s - (px - middle[0]) / scale, t - (py - middle[1]) / scale
-                        if u * u + v * v < radius * radius:
-                            if ti.static(has_board):
-                                if not even:
-                                    hit = _dot_distance(s, t, u, v, so, si, rotation, offset, board)
-                                    light = board[5] if hit[0] < board[4] else board[6]
-                            seen += light / count
-                total += seen * lens_gain[i, j]
-        image_out[row, column] = total
-
-
-def _collect(camera: RenderCamera, samples: int, seed: int, board: tuple | None) -> np.ndarray:
-    runtime.device()
-    bits = max(0, math.ceil(math.log2(samples)))
-    table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(seed)).random_base2(bits)
-    ratio = camera.pupil_radius_mm * camera.sensor_per_pupil / camera.pitch_mm
-    # a lens k steps away lies at least (k cos 30 - 0.58) pitch from a point nearest to its own lens
-    reach = max(1, math.ceil((ratio + 0.6) / 0.866) - 1)
-    image = np.empty(camera.sensor_shape, np.float32)
-    _collect_pixels(
-        (table - 0.5).astype(np.float32),
-        *camera._arguments(),
-        Vector(*np.asarray(camera.offset_mm, float)),
-        reach,
-        Board(*(board or (0.0,) * 7)),
-        board is not None,
-        bool(camera.hexagonal),
-        image,
-    )
-    ti.sync()
-    return image.astype(float)
-
-
-def render_white(camera: RenderCamera, *, samples: int, seed: int) -> np.ndarray:
-    """Image of uniform light: how much of each pixel the pupil's images cover.
-
-    Parameters
-    ----------
-    camera : RenderCamera
-        Camera to look through.
-    samples : int
-        Rays of a pixel that lies on the edge of a microimage; rounded up to a power of two.
-    seed : int
-        Seed of the rays.
-
-    Returns
-    -------
-    ndarray, shape (rows, columns), float64
-        Light relative to a fully lit pixel of a lens of gain 1.
-    """
-    return _collect(camera, samples, seed, None)
-
-
-def render_board(
-    camera: RenderCamera,
-    plane_mm: float,
-    *,
-    dots: tuple[int, int],
-    spacing_mm: float,
-    dot_diameter_mm: float,
-    dot_light: float,
-    board_light: float,
-    samples: int,
-    seed: int,
-) -> np.ndarray:
-    """Image of an endless, evenly radiant board with a grid of round dots in the plane z = plane_mm, traced backward.
-
-    Parameters
-    ----------
-    camera : RenderCamera
-        Camera to look through.
-    plane_mm : float
-        The board's z [mm].
-    dots : tuple of int
-        Dots along x and y, centred on the z axis.
-    spacing_mm, dot_diameter_mm : float
-        Distance of neighbouring dots and diameter of a dot [mm].
-    dot_light, board_light : float
-        Radiance of the dots and of the board between them.
-    samples : int
-        Rays of a pixel; rounded up to a power of two.
-    seed : int
-        Seed of the rays.
-
-    Returns
-    -------
-    ndarray, shape (rows, columns), float64
-        Light relative to a fully lit pixel of a lens of gain 1 looking at radiance 1.
-    """
-    board = (plane_mm, *dots, spacing_mm, dot_diameter_mm / 2, dot_light, board_light)
-    return _collect(camera, samples, seed, board)

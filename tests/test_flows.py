@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lfpiv import flows
+from lfpiv import flows, swirl, turbulence
 from lfpiv.errors import InputError
 
 ROUNDING = 1e-12  # a few float64 operations on values of order one
@@ -14,6 +14,10 @@ TRUTH_ROUNDING = 1e-11  # the sample's writer adds 1e-12 mm to the distance from
 LINEAR_FIT = 1e-8  # the local fit's ridge of 1e-10, times the condition of four points per unknown
 DIFFERENCE_STEP = 1e-5  # mm; central differences are good to its square, about 1e-10
 DIFFERENCE_ERROR = 1e-6  # rounding 1e-16 / step 1e-5, and third derivatives times the step's square, with a margin
+
+
+TRAPEZOID = 1e-6  # curvature times step squared / 12, of thousands of steps
+MONTE_CARLO = 5.0  # standard errors; 1e-6 chance per comparison
 
 
 def points(count, seed=0, half=3.0):
@@ -179,3 +183,96 @@ def test_shapes_are_checked():
     with pytest.raises(ValueError, match="window_mm"):
         flows.window_mean(ring, np.zeros((1, 3)), -1.0)
     assert ring(np.zeros((0, 3))).shape == (0, 3)
+
+
+def top_hat(radius_ratio, mass_ratio, angle_deg, nodes=20_001):
+    """Profiles of Eq. 17's derivation: two flat streams, the outer one turned; the step at one of the nodes."""
+    radius = np.concatenate([np.linspace(0, radius_ratio, nodes), np.linspace(radius_ratio, 1, nodes)])
+    outer = np.arange(len(radius)) >= nodes
+    axial = np.where(outer, 1.0, mass_ratio * (1 / radius_ratio**2 - 1))
+    return radius, axial, np.where(outer, np.tan(np.radians(angle_deg)), 0.0)
+
+
+def test_swirl_number_of_profiles_in_closed_form():
+    """Solid-body rotation in a uniform jet: half the wall's ratio; a swirled annulus round a channel: Eq. 17."""
+    radius = np.linspace(0, 3, 2001)
+    solid = swirl.swirl_number(radius, np.full(2001, 2.0), 0.7 * radius, nozzle_radius=3.0)
+    assert solid == pytest.approx(0.7 * 3 / (2 * 2.0), rel=TRAPEZOID)
+    for ratio, mass, angle in ((12 / 17, 0.42, 37.0), (0.5, 1.3, -50.0), (0.3, 0.0, 20.0)):
+        found = swirl.swirl_number(*top_hat(ratio, mass, angle), nozzle_radius=1.0)
+        assert found == pytest.approx(swirl.injector_swirl_number(angle, ratio, mass), rel=TRAPEZOID)
+    # the paper's injector: 37 degree vanes, radii of 12 and 17 mm, S = 0.55 to the digits given
+    assert round(swirl.injector_swirl_number(37.0, 12 / 17, 0.42), 2) == 0.55
+
+
+@pytest.mark.parametrize(
+    ("profiles", "said"),
+    [
+        (([0, 1], [1, 1, 1], [0, 0]), "one length"),
+        (([1, 0], [1, 1], [0, 0]), "rise"),
+        (([0, 1], [0, 0], [1, 1]), "no.* axis|not defined"),
+        (([0, np.nan], [1, 1], [1, 1]), "finite"),
+    ],
+)
+def test_bad_profiles_are_named(profiles, said):
+    with pytest.raises(ValueError, match=said):
+        swirl.swirl_number(*profiles, nozzle_radius=1.0)
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"swirl_number": -0.8, "mass_ratio": 2.0, "shear_layer_mm": 3.0, "axis": "z", "spreading": 0.2}]
+)
+def test_swirling_jet_keeps_its_swirl_number_and_its_flow(changes):
+    jet = flows.SwirlingJet(bulk_mm=0.4, centre_mm=(1.0, -2.0, 0.5), **changes)
+    number = "xyz".index(jet.axis)
+    along, sideways = np.eye(3)[number], np.eye(3)[(number + 1) % 3]
+    radius = np.linspace(0, 80, 8001)
+    for height in (0.0, 20.0):
+        at = np.array(jet.centre_mm) + height * along + radius[:, None] * sideways
+        moved = jet(at)
+        axial, azimuthal = moved @ along, moved @ np.cross(along, sideways)
+        flow = 2 * np.trapezoid(axial * radius, radius) / jet.nozzle_radius_mm**2
+        assert flow == pytest.approx(0.4, rel=TRAPEZOID * 10)  # the volume flow is kept at every height
+        turning = np.trapezoid(axial * azimuthal * radius**2, radius)
+        if height == 0:
+            found = swirl.swirl_number(radius, axial, azimuthal, nozzle_radius=jet.nozzle_radius_mm)
+            assert found == pytest.approx(jet.swirl_number, rel=TRAPEZOID * 10)
+            angular_momentum = turning
+        assert turning == pytest.approx(angular_momentum, rel=TRAPEZOID * 10)  # and its angular momentum
+    for place in np.array(jet.centre_mm) + 15 * points(40, 8, 1.0):
+        assert abs(np.trace(gradient(jet, place))) < DIFFERENCE_ERROR
+    on_axis = jet(np.array(jet.centre_mm) + np.outer([0, 5.0, 40], along))
+    assert np.allclose(on_axis, np.outer(on_axis @ along, along), atol=ROUNDING)
+    assert abs(on_axis[2] @ along) < abs(on_axis[0] @ along)  # the jet spreads and slows down
+
+
+def test_turbulence_has_the_scales_it_says():
+    """Mean zero, equal rms along x, y, z, no divergence, the stated integral scale, another field for every seed."""
+    table = turbulence.Turbulence(rms_mm=0.2, integral_scale_mm=1.5, smallest_mm=0.3, modes=400)
+    fields = [table.realisation(seed=(1, pair)) for pair in range(40)]
+    at = points(500, 9, 30.0)
+    moved = np.stack([field(at) for field in fields])
+    assert abs(moved.mean()) < MONTE_CARLO * 0.2 / np.sqrt(40 * 100)  # 40 fields of 60 mm hold thousands of scales
+    assert np.allclose((moved**2).mean((0, 1)), 0.2**2, rtol=0.03)  # 40 times 400 modes of random direction
+    for place in at[:5]:
+        assert abs(np.trace(gradient(fields[0], place))) < DIFFERENCE_ERROR
+    # longitudinal correlation over all space, a sum over modes, integrated until it has died away
+    many = [table.realisation(seed=(2, pair)) for pair in range(300)]
+    energy, wave = (np.concatenate([getattr(f, key)[:, 0] for f in many]) for key in ("amplitude_mm", "wave"))
+    lag = np.linspace(0, 15, 301)
+    correlation = np.array([(energy**2 * np.cos(wave * r)).sum() for r in lag]) / (energy**2).sum()
+    assert np.trapezoid(correlation, lag) == pytest.approx(1.5, rel=0.04)  # 120,000 modes
+    assert np.array_equal(table.realisation(seed=(1, 3))(at[:9]), fields[3](at[:9]))
+    assert abs(np.corrcoef(moved[0].ravel(), moved[1].ravel())[0, 1]) < 0.15
+    with pytest.raises(ValueError, match="smallest_mm"):
+        turbulence.Turbulence(rms_mm=0.2, integral_scale_mm=1.0, smallest_mm=3.0)
+
+
+def test_window_mean_of_turbulence_is_exact():
+    """In closed form what a fine quadrature finds, whatever the wavelength; the mean flow is averaged beside it."""
+    field = turbulence.Turbulence(rms_mm=0.2, integral_scale_mm=1.0, smallest_mm=0.4, modes=50).realisation(seed=4)
+    centres, window = points(3, 1), (1.6, 0.8, 1.2)
+    ring = flows.Ring(radius_mm=1.5, core_mm=0.7, peak_mm=0.2)
+    fine = flows.window_mean(lambda at: field(at), centres, window, order=24)
+    exact = flows.window_mean(turbulence.TurbulentFlow(ring, field), centres, window)
+    assert np.abs(exact - fine - flows.window_mean(ring, centres, window)).max() < 1e-9  # 24 nodes on four waves

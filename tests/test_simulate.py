@@ -17,7 +17,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment import open_experiment
 from lfpiv.scene import Noise, Scene, SceneCamera
 from lfpiv.simulate import DEMO_SCENE, _expose, open_scene, render_camera, simulate, true_mapping
-from lfpiv_kernels import render
+from lfpiv_kernels import collect, render
 
 ROUNDING = 1e-12  # float64, a few operations on millimetres
 MOVED_RAYS = (
@@ -165,7 +165,7 @@ def test_white_equals_rays_of_uniform_light(device, rig):
     # rays per wholly lit pixel: each cell of the array spreads its share over one microimage
     cell = abs(np.linalg.det(scene_camera.lattice.basis_mm))
     full = rays * cell / np.prod(2 * half) / eye.microimage_px
-    found = render.render_white(eye, samples=256, seed=0)
+    found = collect.render_white(eye, samples=256, seed=0)
     assert found.max() > (3.9 if rig == "overlapping" else 0.9)  # there four microimages share the corners' pixels
     score = (count / full - found) / np.sqrt((found + 0.05) / full)  # gains below 1 make it narrower still
     assert abs(score.mean()) < MONTE_CARLO / np.sqrt(score.size)
@@ -207,13 +207,13 @@ def test_board_equals_its_twin(device, rig):
     eye, samples = render_camera(scene_camera), 64
     table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(3)).random(samples) - 0.5
     expected = board_twin(scene_camera, 0.15, *board.values(), table)
-    found = render.render_board(eye, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
+    found = collect.render_board(eye, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
     assert expected.max() > 0.3
     assert np.abs(found - expected).max() <= EDGE_SAMPLES / samples
     assert (found == expected).mean() > 0.95  # the same rays: only float32 at an edge makes a difference
     # dark dots are the complement, up to a ray that lands exactly on an edge
-    inverse = render.render_board(eye, 0.15, **board, dot_light=0, board_light=1, samples=samples, seed=3)
-    white = render.render_white(eye, samples=samples, seed=3)
+    inverse = collect.render_board(eye, 0.15, **board, dot_light=0, board_light=1, samples=samples, seed=3)
+    white = collect.render_white(eye, samples=samples, seed=3)
     assert np.abs(found + inverse - white).max() <= EDGE_SAMPLES / samples
 
 
@@ -230,7 +230,7 @@ def test_dots_traced_forward_and_backward_agree(device, rig, tilt_error):
     m = eye.image_distance_mm / (eye.object_distance_mm - ((dots - eye.offset_mm) @ eye.rotation.T)[:, 2])
     lenses = np.pi * 0.05**2 * abs(eye.rotation[2, 2]) * m**2 / abs(np.linalg.det(eye.basis_mm))
     forward = render.render_sources(eye, dots, lenses * eye.microimage_px, 0.05, rays, rng=np.random.default_rng(0))
-    backward = render.render_board(
+    backward = collect.render_board(
         eye, 0.1, dots=(2, 1), spacing_mm=0.2, dot_diameter_mm=0.1, dot_light=1, board_light=0, samples=1024, seed=0
     )
     assert forward.sum() == pytest.approx(backward.sum(), rel=tilt_error)
@@ -427,7 +427,7 @@ def test_same_seed_same_files_and_a_flip_only_mirrors(small, tmp_path):
     ("old", "new", "said"),
     [
         ("f_number = 4.0", "f_numer = 4.0", "f_numer"),
-        ('kind = "swirl"', 'kind = "whirl"', "'uniform' or 'shear' or 'ring' or 'swirl' or 'tracers'"),
+        ('kind = "swirl"', 'kind = "whirl"', "'uniform' or 'shear' or 'ring' or 'swirl' or 'swirling_jet'"),
         ("core_mm = 0.2", "core = 0.2", "not 'core'"),
         ("per_microlens = 0.5", "per_microlens = 0.5\ncount = 3", "either per_microlens or count"),
         ("per_microlens = 0.5", "per_microlens = 1e-9", "at least one particle"),
@@ -499,7 +499,7 @@ def test_reproduces_the_sample_data(device, sample_data, number):
     rng = np.random.default_rng(0)
     disc, blob = render.ray_table(1 << 16, "disc", 0), render.ray_table(1 << 15, "gaussian", 0)
     images = {
-        f"white/{name}.tif": render.render_white(eye, samples=128, seed=0),
+        f"white/{name}.tif": collect.render_white(eye, samples=128, seed=0),
         f"board/{name}/plane_08.tif": render.render_sources(eye, dots, np.full(49, 200.0), 0.05, disc, rng=rng),
         f"particles/{name}/pair_0000_b.tif": render.render_sources(eye, position, intensity * 200, 0.02, blob, rng=rng),
     }
