@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -106,10 +107,12 @@ def measure_board(
     InputError
         If the images do not match the board or the camera, or no plane shows the board's dots.
     ValueError
-        If `estimator` is unknown.
+        If `estimator` is unknown, or the angle is not finite.
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator: expected one of {', '.join(map(repr, ESTIMATORS))}, got {estimator!r}.")
+    if not math.isfinite(nominal_angle_deg):
+        raise ValueError(f"nominal_angle_deg: expected a finite angle [degree], got {nominal_angle_deg}.")
     if len(images) != len(board.planes_mm):
         raise InputError(f"images: expected one per plane, {len(board.planes_mm)}, got {len(images)}.")
     signals = _Signals(images, decoder)
@@ -134,6 +137,9 @@ class _Signals(Sequence):
                     f"plane {plane} of the board: expected an image of shape {tuple(decoder.optics.sensor_shape)}, "
                     f"got {np.shape(image)}."
                 )
+            bad = np.size(image) - np.count_nonzero(np.isfinite(image))
+            if bad:
+                raise InputError(f"plane {plane} of the board: expected finite counts, got {bad} pixels that are not.")
             levels.append(decoder.background(image))
         self._levels = levels
         self.noise = float(np.median([sigma for _, sigma in levels]))

@@ -197,7 +197,7 @@ class Rectifier:
 
 def match_lattice(
     peaks_mm: np.ndarray, contrast: np.ndarray, dots: tuple[int, int], spacing_mm: float
-) -> tuple[np.ndarray, np.ndarray, float]:
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Find the lattice in a cloud of blobs that may lack dots and hold false ones.
 
     The two periods are the wave vectors near (1, 0) and (0, 1) per spacing whose plane waves the blobs follow best; the
@@ -211,8 +211,10 @@ def match_lattice(
         Which blobs they are.
     score : float
         Sum of the contrasts of the members.
+    regular : ndarray of bool, shape (blobs,)
+        Which blobs lie on the lattice, on the board or beyond it.
     """
-    nothing = np.empty((0, 2), int), np.empty(0, int), 0.0
+    nothing = np.empty((0, 2), int), np.empty(0, int), 0.0, np.zeros(len(peaks_mm), bool)
     if len(peaks_mm) < 1:
         return nothing
     weight = np.minimum(contrast, 3 * np.median(contrast))
@@ -240,14 +242,14 @@ def match_lattice(
     index = np.rint(place).astype(int)
     middle = (np.array(dots) - 1) / 2
     index += np.rint(middle + phase).astype(int)  # the origin's place is -phase: the board's middle lands next to it
-    on_board = ((index >= 0) & (index < dots)).all(1) & (np.hypot(*(place - np.rint(place)).T) < _INLIER_SPACINGS)
-    member = np.flatnonzero(on_board)
+    regular = np.hypot(*(place - np.rint(place)).T) < _INLIER_SPACINGS
+    member = np.flatnonzero(((index >= 0) & (index < dots)).all(1) & regular)
     member = member[np.argsort(-contrast[member], kind="stable")]  # of two blobs at one place the stronger
     _, first = np.unique(index[member], axis=0, return_index=True)
     member = np.sort(member[first])
     if len(member) < 1:
         return nothing
-    return index[member], member, float(contrast[member].sum())
+    return index[member], member, float(contrast[member].sum()), regular
 
 
 def strong_enough(contrast: np.ndarray) -> np.ndarray:

@@ -109,13 +109,14 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
     Parameters
     ----------
     volumes : dict
-        Frame name -> volume (z, y, x) with ``residual`` (one number per iteration) and ``stop`` in its attributes.
+        Frame name -> volume (z, y, x) with ``residual`` (one number per iteration) and ``stop`` in its attributes, and
+        ``cameras`` with the ``structure`` of their images, where known.
 
     Returns
     -------
     Dataset
         ``projection_z`` (frame, y, x), ``projection_y`` (frame, z, x), ``projection_x`` (frame, z, y) [counts],
-        ``residual`` (frame, iteration) and ``stop`` (frame).
+        ``residual`` (frame, iteration), ``stop`` (frame) and, where known, ``structure`` (frame, camera).
     """
     frames = list(volumes)
     first = volumes[frames[0]]
@@ -130,7 +131,13 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
         row[: len(history)] = history
     variables["residual"] = (("frame", "iteration"), residual)
     variables["stop"] = (("frame",), [str(volume.attrs["stop"]) for volume in volumes.values()])
-    coordinates = {"frame": frames} | {axis: (axis, first[axis].values, {"units": "mm"}) for axis in _AXES}
+    coordinates: dict[str, Any] = {"frame": frames}
+    if "structure" in first.attrs:
+        structure = [np.atleast_1d(np.asarray(volume.attrs["structure"], float)) for volume in volumes.values()]
+        variables["structure"] = (("frame", "camera"), np.stack(structure))
+        cameras = first.attrs["cameras"]
+        coordinates["camera"] = json.loads(cameras) if isinstance(cameras, str) else list(cameras)
+    coordinates |= {axis: (axis, first[axis].values, {"units": "mm"}) for axis in _AXES}
     return xr.Dataset(variables, coordinates)
 
 

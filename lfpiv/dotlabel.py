@@ -104,7 +104,7 @@ def label_by_integral(
     slopes = np.array([np.trace(slope_of(fits[k].coefficients, radius)) / 2 for k in good])
     chief = np.array([fits[k].coefficients[0] for k in good])
     rounds.pose = pose = detection.pose.fitted(points[good], chief, optics, slopes)
-    candidates = np.union1d(dot, np.flatnonzero(detection.in_field.ravel()))
+    candidates = _candidates(detection, board)
     wanted = board.of_dots_mm(candidates)
     change = np.stack([fits[k].coefficients for k in good]) - _pose_terms(pose, points[good], radius)
     spread = np.stack([_spread(fits[k]) for k in good])
@@ -119,6 +119,17 @@ def label_by_integral(
     return _integral_labels(
         fits, candidates, trusted, np.isin(candidates, dot) & ~trusted, decoder, share, diameter, blur
     )
+
+
+def _candidates(detection: Detection, board: DotBoard) -> np.ndarray:
+    """Numbers of the dots worth a fit: the detected ones and, in planes that show the board, all others in the field.
+
+    In a plane without dots, such as a blank image, fits from a good guess would find some in its noise.
+    """
+    seen = np.bincount(detection.dot // board.size, minlength=len(detection.in_field))
+    shown = (seen > 0) & (seen >= np.minimum(FEWEST_DOTS, detection.in_field.sum(1)))
+    in_field = np.flatnonzero((detection.in_field & shown[:, None]).ravel())
+    return np.union1d(detection.dot[shown[detection.dot // board.size]], in_field)
 
 
 class _Rounds:

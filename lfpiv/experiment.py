@@ -7,15 +7,24 @@ import string
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
 
-from lfpiv import images
+from lfpiv import images, view
 from lfpiv.errors import InputError
 from lfpiv.rig import Grid, Optics
-from lfpiv.settings import SMALLEST_WINDOW, Compute, Correlation, Count, Network, Number, Positive, Smart, Table
+from lfpiv.settings import (
+    SMALLEST_WINDOW,
+    Board,
+    CameraTable,
+    Compute,
+    Correlation,
+    ExperimentTable,
+    Network,
+    Smart,
+    Volume,
+)
 from lfpiv.toml import read_toml
 
 DECODED_PIXELS = 100_000_000
@@ -23,97 +32,6 @@ DECODED_PIXELS = 100_000_000
 
 FEWEST_LENSES = 3
 """Microlenses a sensor must hold along each axis; fewer are a slip in the pitch or the pixel."""
-
-
-class CameraTable(Table):
-    """Table ``[[camera]]``: nominal optics and images of one camera."""
-
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
-    white_image: Annotated[str, Field(min_length=1)]
-    dark_image: Annotated[str, Field(min_length=1)] | None = None
-    image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
-    focal_length_mm: Positive
-    magnification: Number
-    f_number: Positive
-    microlens_pitch_mm: Positive
-    microlens_focal_length_mm: Positive
-    pixel_um: Positive
-    microlens_layout: Literal["square", "hexagonal"] = "square"
-    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
-
-    @field_validator("magnification")
-    @classmethod
-    def _not_zero(cls, value: float) -> float:
-        if value == 0:
-            raise ValueError("a number other than 0")
-        return value
-
-
-class Board(Table):
-    """Table ``[board]``: the dot board and the depths it was recorded at."""
-
-    dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
-    """Dots along x and y."""
-    spacing_mm: Positive
-    """Distance of neighbouring dots [mm]."""
-    dot_diameter_mm: Positive
-    """Diameter of a dot [mm]."""
-    planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
-    """Depth z of each plane [mm]."""
-    images: Annotated[str, Field(min_length=1)]
-    """Path with ``{camera}`` and ``{plane}``, planes counted from 0."""
-
-    @field_validator("planes_mm")
-    @classmethod
-    def _distinct(cls, planes: tuple[float, ...]) -> tuple[float, ...]:
-        if len(set(planes)) != len(planes):
-            raise ValueError("a different depth for each plane")
-        return planes
-
-    @model_validator(mode="after")
-    def _dots_apart(self) -> Board:
-        if self.dot_diameter_mm >= self.spacing_mm:
-            raise ValueError("dot_diameter_mm smaller than spacing_mm")
-        return self
-
-
-class Volume(Table):
-    """Table ``[volume]``: the grid to reconstruct on; (x, y, z) order."""
-
-    centre_mm: tuple[Number, Number, Number]
-    size_mm: tuple[Positive, Positive, Positive]
-    voxel_mm: Positive
-
-
-class Particles(Table):
-    """Table ``[particles]``: the image pairs."""
-
-    images: Annotated[str, Field(min_length=1)]
-    """Path with ``{camera}``, ``{pair}`` and ``{frame}``, pairs counted from 0."""
-    pairs: Count
-    frames: tuple[Annotated[str, Field(min_length=1)], Annotated[str, Field(min_length=1)]] = ("a", "b")
-
-    @field_validator("frames")
-    @classmethod
-    def _differ(cls, frames: tuple[str, str]) -> tuple[str, str]:
-        if frames[0] == frames[1]:
-            raise ValueError("two different frame names")
-        return frames
-
-
-class ExperimentTable(Table):
-    """The whole file."""
-
-    name: Annotated[str, Field(min_length=1)]
-    dt_s: Positive
-    camera: Annotated[tuple[CameraTable, ...], Field(min_length=1)]
-    board: Board
-    volume: Volume
-    particles: Particles
-    smart: Smart = Smart()
-    correlation: Correlation = Correlation()
-    network: Network = Network()
-    compute: Compute = Compute()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,11 +70,11 @@ class Experiment:
     """Path pattern of the particle images, relative to the experiment file."""
 
     def camera(self, name: str) -> CameraSetup:
-        """Return the camera called `name`; KeyError names the known ones."""
+        """Return the camera called `name`; ValueError names the known ones."""
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        raise KeyError(f"no camera {name!r}; the experiment has {', '.join(c.name for c in self.cameras)}")
+        raise ValueError(f"camera: expected one of {', '.join(c.name for c in self.cameras)}, got {name!r}.")
 
     def white(self, name: str) -> np.ndarray:
         """White image of a camera, float32 (rows, columns), dark not subtracted."""
@@ -219,7 +137,8 @@ def open_experiment(path: str | Path) -> Experiment:
     Raises
     ------
     InputError
-        If a key is unknown, missing or out of range, or an image is missing, damaged, or does not fit the others.
+        If a key is unknown, missing or out of range, an image is missing, damaged, or does not fit the others, or the
+        nominal cameras certainly see nothing of the volume.
     """
     path = Path(path)
     table = read_toml(path, ExperimentTable)
@@ -253,6 +172,9 @@ def open_experiment(path: str | Path) -> Experiment:
         compute=table.compute,
         particle_images=table.particles.images,
     )
+    for camera in experiment.cameras:
+        view.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)
+        view.require_volume(path, grid, camera.name, camera.optics, camera.nominal_angle_deg)
     _check_images(experiment)
     return experiment
 

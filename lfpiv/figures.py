@@ -17,12 +17,14 @@ INK = "#808890"
 """Axes and text: half-way between a light and a dark page."""
 COLOURS = ("#2f81d6", "#e0762a", "#2ca36b", "#c2478f", "#8a6fd1", "#9a8d2a")
 """Lines and marks, told apart also by the colour-blind."""
-DPI = 110
+DPI = 150
 
 MOST_SLICES = 6
 """Depths shown of a vector volume."""
 MOST_ARROWS = 40
 """Arrows along an axis; more are thinned out."""
+KEY_INCH = 0.28
+"""Height of the line with the arrows' scale [inch]."""
 
 
 def lens_centres(white: np.ndarray, optics: Optics, lattice: LensLattice, across: int = 7) -> bytes:
@@ -162,7 +164,7 @@ def projections(reconstruction: xr.Dataset, frame: int = 0) -> bytes:
 
 
 def vector_slices(vectors: xr.Dataset, normal: str = "z", most: int = MOST_SLICES) -> bytes:
-    """Slices of a vector volume: arrows for the components in the slice, colour for the one across it.
+    """Slices of a vector volume: arrows with their scale for components in the slice, colour for the one across it.
 
     Parameters
     ----------
@@ -179,8 +181,10 @@ def vector_slices(vectors: xr.Dataset, normal: str = "z", most: int = MOST_SLICE
     places = [count // 2] if most == 1 else np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
     columns = min(3, len(places))
     rows = -(-len(places) // columns)
-    spans = [float(np.ptp(vectors[axis].values)) + _spacing(vectors[axis].values) for axis in (across, up)]
-    height = 3.2 * rows * float(np.clip(spans[1] / spans[0], 0.4, 1.6)) + 0.6
+    apart = {axis: _spacing(vectors[axis].values) for axis in "xyz" if vectors.sizes[axis] > 1}
+    apart = {axis: apart.get(axis, min(apart.values(), default=1.0)) for axis in "xyz"}  # a single layer has no spacing
+    spans = [float(np.ptp(vectors[axis].values)) + apart[axis] for axis in (across, up)]
+    height = 3.2 * rows * float(np.clip(spans[1] / spans[0], 0.4, 1.6)) + 0.6 + KEY_INCH
     figure = _figure(3.3 * columns + 1.2, height, layout="compressed")
     good = vectors["valid"].values & np.isfinite(vectors["u"].values)
     through = np.abs(vectors[component[normal]].values[good])
@@ -188,16 +192,16 @@ def vector_slices(vectors: xr.Dataset, normal: str = "z", most: int = MOST_SLICE
     limit, longest = (float(np.percentile(values, 99)) if values.size else 1.0 for values in (through, inside))
     norm = Normalize(-(limit or 1.0), limit or 1.0)
     step = max(-(-max(vectors.sizes[across], vectors.sizes[up]) // MOST_ARROWS), 1)
-    scale = (longest or 1.0) / (1.3 * step * min(_spacing(vectors[axis].values) for axis in (across, up)))
+    scale = (longest or 1.0) / (1.3 * step * min(apart[axis] for axis in (across, up)))
     for number, place in enumerate(places):
         axes = figure.add_subplot(rows, columns, number + 1)
         slab = vectors.isel({normal: int(place)}).transpose(up, across)
-        ground = (slab[across].values, slab[up].values, slab[component[normal]].values)
-        colour = axes.pcolormesh(*ground, cmap="RdBu_r", norm=norm, shading="nearest", alpha=0.85)
+        edges = (_edges(slab[axis].values, apart[axis]) for axis in (across, up))
+        colour = axes.pcolormesh(*edges, slab[component[normal]].values, cmap="RdBu_r", norm=norm, alpha=0.85)
         thin = slab.isel({across: slice(None, None, step), up: slice(None, None, step)})
         for shown, tint in ((thin["valid"].values, "#101418"), (~thin["valid"].values, "#9aa0a6")):
             arrows = [np.where(shown, thin[component[axis]].values, np.nan) for axis in (across, up)]
-            axes.quiver(
+            quiver = axes.quiver(
                 thin[across].values,
                 thin[up].values,
                 *arrows,
@@ -211,6 +215,7 @@ def vector_slices(vectors: xr.Dataset, normal: str = "z", most: int = MOST_SLICE
         axes.set(xlabel=f"{across} [mm]", ylabel=f"{up} [mm]" if number % columns == 0 else "")
         _style(axes)
     _style_bar(figure.colorbar(colour, ax=figure.axes, shrink=0.7), f"{component[normal]} [m/s]")
+    _arrow_scale(figure, quiver, longest, f"along {across} and {up}")
     return _png(figure)
 
 
@@ -248,6 +253,36 @@ def _extent(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, fl
         half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
         edges += [axis[0] - half, axis[-1] + half]
     return tuple(edges)
+
+
+def _arrow_scale(figure: Figure, quiver, longest: float, where: str) -> None:
+    """Put an arrow of a round speed [m/s] and what it stands for above the slices."""
+    speed = _round_below(longest)
+    if speed == 0:
+        return
+    height = figure.get_figheight()
+    figure.get_layout_engine().set(rect=(0, 0, 1, 1 - KEY_INCH / height))
+    figure.draw_without_rendering()  # the layout first: the key's length is fixed when it is first drawn
+    figure.set_layout_engine("none")
+    key = {"labelpos": "E", "coordinates": "figure", "color": INK}
+    drawn = figure.axes[0].quiverkey(quiver, 0.0, 1 - KEY_INCH / 2 / height, speed, f"{speed:g} m/s {where}", **key)
+    drawn.text.set(color=INK, fontsize=9)
+    axes = quiver.axes
+    length = speed / quiver.scale * axes.bbox.width / np.ptp(axes.get_xlim())
+    drawn.X = (length + 8) / figure.bbox.width  # where its tip lies
+
+
+def _round_below(value: float) -> float:
+    """Largest of 1, 2, 5, 10, ... times a power of ten up to a value; 0 where there is none."""
+    if not (np.isfinite(value) and value > 0):
+        return 0.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))
+
+
+def _edges(positions: np.ndarray, spacing: float) -> np.ndarray:
+    """Edges of evenly spaced cells around positions."""
+    return np.append(positions - spacing / 2, positions[-1] + spacing / 2)
 
 
 def _spacing(positions: np.ndarray) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +18,8 @@ import lfpiv
 from lfpiv import dataset, memory, summary
 from lfpiv.errors import InputError
 from lfpiv.experiment import Experiment, open_experiment
+from lfpiv.folder import Folder, make_writable
+from lfpiv.structure import structure
 from lfpiv_kernels import runtime
 
 if TYPE_CHECKING:
@@ -32,39 +33,6 @@ Progress = Callable[[str, float], None]
 
 FRAME_SHARE = 0.45
 """Part of a pair's work that one of its volumes takes, for progress bars."""
-
-FRAME_NAMES = "ab"
-"""Names of the two frames in output files, whatever the images call them."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Folder:
-    """Where a run keeps its files."""
-
-    path: Path
-
-    @property
-    def calibration(self) -> Path:
-        """The calibration of all cameras."""
-        return self.path / "calibration.h5"
-
-    @property
-    def summary(self) -> Path:
-        """Machine-readable figures of the run."""
-        return self.path / "summary.json"
-
-    @property
-    def report(self) -> Path:
-        """The page for people."""
-        return self.path / "report.html"
-
-    def vectors(self, pair: int) -> Path:
-        """Vectors of one pair."""
-        return self.path / "vectors" / f"pair_{pair:04d}.nc"
-
-    def volume(self, pair: int, frame: int) -> Path:
-        """Volume of one frame (0 or 1) of a pair."""
-        return self.path / "volumes" / f"pair_{pair:04d}_{FRAME_NAMES[frame]}.nc"
 
 
 @contextlib.contextmanager
@@ -82,7 +50,7 @@ def open_job(
     folder = Folder(Path(out))
     numbers = _select(experiment, pairs)
     memory.require(memory.least_bytes(experiment), experiment, "volumes of")
-    made = _make_writable(folder.path)
+    made = make_writable(folder.path)
     collector = _WarningCollector(level=logging.WARNING)
     loggers = [logging.getLogger(name) for name in ("lfpiv", "lfpiv_kernels")]
     for logger in loggers:
@@ -100,40 +68,6 @@ def open_job(
         for path in made:
             with contextlib.suppress(OSError):  # not empty: the run got somewhere
                 path.rmdir()
-
-
-def _make_writable(path: Path) -> list[Path]:
-    """Make a folder and check that it can be written; return the folders made, innermost first."""
-    made = []
-    try:
-        for parent in (path, *path.parents):
-            if parent.exists():
-                break
-            made.append(parent)
-        path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".write-test-{os.getpid()}"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        for parent in made:
-            with contextlib.suppress(OSError):
-                parent.rmdir()
-        raise InputError(
-            f"{path}: expected an output folder that can be written, found: {(error.strerror or str(error)).lower()}. "
-            "Choose another one with --out."
-        ) from None
-    folder = Folder(path)
-    for place in (folder.vectors(0).parent, folder.volume(0, 0).parent):
-        if place.exists() and not place.is_dir():
-            raise InputError(
-                f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
-            )
-    for place in (folder.calibration, folder.summary, folder.report):
-        if place.is_dir():
-            raise InputError(
-                f"{place}: expected a place for a file, found a folder. Remove it or choose another --out."
-            )
-    return made
 
 
 def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> range:
@@ -298,9 +232,11 @@ class Job:
     def build_weights(self, calibration: Calibration) -> Weights:
         """Build the weights of the grid."""
         from lfpiv.calibration import warn_outside
+        from lfpiv.view import require_seen
         from lfpiv.weights import build_weights, compare_with_count
 
         method = self.experiment.compute.weights
+        require_seen(self.experiment.path, calibration, self.experiment.grid)
         warn_outside(calibration, self.experiment.grid)
         if len(calibration.cameras) == 1:
             log.warning(
@@ -312,9 +248,9 @@ class Job:
         if method == "footprint":
             errors = [error for camera in compare_with_count(weights).values() for error in camera]
             self.weights_report["count_check_l2"] = [round(error, 4) for error in errors]
-            log.info(
-                "weights differ from counted rays by %.1f %% (mean of %d voxels)", 100 * np.mean(errors), len(errors)
-            )
+            if errors:  # of the few voxels drawn some camera may see none
+                share = 100 * np.mean(errors)
+                log.info("weights differ from counted rays by %.1f %% (mean of %d voxels)", share, len(errors))
         return weights
 
     def reconstruct(self, calibration: Calibration, weights: Weights, pair: int, *, keep: bool) -> list[xr.DataArray]:
@@ -325,12 +261,14 @@ class Job:
         for number, frame in enumerate(experiment.frames):
             with self.timed(f"volume {pair} {number}"):
                 light, noise = self.read_light(calibration, pair, frame)
+                shown = {name: structure(image, calibration.cameras[name].decoder) for name, image in light.items()}
                 settings = experiment.smart.model_dump()
                 progress = self.pair_step(number * FRAME_SHARE, FRAME_SHARE)
                 try:
                     volume = reconstruct_volume(weights, light, floor=noise, progress=progress, **settings)
                 except ValueError as error:
                     raise InputError(f"pair {pair}, frame {frame!r}: {error}") from error
+            volume.attrs |= {"cameras": list(shown), "structure": list(shown.values())}
             volumes.append(volume)
             if keep:
                 path = self.folder.volume(pair, number)

@@ -55,7 +55,7 @@ def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndar
     if nominal and abs(np.hypot(*lag) / nominal - 1) > NOMINAL_TOLERANCE:
         raise InputError(
             f"nominal_pitch_px: expected the pitch of the white image, about {np.hypot(*lag):.1f} px, got {nominal:g}. "
-            "Check microlens pitch and pixel size, or leave it out."
+            "Check microlens pitch and pixel size."
         )
     return _refine_basis(chosen, _standard_basis(lag, layout), chosen_peaks[1])
 

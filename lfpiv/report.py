@@ -23,6 +23,11 @@ log = logging.getLogger(__name__)
 RIM_POINTS = 48
 """Points on the pupil's edge that draw the outline of a dot's light."""
 
+CSS_DPI = 96
+"""Pixels of a web page per inch of a figure."""
+ENLARGED = 1.6
+"""Width of a figure at full size over its own: what its resolution still holds sharply."""
+
 _STYLE = """
 :root { color-scheme: light dark; --page: #ffffff; --card: #f5f6f8; --ink: #1b1f24; --quiet: #5b6570; --line: #d9dee4;
         --warn: #fff4d6; --warn-line: #d9a400; --accent: #1f6fc4; }
@@ -47,6 +52,19 @@ table { border-collapse: collapse; margin: 8px 0; font-variant-numeric: tabular-
 th, td { text-align: right; padding: 4px 12px; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; } th { color: var(--quiet); font-weight: 500; }
 figure { margin: 12px 0 18px; } figure img { max-width: 100%; height: auto; display: block; }
+.zoom { display: block; overflow-x: auto; cursor: zoom-in; }
+.zoom input { position: absolute; opacity: 0; }
+.zoom:has(input:checked) { cursor: zoom-out; } .zoom:has(input:focus-visible) { outline: 2px solid var(--accent); }
+.zoom input:checked + img { max-width: none; width: var(--full); }
+.zoom::after { content: "click for full size"; position: sticky; left: 0; color: var(--quiet); font-size: 12.5px; }
+.zoom:has(input:checked)::after { content: "click to fit the page"; }
+@media (max-width: 760px) {
+  main { padding: 16px 14px 40px; }
+  .zoom img { max-width: none; }
+  .zoom::after { content: "scroll sideways, or tap to fit the screen"; }
+  .zoom input:checked + img { max-width: 100%; width: auto; }
+  .zoom:has(input:checked)::after { content: "tap to enlarge"; } }
+@media print { .zoom::after { content: none; } }
 figcaption { color: var(--quiet); font-size: 13.5px; max-width: 860px; }
 details { margin: 10px 0; } summary { cursor: pointer; color: var(--accent); }
 code { font-size: 13px; }
@@ -93,7 +111,8 @@ def write_report(
 
 
 def _head(experiment: Experiment, summary: Mapping[str, Any]) -> str:
-    cards = [(str(len(summary["pairs"])), "image pairs finished")]
+    pairs = len(summary["pairs"])
+    cards = [(str(pairs), f"image {'pair' if pairs == 1 else 'pairs'} finished")]
     if summary["pairs"]:
         cards.append((_percent(summary["valid_fraction"]), "valid vectors"))
         cards.append(
@@ -109,7 +128,7 @@ def _head(experiment: Experiment, summary: Mapping[str, Any]) -> str:
     )
     return (
         f"<h1>{html.escape(experiment.name)}</h1>"
-        f'<p class="quiet">Multi-camera light-field PIV, {len(experiment.cameras)} cameras, '
+        f'<p class="quiet">Multi-camera light-field PIV, {_count(len(experiment.cameras), "camera")}, '
         f"lfpiv {html.escape(summary['versions']['lfpiv'])}</p>"
         f'<div class="cards">{boxes}</div>'
     )
@@ -150,10 +169,12 @@ def _calibration_section(experiment: Experiment, calibration: Calibration, summa
         ("lens array rms [px]", "lens_array_rms_px", 4),
         ("lens pitch [px]", "lens_array_pitch_px", 4),
         ("array roll [°]", "lens_array_rotation_deg", 3),
+        ("network's correction, rms [pitch]", "network_correction_pitch", 4),
         ("training [s]", "training_s", 1),
     )
     reports = summary["calibration"]
-    columns = tuple(column for column in columns if any(column[1] in report for report in reports.values()))
+    known = {key for report in reports.values() for key, value in report.items() if value is not None}
+    columns = tuple(column for column in columns if column[1] in known)
     rows = [
         [name, *(_number(report.get(key), digits) for _, key, digits in columns)] for name, report in reports.items()
     ]
@@ -337,10 +358,17 @@ def _small_print(summary: Mapping[str, Any]) -> str:
 
 
 def _figure(draw: Callable[[], bytes], caption: str) -> str:
-    image = base64.b64encode(draw()).decode()
+    """Figure that fits the page and opens at full size on a click; on narrow screens it scrolls, so text stays legible.
+
+    A tick box that is not shown holds the state: no script, no link.
+    """
+    png = draw()
+    width, height = (round(int.from_bytes(png[at : at + 4], "big") * CSS_DPI / figures.DPI) for at in (16, 20))
+    text, image = html.escape(caption), base64.b64encode(png).decode()
     return (
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{image}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        f'<figure><label class="zoom" style="--full: {ENLARGED * width:.0f}px">'
+        f'<input type="checkbox" aria-label="other size"><img alt="{text}" width="{width}" height="{height}" '
+        f'src="data:image/png;base64,{image}"></label><figcaption>{text}</figcaption></figure>'
     )
 
 
@@ -360,6 +388,10 @@ def _number(value: float | None, digits: int) -> str:
 
 def _percent(value: float | None) -> str:
     return "–" if value is None else f"{100 * value:.0f} %"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

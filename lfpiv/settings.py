@@ -1,10 +1,10 @@
-"""The optional tables of an experiment file: every setting a step has, its range and its default, in one place."""
+"""The tables of an experiment file: every key, its range and its default, in one place."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 # Text where a number belongs is refused, and so is `true`; an integer is a good number. TOML's lists become tuples.
 Number = Annotated[float, Field(strict=True)]
@@ -59,7 +59,7 @@ class Correlation(Table):
 class Network(Table):
     """Table ``[network]``: the mapping of Eqs. 6-7 and the labels it is trained on."""
 
-    hidden: tuple[Count, ...] = (20,)
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (20,)
     """Nodes of each hidden layer."""
     epochs: Count = 300
     """Largest number of training epochs; early stopping usually ends sooner."""
@@ -83,3 +83,100 @@ class Compute(Table):
     """Weights integrated over voxel, microlens and pixel, or counted rays (Eq. 10 as printed)."""
     memory_gib: Positive | None = None
     """Memory the run may take [GiB]; absent: what the machine has available."""
+
+
+class NominalCamera(Table):
+    """Keys of ``[[camera]]`` that a data sheet and the plan of the rig give; scenes of the simulator have them too."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    focal_length_mm: Positive
+    magnification: Number
+    f_number: Positive
+    microlens_pitch_mm: Positive
+    microlens_focal_length_mm: Positive
+    pixel_um: Positive
+    microlens_layout: Literal["square", "hexagonal"] = "square"
+    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
+    image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
+    """How the camera's images are mirrored."""
+
+    @field_validator("magnification")
+    @classmethod
+    def _not_zero(cls, value: float) -> float:
+        if value == 0:
+            raise ValueError("a number other than 0")
+        return value
+
+
+class CameraTable(NominalCamera):
+    """Table ``[[camera]]``: nominal optics and images of one camera."""
+
+    white_image: Annotated[str, Field(min_length=1)]
+    dark_image: Annotated[str, Field(min_length=1)] | None = None
+
+
+class Board(Table):
+    """Table ``[board]``: the dot board and the depths it was recorded at."""
+
+    dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
+    """Dots along x and y."""
+    spacing_mm: Positive
+    """Distance of neighbouring dots [mm]."""
+    dot_diameter_mm: Positive
+    """Diameter of a dot [mm]."""
+    planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
+    """Depth z of each plane [mm]."""
+    images: Annotated[str, Field(min_length=1)]
+    """Path with ``{camera}`` and ``{plane}``, planes counted from 0."""
+
+    @field_validator("planes_mm")
+    @classmethod
+    def _distinct(cls, planes: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(planes)) != len(planes):
+            raise ValueError("a different depth for each plane")
+        return planes
+
+    @model_validator(mode="after")
+    def _dots_apart(self) -> Board:
+        if self.dot_diameter_mm >= self.spacing_mm:
+            raise ValueError("dot_diameter_mm smaller than spacing_mm")
+        return self
+
+
+class Volume(Table):
+    """Table ``[volume]``: the grid to reconstruct on; (x, y, z) order."""
+
+    centre_mm: tuple[Number, Number, Number]
+    size_mm: tuple[Positive, Positive, Positive]
+    voxel_mm: Positive
+
+
+class Particles(Table):
+    """Table ``[particles]``: the image pairs."""
+
+    images: Annotated[str, Field(min_length=1)]
+    """Path with ``{camera}``, ``{pair}`` and ``{frame}``, pairs counted from 0."""
+    pairs: Count
+    frames: tuple[Annotated[str, Field(min_length=1)], Annotated[str, Field(min_length=1)]] = ("a", "b")
+
+    @field_validator("frames")
+    @classmethod
+    def _differ(cls, frames: tuple[str, str]) -> tuple[str, str]:
+        if frames[0] == frames[1]:
+            raise ValueError("two different frame names")
+        return frames
+
+
+class ExperimentTable(Table):
+    """The whole file."""
+
+    name: Annotated[str, Field(min_length=1)]
+    dt_s: Positive
+    camera: Annotated[tuple[CameraTable, ...], Field(min_length=1)]
+    board: Board
+    volume: Volume
+    particles: Particles
+    smart: Smart = Smart()
+    correlation: Correlation = Correlation()
+    network: Network = Network()
+    compute: Compute = Compute()

@@ -12,13 +12,18 @@ import xarray as xr
 
 from lfpiv import dataset
 from lfpiv.experiment import Experiment
+from lfpiv.structure import NOISE
 from lfpiv.vectors import Verdict
 
 if TYPE_CHECKING:
-    from lfpiv.calibration import Calibration
+    from lfpiv.calibration import CalibratedCamera, Calibration
+    from lfpiv.rig import Grid
     from lfpiv_kernels.runtime import Device
 
 SCHEMA_VERSION = 1
+
+CORRECTION_RAYS = 4000
+"""Rays that tell the network's part in the mapping: their mean square is known to some percent."""
 
 _STAGES = ("calibration", "network_training", "weights", "reconstruction", "correlation")
 
@@ -63,7 +68,7 @@ def build(
     dict
         JSON-able content of ``summary.json``; ``total`` and the peak memory are filled in at the very end of a run.
     """
-    reports = {name: dict(camera.report) for name, camera in calibration.cameras.items()}
+    reports = {name: _report(camera, experiment.grid) for name, camera in calibration.cameras.items()}
     pairs = [_pair(number, path) for number, path in vectors.items()]
     earlier = previous.get("timings_s", {})
     timings = {
@@ -73,6 +78,7 @@ def build(
         "reconstruction": sum(pair["reconstruction_s"] for pair in pairs),
         "correlation": sum(pair["correlation_s"] for pair in pairs),
     }
+    empty = [text for pair in pairs for text in _without_particles(pair)]
     said = [text for report in reports.values() for text in report.get("warnings", ())]
     poor = [
         f"pair {pair['pair']}: {100 * pair['valid_fraction']:.0f} % of the vectors are valid; {pair['verdict']}"
@@ -105,7 +111,7 @@ def build(
         "pairs": pairs,
         "valid_fraction": _mean(pair["valid_fraction"] for pair in pairs),
         "finite_fraction": _mean(pair["finite_fraction"] for pair in pairs),
-        "warnings": list(dict.fromkeys([*said, *warnings, *poor])),
+        "warnings": list(dict.fromkeys([*said, *warnings, *empty, *poor])),
         "reused": list(reused),
     }
 
@@ -117,6 +123,27 @@ def read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) and found.get("schema_version") == SCHEMA_VERSION else {}
+
+
+def _report(camera: CalibratedCamera, grid: Grid) -> dict[str, Any]:
+    """Figures of a camera's calibration, and of the network's part in it over the volume."""
+    return dict(camera.report) | {"network_correction_pitch": network_correction(camera, grid)}
+
+
+def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
+    """Root mean square of what the network adds to the thin lens over a volume [microlens pitch].
+
+    Rays through the whole pupil from a sample of the voxels; None without a thin lens, where the network is all.
+    """
+    if camera.network is None or camera.baseline is None:
+        return None
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.choice(grid.axis_mm(axis), CORRECTION_RAYS) for axis in (2, 1, 0)], axis=1)
+    radius = camera.optics.pupil_radius_mm * np.sqrt(rng.random(CORRECTION_RAYS))
+    angle = 2 * np.pi * rng.random(CORRECTION_RAYS)
+    pupil = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    correction = camera.network(np.hstack([points, pupil]))
+    return float(np.sqrt((correction**2).sum(1).mean()) / camera.lattice.pitch_mm)
 
 
 def _pair(number: int, path: Path) -> dict[str, Any]:
@@ -140,8 +167,29 @@ def _pair(number: int, path: Path) -> dict[str, Any]:
         frames = [str(frame) for frame in reconstruction["frame"].values]
         history = reconstruction["residual"].values
         result["residual"] = {frame: row[np.isfinite(row)].tolist() for frame, row in zip(frames, history, strict=True)}
+        if "structure" in reconstruction:
+            cameras = [str(name) for name in reconstruction["camera"].values]
+            result["structure"] = {
+                frame: dict(zip(cameras, map(float, row), strict=True))
+                for frame, row in zip(frames, reconstruction["structure"].values, strict=True)
+            }
         result["stop"] = {frame: str(stop) for frame, stop in zip(frames, reconstruction["stop"].values, strict=True)}
     return result
+
+
+def _without_particles(pair: Mapping[str, Any]) -> list[str]:
+    """Warnings of a pair's images that show nothing but noise, one per frame."""
+    texts = []
+    for frame, cameras in pair.get("structure", {}).items():
+        names = [name for name, value in cameras.items() if value < NOISE]
+        if names:
+            lowest = max(cameras[name] for name in names)
+            texts.append(
+                f"pair {pair['pair']}, frame {frame}: no particles, only noise in the image of {', '.join(names)} "
+                f"(light of near pixels correlates by {max(lowest, 0):.3f}; particles give 0.2 or more): check laser, "
+                "trigger and file. Vectors of this pair mean nothing, valid or not."
+            )
+    return texts
 
 
 def _spread(values: xr.DataArray, valid: np.ndarray) -> dict[str, float | None]:

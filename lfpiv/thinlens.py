@@ -106,7 +106,14 @@ def thin_lens_model(optics: Optics, angle_deg: float) -> ThinLensModel:
         Nominal optics.
     angle_deg : float
         Angle of the camera to the z axis [degree]; add an angle error to it for the paper's DRT contrast (Eqs. 11-12).
+
+    Raises
+    ------
+    ValueError
+        If the angle is not finite.
     """
+    if not np.isfinite(angle_deg):
+        raise ValueError(f"angle_deg: expected a finite angle [degree], got {angle_deg}.")
     return ThinLensModel(
         rotation=_rotation_y(np.deg2rad(angle_deg)),
         offset_mm=np.zeros(3),
@@ -142,8 +149,8 @@ def fit_thin_lens(
     Raises
     ------
     ValueError
-        If shapes do not fit, there are fewer than 20 labels, the points do not span the two lateral directions, or
-        the labels are mirrored.
+        If shapes do not fit, values are not finite, there are fewer than 20 labels, the points do not span the two
+        lateral directions, or the labels are mirrored.
     """
     points, pupil, array = (np.asarray(value, float) for value in (points, pupil, array))
     count = len(points)
@@ -152,13 +159,18 @@ def fit_thin_lens(
             "points, pupil, array: expected shapes (n, 3), (n, 2) and (n, 2), got "
             f"{points.shape}, {pupil.shape} and {array.shape}."
         )
+    for name, value in (("points", points), ("pupil", pupil), ("array", array)):
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name}: expected finite values [mm], got NaN or infinity; leave those labels out.")
     if count < 20:
         raise ValueError(f"points: a thin-lens fit needs at least 20 labels, got {count}; find more dots.")
-    if std is not None and np.shape(std) != (count,):
-        raise ValueError(f"std: expected one value per label, shape ({count},), got {np.shape(std)}.")
+    if std is not None:
+        std = np.asarray(std, float)
+        if std.shape != (count,) or not (np.isfinite(std) & (std > 0)).all():
+            raise ValueError(f"std: expected {count} positive finite values, one per label, got shape {std.shape}.")
     chosen = np.unique(np.linspace(0, count - 1, min(count, FIT_SAMPLES)).astype(int))
     points, pupil, array = points[chosen], pupil[chosen], array[chosen]
-    std = np.ones(len(chosen)) if std is None else np.asarray(std, float)[chosen] / np.median(std)
+    std = np.ones(len(chosen)) if std is None else std[chosen] / np.median(std)
     start = _linear_start(points, pupil, array, optics)
 
     def misfit(parameters):

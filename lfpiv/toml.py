@@ -42,7 +42,7 @@ def read_toml(path: Path, model: type[Model]) -> Model:
         others by name.
     """
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")  # editors on Windows like to put a byte order mark first
     except FileNotFoundError:
         raise InputError(f"{path}: expected a TOML file, found no such file. Check the path.") from None
     except IsADirectoryError:

@@ -9,6 +9,7 @@ import tifffile
 from scipy.spatial import cKDTree
 
 from lfpiv.board import DotBoard, measure_board
+from lfpiv.boardoutline import MARGIN, outline, require_stated
 from lfpiv.dotfit import LensIntegral
 from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
@@ -322,6 +323,54 @@ def test_light_of_a_pixel_against_counted_rays(layout):
         assert np.sqrt((miss**2).mean()) < GRADIENT_ERROR * np.abs(growth[:, column]).max()
 
 
+def seen_board(true, stated, view, offset=(0, 0), planes=3, hidden=()):
+    """Places found and in view on the lattice of a stated board; `view` and `offset` in its columns and rows.
+
+    The true board's first dot is named `offset`; the camera sees the names `view` = (first, last) of columns and rows.
+    """
+    rows, columns = stated[1] + 2 * MARGIN, stated[0] + 2 * MARGIN
+    row, column = np.mgrid[:rows, :columns] - MARGIN
+    inside = (column >= view[0][0]) & (column <= view[0][1]) & (row >= view[1][0]) & (row <= view[1][1])
+    there = (column >= offset[0]) & (column < offset[0] + true[0]) & (row >= offset[1]) & (row < offset[1] + true[1])
+    found = there & inside & ~np.isin(column, hidden)
+    rng = np.random.default_rng(0)
+    found = np.stack([(found & (rng.random(found.shape) > 0.1)) | (rng.random(found.shape) < 0.02)] * planes)
+    return found, np.stack([inside] * planes)
+
+
+ALL = ((-9, 20), (-9, 20))
+
+
+def test_the_outline_names_the_dots():
+    """Whole in view, cut on one side, cut on both: the names follow the edges in view and nothing else."""
+    for offset in ((0, 0), (1, -1), (-2, 0)):
+        columns, rows = outline(*seen_board((7, 7), (7, 7), ALL, offset), (7, 7))
+        assert (columns.shift, rows.shift) == offset and columns.fits and rows.fits
+    columns, _ = outline(*seen_board((7, 7), (7, 7), ((-9, 4), (-9, 20)), (1, 0)), (7, 7))  # its right side is cut
+    assert columns.starts and not columns.ends and columns.shift == 1 and columns.fits
+    columns, _ = outline(*seen_board((7, 7), (7, 7), ((3, 20), (-9, 20)), (-1, 0)), (7, 7))  # its left side
+    assert columns.ends and not columns.starts and columns.shift == -1 and columns.fits
+    columns, rows = outline(*seen_board((9, 9), (20, 20), ((5, 12), (5, 12)), (4, 4)), (20, 20))
+    assert columns.open and rows.open and columns.shift == 0 and columns.fits  # nothing tells: the nominal axis stands
+
+
+@pytest.mark.parametrize("stated", [(8, 8), (7, 8), (6, 6), (5, 7), (12, 7)])
+def test_another_number_of_dots_than_stated_is_refused(stated):
+    offset = tuple((n - 7) // 2 for n in stated)
+    found, in_view = seen_board((7, 7), stated, ALL, offset)
+    extents = outline(found, in_view, stated)
+    with pytest.raises(InputError, match=r"planes 0-2: 7 x 7.* Set dots = \[7, 7\]"):
+        require_stated(extents, found)
+
+
+def test_a_hidden_edge_is_refused_and_a_hidden_middle_is_not():
+    found, in_view = seen_board((7, 7), (7, 7), ALL, hidden=(0,))
+    with pytest.raises(InputError, match="6 columns"):
+        require_stated(outline(found, in_view, (7, 7)), found)
+    found, in_view = seen_board((7, 7), (7, 7), ALL, hidden=(3,))
+    require_stated(outline(found, in_view, (7, 7)), found)
+
+
 def test_bad_boards_are_refused():
     scene = replace(SCENES["square, rolled camera, wrong angle"], sensor_shape=(200, 200))
     renderer = Renderer(scene)
@@ -334,6 +383,12 @@ def test_bad_boards_are_refused():
         measure_board(empty[:2], decoder, scene.board, nominal_angle_deg=20)
     with pytest.raises(InputError, match=r"plane 1 of the board: expected an image of shape \(200, 200\)"):
         measure_board([empty[0], np.zeros((3, 3)), empty[2]], decoder, scene.board, nominal_angle_deg=20)
+    holed = empty[1].astype(float)
+    holed[5, 5] = np.nan
+    with pytest.raises(InputError, match=r"plane 1 of the board: expected finite counts, got 1 pixels"):
+        measure_board([empty[0], holed, empty[2]], decoder, scene.board, nominal_angle_deg=20)
+    with pytest.raises(ValueError, match="nominal_angle_deg: expected a finite angle"):
+        measure_board(empty, decoder, scene.board, nominal_angle_deg=np.nan)
     with pytest.raises(ValueError, match="estimator: expected one of 'lens_integral', 'gaussian'"):
         measure_board(empty, decoder, scene.board, nominal_angle_deg=20, estimator="centroid")
 

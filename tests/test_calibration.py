@@ -3,21 +3,26 @@
 import dataclasses
 import json
 import logging
+import shutil
 
 import numpy as np
 import pytest
+import tifffile
 from ideal_rig import rotation
 
 import lfpiv
+from lfpiv import summary, view
 from lfpiv.calibration import _agreeing_dots, warn_outside
 from lfpiv.flows import KINDS, window_mean
 from lfpiv.scene import true_mapping
 from lfpiv.simulate import simulate
+from lfpiv.thinlens import thin_lens_model
 
 MAPPING_PITCH = 0.015  # the project's limit for the mean error over the board's volume
 MAPPING_AIM_PITCH = 0.006  # its aim, reached on clean images
 INTERIOR_VOXEL = 0.45  # the project's limit for the mean displacement error of interior vectors
 FINITE = 0.95  # the project's limit for the part of grid points with a finite vector
+CORRECTION_SHARE = 0.1  # two samples of rays: voxel centres within the volume against all of the volume
 ROUND_TRIP_MM = 1e-9  # a calibration read back is the same to rounding
 
 SCENE = """
@@ -165,8 +170,74 @@ def test_a_board_that_no_such_camera_can_see_is_refused(rig, mistake):
         lfpiv.calibrate(wrong)
 
 
+@pytest.mark.parametrize("stated", [(6, 6), (8, 5), (4, 4), (5, 3), (30, 30)])
+def test_a_board_stated_larger_or_smaller_than_it_is_is_refused(rig, stated):
+    """An even number for an odd one shifts all names by half a spacing and nothing else would tell."""
+    experiment, _, _ = rig
+    board = experiment.board.model_copy(update={"dots": stated})
+    with pytest.raises(lfpiv.InputError, match=r"planes 0-4: 5 x 5.* Set dots = \[5, 5\]"):
+        lfpiv.calibrate(dataclasses.replace(experiment, board=board))
+
+
+def spoiled(experiment, folder, images):
+    """The experiment with other images in some planes of its board."""
+    shutil.copytree(experiment.path.parent, folder)
+    for plane, image in images.items():
+        tifffile.imwrite(folder / experiment.board_path("only", plane).relative_to(experiment.path.parent), image)
+    return lfpiv.open_experiment(folder / experiment.path.name)
+
+
+def test_planes_without_dots_are_named_and_left_out(rig, tmp_path, caplog):
+    experiment, spec, _ = rig
+    rng = np.random.default_rng(0)
+    noise = [np.rint(40 + 3 * rng.standard_normal((400, 420))).astype(np.uint16) for _ in range(4)]
+    with caplog.at_level(logging.WARNING):
+        camera = lfpiv.calibrate(spoiled(experiment, tmp_path / "one", {2: noise[0]})).cameras["only"]
+    assert "plane 2 of the board (z = 0 mm)" in caplog.text and "plane_02.tif" in caplog.text
+    assert camera.report["dots_found_per_plane"] == [25, 25, 0, 25, 25]
+    assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8]) <= MAPPING_AIM_PITCH
+    with pytest.raises(lfpiv.InputError, match=r"dots in 2 planes or more, found them in 1 of 5.*plane_00\.tif"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "four", dict(enumerate(noise))))
+
+
+def test_particle_images_in_place_of_boards_are_refused(rig, tmp_path):
+    experiment, _, _ = rig
+    frames = [experiment.particle_image("only", 0, frame).astype(np.uint16) for frame in "ab"]
+    wrong = {plane: frames[plane % 2][:: 1 - 2 * (plane // 2 % 2)] for plane in range(5)}
+    with pytest.raises(lfpiv.InputError, match="board images"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "data", wrong))
+
+
+def test_a_volume_that_the_calibrated_camera_does_not_see_is_refused(rig, caplog):
+    experiment, _, calibration = rig
+    sees = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
+    assert view.seen_share(calibration.cameras["only"], sees) == 1
+    beside = lfpiv.Grid.from_extent(centre_mm=(0, 4.0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
+    with pytest.raises(lfpiv.InputError, match=r"around \(0, 4, 0\) mm of which camera 'only' sees nothing"):
+        view.require_seen(experiment.path, calibration, beside)
+    half = lfpiv.Grid.from_extent(centre_mm=(0, 2.2, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
+    with caplog.at_level(logging.WARNING):
+        view.require_seen(experiment.path, calibration, half)
+    assert "% of the volume" in caplog.text
+
+
+def test_the_networks_part_is_what_it_adds_to_the_thin_lens(rig):
+    experiment, _, calibration = rig
+    camera = calibration.cameras["only"]
+    points, pupil = rays_in([-1, -1, -0.6], [1, 1, 0.6], count=20_000)
+    added = camera.map(points, pupil) - camera.baseline(points, pupil)
+    expected = np.sqrt((added**2).sum(1).mean()) / camera.lattice.pitch_mm
+    assert summary.network_correction(camera, experiment.grid) == pytest.approx(expected, rel=CORRECTION_SHARE)
+    assert summary.network_correction(lfpiv.thin_lens(experiment).cameras["only"], experiment.grid) is None
+
+
 def test_wrong_arguments_are_named(rig, tmp_path):
-    _, _, calibration = rig
+    experiment, _, calibration = rig
+    for angle in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="angle_error_deg: expected a finite angle"):
+            lfpiv.thin_lens(experiment, angle_error_deg=angle)
+    with pytest.raises(ValueError, match="angle_deg: expected a finite"):
+        thin_lens_model(calibration.cameras["only"].optics, np.nan)
     with pytest.raises(ValueError, match=r"expected shapes \(n, 3\) and \(n, 2\)"):
         calibration.cameras["only"].map(np.zeros((3, 2)), np.zeros((3, 2)))
     with pytest.raises(lfpiv.InputError, match="could not read it"):

@@ -61,6 +61,19 @@ def test_flip_is_undone_in_every_image_of_the_camera(tiny_experiment, flip, undo
     np.testing.assert_array_equal(flipped.white("right"), plain.white("right"))
 
 
+def test_a_byte_order_mark_is_no_part_of_the_file(tiny_experiment):
+    plain = open_experiment(tiny_experiment)
+    tiny_experiment.write_bytes(b"\xef\xbb\xbf" + tiny_experiment.read_bytes())
+    assert open_experiment(tiny_experiment) == plain
+
+
+@pytest.mark.parametrize("centre", [(1.2, 0.0, 0.0), (0.0, -1.2, 0.0), (0.0, 0.0, 3.0)])
+def test_a_volume_that_a_misaligned_camera_may_see_is_accepted(tiny_experiment, centre):
+    """Two fields of view aside is odd, but nothing that the nominal rig could be sure of."""
+    edit(tiny_experiment, "centre_mm = [0.0, 0.0, 0.1]", f"centre_mm = {list(centre)}")
+    assert open_experiment(tiny_experiment).grid.size == 8 * 12 * 16
+
+
 BAD_KEYS = {
     "misspelt": ("pairs = 2", "pairs = 2\n[smart]\niteration = 4", ["smart.iteration", "unknown", "'iterations'"]),
     "unknown table": ("pairs = 2", "pairs = 2\n[smarts]\n", ["smarts", "'smart'"]),
@@ -98,6 +111,23 @@ BAD_KEYS = {
         "pairs = 2",
         "pairs = 2\n[correlation]\nwindows = [[16, 16, 16]]",
         ["correlation.windows", "16", "along z"],
+    ),
+    "no hidden layer": ("pairs = 2", "pairs = 2\n[network]\nhidden = []", ["network.hidden", "at least 1"]),
+    "million dots": ("dots = [5, 5]", "dots = [1000000, 1000000]", ["board.dots", "1000000 x 1000000", "sees about"]),
+    "tiny board": (
+        "dots = [5, 5]\nspacing_mm = 0.1\ndot_diameter_mm = 0.02",
+        "dots = [5, 5]\nspacing_mm = 0.001\ndot_diameter_mm = 0.0002",
+        ["board.spacing_mm", "microlens", "0.001"],
+    ),
+    "far volume": (
+        "centre_mm = [0.0, 0.0, 0.1]",
+        "centre_mm = [20.0, 0.0, 0.1]",
+        ["volume.centre_mm", "'left'", "(20, 0, 0.1) mm"],
+    ),
+    "volume behind the lens": (
+        "centre_mm = [0.0, 0.0, 0.1]",
+        "centre_mm = [0.0, 0.0, 1000.0]",
+        ["volume.centre_mm", "behind the lens"],
     ),
     "no TOML": ("pairs = 2", "pairs = = 2", ["TOML", "line"]),
     "pixel unit": ("pixel_um = 10.0", "pixel_um = 0.01", ["microlens_pitch_mm", "pixel_um"]),
@@ -276,6 +306,16 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["pair_0000.nc", "volume.nc"]
 
 
+def test_the_structure_of_the_images_travels_with_the_volumes(tmp_path):
+    pair = {"a": volume(1, [0.9, 0.5]), "b": volume(2, [0.8, 0.6])}
+    for frame, values in (("a", [0.5, 0.01]), ("b", [0.4, 0.6])):
+        pair[frame].attrs |= {"cameras": ["left", "right"], "structure": values}
+        dataset.write_volume(pair[frame], tmp_path / f"{frame}.nc", attributes={})
+    condensed = dataset.build_reconstruction({frame: dataset.read_volume(tmp_path / f"{frame}.nc") for frame in "ab"})
+    assert condensed["structure"].sel(frame="a", camera="right") == 0.01
+    xr.testing.assert_equal(condensed, dataset.build_reconstruction(pair))
+
+
 def test_a_vector_file_of_another_form_is_refused(tmp_path):
     with pytest.raises(ValueError, match="peak_ratio"):
         dataset.write_vectors(vectors().drop_vars("peak_ratio"), tmp_path / "pair.nc", attributes={})
@@ -314,7 +354,7 @@ def test_settings_hash_sees_every_value_and_no_order():
 
 
 def test_camera_and_name_lookups_name_the_known_ones(tiny_experiment):
-    with pytest.raises(KeyError, match="left, right"):
-        open_experiment(tiny_experiment).camera("middle")
+    with pytest.raises(ValueError, match="camera: expected one of left, right, got 'middle'"):
+        open_experiment(tiny_experiment).white("middle")
     with pytest.raises(AttributeError, match="frobnicate"):
         _ = lfpiv.frobnicate

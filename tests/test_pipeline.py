@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from lfpiv import dataset, pipeline
+from lfpiv import dataset, figures, pipeline, report
 from lfpiv.simulate import simulate
 
 DISPLACEMENT_VOXEL = (0.8, -0.6, 0.4)
@@ -17,6 +17,9 @@ DISPLACEMENT_VOXEL = (0.8, -0.6, 0.4)
 TOLERANCE_VOXEL = 0.2
 """Mean of the valid vectors against the flow. Particles are few and two cameras blur depth; a wrong sign, axis, frame
 order or scale misses by 0.4 voxel or more."""
+
+KEY_LENGTH = 0.02
+"""The arrow of the scale against the vectors' own: what the eye cannot tell."""
 
 SCENE = """
 name = "small"
@@ -114,7 +117,10 @@ def test_every_file_of_the_contract_is_there_and_whole(finished):
         figures = summary["calibration"][camera]
         assert {"sigma_nor_test", "dots_found", "dots_expected", "lens_array_rms_px"} <= set(figures)
         assert 0 < figures["dots_found"] <= figures["dots_expected"] <= 5 * 5 * 5
+        assert 0 < figures["network_correction_pitch"] < 0.1  # rendered by an ideal lens: hardly anything is left
     assert [len(pair["residual"]["a"]) for pair in summary["pairs"]] == [9, 9]
+    assert all(set(pair["structure"]["b"]) == {"left", "right"} for pair in summary["pairs"])
+    assert not any("noise" in text for text in summary["warnings"])
 
 
 def test_the_report_holds_its_pictures(finished):
@@ -128,9 +134,46 @@ def test_the_report_holds_its_pictures(finished):
     )  # lens centres and dots of each camera; errors, projections, residuals, three of the vectors
     for picture in pictures:
         assert np.ptp(imread(io.BytesIO(base64.b64decode(picture)))) > 0.5
+        width = imread(io.BytesIO(base64.b64decode(picture))).shape[1]
+        assert f'width="{round(width * report.CSS_DPI / figures.DPI)}"' in page
+    assert page.count('<label class="zoom"') == len(pictures)  # each opens at full size and scrolls on small screens
     assert not re.search(r'(src|href)="(?!data:)', page), "the page refers to something outside itself"
-    for text in ("left", "right", *(text.split(":")[0] for text in summary["warnings"])):
+    for text in (
+        "left",
+        "right",
+        "2 cameras",
+        "correction, rms [pitch]",
+        *(text.split(":")[0] for text in summary["warnings"]),
+    ):
         assert text in page
+
+
+def test_arrows_have_a_scale(finished, monkeypatch):
+    """The key's arrow is as long as one of the round speed it names; a field at rest has none."""
+    from matplotlib.axes import Axes
+
+    _, out, _ = finished
+    vectors = dataset.read_vectors(out / "vectors" / "pair_0000.nc")
+    drawn, quiverkey = {}, Axes.quiverkey
+
+    def keep(axes, quiver, x, y, speed, label, **settings):
+        drawn.update(quiver=quiver, speed=speed, label=label)
+        drawn["key"] = quiverkey(axes, quiver, x, y, speed, label, **settings)
+        return drawn["key"]
+
+    monkeypatch.setattr(Axes, "quiverkey", keep)
+    figures.vector_slices(vectors)
+    fastest = float(np.hypot(vectors["u"], vectors["v"]).max())
+    assert 0.3 * fastest < drawn["speed"] <= fastest and f"{drawn['speed']:g} m/s" in drawn["label"]
+    axes = drawn["quiver"].axes
+    pixels_per_mm = axes.bbox.width / np.ptp(axes.get_xlim())
+    arrow = drawn["key"].vector
+    length = np.ptp(arrow.get_transform().transform(arrow.get_paths()[0].vertices)[:, 0])
+    assert length == pytest.approx(drawn["speed"] / drawn["quiver"].scale * pixels_per_mm, rel=KEY_LENGTH)
+    assert [figures._round_below(value) for value in (0.0, 0.0199, 1.0, 7e3, np.nan)] == [0, 0.01, 1, 5000, 0]
+    still = vectors.assign({name: 0 * vectors[name] for name in "uvw"})
+    drawn.clear()
+    assert figures.vector_slices(still) and not drawn
 
 
 def test_a_second_run_does_nothing_anew(finished):

@@ -1,0 +1,76 @@
+"""Whether an image shows particles or nothing but noise, told from the images alone.
+
+A particle's light fills many neighbouring pixels of a microimage; noise, of the read-out or of photons, is independent
+from pixel to pixel. So near pixels under one microlens tell the two apart at any brightness: what correlates
+between them is light with a structure. SMART and the correlation do not notice: they make a volume, and vectors that
+agree with their neighbours, of noise too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from lfpiv.lightfield import LightFieldDecoder
+
+NOISE = 0.05
+"""Structure below which an image is taken for noise. Particle images have 0.3 and more, noise has less than 0.01."""
+
+_CORE_COVERAGE = 0.99  # pixels wholly inside a microimage
+_LEAST_GAIN = 0.2  # pixels under dead lenses or in dark corners are left out
+_EVEN_PITCHES = 3.0  # half width of the local mean, which is left out: reflections, ambient light
+_LAG = 0.2  # of a microimage between the two pixels: further than a sensor's own blur, nearer than a particle's light
+_CLIP = 5.0  # robust standard deviations at which pixels are clipped, so that no hot ones outweigh the rest
+_SMALLEST_COUNT = 0.3  # [counts]: noise of rounding alone
+_FEWEST_PAIRS = 1000  # pairs of neighbours that tell anything
+
+
+def structure(light: np.ndarray, decoder: LightFieldDecoder) -> float:
+    """Correlation of near pixels under the same microlens, from -1 to 1: about 0 for noise.
+
+    Parameters
+    ----------
+    light : ndarray, shape (rows, columns)
+        Image without its dark level [counts].
+    decoder : LightFieldDecoder
+        The camera's decoder.
+
+    Returns
+    -------
+    float
+        The lower of the correlations along both diagonals, so that neither stripes along rows nor along columns count;
+        1 where an image has too few pixels inside microimages to tell.
+    """
+    core = (decoder.coverage > _CORE_COVERAGE) & (decoder.gain > _LEAST_GAIN)
+    if not core.any():
+        return 1.0
+    even = np.divide(light, decoder.gain, out=np.zeros(light.shape, np.float32), where=core)
+    even = np.where(core, _clipped(even, core), 0)
+    pitch = decoder.optics.microimage_pitch_px
+    reach = int(_EVEN_PITCHES * pitch)
+    share, mean = (ndimage.uniform_filter(part.astype(np.float32), 2 * reach + 1) for part in (core, even))
+    even = _clipped(even - mean / np.maximum(share, 1e-6), core)
+    core[:reach], core[-reach:], core[:, :reach], core[:, -reach:] = False, False, False, False  # one-sided means
+    lag = max(1, round(_LAG * pitch))
+    return min(_correlation(even, core, decoder.lens_index, lag, side) for side in (lag, -lag))
+
+
+def _clipped(values: np.ndarray, core: np.ndarray) -> np.ndarray:
+    """Clip to a few robust standard deviations about the median, so that no hot pixels outweigh the rest."""
+    median = float(np.median(values[core]))
+    reach = _CLIP * max(1.4826 * float(np.median(np.abs(values[core] - median))), _SMALLEST_COUNT)
+    return np.clip(values, median - reach, median + reach)
+
+
+def _correlation(values: np.ndarray, core: np.ndarray, lens_index: np.ndarray, down: int, aside: int) -> float:
+    """Correlation of pixels of one lens with those `down` rows and `aside` columns away."""
+    rows, columns = values.shape
+    first = slice(0, rows - down), slice(max(-aside, 0), columns - max(aside, 0))
+    second = slice(down, rows), slice(max(aside, 0), columns + min(aside, 0))
+    pair = core[first] & core[second] & (lens_index[first] == lens_index[second]).all(-1)
+    if np.count_nonzero(pair) < _FEWEST_PAIRS:
+        return 1.0
+    a, b = values[first][pair], values[second][pair]
+    if not min(a.std(), b.std()) > 0:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
