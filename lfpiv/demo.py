@@ -61,7 +61,7 @@ def compare_with_truth(scene: Scene, out: Path) -> dict[str, float]:
     window_mm = np.array(json.loads(vectors.attrs["passes"])[-1]["window"][::-1]) * voxel_mm
     inner = vectors.isel({axis: slice(1, -1) for axis in "zyx" if vectors.sizes[axis] > 2})
     z, y, x = np.meshgrid(*(inner[axis].values for axis in "zyx"), indexing="ij")
-    truth = window_mean(scene.flow, np.stack([x, y, z], axis=-1).reshape(-1, 3), tuple(window_mm)) / voxel_mm
+    truth = window_mean(scene.flow_of(0), np.stack([x, y, z], axis=-1).reshape(-1, 3), tuple(window_mm)) / voxel_mm
     measured = np.stack([inner[f"displacement_{axis}"].values.ravel() for axis in "xyz"], axis=1)
     error = np.linalg.norm(measured - truth, axis=1)
     error = error[np.isfinite(error)]

@@ -157,7 +157,7 @@ class Job:
             calibration=self.calibration_hash,
             grid=dataclasses.asdict(experiment.grid),
             smart=experiment.smart.model_dump(),
-            weights=experiment.compute.weights,
+            weights=(experiment.compute.weights, experiment.compute.weights_form),
             images=identity,
         )
 
@@ -224,9 +224,16 @@ class Job:
         """Refuse a volume whose weights do not fit into memory, before any work: from the nominal rig."""
         from lfpiv.weights import estimate_memory
 
-        weights = estimate_memory(_nominal_cameras(self.experiment), self.experiment.grid)
+        cameras, grid, form = (
+            _nominal_cameras(self.experiment),
+            self.experiment.grid,
+            self.experiment.compute.weights_form,
+        )
+        weights = estimate_memory(cameras, grid, form)
         needed = memory.least_bytes(self.experiment) + weights
         log.info("memory: about %.1f GiB needed, %.1f GiB of it for weights", needed / memory.GIB, weights / memory.GIB)
+        if form == "auto" and (most := estimate_memory(cameras, grid, "pixels")) > weights:
+            log.info("memory: up to %.1f GiB for weights where rays bend", most / memory.GIB)
         memory.require(needed, self.experiment, "volumes and weights of")
 
     def build_weights(self, calibration: Calibration) -> Weights:
@@ -243,9 +250,20 @@ class Job:
                 "one camera hardly sees depth: w and displacement_z are not to be trusted, nor is their validation"
             )
         with self.timed("weights"):
-            weights = build_weights(calibration, self.experiment.grid, method=method, progress=self.step("weights"))
+            weights = build_weights(
+                calibration,
+                self.experiment.grid,
+                method,
+                form=self.experiment.compute.weights_form,
+                limit_bytes=memory.left_for_weights(self.experiment),
+                progress=self.step("weights"),
+            )
         self.weights_report = {"method": method, "memory_mib": weights.memory_bytes / memory.MIB}
         if method == "footprint":
+            self.weights_report["form"] = dict(weights.forms)
+            self.weights_report["profiles_check_l2"] = {
+                name: [round(error, 4) for error in errors] for name, errors in weights.profile_errors.items()
+            }
             errors = [error for camera in compare_with_count(weights).values() for error in camera]
             self.weights_report["count_check_l2"] = [round(error, 4) for error in errors]
             if errors:  # of the few voxels drawn some camera may see none

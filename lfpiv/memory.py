@@ -50,6 +50,14 @@ def available_bytes() -> int:
     return max(free, 0)
 
 
+def left_for_weights(experiment: Experiment) -> int:
+    """Return the memory that the weights may take [byte], beside volumes that are still to come."""
+    left = available_bytes() - BYTES_PER_VOXEL * experiment.grid.size
+    if experiment.compute.memory_gib is not None:
+        left = min(left, int(experiment.compute.memory_gib * GIB) - least_bytes(experiment))
+    return left
+
+
 def require(needed: int, experiment: Experiment, what: str) -> None:
     """Refuse work that needs more memory than there is, or than ``compute.memory_gib`` allows.
 

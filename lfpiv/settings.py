@@ -81,6 +81,9 @@ class Compute(Table):
     """CPU threads; absent: the cores this process may use."""
     weights: Literal["footprint", "count"] = "footprint"
     """Weights integrated over voxel, microlens and pixel, or counted rays (Eq. 10 as printed)."""
+    weights_form: Literal["auto", "profiles", "pixels"] = "auto"
+    """How footprints are stored: as products of profiles, for straight rays and square microlenses; pixel by pixel, for
+    any optics; "auto": as profiles for each camera where counted rays say that they serve."""
     memory_gib: Positive | None = None
     """Memory the run may take [GiB]; absent: what the machine has available."""
 

@@ -137,8 +137,13 @@ def pack_camera(camera) -> CameraKernels:
     )
 
 
-def footprint_blocks(stored: StoredGrid, camera, form: str, progress: Progress) -> Blocks:
-    """Compute the blocks of one camera: count them, allocate once, fill chunk by chunk."""
+def footprint_blocks(
+    stored: StoredGrid, camera, form: str, progress: Progress, allow: Callable[[int], None] = lambda _: None
+) -> Blocks:
+    """Compute the blocks of one camera: count them, allocate once, fill chunk by chunk.
+
+    `allow` is called with the memory they take [byte] before it is allocated, and may raise.
+    """
     pack, size = pack_camera(camera), stored.grid.size
     plane = size // stored.shape[0]
     first_block, first_row = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
@@ -156,6 +161,7 @@ def footprint_blocks(stored: StoredGrid, camera, form: str, progress: Progress) 
         first_block[part], first_row[part] = measure(pack, model, form)
     np.cumsum(first_block, out=first_block)
     np.cumsum(first_row, out=first_row)
+    allow(int(6 * first_block[-1] + LANES * first_row[-1] + 16 * size))
     blocks = Blocks(
         form=form,
         first_block=first_block.astype(np.int32),

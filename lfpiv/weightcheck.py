@@ -16,8 +16,8 @@ VOXELS = 6
 SAMPLES = 100
 """Pupil points per axis of each of two counts: 4e6 rays per voxel, 0.7 % noise, known from the two and subtracted."""
 PROFILES_MEAN, PROFILES_WORST = 0.015, 0.025
-"""Largest relative L2 difference from counted rays, mean and worst voxel of the sample, with which profiles serve: three
-quarters of the project's goals, for a sample of few voxels may miss the worst; straight rays have about 0.010, 0.017."""
+"""Largest relative L2 difference from counted rays, mean and worst voxel of the sample, with which profiles serve:
+three quarters of the project's goals, for a small sample may miss the worst; straight rays have about 0.010, 0.017."""
 
 
 class CountedVoxels:

@@ -9,10 +9,12 @@ two forms, chosen for each camera by a few counted voxels: products of profiles,
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from lfpiv.errors import InputError
 from lfpiv.raymodel import ray_models
 from lfpiv.rig import Grid
 from lfpiv.weightblocks import (
@@ -54,6 +56,7 @@ class Weights:
         grid: Grid,
         method: str,
         form: str = "auto",
+        limit_bytes: float = math.inf,
         progress: Progress | None = None,
     ):
         self.cameras = dict(cameras)
@@ -64,7 +67,7 @@ class Weights:
         """Camera name -> form in which its weights are stored."""
         self.profile_errors: dict[str, list[float]] = {}
         """Camera name -> difference of profiles from counted rays, where these decided the form."""
-        self._asked = form
+        self._asked, self._limit_bytes = form, limit_bytes
         self._counted: dict[str, CountedVoxels] = {}
         self._projectors: dict[str, Projector] = {}
         self._column_sum: np.ndarray | None = None
@@ -200,10 +203,31 @@ class Weights:
 
             if self.method == "footprint":
                 self.forms[name] = self._choose(name, camera)
-                blocks = footprint_blocks(self.stored, camera, self.forms[name], step)
+                blocks = footprint_blocks(self.stored, camera, self.forms[name], step, self._allow(name))
             else:
                 blocks = count_blocks(self.stored, camera, step)
             self._projectors[name] = Projector(blocks)
+
+    def _allow(self, name: str) -> Callable[[int], None]:
+        """Check of one camera's memory before it is taken."""
+
+        def allow(needed: int) -> None:
+            left = self._limit_bytes - self.memory_bytes
+            if needed > left:
+                errors = self.profile_errors.get(name)
+                other = (
+                    f", or set compute.weights_form to 'profiles', {100 * np.mean(errors):.0f} % from counted rays here"
+                    if errors and self.forms[name] == "pixels"
+                    else ""
+                )
+                shape = " x ".join(map(str, self.grid.shape))
+                raise InputError(
+                    f"volume: the weights of {shape} voxels (z, y, x) on camera {name!r} "
+                    f"need {needed / 2**30:.1f} GiB as {self.forms[name]}, {max(left, 0) / 2**30:.1f} GiB are left. "
+                    f"Raise volume.voxel_mm, shrink volume.size_mm{other}."
+                )
+
+        return allow
 
     def _choose(self, name: str, camera) -> str:
         """Form of a camera's weights: profiles where counted rays say that they serve."""
@@ -266,7 +290,13 @@ class Adjoint:
 
 
 def build_weights(
-    calibration, grid: Grid, method: str = "footprint", *, form: str = "auto", progress: Progress | None = None
+    calibration,
+    grid: Grid,
+    method: str = "footprint",
+    *,
+    form: str = "auto",
+    limit_bytes: float = math.inf,
+    progress: Progress | None = None,
 ) -> Weights:
     """Weights of every voxel of a grid on every pixel of every camera (Eq. 10).
 
@@ -283,6 +313,8 @@ def build_weights(
         How footprints are stored. "profiles": products of a profile along the sensor's columns and one along its rows
         for every voxel and lens (rank 1), small and fast, for straight rays and square microlenses. "pixels": one value
         per pixel, for any optics. "auto": profiles for each camera where they agree with counted rays.
+    limit_bytes : float
+        Memory that the weights may take [byte]; default: no limit.
     progress : callable, optional
         Called with the finished fraction.
 
@@ -293,13 +325,17 @@ def build_weights(
     Raises
     ------
     ValueError
-        If `method` or `form` is unknown, or profiles are asked for a hexagonal microlens layout.
+        If `method` or `form` is unknown, profiles are asked for a hexagonal microlens layout, or the weights do not fit
+        into `limit_bytes`: before they are stored.
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}.")
     if form not in FORMS:
         raise ValueError(f"form: expected one of {', '.join(FORMS)}, got {form!r}.")
-    weights = Weights(calibration.cameras, grid, method, form, progress)
+    hexagonal = [name for name, camera in calibration.cameras.items() if camera.lattice.layout != "square"]
+    if form == "profiles" and hexagonal:
+        raise ValueError(f"form: 'profiles' need square microlenses, those of camera {hexagonal[0]!r} are hexagonal.")
+    weights = Weights(calibration.cameras, grid, method, form, limit_bytes, progress)
     if method == "footprint":
         log.info(
             "weights of %d voxels on %d cameras: %.0f MiB",

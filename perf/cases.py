@@ -142,8 +142,9 @@ def _rows_of(blocks, first: int, last: int) -> sparse.csr_array:
     rays, profiles = blocks.microimages, blocks.form == "profiles"
     part = slice(blocks.first_block[first], blocks.first_block[last])
     height = blocks.height[part].astype(np.int64)
-    tall = 1 + -(-height // 8) if profiles else height
-    head = np.concatenate([[0], np.cumsum(tall)])[:-1] + blocks.first_row[first]  # no block without rows: see the gates
+    tall = np.concatenate([[0], np.cumsum(1 + -(-height // 8) if profiles else height)])
+    start = blocks.first_block[first : last + 1] - blocks.first_block[first]
+    head = tall[:-1] + np.repeat(blocks.first_row[first:last] - tall[start[:-1]], np.diff(start))
     block = np.repeat(np.arange(len(height)), height)
     row = np.arange(len(block)) - np.repeat(np.cumsum(height) - height, height)
     if profiles:
@@ -153,7 +154,7 @@ def _rows_of(blocks, first: int, last: int) -> sparse.csr_array:
     else:
         level = blocks.value[head[block] + row].astype(np.float32)
     ray = blocks.ray[part][block, None] + row[:, None] * rays.edge + np.arange(8)
-    voxel = np.repeat(np.arange(last - first), np.diff(blocks.first_block[first : last + 1]))[block]
+    voxel = np.repeat(np.arange(last - first), np.diff(start))[block]
     lit = (level > 0) & (rays.share[ray] > 0)
     data = (level * blocks.scale[first + voxel, None] * rays.share[ray])[lit]
     index = np.broadcast_to(voxel[:, None], lit.shape)[lit], rays.pixel[ray[lit]]

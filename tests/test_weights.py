@@ -10,7 +10,7 @@ import lfpiv
 from lfpiv.microimages import lay_out
 from lfpiv.raymodel import ray_models
 from lfpiv.weightblocks import count_voxels
-from lfpiv.weights import estimate_memory
+from lfpiv.weights import compare_with_count, estimate_memory
 from lfpiv_kernels import footprint, raymodel, reference, runtime, trace
 from lfpiv_kernels.lattice import pack_lattice
 
@@ -223,10 +223,26 @@ def test_memory_estimate_holds_before_building():
     assert estimate_memory(rig, huge) > estimate  # and nothing of that size was allocated
 
 
+def test_form_follows_the_optics_and_the_limit_is_kept():
+    grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
+    cameras = {"straight": RIGS["misaligned"], "bent": IdealCamera("bent", rotation(-45), coma=0.02)}
+    cameras["hexagonal"] = RIGS["hexagonal"]
+    weights = lfpiv.build_weights(IdealRig(cameras), grid)
+    assert weights.forms == {"straight": "profiles", "bent": "pixels", "hexagonal": "pixels"}
+    assert min(weights.profile_errors["bent"]) > FOOTPRINT_MEAN
+    for name, errors in compare_with_count(weights).items():
+        assert errors and np.mean(errors) <= FOOTPRINT_MEAN and max(errors) <= FOOTPRINT_WORST, name
+    with pytest.raises(ValueError, match=r"camera 'bent'.* as pixels.*weights_form to 'profiles'"):
+        lfpiv.build_weights(IdealRig(cameras), grid, limit_bytes=weights.memory_bytes // 4)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda w: lfpiv.build_weights(IdealRig(w.cameras), w.grid, method="exact"), "method: expected one of"),
+        (lambda w: lfpiv.build_weights(IdealRig(w.cameras), w.grid, form="exact"), "form: expected one of"),
+        (lambda w: lfpiv.build_weights(IdealRig(RIGS), w.grid, form="profiles"), "those of camera 'hexagonal'"),
+        (lambda w: w(np.zeros(w.grid.shape), out={n: np.zeros(c.gain.shape) for n, c in w.cameras.items()}), "out"),
         (lambda w: w(np.zeros((2, 2, 2))), r"volume: expected shape \(5, 6, 7\)"),
         (lambda w: w.T({"cam1": np.zeros((400, 480))}), "camera 'cam2' is missing"),
         (lambda w: w.T({"cam1": np.zeros((4, 4)), "cam2": np.zeros((4, 4))}), r"expected shape \(400, 480\)"),
