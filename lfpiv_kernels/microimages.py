@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
-from scipy import sparse
 
 from lfpiv_kernels import runtime
 
@@ -74,7 +73,7 @@ def _collect(
     pixel = first_pixel + wp.tid()
     light = float(0.0)
     for k in range(first[pixel], first[pixel + 1]):
-        light += share[k] * rays[ray[k]]
+        light += share[ray[k]] * rays[ray[k]]
     image_out[pixel] = light
 
 
@@ -85,16 +84,15 @@ class RayMap:
         device = runtime.device().warp
         lit = np.flatnonzero(microimages.share > 0).astype(np.int32)
         rows, columns = microimages.sensor_shape
-        by_pixel = sparse.csr_array(
-            (microimages.share[lit], (microimages.pixel[lit], lit)), shape=(rows * columns, microimages.size)
-        )
+        first = np.zeros(rows * columns + 1, np.int32)
+        pixel = microimages.pixel[lit]
+        np.cumsum(np.bincount(pixel, minlength=rows * columns), out=first[1:])
+        ray = lit[np.argsort(pixel, kind="stable")]
         self._pixels = rows * columns
         self._rays = microimages.size
-        self._spread = [wp.array(array, device=device, copy=False) for array in (microimages.pixel, microimages.share)]
-        self._collect = [
-            wp.array(np.ascontiguousarray(array, dtype), device=device, copy=False)
-            for array, dtype in ((by_pixel.indptr, np.int32), (by_pixel.indices, np.int32), (by_pixel.data, np.float32))
-        ]
+        share = wp.array(microimages.share, device=device, copy=False)
+        self._spread = [wp.array(microimages.pixel, device=device, copy=False), share]
+        self._collect = [wp.array(first, device=device), wp.array(ray, device=device), share]
         wp.load_module(sys.modules[__name__], device=device)  # before threads use it
 
     def spread(self, image: wp.array, rays_out: wp.array) -> None:

@@ -17,9 +17,9 @@ def pytest_addoption(parser):
     )
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="session", autouse=True)
 def device(request):
-    """The running kernel device, started once."""
+    """The running kernel device, started once and before any test can pick another."""
     from lfpiv_kernels import runtime
 
     return runtime.start(request.config.getoption("--device"))
