@@ -15,7 +15,7 @@ from lfpiv.microimages import lay_out, microimage_edge, plain
 from lfpiv.raymodel import fit_rays, grid_models
 from lfpiv.rig import Grid
 from lfpiv_kernels import footprint, runtime
-from lfpiv_kernels.lattice import pack_lattice
+from lfpiv_kernels.lattice import cell_frame, cell_rectangles, pack_lattice
 from lfpiv_kernels.microimages import Microimages
 from lfpiv_kernels.project import Blocks
 from lfpiv_kernels.raymodel import LANES, LEVELS
@@ -132,8 +132,8 @@ def pack_camera(camera) -> CameraKernels:
         ),
         lattice=pack_lattice(lattice.origin_mm, lattice.basis_mm),
         cell_mm=float(cell),
-        frame=footprint.cell_frame(basis, lattice.layout),
-        rectangles=footprint.cell_rectangles(lattice.layout),
+        frame=cell_frame(basis, lattice.layout),
+        rectangles=cell_rectangles(lattice.layout),
     )
 
 

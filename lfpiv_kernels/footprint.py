@@ -60,32 +60,6 @@ def pack_camera(*, sensor_per_pupil, pixel_mm, sensor_shape, pupil_radius_mm, ed
     return Camera(sensor_per_pupil, pixel_mm, columns / 2, rows / 2, pupil_radius_mm, columns, rows, edge)
 
 
-def cell_rectangles(layout: str) -> np.ndarray:
-    """Rectangles that make up a lens's cell, rows (a_low, a_high, b_low, b_high) in the lattice's frame [pitch].
-
-    A square cell is one rectangle; a hexagonal one is cut into strips along b, where its flat sides face +-a.
-    """
-    if layout == "square":
-        return np.array([[-0.5, 0.5, -0.5, 0.5]], np.float32)
-    side, tip, strips = 1 / (2 * np.sqrt(3)), 1 / np.sqrt(3), 4
-    edges = np.linspace(side, tip, strips + 1)
-    half = 0.5 * (tip - (edges[1:] + edges[:-1]) / 2) / (tip - side)
-    rows = [(-0.5, 0.5, -side, side)]
-    for low, high, a in zip(edges[:-1], edges[1:], half, strict=True):
-        rows += [(-a, a, low, high), (-a, a, -high, -low)]
-    return np.array(rows, np.float32)
-
-
-def cell_frame(basis_mm: np.ndarray, layout: str) -> np.ndarray:
-    """Matrix F, shape (2, 2): (a, b) = F (s, t) turns array millimetres into the frame of `cell_rectangles`."""
-    basis = np.asarray(basis_mm, float)
-    if layout == "square":
-        return np.linalg.inv(basis).T
-    pitch = np.sqrt(abs(np.linalg.det(basis)) * 2 / np.sqrt(3))
-    a = basis[0] / np.linalg.norm(basis[0])
-    return np.array([a, [-a[1], a[0]]]) / pitch
-
-
 @ti.kernel
 def _measure_blocks(
     # in
@@ -432,7 +406,7 @@ def fill_blocks(
     model, camera, lattice, cell_mm, microimages, form
         As for `measure_blocks`.
     frame, rectangles
-        The lens's cell, from `cell_frame` and `cell_rectangles`; profiles need a single rectangle.
+        The lens's cell, from `lattice.cell_frame` and `lattice.cell_rectangles`; profiles need a single rectangle.
     first_block, first_row : ndarray, shape (voxel + 1,), int64
         Where each voxel's blocks and rows begin; the first entries are those of `ray` and `value`.
     ray : ndarray, shape (block,), int32

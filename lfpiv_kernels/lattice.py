@@ -1,4 +1,4 @@
-"""Taichi functions on a microlens lattice, shared by every kernel that sends rays through the array."""
+"""The microlens lattice as kernels take it: centres, cells, and Taichi functions that find the lens of a ray."""
 
 import numpy as np
 import taichi as ti
@@ -36,3 +36,29 @@ def nearest_lens(lattice, s, t, hexagonal: ti.template()):
                 best, best_i, best_j = distance, i + a, j + b
         i, j = best_i, best_j
     return ti.Vector([i, j])
+
+
+def cell_rectangles(layout: str) -> np.ndarray:
+    """Rectangles that make up a lens's cell, rows (a_low, a_high, b_low, b_high) in the lattice's frame [pitch].
+
+    A square cell is one rectangle; a hexagonal one is cut into strips along b, where its flat sides face +-a.
+    """
+    if layout == "square":
+        return np.array([[-0.5, 0.5, -0.5, 0.5]], np.float32)
+    side, tip, strips = 1 / (2 * np.sqrt(3)), 1 / np.sqrt(3), 4
+    edges = np.linspace(side, tip, strips + 1)
+    half = 0.5 * (tip - (edges[1:] + edges[:-1]) / 2) / (tip - side)
+    rows = [(-0.5, 0.5, -side, side)]
+    for low, high, a in zip(edges[:-1], edges[1:], half, strict=True):
+        rows += [(-a, a, low, high), (-a, a, -high, -low)]
+    return np.array(rows, np.float32)
+
+
+def cell_frame(basis_mm: np.ndarray, layout: str) -> np.ndarray:
+    """Matrix F, shape (2, 2): (a, b) = F (s, t) turns array millimetres into the frame of `cell_rectangles`."""
+    basis = np.asarray(basis_mm, float)
+    if layout == "square":
+        return np.linalg.inv(basis).T
+    pitch = np.sqrt(abs(np.linalg.det(basis)) * 2 / np.sqrt(3))
+    a = basis[0] / np.linalg.norm(basis[0])
+    return np.array([a, [-a[1], a[0]]]) / pitch

@@ -47,7 +47,7 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
     optics, lattice
         Values with the attributes of ``lfpiv.rig.Optics`` and ``LensLattice``.
     frame, rectangles
-        From ``footprint.cell_frame`` and ``footprint.cell_rectangles``.
+        From ``lattice.cell_frame`` and ``lattice.cell_rectangles``.
     local : bool
         Slopes followed pixel by pixel instead of taken under the lens's middle.
 

@@ -12,7 +12,7 @@ from lfpiv.raymodel import ray_models
 from lfpiv.weightblocks import count_voxels
 from lfpiv.weights import compare_with_count, estimate_memory
 from lfpiv_kernels import footprint, raymodel, reference, runtime, trace
-from lfpiv_kernels.lattice import pack_lattice
+from lfpiv_kernels.lattice import cell_frame, cell_rectangles, pack_lattice
 
 VOXEL_MM = 0.1
 LEVEL = 0.5 / raymodel.LEVELS * 1.1  # rounding to 8 bits, in units of the largest weight; the bound is 4-10 % above it
@@ -78,8 +78,8 @@ def test_footprint_kernel_equals_its_twin(name, form):
         ray_models(camera, centre[None], VOXEL_MM)[0],
         optics=camera.optics,
         lattice=camera.lattice,
-        frame=footprint.cell_frame(camera.lattice.basis_mm, camera.lattice.layout),
-        rectangles=footprint.cell_rectangles(camera.lattice.layout),
+        frame=cell_frame(camera.lattice.basis_mm, camera.lattice.layout),
+        rectangles=cell_rectangles(camera.lattice.layout),
         local=form == "pixels",
     )
     rays = lay_out(camera.optics, camera.lattice)
