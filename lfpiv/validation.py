@@ -3,6 +3,9 @@
 Fields are arrays (z, y, x, 3) of displacements [voxel]; neighbours are the 26 grid points around one. A vector passes
 if it agrees with their median, or with their median after each was moved along the local gradient: in a steep gradient,
 and at the edges of the grid where neighbours lie on one side only, the first alone makes outliers of good vectors.
+Where the flow bends from window to window, and few layers of vectors tell so, good vectors agree with neither. There
+a field known from a pass before helps: a vector with a clear peak also passes if its step from that field agrees with
+its neighbours' steps. Without a clear peak that proves nothing: a wrong field confirms itself.
 
 References
 ----------
@@ -24,6 +27,8 @@ NOISE_VOXEL = 0.1
 LARGEST_PART = 0.5
 """Largest accepted difference from the neighbours, as a part of the search range. Peaks of noise lie anywhere in that
 range: neighbours that scatter like them prove nothing."""
+CLEAR_RATIO = 2.0
+"""Peak ratio of a peak that is no chance: in noise 8 voxel windows reach 1.5 now and then, hardly ever 2."""
 MIN_NEIGHBOURS = 3
 """A vector with fewer good neighbours cannot be judged and is rejected, unless the grid itself has no more."""
 
@@ -32,7 +37,13 @@ _CUBE = np.ones((3, 3, 3), bool)
 
 
 def validate(
-    first: np.ndarray, second: np.ndarray, measured: np.ndarray, search: tuple[float, float, float]
+    first: np.ndarray,
+    second: np.ndarray,
+    measured: np.ndarray,
+    search: tuple[float, float, float],
+    *,
+    predicted: np.ndarray | None = None,
+    peak_ratio: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Test the displacement of the highest peaks, try the second peak where it fails, fill what remains.
 
@@ -44,6 +55,10 @@ def validate(
         Where `first` may be trusted at all.
     search : tuple of float
         Largest lag at which peaks were searched, order (z, y, x) [voxel].
+    predicted : ndarray, shape (z, y, x, 3), optional
+        Displacement known before, around which peaks were searched [voxel].
+    peak_ratio : ndarray, shape (z, y, x), optional
+        Highest coefficient over its rival; needed with `predicted`.
 
     Returns
     -------
@@ -60,8 +75,12 @@ def validate(
     for _ in range(_ROUNDS):  # what was rejected is no neighbour any more, so other vectors may pass again
         prediction = predict(first, valid, todo)
         judged = prediction.count >= needed[todo]
+        agrees = _agrees(first[todo], prediction, search)
+        if predicted is not None:
+            step = first - predicted
+            agrees |= (peak_ratio[todo] >= CLEAR_RATIO) & _agrees(step[todo], predict(step, valid, todo), search)
         passed = valid.copy()
-        passed[todo] = measured[todo] & judged & (_agrees(first[todo], prediction, search) | (needed[todo] == 0))
+        passed[todo] = measured[todo] & judged & (agrees | (needed[todo] == 0))
         second_agrees[todo] = judged & _agrees(second[todo], prediction, search)
         changed = passed != valid
         if not changed.any():

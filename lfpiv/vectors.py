@@ -10,6 +10,7 @@ import enum
 import json
 import logging
 import math
+import numbers
 from collections.abc import Sequence
 
 import numpy as np
@@ -119,16 +120,16 @@ def correlate(
     .. [1] B. Wieneke, "PIV uncertainty quantification from correlation statistics", Meas. Sci. Technol. 26 (2015)
        074002, doi:10.1088/0957-0233/26/7/074002.
     """
-    axes_mm, spacing_mm = _check_axes(volume_a, volume_b, voxel_mm)
     first, second = _check_volume(volume_a, "volume_a"), _check_volume(volume_b, "volume_b")
-    if not (math.isfinite(dt_s) and dt_s > 0):
-        raise ValueError(f"dt_s: expected a positive time [s], got {dt_s}.")
-    if not 0 <= overlap < 1:
-        raise ValueError(f"overlap: expected 0 <= overlap < 1, got {overlap}.")
-    if not (math.isfinite(smoothing_voxel) and smoothing_voxel >= 0):
-        raise ValueError(f"smoothing_voxel: expected a value >= 0, got {smoothing_voxel}.")
-    if not (math.isfinite(intensity_power) and intensity_power > 0):
-        raise ValueError(f"intensity_power: expected a value > 0, got {intensity_power}.")
+    axes_mm, spacing_mm = _check_axes(volume_a, volume_b, voxel_mm)
+    if not (_is_finite(dt_s) and dt_s > 0):
+        raise ValueError(f"dt_s: expected a positive time [s], got {dt_s!r}.")
+    if not (_is_finite(overlap) and 0 <= overlap < 1):
+        raise ValueError(f"overlap: expected 0 <= overlap < 1, got {overlap!r}.")
+    if not (_is_finite(smoothing_voxel) and smoothing_voxel >= 0):
+        raise ValueError(f"smoothing_voxel: expected a value >= 0, got {smoothing_voxel!r}.")
+    if not (_is_finite(intensity_power) and intensity_power > 0):
+        raise ValueError(f"intensity_power: expected a value > 0, got {intensity_power!r}.")
     schedule = _check_windows(windows, first.shape)
     search = _first_search(max_displacement_voxel, schedule[0], first.shape)
     if smoothing_voxel > 0:
@@ -138,7 +139,7 @@ def correlate(
     multi_pass = _MultiPass(first, second, symmetric=len(schedule) > 1)
     for number, window in enumerate(schedule):
         shared = overlap if number == len(schedule) - 1 else max(overlap, COARSE_OVERLAP)
-        multi_pass.run(window, tuple(max(1, round(edge * (1 - shared))) for edge in window), search)
+        multi_pass.run(window, shared, search)
         search = (REFINE_SEARCH,) * 3
     settings = {
         "windows": [list(window) for window in schedule],
@@ -160,9 +161,10 @@ class _MultiPass:
         self.centres: list[np.ndarray] = []
         self.passes: list[dict] = []
 
-    def run(self, window: tuple[int, int, int], step: tuple[int, int, int], search: tuple[int, int, int]) -> None:
+    def run(self, window: tuple[int, int, int], overlap: float, search: tuple[int, int, int]) -> None:
         """Deform by the field so far, correlate, validate."""
         shape = self.volumes[0].shape
+        step = tuple(max(1, round(edge * (1 - overlap))) for edge in window)
         origin, count = kernel.window_grid(shape, window, step)
         centres = [o + (w - 1) / 2 + s * np.arange(n) for o, w, s, n in zip(origin, window, step, count, strict=True)]
         first, second, predicted = *self.volumes, np.zeros(3)
@@ -181,6 +183,8 @@ class _MultiPass:
             self.peaks.second_displacement + predicted,
             self.peaks.measured,
             search,
+            predicted=predicted if self.passes and overlap < COARSE_OVERLAP else None,
+            peak_ratio=self.peaks.correlation / np.maximum(self.peaks.rival, LOWEST_RIVAL),
         )
         # without any valid vector what was known before is the best guess
         self.guess = self.field if self.valid.any() else np.broadcast_to(predicted, self.field.shape)
@@ -257,13 +261,25 @@ def _dataset(
     return xr.Dataset(variables, places, attributes)
 
 
+def _is_finite(value: object) -> bool:
+    """Whether a value is a finite real number."""
+    return isinstance(value, numbers.Real) and math.isfinite(value)
+
+
 def _check_volume(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
     """Background-free copy of a volume as float32, scaled to a largest magnitude of 1."""
-    values = np.asarray(volume)
+    try:
+        values = np.asarray(volume)
+    except ValueError:  # rows of unequal length
+        raise ValueError(
+            f"{name}: expected a volume of numbers (z, y, x), got nested sequences of other form."
+        ) from None
     if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fiub":
         raise ValueError(f"{name}: expected a volume of numbers (z, y, x), got {values.dtype} of shape {values.shape}.")
     with np.errstate(over="ignore"):
         values = values.astype(np.float32)
+    if isinstance(volume, np.ma.MaskedArray):
+        values[np.ma.getmaskarray(volume)] = np.nan
     bad = values.size - int(np.isfinite(values).sum())
     if bad:
         raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
@@ -280,8 +296,8 @@ def _check_axes(
         raise ValueError(f"volume_b: expected the shape of volume_a, {np.shape(volume_a)}, got {np.shape(volume_b)}.")
     labelled = [isinstance(volume, xr.DataArray) for volume in (volume_a, volume_b)]
     if not all(labelled):
-        if voxel_mm is None or not (math.isfinite(voxel_mm) and voxel_mm > 0):
-            raise ValueError(f"voxel_mm: expected the voxel edge [mm] > 0, which arrays need, got {voxel_mm}.")
+        if not (_is_finite(voxel_mm) and voxel_mm > 0):
+            raise ValueError(f"voxel_mm: expected the voxel edge [mm] > 0, which arrays need, got {voxel_mm!r}.")
         return [voxel_mm * np.arange(n) for n in np.shape(volume_a)], (voxel_mm,) * 3
     if voxel_mm is not None:
         raise ValueError("voxel_mm: expected no value with DataArrays, whose coordinates tell it. Leave it out.")
@@ -313,7 +329,7 @@ def _check_windows(windows, shape: tuple[int, int, int]) -> list[tuple[int, int,
     schedule = []
     for window in windows:
         edges = tuple(window) if np.ndim(window) else (window,) * 3
-        if len(edges) != 3 or any(int(edge) != edge or edge < 4 for edge in edges):
+        if len(edges) != 3 or not all(_is_finite(edge) and int(edge) == edge and edge >= 4 for edge in edges):
             raise ValueError(f"windows: expected edges of whole voxels >= 4, one or (z, y, x) per pass, got {window}.")
         edges = tuple(int(edge) for edge in edges)
         too_large = [(axis, edge, n) for axis, edge, n in zip(_AXES, edges, shape, strict=True) if edge > n]
@@ -338,7 +354,7 @@ def _first_search(
     """Largest lag of the first pass: a peak needs one lag beyond it."""
     if max_displacement_voxel is None:
         return tuple(max(REFINE_SEARCH, math.ceil(FIRST_SEARCH * edge) + 1) for edge in window)
-    if not (math.isfinite(max_displacement_voxel) and 0 < max_displacement_voxel < max(shape)):
+    if not (_is_finite(max_displacement_voxel) and 0 < max_displacement_voxel < max(shape)):
         raise ValueError(
             f"max_displacement_voxel: expected a value > 0 and within the volume {shape}, got {max_displacement_voxel}."
         )

@@ -5,14 +5,15 @@ range, so each lag uses the full window ("extended search area"): nothing wraps 
 lags. Two ways to the sums of products:
 
 - *direct*: windows that overlap share voxels, so the sums are formed once for blocks (the greatest common divisor of
-  window and step) and added up per window: an eighth of the work at 50 % overlap;
+  window and step) and added up per window: an eighth of the work at 50 % overlap. Along z a transform as long as block
+  and lags together replaces most products where there are many lags (`products_along_z`);
 - *fft*: zero-padded transforms, window by window, cheaper for large windows with a large search range.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
@@ -20,21 +21,20 @@ import warp as wp
 from numpy.lib.stride_tricks import sliding_window_view
 
 from . import correlation_kernels as kernels
-from . import runtime
-from .correlation_kernels import LANES, Row
+from . import runtime, window_kernels
+from .correlation_kernels import LANES
+from .correlation_plan import Plan, make_plan, products_along_z, whole_groups, window_grid
+from .window_kernels import ROW, Row
 
-METHODS = ("auto", "direct", "fft")
+__all__ = ["WindowPeaks", "box_sum", "correlate_windows", "window_grid"]
+
 SIGNAL_FLOOR = 1e-4
 """A window whose variance is below this part of the whole volume's variance holds no signal."""
 
-_SLAB_BYTES = 1 << 26
+_SLAB_BYTES = 1 << 25
 """Correlation sums held at a time; larger problems run in slabs of window layers."""
-_DIRECT_SECONDS = 6.5e-11
-"""Cost of one multiply-add of the direct kernel, all lanes counted (measured, one core, AVX2)."""
-_SUM_SECONDS = 2.5e-10
-"""Cost of adding one block's lag to its window (measured, as above)."""
-_FFT_SECONDS = 1.1e-9
-"""Cost of a transform per point and log2(points), three transforms a window, copies included (measured, as above)."""
+_SCORE_BYTES = 1 << 20
+"""Coefficients a CPU thread holds at a time."""
 
 
 @dataclass(frozen=True)
@@ -51,127 +51,6 @@ class WindowPeaks:
     """Highest coefficient more than two lags away from the highest peak, a peak of its own or not; at least 0."""
     measured: np.ndarray
     """True where the window holds signal and its highest peak lies inside the search range, not on its border."""
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """Where windows, blocks and lags lie; every triple in the order (z, y, x)."""
-
-    shape: tuple[int, int, int]
-    window: tuple[int, int, int]
-    step: tuple[int, int, int]
-    search: tuple[int, int, int]
-    origin: tuple[int, int, int]
-    """First voxel of window (0, 0, 0)."""
-    count: tuple[int, int, int]
-    """Windows per axis."""
-    block: tuple[int, int, int]
-    """Edges of the blocks that windows are made of; the window itself where nothing is shared."""
-
-    @property
-    def lags(self) -> tuple[int, int, int]:
-        """Lags per axis."""
-        return tuple(2 * r + 1 for r in self.search)
-
-    @property
-    def groups(self) -> tuple[int, int]:
-        """Groups of lags along y and x, `LANES` each."""
-        return -(-self.lags[1] // LANES), -(-self.lags[2] // LANES)
-
-    @property
-    def lag_shape(self) -> tuple[int, int, int]:
-        """Lags per axis as stored, padded to whole groups."""
-        return self.lags[0], LANES * self.groups[0], LANES * self.groups[1]
-
-    @property
-    def padded_shape(self) -> tuple[int, int, int]:
-        """Second volume with room for every lag that is stored."""
-        return (
-            self.shape[0] + 2 * self.search[0],
-            self.shape[1] + self.lag_shape[1] + 1,
-            self.shape[2] + self.lag_shape[2],
-        )
-
-    @property
-    def shared(self) -> bool:
-        """Whether windows are sums of smaller blocks."""
-        return self.block != self.window
-
-    @property
-    def stride(self) -> tuple[int, int, int]:
-        """Distance of blocks [voxel]."""
-        return self.block if self.shared else self.step
-
-    @property
-    def block_count(self) -> tuple[int, int, int]:
-        """Blocks per window and axis."""
-        return tuple(w // b for w, b in zip(self.window, self.block, strict=True))
-
-    @property
-    def block_step(self) -> tuple[int, int, int]:
-        """Distance of windows [block]."""
-        return tuple(s // d for s, d in zip(self.step, self.stride, strict=True))
-
-    @property
-    def block_grid(self) -> tuple[int, int, int]:
-        """Blocks per axis that all windows need."""
-        return tuple((c - 1) * m + k for c, m, k in zip(self.count, self.block_step, self.block_count, strict=True))
-
-    def direct_seconds(self) -> float:
-        """Predict the time of the direct way on one CPU core."""
-        lags = math.prod(self.lag_shape)
-        products = math.prod(self.block_grid) * math.prod(self.block) * lags
-        sums = math.prod(self.count) * math.prod(self.block_count) * lags
-        return products * _DIRECT_SECONDS + sums * _SUM_SECONDS
-
-    def fft_seconds(self) -> float:
-        """Predict the time of the transforms on one CPU core."""
-        points = math.prod(self.transform_shape())
-        return math.prod(self.count) * points * math.log2(points) * _FFT_SECONDS
-
-    def transform_shape(self) -> tuple[int, int, int]:
-        """Zero-padded transform that holds a window and every lag without wrapping around."""
-        return tuple(scipy.fft.next_fast_len(w + n - 1, real=True) for w, n in zip(self.window, self.lags, strict=True))
-
-    def mirrored(self) -> _Plan:
-        """Place the same windows in the mirrored volume, in backward order."""
-        origin = tuple(
-            n - o - (c - 1) * s - w
-            for n, o, c, s, w in zip(self.shape, self.origin, self.count, self.step, self.window, strict=True)
-        )
-        return replace(self, origin=origin)
-
-    def slabs(self):
-        """Parts of whole window layers whose correlation sums fit `_SLAB_BYTES`, as (slice of windows, plan)."""
-        per_layer = math.prod(self.count[1:])
-        blocks_per_layer = self.block_step[0] * math.prod(self.block_grid[1:])
-        layer_bytes = 4 * math.prod(self.lag_shape) * (per_layer + blocks_per_layer)
-        depth = max(1, _SLAB_BYTES // layer_bytes)
-        for layer in range(0, self.count[0], depth):
-            part = min(depth, self.count[0] - layer)
-            origin = (self.origin[0] + layer * self.step[0], *self.origin[1:])
-            windows = slice(layer * per_layer, (layer + part) * per_layer)
-            yield windows, replace(self, origin=origin, count=(part, *self.count[1:]))
-
-
-def window_grid(
-    shape: tuple[int, int, int], window: tuple[int, int, int], step: tuple[int, int, int]
-) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
-    """Place windows inside a volume; what remains is shared between both ends.
-
-    Parameters
-    ----------
-    shape, window, step : tuple of int
-        Volume, window edges and their distance, order (z, y, x) [voxel].
-
-    Returns
-    -------
-    origin, count : tuple of int
-        First voxel of the first window, and the number of windows, per axis.
-    """
-    count = tuple((n - w) // s + 1 for n, w, s in zip(shape, window, step, strict=True))
-    origin = tuple((n - w - (c - 1) * s) // 2 for n, w, s, c in zip(shape, window, step, count, strict=True))
-    return origin, count
 
 
 def box_sum(volume: np.ndarray, window: tuple[int, int, int], keep: tuple[slice, ...] | None = None) -> np.ndarray:
@@ -201,9 +80,9 @@ def box_sum(volume: np.ndarray, window: tuple[int, int, int], keep: tuple[slice,
 def _sum_along(volume: np.ndarray, axis: int, width: int) -> np.ndarray:
     """Sum `width` neighbours along an axis, starting at each voxel; the last ``width - 1`` sums mean nothing."""
     pitch = math.prod(volume.shape[axis + 1 :])
-    rows = -(-volume.size // LANES)
-    part = max(n for n in range(1, math.isqrt(width) + 1) if width % n == 0)  # sums of sums: part + width / part terms
-    taken, written = (np.zeros(rows * LANES + width * pitch + LANES, np.float32) for _ in range(2))
+    rows = -(-volume.size // ROW)
+    part = _factor(width)  # sums of sums: part + width / part terms
+    taken, written = (np.zeros(rows * ROW + width * pitch + ROW, np.float32) for _ in range(2))
     taken[: volume.size] = volume.ravel()
     taken, written = _to_device(taken), _to_device(written)
     batch = 1 if runtime.device().kind == "cuda" else 64  # a CPU task costs as much as adding several rows
@@ -211,7 +90,11 @@ def _sum_along(volume: np.ndarray, axis: int, width: int) -> np.ndarray:
         if terms > 1:
             rows_out = wp.array(ptr=written.ptr, dtype=Row, shape=(rows,), device=written.device)
             _launch(
-                kernels._box_sum, -(-rows // batch), (), [_overlapping(taken), spacing, terms, rows, batch], [rows_out]
+                window_kernels._box_sum,
+                -(-rows // batch),
+                (),
+                [_overlapping(taken), spacing, terms, rows, batch],
+                [rows_out],
             )
             taken, written = written, taken
     return taken.numpy()[: volume.size].reshape(volume.shape)
@@ -256,157 +139,283 @@ def correlate_windows(
     Raises
     ------
     ValueError
-        If shapes differ, a window does not fit, `search` is below 2 or the method is unknown.
+        If shapes differ, values are not finite, a window does not fit, `search` is below 2 or the method is unknown.
     """
-    plan, method = _make_plan(first.shape, second.shape, window, step, search, method)
-    sides = [_Side(plan, first, second)]
-    if symmetric:  # mirroring turns the lag -L into L
-        sides.append(_Side(plan.mirrored(), *(np.flip(volume) for volume in (second, first))))
-    size = math.prod(plan.count)
-    displacement = np.empty((size, 2, 3), np.float32)
-    correlation, found = np.empty((size, 2), np.float32), np.empty((size, 2), np.int32)
-    for windows, slab in plan.slabs():
-        scores = sides[0].scores(slab, windows, method)
-        if symmetric:
-            backwards = slice(size - windows.stop, size - windows.start)
-            sides[1].scores(slab.mirrored(), backwards, method, average_with=scores)
-        displacement[windows], correlation[windows], found[windows] = _peaks(slab, scores)
-    displacement[found == 0] = np.nan
+    plan, method = make_plan(first.shape, second.shape, window, step, search, method)
+    for name, volume in (("first", first), ("second", second)):
+        flat = np.ravel(volume)
+        if not math.isfinite(float(np.dot(flat, flat))):
+            raise ValueError(f"{name}: expected finite values whose squares add up to a float32, got others.")
+    sides = _Side(plan, first, search if symmetric else (0, 0, 0)), _Side(plan, second, search)
+    peaks = _measure(plan, sides, symmetric, method)
     return WindowPeaks(
-        displacement=displacement[:, 0].reshape(*plan.count, 3),
-        second_displacement=displacement[:, 1].reshape(*plan.count, 3),
-        correlation=correlation[:, 0].reshape(plan.count),
-        rival=correlation[:, 1].reshape(plan.count),
-        measured=found[:, 0].reshape(plan.count) > 0,
+        displacement=np.ascontiguousarray(np.moveaxis(peaks[:3], 0, -1)),
+        second_displacement=np.ascontiguousarray(np.moveaxis(peaks[3:6], 0, -1)),
+        correlation=np.ascontiguousarray(peaks[6]),
+        rival=np.ascontiguousarray(peaks[7]),
+        measured=np.isfinite(peaks[0]),
     )
 
 
 class _Side:
-    """The windows of one volume against the surroundings of these windows in the other."""
+    """One volume as the kernels take it: split by phase, with the statistics of its windows at every lag."""
 
-    def __init__(self, plan: _Plan, first: np.ndarray, second: np.ndarray):
-        self.first = np.ascontiguousarray(first, np.float32)
-        self.padded = np.zeros(plan.padded_shape, np.float32)
-        self.padded[tuple(slice(r, r + n) for r, n in zip(plan.search, plan.shape, strict=True))] = second
-        corners = tuple(
-            slice(o, o + (c - 1) * s + 1, s) for o, c, s in zip(plan.origin, plan.count, plan.step, strict=True)
-        )
-        first_mean, first_scale = _window_statistics(self.first, plan.window, corners)
-        self.first_sum, self.first_scale = math.prod(plan.window) * first_mean.ravel(), first_scale.ravel()
-        self.device_first = _to_device(np.append(self.first.ravel(), np.zeros(plan.shape[2], np.float32)))
-        volumes = (self.padded, *_window_statistics(self.padded, plan.window))
-        self.device_second = [_to_device(volume.ravel()) for volume in volumes]
-
-    def scores(self, plan: _Plan, windows: slice, method: str, *, average_with: wp.array | None = None) -> wp.array:
-        """Correlation coefficients of the plan's windows, (window, lag z, lag y, lag x / 8) of `Row`."""
-        if method == "fft":
-            sums = _fft_sums(plan, self.first, self.padded)
-        else:
-            sums = _direct_sums(plan, self.device_first, self.device_second[0])
-        count, where = math.prod(plan.count), runtime.device().warp
-        scores = average_with
-        if scores is None:
-            scores = wp.empty((count, *sums.shape[1:]), dtype=Row, device=where)
-        mean, scale = (_overlapping(values) for values in self.device_second[1:])
-        statistics = [_to_device(values[windows]) for values in (self.first_sum, self.first_scale)]
-        layout = [plan.count, plan.block_grid, plan.origin, plan.step, plan.block_step, plan.block_count]
-        inputs = [sums, mean, scale, *statistics, _pitch(plan), plan.lags[1], *(wp.vec3i(*t) for t in layout)]
-        mirrored = int(average_with is not None)
-        _launch(kernels._normalise, count, (plan.lags[0], plan.groups[1]), [*inputs, mirrored], [scores])
-        return scores
+    def __init__(self, plan: Plan, volume: np.ndarray, search: tuple[int, int, int]):
+        self.volume, self.search = np.ascontiguousarray(volume, np.float32), search
+        self.lags = tuple(2 * r + 1 for r in search)
+        reach = tuple(b + n - 1 for b, n in zip(plan.block, self.lags, strict=True))
+        corner = tuple(o - r for o, r in zip(plan.origin, search, strict=True))
+        self.voxels = _Split.empty(plan, reach)
+        phases, lanes = wp.vec2i(*self.voxels.shape[1:3]), self.voxels.shape[3]
+        layout = [wp.vec3i(*plan.shape), wp.vec3i(*corner), wp.vec2i(*plan.stride[1:]), phases, plan.pitch, lanes]
+        inputs = [_to_device(self.volume.ravel()), *layout]
+        _launch(kernels._split, self.voxels.shape[0], (), inputs, [self.voxels.flat])
+        self.mean, self.scale = _statistics(plan, self.volume, search)
 
 
-def _make_plan(shape, second_shape, window, step, search, method) -> tuple[_Plan, str]:
-    """Check the arguments of `correlate_windows`; the plan and the method to use."""
-    if second_shape != shape or len(shape) != 3:
-        raise ValueError(f"second: expected two volumes of equal shape (z, y, x), got {shape} and {second_shape}.")
-    if any(not 1 <= w <= n for w, n in zip(window, shape, strict=True)) or min(step) < 1:
-        raise ValueError(f"window: expected edges within the volume {shape} and steps >= 1, got {window} and {step}.")
-    if min(search) < 2:
-        raise ValueError(f"search: expected at least 2 voxels per axis, got {search}.")
-    if method not in METHODS:
-        raise ValueError(f"method: expected one of {METHODS}, got {method!r}.")
-    origin, count = window_grid(shape, window, step)
-    whole = _Plan(shape, tuple(window), tuple(step), tuple(search), origin, count, tuple(window))
-    shared = replace(whole, block=tuple(math.gcd(w, s) for w, s in zip(window, step, strict=True)))
-    direct = min((whole, shared), key=_Plan.direct_seconds)
-    if method == "auto":
-        on_gpu = runtime.device().kind == "cuda"
-        method = "direct" if on_gpu or direct.direct_seconds() <= whole.fft_seconds() else "fft"
-    return (whole if method == "fft" else direct), method
+@dataclass(frozen=True)
+class _Split:
+    """Values at the lattice of blocks and at every offset from it, (plane, phase y, phase x, lane)."""
+
+    shape: tuple[int, int, int, int]
+    array: wp.array
+    offsets: tuple[wp.array, wp.array]
+    """Distance in memory for every offset in voxels along y and x."""
+
+    @classmethod
+    def empty(cls, plan: Plan, reach: tuple[int, int, int]) -> _Split:
+        """Room for the offsets 0 to ``reach - 1``."""
+        phases = tuple(min(s, r) for s, r in zip(plan.stride, reach, strict=True))
+        past = [(r - 1) // s for r, s in zip(reach, plan.stride, strict=True)]
+        lanes = whole_groups(plan.lanes + past[1] * plan.pitch + past[2] + LANES)
+        shape = ((plan.block_grid[0] - 1) * plan.stride[0] + reach[0], phases[1], phases[2], lanes)
+        y, x = (np.arange(r) for r in reach[1:])
+        along_y = y % plan.stride[1] * phases[2] * lanes + y // plan.stride[1] * plan.pitch
+        along_x = x % plan.stride[2] * lanes + x // plan.stride[2]
+        where = runtime.device().warp
+        offsets = tuple(wp.array(o.astype(np.int32), dtype=int, device=where) for o in (along_y, along_x))
+        return cls(shape, _new(shape), offsets)
+
+    @property
+    def flat(self) -> wp.array:
+        """The array as the kernels index it."""
+        return self.array.flatten()
+
+    @property
+    def plane(self) -> int:
+        """Elements per plane."""
+        return math.prod(self.shape[1:])
 
 
-def _window_statistics(
-    volume: np.ndarray, window: tuple[int, int, int], keep: tuple[slice, ...] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of each window, and 1 / sqrt(sum of squared deviations), 0 where there is no signal; by first voxel."""
-    voxels = np.float32(math.prod(window))
-    mean = box_sum(volume, window, keep)
-    deviation = box_sum(volume * volume, window, keep)
-    deviation -= mean * mean / voxels
-    mean /= voxels
+def _statistics(plan: Plan, volume: np.ndarray, search: tuple[int, int, int]) -> tuple[_Split, _Split]:
+    """Mean of the windows at every lag, and 1 / sqrt(sum of squared deviations), 0 where there is no signal."""
+    window, shape, where = wp.vec3i(*plan.window), wp.vec3i(*plan.shape), runtime.device()
+    on_cpu = where.kind == "cpu"
+    sums = tuple(n + 2 * r - w + 1 for n, r, w in zip(plan.shape, search, plan.window, strict=True))
+    rows = plan.shape[0], *sums[1:]
+    total, square = (_new(rows) for _ in range(2))
+    part = [_factor(edge) for edge in plan.window[1:]]
+    padded = plan.shape[1] + 2 * search[1], plan.shape[2] + 2 * search[2]
+    scratch_pitch = 3 * padded[1] + sums[2] * (2 * plan.shape[1] + padded[0])
+    scratch = _new(((runtime.CHUNKS if on_cpu else plan.shape[0]) * scratch_pitch,))
+    inputs = [_to_device(volume.ravel()), shape, wp.vec3i(*search), window, wp.vec2i(*part)]
+    outputs = [array.flatten() for array in (scratch, total, square)]
+    _launch(window_kernels._sum_planes, plan.shape[0], (), inputs, outputs, slots=True, after_slot=[scratch_pitch])
     flat = volume.ravel()
     variance = float(np.dot(flat, flat)) / flat.size - float(flat.mean()) ** 2
-    floor = np.float32(SIGNAL_FLOOR * voxels * variance + np.finfo(np.float32).tiny)
-    scale = np.zeros_like(deviation)
-    np.divide(1, np.sqrt(np.maximum(deviation, floor)), where=deviation > floor, out=scale)
+    floor = SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
+    lags = tuple(2 * r + 1 for r in search)
+    mean, scale = (_Split.empty(plan, lags) for _ in range(2))
+    phases = wp.vec3i(*(min(s, n) for s, n in zip(plan.stride, lags, strict=True)))
+    layout = [wp.vec3i(*rows), search[0], window, floor, wp.vec3i(*plan.origin), wp.vec3i(*plan.stride), phases]
+    inputs = [*outputs[1:], *layout, mean.shape[0], plan.pitch, mean.shape[3]]
+    _launch(window_kernels._window_statistics, sums[1], (), inputs, [mean.flat, scale.flat])
     return mean, scale
 
 
-def _direct_sums(plan: _Plan, first: wp.array, padded: wp.array) -> wp.array:
-    """Sum the products of all blocks at all lags, (block, lag z, lag y, lag x / 8) of `Row`."""
-    blocks, groups = math.prod(plan.block_grid), plan.groups
-    where = runtime.device().warp
-    sums = wp.empty((blocks, plan.lags[0], LANES * groups[0], groups[1]), dtype=Row, device=where)
-    pitches = wp.vec2i(plan.shape[1] * plan.shape[2], plan.shape[2]), _pitch(plan)
-    layout = [wp.vec3i(*triple) for triple in (plan.block_grid, plan.origin, plan.stride, plan.block)]
-    _launch(
-        kernels._correlate_blocks,
-        blocks,
-        (plan.lags[0], *groups),
-        [first, _overlapping(padded), *pitches, *layout],
-        [sums],
-    )
-    return sums
+def _slab_depth(plan: Plan, symmetric: bool) -> int:
+    """Layers of windows whose correlation sums fit `_SLAB_BYTES`."""
+    layer_bytes = 4 * (1 + symmetric) * math.prod(plan.lags) * plan.lanes
+    return min(plan.count[0], max(1, (_SLAB_BYTES // layer_bytes - plan.block_count[0]) // plan.block_step[0] + 1))
 
 
-def _fft_sums(plan: _Plan, first: np.ndarray, padded: np.ndarray) -> wp.array:
-    """Return what `_direct_sums` returns for whole windows, by zero-padded transforms."""
-    sums = np.empty((math.prod(plan.count), *plan.lag_shape), np.float32)
+def _factor(edge: int) -> int:
+    """Largest factor that is no larger than its counterpart."""
+    return max(n for n in range(1, math.isqrt(edge) + 1) if edge % n == 0)
+
+
+def _measure(plan: Plan, sides: tuple[_Side, _Side], symmetric: bool, method: str) -> np.ndarray:
+    """Two displacements (z, y, x), highest coefficient and its rival of all windows, (8, z, y, x)."""
+    on_cpu = runtime.device().kind == "cpu"
+    lags, step, depth = math.prod(plan.lags), plan.block_step[0], _slab_depth(plan, symmetric)
+    ring = (depth - 1) * step + plan.block_count[0]
+    spare = plan.block_count[1] * plan.pitch + plan.block_count[2] + 2 * LANES  # read by lanes that hold no window
+    sums = [_new((ring * lags * plan.lanes + spare,)) for _ in range(1 + symmetric)]
+    group = 1
+    if on_cpu:
+        group = LANES * max(1, min(4, _SCORE_BYTES // (4 * LANES * lags)))
+    groups = -(-plan.lanes // group)
+    slot_pitch = lags * group + group + plan.block_count[2] + LANES
+    scratch = _new((runtime.CHUNKS * slot_pitch if on_cpu else depth * groups * lags,))
+    peaks = _new((8, plan.count[0], plan.lanes))
+    work = _Work.empty(plan, sides, ring if method == "direct" else 0)
+    first, second = sides
+    statistics = [first.mean.flat, first.scale.flat, second.mean.flat, second.scale.flat]
+    offsets = [*first.mean.offsets, *second.mean.offsets]
+    pitches = wp.vec2i(first.mean.plane, second.mean.plane)
+    gathered = on_cpu and min(plan.block_count[1:]) > 2  # windows that share rows of blocks add them up once
+    done = 0
+    for begin in range(0, plan.count[0], depth):
+        end = min(begin + depth, plan.count[0])
+        layers = range(done, (end - 1) * step + plan.block_count[0])
+        done = layers.stop
+        for sum_, (a, b) in zip(sums, (sides, sides[::-1]), strict=False):
+            if method == "fft":
+                _transform_layers(plan, a, b, layers, ring, sum_)
+            else:
+                _correlate_layers(plan, a, b, layers, ring, work, sum_)
+            if gathered:
+                layout = [*plan.block_count[1:], plan.pitch, plan.lanes, lags, ring, layers.start]
+                _launch(kernels._gather_blocks, len(layers) * lags, (), layout, [sum_])
+        layout = [
+            pitches,
+            wp.vec3i(*first.search),
+            plan.stride[0],
+            math.prod(plan.window),
+            wp.vec3i(*((plan.block_count[0], 1, 1) if gathered else plan.block_count)),
+            step,
+            wp.vec3i(*plan.lags),
+            begin,
+            ring,
+            groups,
+            group,
+            plan.pitch,
+            plan.lanes,
+        ]
+        inputs = [sums[0], sums[-1], int(symmetric), *statistics, *offsets, *layout]
+        size = (end - begin) * groups
+        _launch(
+            window_kernels._find_peaks,
+            size,
+            (),
+            inputs,
+            [scratch, peaks.flatten()],
+            slots=True,
+            after_slot=[slot_pitch, group if on_cpu else size, plan.count[0] * plan.lanes],
+        )
+    lattice = peaks.numpy()[:, :, : plan.block_grid[1] * plan.pitch].reshape(8, plan.count[0], -1, plan.pitch)
+    along_y, along_x = (slice(0, (c - 1) * m + 1, m) for c, m in zip(plan.count[1:], plan.block_step[1:], strict=True))
+    return lattice[:, :, along_y, along_x]
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Memory that `_correlate_layers` works in, the same for every slab."""
+
+    taps: wp.array
+    near: wp.array
+    scratch: wp.array
+    scratch_pitch: int
+
+    @classmethod
+    def empty(cls, plan: Plan, sides: tuple[_Side, _Side], layers: int) -> _Work:
+        """Room for some layers of blocks."""
+        depth = 1 if plan.products else plan.block[0]
+        reach = math.prod(b + n - 1 for b, n in zip(plan.block[1:], plan.lags[1:], strict=True))
+        kept = plan.products * -(-plan.lags[1] * plan.lags[2] // 3) * 3
+        pitch = LANES * (depth * (math.prod(plan.block[1:]) + reach) + kept)
+        plane = max(side.voxels.plane for side in sides)
+        taps, near = (_new((max(1, layers * plan.products * plane),)) for _ in range(2))
+        on_cpu = runtime.device().kind == "cpu"
+        return cls(taps, near, _new((runtime.CHUNKS * pitch if on_cpu else 1,)), pitch)
+
+
+def _correlate_layers(
+    plan: Plan, first: _Side, second: _Side, layers: range, ring: int, work: _Work, sums: wp.array
+) -> None:
+    """Sum the products of the blocks of some layers at all lags."""
+    on_cpu = runtime.device().kind == "cpu"
+    group, parts = (LANES, 1) if on_cpu else (1, plan.lags[0])
+    groups = plan.lanes // group
+    taps, near = _shifted(first, first.search), second.voxels.flat
+    inverse = np.zeros((1, 1))
+    if plan.products:
+        *matrices, inverse = products_along_z(plan.block[0], plan.lags[0])
+        start, stride = layers.start * plan.stride[0], plan.stride[0]
+        _combine(matrices[0], taps[0], start, stride, len(layers), first.voxels.plane, work.taps)
+        _combine(matrices[1], near, start, stride, len(layers), second.voxels.plane, work.near)
+        taps, near = (work.taps, *taps[1:]), work.near
+    inputs = [taps[0], near, *taps[1:], *second.voxels.offsets]
+    inputs += [wp.vec2i(first.voxels.plane, second.voxels.plane), plan.stride[0], wp.vec3i(*plan.block)]
+    inputs += [wp.vec3i(*plan.lags), layers.start, ring, groups, group, parts, plan.products, *_padded(inverse.T)]
+    size = len(layers) * groups * parts
+    _launch(kernels._correlate_blocks, size, (), [*inputs, work.scratch_pitch], [work.scratch, sums], slots=True)
+
+
+def _combine(
+    matrix: np.ndarray, volume: wp.array, start: int, stride: int, layers: int, plane: int, out: wp.array
+) -> None:
+    """Combine the planes of each layer, (layer, row of the matrix, element of a plane)."""
+    rows, terms = matrix.shape
+    part = 256  # so that the planes' parts stay in the fastest cache
+    inputs = [volume, *_padded(matrix.T), terms, rows, start, stride, plane, part]
+    _launch(kernels._transform_planes, layers * -(-plane // part), (), inputs, [out])
+
+
+def _padded(matrix: np.ndarray) -> tuple[wp.array, int]:
+    """Flat matrix with rows of whole sixes, and their length."""
+    columns = -(-matrix.shape[1] // 6) * 6
+    padded = np.zeros((len(matrix), columns), np.float32)
+    padded[:, : matrix.shape[1]] = matrix
+    return wp.array(padded.ravel(), dtype=float, device=runtime.device().warp), columns
+
+
+def _shifted(side: _Side, search: tuple[int, int, int]) -> tuple[wp.array, wp.array, wp.array]:
+    """Voxels of a side and offsets, counted from its blocks instead of from the farthest lag."""
+    voxels = side.voxels
+    flat = voxels.flat
+    start = search[0] * voxels.plane
+    planes = wp.array(ptr=flat.ptr + 4 * start, dtype=float, shape=(flat.size - start,), device=flat.device)
+    planes._owner = flat  # the view must not outlive the memory
+    return planes, *(offsets[r:] for offsets, r in zip(voxels.offsets, search[1:], strict=True))
+
+
+def _transform_layers(plan: Plan, first: _Side, second: _Side, layers: range, ring: int, sums: wp.array) -> None:
+    """Do what `_correlate_layers` does, for whole windows, by zero-padded transforms."""
     shape = plan.transform_shape()
     reach = tuple(w + n - 1 for w, n in zip(plan.window, plan.lags, strict=True))
+    padded = np.pad(second.volume, [(r, r) for r in plan.search])
     corner = [o + s * np.arange(c) for o, s, c in zip(plan.origin, plan.step, plan.count, strict=True)]
     batch = max(1, (1 << 22) // math.prod(shape))
+    lags = math.prod(plan.lags)
+    host = sums.numpy()[: ring * lags * plan.lanes].reshape(ring, lags, plan.lanes)
+    grid = (len(layers), *plan.count[1:])
 
     def transform(chunk: int, begin: int, end: int) -> None:
         for start in range(begin, end, batch):
-            index = np.unravel_index(np.arange(start, min(start + batch, end)), plan.count)
-            z, y, x = (c[i] for c, i in zip(corner, index, strict=True))
-            a = sliding_window_view(first, plan.window)[z, y, x]
+            layer, row, column = np.unravel_index(np.arange(start, min(start + batch, end)), grid)
+            layer = layer + layers.start
+            z, y, x = (c[i] for c, i in zip(corner, (layer, row, column), strict=True))
+            a = sliding_window_view(first.volume, plan.window)[z, y, x]
             b = sliding_window_view(padded, reach)[z, y, x]
             spectrum = scipy.fft.rfftn(b, shape, axes=(1, 2, 3))
             spectrum *= scipy.fft.rfftn(a, shape, axes=(1, 2, 3)).conj()
-            lags = scipy.fft.irfftn(spectrum, shape, axes=(1, 2, 3))
-            n = plan.lags
-            sums[start : start + len(z), : n[0], : n[1], : n[2]] = lags[:, : n[0], : n[1], : n[2]]
+            product = scipy.fft.irfftn(spectrum, shape, axes=(1, 2, 3))[
+                :, : plan.lags[0], : plan.lags[1], : plan.lags[2]
+            ]
+            host[layer % ring, :, row * plan.pitch + column] = product.reshape(len(z), lags)
 
-    runtime.run_chunks(len(sums), transform)
-    rows = sums.reshape(*sums.shape[:3], plan.groups[1], LANES)
-    return wp.array(rows, dtype=Row, device=runtime.device().warp, copy=False)
-
-
-def _peaks(plan: _Plan, scores: wp.array) -> list[np.ndarray]:
-    """Displacement, coefficient and existence of the two highest peaks of the plan's windows."""
-    windows, where = math.prod(plan.count), runtime.device().warp
-    flat_scores = wp.array(ptr=scores.ptr, dtype=float, shape=(windows, *plan.lag_shape), device=where)
-    peaks = [wp.zeros((windows, 2), dtype=kind, device=where) for kind in (wp.vec3, float, int)]
-    _launch(kernels._find_peaks, windows, (), [flat_scores, wp.vec3i(*plan.search)], peaks)
-    return [peak.numpy() for peak in peaks]
+    runtime.run_chunks(math.prod(grid), transform)
+    if runtime.device().kind != "cpu":
+        wp.copy(sums, wp.array(host.ravel(), dtype=float, device=sums.device), count=host.size)
 
 
-def _pitch(plan: _Plan) -> wp.vec2i:
-    """Elements per layer and per row of the padded second volume."""
-    return wp.vec2i(plan.padded_shape[1] * plan.padded_shape[2], plan.padded_shape[2])
+def _new(shape: tuple[int, ...]) -> wp.array:
+    """Uninitialised float array on the running device; on the CPU NumPy's, which asks for large pages."""
+    where = runtime.device()
+    if where.kind == "cpu":
+        return wp.array(np.empty(shape, np.float32), dtype=float, device=where.warp, copy=False)
+    return wp.empty(shape, dtype=float, device=where.warp)
 
 
 def _to_device(values: np.ndarray) -> wp.array:
@@ -416,17 +425,22 @@ def _to_device(values: np.ndarray) -> wp.array:
 
 
 def _overlapping(flat: wp.array) -> wp.array:
-    """View a flat float array as rows of `LANES` that start at every element; the caller keeps it alive."""
-    count = flat.shape[0] - LANES + 1
+    """View a flat float array as rows of `ROW` that start at every element; the caller keeps it alive."""
+    count = flat.shape[0] - ROW + 1
     return wp.array(ptr=flat.ptr, dtype=Row, shape=(count,), strides=(4,), device=flat.device)
 
 
-def _launch(kernel: wp.Kernel, size: int, inner: tuple[int, ...], inputs: list, outputs: list) -> None:
-    """Launch over (size, *inner), threaded on the CPU; the kernel's last input is the first index of its part."""
-    where = runtime.device().warp
-    wp.load_module(kernels, device=where)  # before threads start: compilation is not thread-safe
+def _launch(kernel, size, inner, inputs, outputs, *, slots=False, after_slot=()) -> None:
+    """Launch over (size, *inner), threaded on the CPU; the kernel's last input is the first index of its part.
+
+    With `slots` the input before says which scratch memory is the part's own; -1 on CUDA.
+    """
+    where = runtime.device()
+    wp.load_module(kernel.module, device=where.warp)  # before threads start: compilation is not thread-safe
 
     def part(chunk: int, begin: int, end: int) -> None:
-        wp.launch(kernel, dim=(end - begin, *inner), inputs=[*inputs, begin], outputs=outputs, device=where)
+        own = [chunk if where.kind == "cpu" else -1] if slots else []
+        arguments = [*inputs, *own, *after_slot, begin]
+        wp.launch(kernel, dim=(end - begin, *inner), inputs=arguments, outputs=outputs, device=where.warp)
 
     runtime.run_chunks(size, part)

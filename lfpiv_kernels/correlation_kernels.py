@@ -1,7 +1,12 @@
 """Warp kernels of the window correlation; `correlate` launches them.
 
-Vectors of eight lags along x come from one unaligned load: the padded second volume is viewed as rows that start at
-every element.
+The lanes of a vector are neighbouring windows. A lattice of windows or blocks is walked by lane: lane
+``ky * pitch + kx`` is the one at row ky and column kx of a layer, rows being followed by spare lanes, so that the lane
+of a neighbour lies at a fixed distance. Volumes are stored split by phase, ``[plane, y % stride, x % stride, lane]``:
+whatever the offset from a window's corner, the voxels at that offset of neighbouring windows are neighbours in memory.
+Arrays of offsets along y and x hold the distance in memory for each offset in voxels.
+
+The inner loops are native: on the CPU in vectors of clang, as wide as the registers; on CUDA a lane is a thread.
 """
 
 import warp as wp
@@ -14,248 +19,445 @@ wp.set_module_options(
     }
 )
 
-LANES = 8
-"""Lags along x per vector, and lag rows along y per thread."""
-Row = wp.types.vector(length=LANES, dtype=float)
+LANES = 16
+"""Lanes a CPU task works on; lattices are padded to whole groups of them."""
+MOST_LAGS = 11
+"""Lags along x that are summed in registers at once."""
+
+VECTORS = """
+#if defined(__CUDA_ARCH__)
+    typedef float V;
+    typedef int M;
+    const int width = 1, group = 1;
+    auto load = [](const float* p) { return *p; };
+    auto store = [](float* p, V v) { *p = v; };
+    auto any = [](M m) { return m != 0; };
+    auto value = [](V v, int k) { return v; };
+    auto at = [](M m, int k) { return m; };
+    auto fetch = [](const float*) {};
+#else
+#if defined(__AVX512F__)
+    enum { width = 16 };
+#else
+    enum { width = 8 };
+#endif
+    typedef float V __attribute__((vector_size(4 * width)));
+    typedef int M __attribute__((vector_size(4 * width)));
+    typedef float U __attribute__((vector_size(4 * width), aligned(4)));
+    const int group = 16;
+    auto load = [](const float* p) { return (V)*(const U*)p; };
+    auto store = [](float* p, V v) { *(U*)p = v; };
+    auto any = [](M m) { return __builtin_reduce_or(m) != 0; };
+    auto value = [](V v, int k) { return v[k]; };
+    auto at = [](M m, int k) { return m[k]; };
+    auto fetch = [](const float* p) { __builtin_prefetch(p); };
+#endif
+"""
+
+_BLOCK = (
+    VECTORS
+    + """
+    const int bz = products > 0 ? 1 : block[0], by = block[1], bx = block[2], ny = lags[1], nx = lags[2];
+    const int ey = by + ny - 1, ex = bx + nx - 1, shared_pitch = (ny * nx + 2) / 3 * 3;
+#if defined(__CUDA_ARCH__)
+    const float* a0 = first.data + lane;
+    const float* b0 = second.data + lane;
+    auto tap_row = [&](int z, int y) {
+        return a0 + (int64_t)(first_plane + z) * first_pitch + first_y.data[y];
+    };
+    auto lag_row = [&](int z, int y) {
+        return b0 + (int64_t)(second_plane + z) * second_pitch + second_y.data[y];
+    };
+    auto tap_at = [&](const float* row, int x) { return row[first_x.data[x]]; };
+    auto lag_at = [&](const float* row, int x) { return row[second_x.data[x]]; };
+#else
+    float* taps = scratch_out.data + (int64_t)slot * scratch_pitch;  // the group's voxels, gathered: [z][y][x][lane]
+    float* near = taps + (int64_t)bz * by * bx * group;
+    auto gather_taps = [&](int plane) {
+        for (int z = 0; z < bz; ++z) for (int y = 0; y < by; ++y) for (int x = 0; x < bx; ++x) {
+            const float* from = first.data + (int64_t)(first_plane + plane + z) * first_pitch;
+            float* to = taps + ((z * by + y) * bx + x) * group;
+            for (int k = 0; k < group; k += width)
+                store(to + k, load(from + first_y.data[y] + first_x.data[x] + lane + k));
+        }
+    };
+    auto gather = [&](int plane, int slot) {  // one plane of the surroundings; the last bz are kept
+        for (int y = 0; y < ey; ++y) for (int x = 0; x < ex; ++x) {
+            const float* from = second.data + (int64_t)(second_plane + plane) * second_pitch + second_y.data[y];
+            float* to = near + ((slot * ey + y) * ex + x) * group;
+            for (int k = 0; k < group; k += width) store(to + k, load(from + second_x.data[x] + lane + k));
+        }
+    };
+    int half = 0;
+    auto tap_row = [&](int z, int y) { return taps + (z * by + y) * bx * group + half; };
+    auto lag_row = [&](int z, int y) { return near + ((z % bz) * ey + y) * ex * group + half; };
+    auto tap_at = [&](const float* row, int x) { return load(row + x * group); };
+    auto lag_at = [&](const float* row, int x) { return load(row + x * group); };
+#endif
+    const int64_t out_pitch = products > 0 ? group : sum_pitch;
+    auto multiply = [&](auto& total, auto& tap, const float* row, const float* beside, int x, int lag) {
+        constexpr int T = sizeof(total) / sizeof(V), C = sizeof(tap) / sizeof(V);
+        #pragma unroll
+        for (int c = 0; c < C; ++c) tap[c] = tap_at(row, x + c);
+        #pragma unroll
+        for (int k = 0; k < T + C - 1; ++k) {
+            V v = lag_at(beside, x + lag + k);
+            #pragma unroll
+            for (int c = 0; c < C; ++c) if (k >= c && k - c < T) total[k - c] += tap[c] * v;
+        }
+    };
+    auto sum = [&](auto& total, int lag_z, int lag_y, int lag, float* out) {
+        constexpr int T = sizeof(total) / sizeof(V);
+        #pragma unroll
+        for (int t = 0; t < T; ++t) total[t] = V{};
+        for (int z = 0; z < bz; ++z) for (int y = 0; y < by; ++y) {
+            const float* row = tap_row(z, y);
+            const float* beside = lag_row(lag_z + z, lag_y + y);
+            int x = 0;
+            for (; x + 4 <= bx; x += 4) { V tap[4]; multiply(total, tap, row, beside, x, lag); }
+            for (; x < bx; ++x) { V tap[1]; multiply(total, tap, row, beside, x, lag); }
+        }
+        #pragma unroll
+        for (int t = 0; t < T; ++t) store(out + (int64_t)(lag + t) * out_pitch, total[t]);
+    };
+    auto plane = [&](int lag_z, float* out) {  // all lags along y and x
+        for (int k = 0; k < group; k += width) {
+#if !defined(__CUDA_ARCH__)
+            half = k;
+#endif
+            for (int lag_y = 0; lag_y < ny; ++lag_y) {
+                float* row = out + (int64_t)lag_y * nx * out_pitch + k;
+                int parts = (nx + MOST_LAGS - 1) / MOST_LAGS;
+                for (int lag = 0; parts > 0; --parts) {  // nearly equal parts of the lags along x
+                    int some = (nx - lag + parts - 1) / parts;
+                    switch (some) {
+CASES
+                    }
+                    lag += some;
+                }
+            }
+        }
+    };
+#if !defined(__CUDA_ARCH__)
+    if (products > 0) {
+        float* part = near + (int64_t)ey * ex * group;
+        for (int r = 0; r < products; ++r) {
+            gather_taps(r);
+            gather(r, 0);
+            plane(0, part + (int64_t)r * shared_pitch * group);
+        }
+        for (int k = 0; k < group; k += width) for (int lag = 0; lag < ny * nx; lag += 3) {
+            const int some = ny * nx - lag < 3 ? ny * nx - lag : 3;
+            for (int z = 0; z < lags[0]; z += 6) {
+                V total[6][3];
+                #pragma unroll
+                for (int j = 0; j < 18; ++j) total[j / 3][j % 3] = V{};
+                const float* from = part + (int64_t)lag * group + k;
+                for (int r = 0; r < products; ++r, from += (int64_t)shared_pitch * group) {
+                    V v[3];
+                    #pragma unroll
+                    for (int j = 0; j < 3; ++j) v[j] = load(from + j * group);
+                    #pragma unroll
+                    for (int i = 0; i < 6; ++i) {
+                        const float weight = inverse.data[r * inverse_pitch + z + i];
+                        #pragma unroll
+                        for (int j = 0; j < 3; ++j) total[i][j] += weight * v[j];
+                    }
+                }
+                for (int i = 0; i < 6 && z + i < lags[0]; ++i) for (int j = 0; j < some; ++j) {
+                    const int64_t row = sum_row + (int64_t)(z + i) * ny * nx + lag + j;
+                    store(sum_out.data + row * sum_pitch + lane + k, total[i][j]);
+                }
+            }
+        }
+        return;
+    }
+    gather_taps(0);
+    for (int z = lag_begin; z < lag_begin + bz - 1; ++z) gather(z, z % bz);
+#endif
+    for (int lag_z = lag_begin; lag_z < lag_end; ++lag_z) {
+#if !defined(__CUDA_ARCH__)
+        gather(lag_z + bz - 1, (lag_z + bz - 1) % bz);
+#endif
+        plane(lag_z, sum_out.data + (sum_row + (int64_t)lag_z * ny * nx) * sum_pitch + lane);
+    }
+""".replace(
+        "CASES",
+        "\n".join(
+            f"                    case {n}: {{ V total[{n}]; sum(total, lag_z, lag_y, lag, row); break; }}"
+            for n in range(3, MOST_LAGS + 1)
+        ),
+    ).replace("MOST_LAGS", str(MOST_LAGS))
+)
 
 
-@wp.func
-def _unravel(index: int, shape: wp.vec3i):
-    """Index triple (z, y, x) of a linear C-order index."""
-    x = index % shape[2]
-    y = (index // shape[2]) % shape[1]
-    return wp.vec3i(index // (shape[2] * shape[1]), y, x)
+_TRANSFORM = (
+    VECTORS
+    + """
+    auto combine = [&](auto& v, int64_t e, int r) {
+        constexpr int C = sizeof(v) / sizeof(V);
+        V total[6][C];
+        #pragma unroll
+        for (int i = 0; i < 6 * C; ++i) total[i / C][i % C] = V{};
+        const float* from = volume.data + plane * pitch + e;
+        for (int k = 0; k < terms; ++k, from += pitch) {
+            #pragma unroll
+            for (int c = 0; c < C; ++c) v[c] = load(from + c * width);
+            #pragma unroll
+            for (int i = 0; i < 6; ++i) {
+                const float weight = matrix.data[k * matrix_pitch + r + i];
+                #pragma unroll
+                for (int c = 0; c < C; ++c) total[i][c] += weight * v[c];
+            }
+        }
+        #pragma unroll
+        for (int i = 0; i < 6; ++i) if (r + i < rows)
+            #pragma unroll
+            for (int c = 0; c < C; ++c) store(plane_out.data + (out + r + i) * pitch + e + c * width, total[i][c]);
+    };
+    for (int r = 0; r < rows; r += 6) {
+        int64_t e = begin;
+        for (; e + 4 * width <= end; e += 4 * width) { V v[4]; combine(v, e, r); }
+        for (; e < end; e += width) { V v[1]; combine(v, e, r); }
+    }
+"""
+)
+
+
+@wp.func_native(_TRANSFORM)
+def _combine(
+    volume: wp.array(dtype=float),
+    matrix: wp.array(dtype=float),
+    matrix_pitch: int,
+    terms: int,
+    rows: int,
+    plane: wp.int64,
+    pitch: wp.int64,
+    begin: wp.int64,
+    end: wp.int64,
+    out: wp.int64,
+    plane_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _transform_planes(
+    # in
+    volume: wp.array(dtype=float),  # split by phase
+    matrix: wp.array(dtype=float),  # (term, row rounded up to sixes)
+    matrix_pitch: int,
+    terms: int,  # planes that are combined
+    rows: int,  # combinations of them
+    first_plane: int,  # of layer 0
+    stride: int,  # distance of layers
+    pitch: int,  # elements per plane
+    part: int,  # elements per thread, a multiple of `LANES`
+    begin: int,
+    # out
+    plane_out: wp.array(dtype=float),  # (layer, row, element)
+):
+    index = begin + wp.tid()
+    parts = (pitch + part - 1) // part
+    layer = index // parts
+    start = index % parts * part
+    _combine(
+        volume,
+        matrix,
+        matrix_pitch,
+        terms,
+        rows,
+        wp.int64(first_plane + layer * stride),
+        wp.int64(pitch),
+        wp.int64(start),
+        wp.int64(wp.min(start + part, pitch)),
+        wp.int64(layer * rows),
+        plane_out,
+    )
+
+
+@wp.func_native(_BLOCK)
+def _sum_products(
+    first: wp.array(dtype=float),
+    second: wp.array(dtype=float),
+    first_y: wp.array(dtype=int),
+    first_x: wp.array(dtype=int),
+    second_y: wp.array(dtype=int),
+    second_x: wp.array(dtype=int),
+    first_pitch: int,
+    second_pitch: int,
+    first_plane: int,
+    second_plane: int,
+    block: wp.vec3i,
+    lags: wp.vec3i,
+    lag_begin: int,
+    lag_end: int,
+    lane: int,
+    products: int,
+    inverse: wp.array(dtype=float),
+    inverse_pitch: int,
+    sum_row: int,
+    sum_pitch: int,
+    slot: int,
+    scratch_pitch: int,
+    scratch_out: wp.array(dtype=float),
+    sum_out: wp.array(dtype=float),
+): ...
 
 
 @wp.kernel
 def _correlate_blocks(
     # in
-    first: wp.array(dtype=float),  # first volume, flat, (z * y * x + one spare row,)
-    second: wp.array(dtype=Row),  # second volume, padded, as overlapping rows: [i] holds floats i .. i + 7
-    first_pitch: wp.vec2i,  # elements per layer and per row of `first`
-    second_pitch: wp.vec2i,  # the same of `second`
-    grid: wp.vec3i,  # number of blocks per axis
-    origin: wp.vec3i,  # first voxel of block (0, 0, 0)
-    stride: wp.vec3i,  # distance of blocks [voxel]
+    first: wp.array(dtype=float),  # first volume, split by phase
+    second: wp.array(dtype=float),  # second volume, the same
+    first_y: wp.array(dtype=int),  # offsets along y and x, see the head of this module
+    first_x: wp.array(dtype=int),
+    second_y: wp.array(dtype=int),
+    second_x: wp.array(dtype=int),
+    pitches: wp.vec2i,  # elements per plane of `first` and of `second`
+    stride: int,  # distance of layers of blocks [voxel]
     block: wp.vec3i,  # edges of a block [voxel]
-    first_block: int,
+    lags: wp.vec3i,  # lags per axis
+    begin_layer: int,
+    ring: int,  # layers that `sum_out` holds: layer i lies at i % ring
+    groups: int,  # groups of lanes
+    group: int,  # lanes of a group: `LANES` on the CPU, 1 on CUDA
+    parts: int,  # parts the lags along z are cut into
+    products: int,  # planes of `_transform_planes` per layer of blocks, in both volumes; 0: voxels
+    inverse: wp.array(dtype=float),  # from products to lags along z, (product, lag)
+    inverse_pitch: int,  # lags in `inverse`: as many as there are, rounded up to sixes
+    scratch_pitch: int,  # elements of scratch memory per slot
+    slot: int,
+    begin: int,
     # out
-    score_out: wp.array4d(dtype=Row),  # sums of products, (block, lag z, lag y, lag x / 8)
+    scratch_out: wp.array(dtype=float),
+    sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
 ):
-    index, lag_z, group_y, group_x = wp.tid()
-    cell = _unravel(first_block + index, grid)
-    z0 = origin[0] + cell[0] * stride[0]
-    y0 = origin[1] + cell[1] * stride[1]
-    x0 = origin[2] + cell[2] * stride[2]
-    row = second_pitch[1]
-    s0 = Row()
-    s1 = Row()
-    s2 = Row()
-    s3 = Row()
-    s4 = Row()
-    s5 = Row()
-    s6 = Row()
-    s7 = Row()
-    for z in range(block[0]):
-        for half in range((block[1] + 1) // 2):  # two rows of the block at once share seven of nine loads
-            y = 2 * half
-            keep = wp.float32(1.0)
-            if y + 1 == block[1]:
-                keep = wp.float32(0.0)
-            i = (z0 + z) * first_pitch[0] + (y0 + y) * first_pitch[1] + x0
-            j = (z0 + z + lag_z) * second_pitch[0] + (y0 + y + 8 * group_y) * row + x0 + 8 * group_x
-            for x in range(block[2]):
-                f = first[i + x]
-                g = keep * first[i + x + first_pitch[1]]
-                r0 = second[j + x]
-                r1 = second[j + x + row]
-                r2 = second[j + x + 2 * row]
-                r3 = second[j + x + 3 * row]
-                r4 = second[j + x + 4 * row]
-                r5 = second[j + x + 5 * row]
-                r6 = second[j + x + 6 * row]
-                r7 = second[j + x + 7 * row]
-                r8 = second[j + x + 8 * row]
-                s0 += f * r0
-                s1 += f * r1
-                s2 += f * r2
-                s3 += f * r3
-                s4 += f * r4
-                s5 += f * r5
-                s6 += f * r6
-                s7 += f * r7
-                s0 += g * r1
-                s1 += g * r2
-                s2 += g * r3
-                s3 += g * r4
-                s4 += g * r5
-                s5 += g * r6
-                s6 += g * r7
-                s7 += g * r8
-    b = first_block + index
-    y = 8 * group_y
-    score_out[b, lag_z, y, group_x] = s0
-    score_out[b, lag_z, y + 1, group_x] = s1
-    score_out[b, lag_z, y + 2, group_x] = s2
-    score_out[b, lag_z, y + 3, group_x] = s3
-    score_out[b, lag_z, y + 4, group_x] = s4
-    score_out[b, lag_z, y + 5, group_x] = s5
-    score_out[b, lag_z, y + 6, group_x] = s6
-    score_out[b, lag_z, y + 7, group_x] = s7
-
-
-@wp.kernel
-def _box_sum(
-    # in
-    source: wp.array(dtype=Row),  # overlapping rows of a flat volume
-    pitch: int,  # distance of the terms [element]
-    terms: int,
-    rows: int,  # rows of `sum_out`
-    batch: int,  # rows per thread
-    first_batch: int,
-    # out
-    sum_out: wp.array(dtype=Row),  # every eighth overlapping row: [i] holds floats 8 i .. 8 i + 7
-):
-    begin = (first_batch + wp.tid()) * batch
-    for index in range(begin, wp.min(begin + batch, rows)):
-        total = source[8 * index]
-        for k in range(1, terms):
-            total += source[8 * index + k * pitch]
-        sum_out[index] = total
-
-
-@wp.kernel
-def _normalise(
-    # in
-    block_score: wp.array4d(dtype=Row),  # sums of products of blocks, (block, lag z, lag y, lag x / 8)
-    second_mean: wp.array(dtype=Row),  # window means of the second volume, overlapping rows, padded
-    second_scale: wp.array(dtype=Row),  # 1 / sqrt(window sum of squared deviations), the same layout
-    first_sum: wp.array(dtype=float),  # window sums of the first volume, (window,)
-    first_scale: wp.array(dtype=float),  # as `second_scale`, (window,)
-    pitch: wp.vec2i,  # elements per layer and per row of the padded volume
-    lags_y: int,
-    window_grid: wp.vec3i,  # windows per axis
-    block_grid: wp.vec3i,  # blocks per axis
-    origin: wp.vec3i,  # first voxel of window (0, 0, 0)
-    step: wp.vec3i,  # distance of windows [voxel]
-    block_step: wp.vec3i,  # distance of windows [block]
-    block_count: wp.vec3i,  # blocks per window and axis
-    mirrored: int,  # 1: volumes are swapped and mirrored, windows run backwards; average with what is there
-    first_window: int,
-    # out
-    score_out: wp.array4d(dtype=Row),  # correlation coefficients, (window, lag z, lag y, lag x / 8)
-):
-    index, lag_z, group_x = wp.tid()
-    written = first_window + index
-    window = written
-    if mirrored == 1:
-        window = window_grid[0] * window_grid[1] * window_grid[2] - 1 - written
-    cell = _unravel(window, window_grid)
-    corner = cell[0] * block_step[0] * block_grid[1] + cell[1] * block_step[1]
-    corner = corner * block_grid[2] + cell[2] * block_step[2]
-    z = origin[0] + cell[0] * step[0] + lag_z
-    y = origin[1] + cell[1] * step[1]
-    row = z * pitch[0] + y * pitch[1] + origin[2] + cell[2] * step[2] + 8 * group_x
-    mean = first_sum[window]
-    scale = first_scale[window]
-    for lag_y in range(lags_y):
-        total = Row()
-        for bz in range(block_count[0]):
-            for by in range(block_count[1]):
-                b = corner + (bz * block_grid[1] + by) * block_grid[2]
-                for bx in range(block_count[2]):
-                    total += block_score[b + bx, lag_z, lag_y, group_x]
-        j = row + lag_y * pitch[1]
-        total -= mean * second_mean[j]
-        total = scale * wp.cw_mul(total, second_scale[j])
-        if mirrored == 1:
-            total = 0.5 * (total + score_out[written, lag_z, lag_y, group_x])
-        score_out[written, lag_z, lag_y, group_x] = total
-
-
-@wp.func
-def _three_point(left: float, centre: float, right: float):
-    """Offset of a peak from its three values: Gaussian fit, parabola where a neighbour is not positive."""
-    a = left
-    b = centre
-    c = right
-    if left > 0.0 and right > 0.0:
-        a = wp.log(left)
-        b = wp.log(centre)
-        c = wp.log(right)
-    curvature = a - 2.0 * b + c
-    if curvature >= 0.0:
-        return wp.float32(0.0)
-    return 0.5 * (a - c) / curvature
-
-
-@wp.func
-def _refine(score: wp.array4d(dtype=float), window: int, lag: wp.vec3i, search: wp.vec3i):
-    """Displacement (z, y, x) of the peak at a lag inside the search range."""
-    z = lag[0]
-    y = lag[1]
-    x = lag[2]
-    centre = score[window, z, y, x]
-    return wp.vec3(
-        float(z - search[0]) + _three_point(score[window, z - 1, y, x], centre, score[window, z + 1, y, x]),
-        float(y - search[1]) + _three_point(score[window, z, y - 1, x], centre, score[window, z, y + 1, x]),
-        float(x - search[2]) + _three_point(score[window, z, y, x - 1], centre, score[window, z, y, x + 1]),
+    index = begin + wp.tid()
+    lane = (index % groups) * group
+    part = (index // groups) % parts
+    layer = begin_layer + index // groups // parts
+    plane = layer * stride
+    if products > 0:
+        plane = (layer - begin_layer) * products
+    _sum_products(
+        first,
+        second,
+        first_y,
+        first_x,
+        second_y,
+        second_x,
+        pitches[0],
+        pitches[1],
+        plane,
+        plane,
+        block,
+        lags,
+        part * lags[0] // parts,
+        (part + 1) * lags[0] // parts,
+        lane,
+        products,
+        inverse,
+        inverse_pitch,
+        (layer % ring) * lags[0] * lags[1] * lags[2],
+        groups * group,
+        slot,
+        scratch_pitch,
+        scratch_out,
+        sum_out,
     )
 
 
+_SPLIT = """
+    const int ny = shape[1], nx = shape[2], total = phases[0] * phases[1];
+    float* out = split_out.data + (int64_t)plane * total * lanes;
+    const int z = corner[0] + plane;
+    for (int ky = 0; ky * pitch < lanes; ++ky) for (int ry = 0; ry < phases[0]; ++ry) {
+        const int y = corner[1] + ky * stride[0] + ry, some = lanes - ky * pitch < pitch ? lanes - ky * pitch : pitch;
+        const bool inside = z >= 0 && z < shape[0] && y >= 0 && y < ny;
+        const float* row = volume.data + (inside ? ((int64_t)z * ny + y) * nx : 0);
+        for (int rx = 0; rx < phases[1]; ++rx) {
+            float* to = out + (int64_t)(ry * phases[1] + rx) * lanes + ky * pitch;
+            const int x = corner[2] + rx;  // of lane 0
+            int low = x < 0 ? (-x + stride[1] - 1) / stride[1] : 0;
+            int high = x < nx ? (nx - x + stride[1] - 1) / stride[1] : 0;
+            high = inside && high > 0 ? (high < some ? high : some) : 0;
+            low = low < high ? low : high;
+            for (int k = 0; k < low; ++k) to[k] = 0.0f;
+            for (int k = low; k < high; ++k) to[k] = row[x + k * stride[1]];
+            for (int k = high; k < some; ++k) to[k] = 0.0f;
+        }
+    }
+"""
+
+
+@wp.func_native(_SPLIT)
+def _split_plane(
+    volume: wp.array(dtype=float),
+    shape: wp.vec3i,
+    corner: wp.vec3i,
+    stride: wp.vec2i,
+    phases: wp.vec2i,
+    pitch: int,
+    lanes: int,
+    plane: int,
+    split_out: wp.array(dtype=float),
+): ...
+
+
 @wp.kernel
-def _find_peaks(
+def _split(
     # in
-    score: wp.array4d(dtype=float),  # correlation coefficients, (window, lag z, lag y, lag x), rows padded
-    search: wp.vec3i,  # largest lag per axis
-    first_window: int,
+    volume: wp.array(dtype=float),  # flat, (z, y, x)
+    shape: wp.vec3i,
+    corner: wp.vec3i,  # voxel of plane 0, phase (0, 0), lane 0; what lies outside the volume is 0
+    stride: wp.vec2i,  # distance of the lattice's rows and columns [voxel]
+    phases: wp.vec2i,  # phases stored along y and x
+    pitch: int,  # lanes per row
+    lanes: int,  # lanes stored
+    begin: int,
     # out
-    displacement_out: wp.array2d(dtype=wp.vec3),  # (window, 2): first and second peak
-    correlation_out: wp.array2d(dtype=float),  # (window, 2): highest peak, highest more than 2 lags away from it
-    found_out: wp.array2d(dtype=int),  # (window, 2): 1 where the peak exists and is not on the border
+    split_out: wp.array(dtype=float),  # (plane, phase y, phase x, lane)
 ):
-    w = first_window + wp.tid()
-    top = wp.vec3i(2 * search[0], 2 * search[1], 2 * search[2])
-    best = wp.float32(0.0)
-    lag = wp.vec3i(0, 0, 0)
-    for z in range(top[0] + 1):
-        for y in range(top[1] + 1):
-            for x in range(top[2] + 1):
-                if score[w, z, y, x] > best:
-                    best = score[w, z, y, x]
-                    lag = wp.vec3i(z, y, x)
-    rival = wp.float32(0.0)
-    second = wp.float32(0.0)
-    second_lag = wp.vec3i(0, 0, 0)
-    for z in range(top[0] + 1):
-        for y in range(top[1] + 1):
-            for x in range(top[2] + 1):
-                value = score[w, z, y, x]
-                if value > wp.min(rival, second):
-                    distance = wp.max(wp.max(wp.abs(z - lag[0]), wp.abs(y - lag[1])), wp.abs(x - lag[2]))
-                    if distance > 2:
-                        rival = wp.max(rival, value)
-                    inner = z > 0 and y > 0 and x > 0 and z < top[0] and y < top[1] and x < top[2]
-                    if inner and distance > 1 and value > second:
-                        if (
-                            value >= score[w, z - 1, y, x]
-                            and value >= score[w, z + 1, y, x]
-                            and value >= score[w, z, y - 1, x]
-                            and value >= score[w, z, y + 1, x]
-                            and value >= score[w, z, y, x - 1]
-                            and value >= score[w, z, y, x + 1]
-                        ):
-                            second = value
-                            second_lag = wp.vec3i(z, y, x)
-    correlation_out[w, 0] = best
-    correlation_out[w, 1] = rival
-    inside = wp.min(wp.min(lag[0], lag[1]), lag[2]) > 0
-    inside = inside and lag[0] < top[0] and lag[1] < top[1] and lag[2] < top[2]
-    found_out[w, 0] = 0
-    found_out[w, 1] = 0
-    if inside:
-        found_out[w, 0] = 1
-        displacement_out[w, 0] = _refine(score, w, lag, search)
-    if second > 0.0:
-        found_out[w, 1] = 1
-        displacement_out[w, 1] = _refine(score, w, second_lag, search)
+    _split_plane(volume, shape, corner, stride, phases, pitch, lanes, begin + wp.tid(), split_out)
+
+
+_GATHER = (
+    VECTORS
+    + """
+    for (int y = 0; y < lanes; y += width) {  // reads run ahead of writes: lanes behind the row's end hold no window
+        V total = load(row_out.data + begin + y);
+        for (int k = 1; k < blocks_y; ++k) total += load(row_out.data + begin + y + k * pitch);
+        store(row_out.data + begin + y, total);
+    }
+    for (int x = 0; x < lanes; x += width) {
+        V total = load(row_out.data + begin + x);
+        for (int k = 1; k < blocks_x; ++k) total += load(row_out.data + begin + x + k);
+        store(row_out.data + begin + x, total);
+    }
+"""
+)
+
+
+@wp.func_native(_GATHER)
+def _gather_row(
+    blocks_y: int, blocks_x: int, pitch: int, lanes: int, begin: wp.int64, row_out: wp.array(dtype=float)
+): ...
+
+
+@wp.kernel
+def _gather_blocks(
+    # in
+    blocks_y: int,  # blocks per window along y and x
+    blocks_x: int,
+    pitch: int,  # lanes per row of blocks
+    lanes: int,  # lanes per lag
+    lags: int,
+    ring: int,  # layers that `sum_out` holds: layer i lies at i % ring
+    begin_layer: int,
+    begin: int,
+    # out
+    sum_out: wp.array(dtype=float),  # (layer, lag, lane): of blocks before, of windows' layers of blocks after
+):
+    index = begin + wp.tid()
+    row = (begin_layer + index // lags) % ring * lags + index % lags
+    _gather_row(blocks_y, blocks_x, pitch, lanes, wp.int64(row) * wp.int64(lanes), sum_out)

@@ -28,43 +28,67 @@ MARGIN = 6
 """Voxels of zeros around a volume before the spline's prefilter: samples fall smoothly to 0 outside the volume."""
 
 
-@wp.func
-def _spline_weights(t: float):
-    """Weights of four neighbouring cubic B-spline coefficients at fraction t behind the second one."""
-    s = 1.0 - t
-    return wp.vec4(s * s * s, 4.0 - 6.0 * t * t + 3.0 * t * t * t, 4.0 - 6.0 * s * s + 3.0 * s * s * s, t * t * t) / 6.0
+_SAMPLE = """
+#if defined(__CUDA_ARCH__)
+    struct V {
+        float x[4];
+        __device__ V operator*(const V& o) const { V r; for (int k = 0; k < 4; ++k) r.x[k] = x[k] * o.x[k]; return r; }
+        __device__ V operator+(const V& o) const { V r; for (int k = 0; k < 4; ++k) r.x[k] = x[k] + o.x[k]; return r; }
+        __device__ float operator[](int k) const { return x[k]; }
+    };
+    auto load = [](const float* p) { return V{p[0], p[1], p[2], p[3]}; };
+#else
+    typedef float V __attribute__((vector_size(16)));
+    typedef float U __attribute__((vector_size(16), aligned(4)));
+    auto load = [](const float* p) { return (V)*(const U*)p; };
+#endif
+    auto all = [](float v) { return V{v, v, v, v}; };
+    // four neighbouring B-splines at fraction t behind the second one's node, as polynomials in t
+    const V c0 = {1.0f / 6, 4.0f / 6, 1.0f / 6, 0}, c1 = {-0.5f, 0, 0.5f, 0}, c2 = {0.5f, -1, 0.5f, 0};
+    const V c3 = {-1.0f / 6, 0.5f, -0.5f, 1.0f / 6};
+    auto place = [&](float position, int count, V& weight) {  // first of four coefficients, kept inside the array
+        int cell = (int)floorf(position) - 1;
+        cell = cell < 0 ? 0 : cell > count - 4 ? count - 4 : cell;
+        float t = position - (float)(cell + 1);
+        t = t < 0.0f ? 0.0f : t > 1.0f ? 1.0f : t;
+        weight = c0 + all(t) * (c1 + all(t) * (c2 + all(t) * c3));
+        return cell;
+    };
+    V wz, wy, wx;
+    const int cz = place(z, shape[0], wz), cy = place(y, shape[1], wy), cx = place(x, shape[2], wx);
+    const int pitch = shape[2];
+    const float* from = coefficients.data + ((int64_t)cz * shape[1] + cy) * pitch + cx;
+    V total = all(0.0f);
+    #pragma unroll
+    for (int i = 0; i < 4; ++i, from += (int64_t)shape[1] * pitch) {
+        const V near = all(wy[0]) * load(from) + all(wy[1]) * load(from + pitch);
+        const V far = all(wy[2]) * load(from + 2 * pitch) + all(wy[3]) * load(from + 3 * pitch);
+        total = total + all(wz[i]) * (near + far);
+    }
+    total = total * wx;
+    return (total[0] + total[1]) + (total[2] + total[3]);
+"""
 
 
-@wp.func
-def _cell(position: float, count: int):
-    """First of the four coefficients around a position, kept inside the array."""
-    return wp.clamp(int(wp.floor(position)) - 1, 0, count - 4)
-
-
-@wp.func
-def _sample(coefficients: wp.array(dtype=wp.vec4), shape: wp.vec3i, z: float, y: float, x: float):
+@wp.func_native(_SAMPLE)
+def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: float, x: float) -> float:
     """Value of the spline at a position given in coefficients; the nearest edge outside the array."""
-    cz = _cell(z, shape[0])
-    cy = _cell(y, shape[1])
-    cx = _cell(x, shape[2])
-    wz = _spline_weights(wp.clamp(z - float(cz + 1), 0.0, 1.0))
-    wy = _spline_weights(wp.clamp(y - float(cy + 1), 0.0, 1.0))
-    wx = _spline_weights(wp.clamp(x - float(cx + 1), 0.0, 1.0))
-    total = wp.vec4()
-    for i in range(4):
-        layer = wp.vec4()
-        row = ((cz + i) * shape[1] + cy) * shape[2] + cx
-        for j in range(4):
-            layer += wy[j] * coefficients[row + j * shape[2]]
-        total += wz[i] * layer
-    return wp.dot(wx, total)
+    ...
+
+
+@wp.func
+def _between(field: wp.array3d(dtype=wp.vec3), iz: int, iy: int, ix: int, tz: float, ty: float):
+    """Displacement at a control point along x, interpolated between four along z and y."""
+    near = (1.0 - ty) * field[iz, iy, ix] + ty * field[iz, iy + 1, ix]
+    far = (1.0 - ty) * field[iz + 1, iy, ix] + ty * field[iz + 1, iy + 1, ix]
+    return (1.0 - tz) * near + tz * far
 
 
 @wp.kernel
 def _deform_pair(
     # in
-    first: wp.array(dtype=wp.vec4),  # spline coefficients of the first volume, flat, as overlapping rows
-    second: wp.array(dtype=wp.vec4),  # the same of the second volume
+    first: wp.array(dtype=float),  # spline coefficients of the first volume, flat
+    second: wp.array(dtype=float),  # the same of the second volume
     shape: wp.vec3i,  # coefficients per axis, margin included
     field: wp.array3d(dtype=wp.vec3),  # displacement (z, y, x) [voxel] on the control grid
     spacing: wp.vec3,  # distance of control points [voxel], the first one at voxel (0, 0, 0)
@@ -84,15 +108,18 @@ def _deform_pair(
     iy = wp.min(int(fy), field.shape[1] - 2)
     tz = fz - float(iz)
     ty = fy - float(iy)
+    left = wp.vec3()
+    right = wp.vec3()
+    cell = wp.int32(-1)
     for x in range(part * batch, wp.min((part + 1) * batch, first_out.shape[2])):
         fx = (float(x) + offset) / spacing[2]
         ix = wp.min(int(fx), field.shape[2] - 2)
         tx = fx - float(ix)
-        near = (1.0 - ty) * ((1.0 - tx) * field[iz, iy, ix] + tx * field[iz, iy, ix + 1])
-        near += ty * ((1.0 - tx) * field[iz, iy + 1, ix] + tx * field[iz, iy + 1, ix + 1])
-        far = (1.0 - ty) * ((1.0 - tx) * field[iz + 1, iy, ix] + tx * field[iz + 1, iy, ix + 1])
-        far += ty * ((1.0 - tx) * field[iz + 1, iy + 1, ix] + tx * field[iz + 1, iy + 1, ix + 1])
-        half = 0.5 * ((1.0 - tz) * near + tz * far)
+        if ix != cell:
+            left = _between(field, iz, iy, ix, tz, ty)
+            right = _between(field, iz, iy, ix + 1, tz, ty)
+            cell = ix
+        half = 0.5 * ((1.0 - tx) * left + tx * right)
         pz = float(z + margin) + offset
         py = float(y + margin) + offset
         px = float(x + margin) + offset
@@ -146,12 +173,11 @@ def deform_pair(
     wp.load_module(__name__, device=where.warp)  # before threads start: compilation is not thread-safe
     on_cpu = where.kind == "cpu"
     flat = [wp.array(c.ravel(), dtype=float, device=where.warp, copy=not on_cpu) for c in (first, second)]
-    rows = [wp.array(ptr=c.ptr, dtype=wp.vec4, shape=(c.size - 3,), strides=(4,), device=where.warp) for c in flat]
     shape = tuple(n - 2 * MARGIN for n in first.shape)
     nodes = wp.array(np.ascontiguousarray(field, np.float32), dtype=wp.vec3, device=where.warp)
     outputs = [wp.empty(shape, dtype=float, device=where.warp) for _ in range(2)]
     batch = shape[2] if on_cpu else 1
-    inputs = [*rows, wp.vec3i(*first.shape), nodes, wp.vec3(*spacing), OFFSET, MARGIN, batch]
+    inputs = [*flat, wp.vec3i(*first.shape), nodes, wp.vec3(*spacing), OFFSET, MARGIN, batch]
 
     def part(chunk: int, begin: int, end: int) -> None:
         dim = (end - begin, shape[1], -(-shape[2] // batch))

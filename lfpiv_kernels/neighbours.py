@@ -9,8 +9,23 @@ from . import runtime
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-_Cube = wp.types.vector(length=27, dtype=float)
-_MIDDLE = 13
+LANES = 16
+"""Vectors a CPU thread predicts at once; a CUDA thread takes one."""
+
+
+def _sort(size: int) -> str:
+    """Statements that sort `size` values in place: Batcher's odd-even merge network, the same steps for any values."""
+    steps, merged = [], 1
+    while merged < size:
+        distance = merged
+        while distance:
+            for start in range(distance % merged, size - distance, 2 * distance):
+                for low in range(start, min(start + distance, size - distance)):
+                    if low // (2 * merged) == (low + distance) // (2 * merged):
+                        steps.append(f"order(v[{low}], v[{low + distance}]);")
+            distance //= 2
+        merged *= 2
+    return " ".join(steps)
 
 
 @dataclass(frozen=True)
@@ -33,101 +48,132 @@ class Prediction:
     """Number of neighbours, shape (vector,)."""
 
 
-@wp.func
-def _median(values: _Cube, count: int):
-    """Median of the first `count` values, which are sorted by insertion."""
-    for i in range(1, count):
-        value = values[i]
-        j = i - 1
-        while j >= 0 and values[j] > value:
-            values[j + 1] = values[j]
-            j -= 1
-        values[j + 1] = value
-    return 0.5 * (values[(count - 1) // 2] + values[count // 2])
+_PREDICT = """
+#if defined(__CUDA_ARCH__)
+    typedef float V;
+    typedef int M;
+    const int lanes = 1;
+    auto put = [](auto& v, int k, auto value) { v = value; };
+    auto get = [](auto v, int k) { return v; };
+#else
+    typedef float V __attribute__((vector_size(64)));
+    typedef int M __attribute__((vector_size(64)));
+    const int lanes = 16;
+    auto put = [](auto& v, int k, auto value) { v[k] = value; };
+    auto get = [](auto v, int k) { return v[k]; };
+#endif
+    const int nz = shape[0], ny = shape[1], nx = shape[2], some = count < lanes ? count : lanes;
+    const V none = V{} + INFINITY;  // stands for a missing value, behind all others
+    auto order = [](V& a, V& b) { const V low = a < b ? a : b; b = a < b ? b : a; a = low; };
+    auto sort26 = [&](V* v) { SORT26 };
+    auto sort18 = [&](V* v) { SORT18 };
+    auto middle = [](const V* v, int most, M number) {  // median of the first `number` of sorted values
+        V low = v[0], high = v[0];
+        for (int i = 1; i <= most / 2; ++i) {
+            low = (number - 1) / 2 == i ? v[i] : low;
+            high = number / 2 == i ? v[i] : high;
+        }
+        return 0.5f * (low + high);
+    };
+    V cube[27];
+    M present[27], number = M{};
+    int64_t at[lanes][27];
+    for (int i = 0; i < 27; ++i) present[i] = M{};
+    for (int k = 0; k < some; ++k) {
+        const int point = points.data[first + k], z = point / (ny * nx), y = point / nx % ny, x = point % nx;
+        for (int i = 0; i < 27; ++i) {
+            const int pz = z + i / 9 - 1, py = y + i / 3 % 3 - 1, px = x + i % 3 - 1;
+            const bool inside = pz >= 0 && py >= 0 && px >= 0 && pz < nz && py < ny && px < nx;
+            at[k][i] = inside ? ((int64_t)pz * ny + py) * nx + px : 0;
+            if (i != 13 && inside && keep.data[at[k][i]]) put(present[i], k, -1);
+        }
+    }
+    for (int i = 0; i < 27; ++i) number = number + (present[i] != 0 ? M{} + 1 : M{});
+    for (int component = 0; component < 3; ++component) {
+        for (int i = 0; i < 27; ++i) {
+            V value = V{};
+            for (int k = 0; k < some; ++k) put(value, k, field.data[3 * at[k][i] + component]);
+            cube[i] = present[i] != 0 ? value : none;
+        }
+        V v[26], result[6];
+        auto robust = [&](V* out) {  // median of v, and the median distance from it
+            sort26(v);
+            out[0] = middle(v, 26, number);
+            for (int i = 0; i < 26; ++i) {
+                const V distance = v[i] - out[0];
+                v[i] = distance < 0.0f ? -distance : distance;
+            }
+            sort26(v);
+            out[1] = middle(v, 26, number);
+        };
+        for (int i = 0; i < 26; ++i) v[i] = cube[i < 13 ? i : i + 1];
+        robust(result);
+        V slope[3];
+        for (int axis = 0; axis < 3; ++axis) {  // median difference of adjacent neighbours, 0 without any
+            const int stride = axis == 0 ? 9 : axis == 1 ? 3 : 1;
+            M pairs = M{};
+            int n = 0;
+            for (int i = 0; i < 27 - stride; ++i) {
+                if (i / stride % 3 == 2) continue;
+                const M both = (present[i] != 0) & (present[i + stride] != 0);
+                v[n++] = both != 0 ? cube[i + stride] - cube[i] : none;
+                pairs = pairs + (both != 0 ? M{} + 1 : M{});
+            }
+            sort18(v);
+            slope[axis] = pairs > 0 ? middle(v, 18, pairs) : V{};
+        }
+        result[4] = none;
+        result[5] = -none;
+        for (int i = 0, n = 0; i < 27; ++i) {
+            if (i == 13) continue;
+            const V value = cube[i];
+            const V away = slope[0] * (float)(i / 9 - 1) + slope[1] * (float)(i / 3 % 3 - 1)
+                + slope[2] * (float)(i % 3 - 1);
+            result[4] = value < result[4] ? value : result[4];
+            result[5] = (present[i] != 0) & (value > result[5]) ? value : result[5];
+            v[n++] = present[i] != 0 ? value - away : none;
+        }
+        robust(result + 2);
+        for (int j = 0; j < 6; ++j) for (int k = 0; k < some; ++k)
+            prediction_out.data[((int64_t)(first + k) * 3 + component) * 6 + j] = get(result[j], k);
+    }
+    for (int k = 0; k < some; ++k) {
+        const int neighbours = get(number, k);
+        count_out.data[first + k] = neighbours;
+        if (neighbours == 0)
+            for (int j = 0; j < 18; ++j) prediction_out.data[(int64_t)(first + k) * 18 + j] = NAN;
+    }
+""".replace("SORT26", _sort(26)).replace("SORT18", _sort(18))
 
 
-@wp.func
-def _slope(cube: _Cube, present: int, stride: int):
-    """Median difference of adjacent neighbours along the axis whose elements are `stride` apart; 0 without any."""
-    differences = _Cube()
-    count = wp.int32(0)
-    for i in range(27 - stride):
-        if (i // stride) % 3 < 2 and (present >> i) & (present >> (i + stride)) & 1 == 1:
-            differences[count] = cube[i + stride] - cube[i]
-            count += 1
-    if count == 0:
-        return wp.float32(0.0)
-    return _median(differences, count)
-
-
-@wp.func
-def _median_and_scatter(values: _Cube, count: int):
-    """Median of the first `count` values and the median of their distances from it."""
-    median = _median(values, count)
-    distances = _Cube()
-    for i in range(count):
-        distances[i] = wp.abs(values[i] - median)
-    return wp.vec2(median, _median(distances, count))
+@wp.func_native(_PREDICT)
+def _predict_group(
+    field: wp.array(dtype=float),
+    keep: wp.array(dtype=int),
+    points: wp.array(dtype=int),
+    shape: wp.vec3i,
+    first: int,
+    count: int,
+    prediction_out: wp.array(dtype=float),
+    count_out: wp.array(dtype=int),
+): ...
 
 
 @wp.kernel
 def _predict(
     # in
-    field: wp.array4d(dtype=float),  # (z, y, x, component)
-    keep: wp.array3d(dtype=int),  # 1 where a vector counts as neighbour
+    field: wp.array(dtype=float),  # flat, (z, y, x, component)
+    keep: wp.array(dtype=int),  # flat, (z, y, x): 1 where a vector counts as neighbour
     points: wp.array(dtype=int),  # linear index of the vectors wanted
-    first_point: int,
+    shape: wp.vec3i,  # of the grid
+    group: int,  # vectors per thread: `LANES` on the CPU, 1 on CUDA
+    first_group: int,
     # out
-    prediction_out: wp.array3d(dtype=float),  # (vector, component, 6): as in `Prediction`
+    prediction_out: wp.array(dtype=float),  # flat, (vector, component, 6): as in `Prediction`
     count_out: wp.array(dtype=int),  # neighbours, (vector,)
 ):
-    index, component = wp.tid()
-    point = first_point + index
-    z = points[point] // (keep.shape[1] * keep.shape[2])
-    y = points[point] // keep.shape[2] % keep.shape[1]
-    x = points[point] % keep.shape[2]
-    cube = _Cube()
-    values = _Cube()
-    present = wp.int32(0)
-    count = wp.int32(0)
-    for i in range(27):
-        pz = z + i // 9 - 1
-        py = y + (i // 3) % 3 - 1
-        px = x + i % 3 - 1
-        if i != _MIDDLE and pz >= 0 and py >= 0 and px >= 0:
-            if pz < keep.shape[0] and py < keep.shape[1] and px < keep.shape[2]:
-                if keep[pz, py, px] == 1:
-                    cube[i] = field[pz, py, px, component]
-                    values[count] = cube[i]
-                    present = present | (1 << i)
-                    count += 1
-    if component == 0:
-        count_out[point] = count
-    if count == 0:
-        for k in range(6):
-            prediction_out[point, component, k] = wp.nan
-    else:
-        plain = _median_and_scatter(values, count)
-        lowest = values[0]
-        highest = values[0]
-        slope_z = _slope(cube, present, 9)
-        slope_y = _slope(cube, present, 3)
-        slope_x = _slope(cube, present, 1)
-        n = wp.int32(0)
-        for i in range(27):
-            if (present >> i) & 1 == 1:
-                lowest = wp.min(lowest, cube[i])
-                highest = wp.max(highest, cube[i])
-                away = slope_z * float(i // 9 - 1) + slope_y * float((i // 3) % 3 - 1) + slope_x * float(i % 3 - 1)
-                values[n] = cube[i] - away
-                n += 1
-        moved = _median_and_scatter(values, count)
-        prediction_out[point, component, 0] = plain[0]
-        prediction_out[point, component, 1] = plain[1]
-        prediction_out[point, component, 2] = moved[0]
-        prediction_out[point, component, 3] = moved[1]
-        prediction_out[point, component, 4] = lowest
-        prediction_out[point, component, 5] = highest
+    first = (first_group + wp.tid()) * group
+    _predict_group(field, keep, points, shape, first, points.shape[0] - first, prediction_out, count_out)
 
 
 def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Prediction:
@@ -161,18 +207,14 @@ def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Predicti
     wp.load_module(__name__, device=where.warp)  # before threads start: compilation is not thread-safe
     points = np.flatnonzero(wanted).astype(np.int32)
     arrays = ((field, np.float32, float), (keep, np.int32, int), (points, np.int32, int))
-    inputs = [wp.array(np.ascontiguousarray(a, kind), dtype=t, device=where.warp) for a, kind, t in arrays]
+    inputs = [wp.array(np.ascontiguousarray(a, kind).ravel(), dtype=t, device=where.warp) for a, kind, t in arrays]
     prediction = wp.empty((len(points), 3, 6), dtype=float, device=where.warp)
     count = wp.empty(len(points), dtype=int, device=where.warp)
+    group = LANES if where.kind == "cpu" else 1
+    layout, outputs = [wp.vec3i(*keep.shape), group], [prediction.flatten(), count]
 
     def part(chunk: int, begin: int, end: int) -> None:
-        wp.launch(
-            _predict,
-            dim=(end - begin, 3),
-            inputs=[*inputs, begin],
-            outputs=[prediction, count],
-            device=where.warp,
-        )
+        wp.launch(_predict, dim=end - begin, inputs=[*inputs, *layout, begin], outputs=outputs, device=where.warp)
 
-    runtime.run_chunks(len(points), part)
+    runtime.run_chunks(-(-len(points) // group), part)
     return Prediction(*np.moveaxis(prediction.numpy(), -1, 0), count.numpy())

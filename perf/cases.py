@@ -301,11 +301,15 @@ def _smart(scale, iterations, form="profiles") -> Work:
     return work
 
 
-def _correlate(scale, window, search) -> Work:
+def _correlate(scale, window, search=None) -> Work:
+    """The bare kernel; without `search` what a user calls: one pass with its own range, validation and a dataset."""
     first, second = particles(scale["volume"]), particles(scale["volume"], SHIFT)
     cube = (window,) * 3
 
     def run():
+        if search is None:
+            vectors = lfpiv.correlate(first, second, dt_s=1.0, voxel_mm=0.1, windows=(window,))
+            return np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
         peaks = correlate.correlate_windows(first, second, window=cube, step=(window // 2,) * 3, search=(search,) * 3)
         return peaks.displacement
 
@@ -463,6 +467,8 @@ OPERATIONS = {
     "correlate_8": (_correlate, {"window": 8, "search": 4}),
     "correlate_16": (_correlate, {"window": 16, "search": 8}),
     "correlate_16_quarter": (_correlate, {"window": 16, "search": 4}),
+    "correlate_user_8": (_correlate, {"window": 8}),
+    "correlate_user_16": (_correlate, {"window": 16}),
     "deform": (_deform, {}),
     "vectors": (_vectors, {}),
     "train": (_train, {"epochs": 10}),

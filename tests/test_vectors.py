@@ -1,6 +1,7 @@
 """Correlation: kernels against slow twins, known displacements, symmetries, validation, honest uncertainty."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import xarray as xr
 import lfpiv
 from lfpiv import validation, vectors
 from lfpiv_kernels import correlate as kernel
-from lfpiv_kernels import deform, neighbours
+from lfpiv_kernels import correlation_plan, deform, neighbours, runtime
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -150,7 +151,12 @@ def peaks_twin(score, search):
 @pytest.mark.parametrize("method", ["direct", "fft"])
 @pytest.mark.parametrize(
     ("window", "step", "search"),
-    [((8, 8, 8), (4, 4, 4), (3, 3, 3)), ((7, 9, 10), (7, 3, 5), (2, 5, 3)), ((16, 16, 16), (16, 8, 8), (4, 4, 4))],
+    [
+        ((8, 8, 8), (4, 4, 4), (3, 3, 3)),
+        ((7, 9, 10), (7, 3, 5), (2, 5, 3)),
+        ((16, 16, 16), (16, 8, 8), (4, 4, 4)),
+        ((12, 12, 8), (6, 4, 2), (3, 2, 6)),  # several blocks along y and x, two parts of the lags along x
+    ],
 )
 def test_peaks_equal_the_definition(monkeypatch, window, step, search, method, symmetric):
     monkeypatch.setattr(kernel, "_SLAB_BYTES", 1)  # every layer of windows on its own
@@ -169,6 +175,37 @@ def test_peaks_equal_the_definition(monkeypatch, window, step, search, method, s
         np.testing.assert_allclose(peaks.displacement[cell], displacement, atol=TOLERANCE_PEAK)
         np.testing.assert_allclose(peaks.second_displacement[cell], second_displacement, atol=TOLERANCE_PEAK)
         assert peaks.measured[cell] == np.isfinite(displacement).all()
+
+
+@pytest.mark.parametrize(("block", "lags"), [(1, 5), (4, 9), (8, 17), (8, 19), (7, 12)])
+def test_fewer_products_make_the_same_correlation(block, lags):
+    rng = np.random.default_rng(7)
+    a, b = rng.normal(size=block), rng.normal(size=block + lags - 1)
+    taps, near, inverse = correlation_plan.products_along_z(block, lags)
+    np.testing.assert_allclose(inverse @ ((taps @ a) * (near @ b)), np.correlate(b, a, "valid"), atol=1e-12)
+
+
+@pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
+def test_peaks_do_not_depend_on_how_they_are_computed(monkeypatch, device, symmetric):
+    pair = particle_pair((30, 34, 38), uniform(0.4, -1.2, 0.8), seed=8, ghosts=0.5, noise=0.05)
+    arguments = {"window": (12, 12, 12), "step": (6, 6, 6), "search": (4, 4, 4), "symmetric": symmetric}
+
+    def peaks():
+        found = kernel.correlate_windows(*pair, method="direct", **arguments)
+        return {name: getattr(found, name) for name in ("displacement", "second_displacement", "correlation", "rival")}
+
+    ways = []
+    for cost in (0.0, 1e9):  # of the planes that are combined for fewer products
+        monkeypatch.setattr(correlation_plan, "_PLANE_SECONDS", cost)
+        ways.append(peaks())
+        plan = correlation_plan.make_plan(pair[0].shape, pair[1].shape, (12,) * 3, (6,) * 3, (4,) * 3, "direct")[0]
+        assert device.kind == "cuda" or (plan.products > 0) == (cost == 0)
+    for name, values in ways[0].items():
+        np.testing.assert_allclose(values, ways[1][name], atol=TOLERANCE_PEAK, err_msg=name)
+    with ThreadPoolExecutor(1) as pool:
+        monkeypatch.setattr(runtime, "_pool", pool)
+        for name, values in peaks().items():
+            np.testing.assert_array_equal(values, ways[1][name], err_msg=f"{name} depends on the number of threads")
 
 
 def test_windows_without_signal_are_not_measured():
@@ -282,6 +319,24 @@ def test_outliers_are_found_and_replaced():
     assert np.abs(result - truth).max() < replaced
 
 
+def test_a_known_field_helps_clear_peaks_only():
+    rng = np.random.default_rng(9)
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in (2, 9, 10)), indexing="ij"), -1).astype(float)
+    bent = np.sin(1.5 * index[..., [2, 1, 2]] + index[..., [0, 0, 1]])  # bends from vector to vector, in two layers
+    field = bent + 0.03 * rng.normal(size=bent.shape)
+    wrong = rng.random(bent.shape[:3]) < 0.1
+    field[wrong] += rng.choice((-1, 1), (wrong.sum(), 3)) * rng.uniform(1, 2, (wrong.sum(), 3))
+    nowhere, measured = np.full_like(field, np.nan), np.ones(wrong.shape, bool)
+    shares = []
+    for ratio in (1.0, 4.0):
+        known = {"predicted": bent + 0.2, "peak_ratio": np.full(wrong.shape, ratio)}
+        valid = validation.validate(field, nowhere, measured, (3, 3, 3), **known)[1]
+        assert valid[wrong].mean() < 0.2  # a few agree with what scatters around them
+        shares.append(valid[~wrong].mean())
+    plain = validation.validate(field, nowhere, measured, (3, 3, 3))[1]
+    assert shares[0] == plain[~wrong].mean() < 0.8 and shares[1] > 0.98
+
+
 def test_nothing_valid_gives_nothing():
     field = np.full((2, 3, 4, 3), np.nan)
     result, valid = validation.validate(field, field, np.zeros((2, 3, 4), bool), SEARCH)
@@ -332,6 +387,15 @@ def test_flows_are_recovered(flow, limit, noisy_limit):
         assert error.mean() < allowed
         assert float(result["valid"].mean()) > 0.95 and np.isfinite(measured(result)).all()
     assert json.loads(result.attrs["passes"])[-1]["valid"] == pytest.approx(float(result["valid"].mean()), abs=1e-4)
+
+
+@pytest.mark.parametrize(("depth", "window"), [(30, 20), (30, 14), (24, 16)], ids=str)
+def test_few_layers_of_vectors_are_enough(depth, window):
+    shape = (depth, 56, 56)
+    for spoilt in ({}, {"ghosts": 1.0, "noise": 0.05}):
+        result = correlate(particle_pair(shape, ring(shape), seed=3, **spoilt), windows=(window, window))
+        error = np.linalg.norm(error_of(result, ring(shape), window), axis=-1)
+        assert float(result["valid"].mean()) > 0.9 and error.mean() < 0.3  # of a peak displacement of 2
 
 
 def test_large_displacements_need_only_the_quarter_rule():
@@ -455,6 +519,10 @@ def test_intensity_power_keeps_bright_spots_from_outweighing_particles():
         ({"windows": ((16, 16),)}, "windows: expected edges of whole voxels >= 4"),
         ({"overlap": 1.0}, "overlap: expected 0 <= overlap < 1, got 1.0"),
         ({"dt_s": 0.0}, "dt_s: expected a positive time"),
+        ({"dt_s": None}, "dt_s: expected a positive time"),
+        ({"windows": (None,)}, "windows: expected edges of whole voxels >= 4"),
+        ({"volume_a": [[1, 2], [3]]}, "volume_a: expected a volume of numbers"),
+        ({"volume_b": np.ma.masked_equal(np.zeros((20, 24, 28)), 0)}, "volume_b: expected finite intensities"),
         ({"voxel_mm": None}, "voxel_mm: expected the voxel edge"),
         ({"voxel_mm": -0.1}, "voxel_mm: expected the voxel edge"),
         ({"smoothing_voxel": -1.0}, "smoothing_voxel: expected a value >= 0"),
@@ -466,6 +534,13 @@ def test_bad_input_is_refused(change, message):
     good = {"volume_a": np.zeros((20, 24, 28)), "volume_b": np.zeros((20, 24, 28)), "dt_s": 1e-3, "voxel_mm": 0.1}
     with pytest.raises(ValueError, match=message):
         lfpiv.correlate(**{**good, **change})
+
+
+def test_the_kernel_refuses_what_is_not_finite():
+    pair = particle_pair((16, 16, 16), uniform(0, 0, 0), seed=42)
+    pair[1][3, 4, 5] = np.nan
+    with pytest.raises(ValueError, match="second: expected finite values"):
+        kernel.correlate_windows(*pair, window=(8, 8, 8), step=(4, 4, 4), search=(3, 3, 3))
 
 
 def test_coordinates_must_agree():
