@@ -29,16 +29,24 @@ class Table(BaseModel):
 class Smart(Table):
     """Table ``[smart]``: the reconstruction (Eq. 5)."""
 
-    iterations: Count = 20
-    """SMART iterations."""
+    iterations: Count = 40
+    """Largest number of SMART iterations; `tolerance` usually ends them sooner."""
     relaxation: Annotated[float, Field(strict=True, gt=0, le=3)] = 1.0
     """Relaxation mu of Eq. 5. Values near 3 diverge."""
     normalisation: Literal["column", "paper"] = "column"
     """Exponent divided by the voxel's column sum, or Eq. 5 as printed with weights scaled to a maximum of 1."""
+    accelerate: Flag = True
+    """Nesterov's momentum in the volume's logarithm: the same limit in fewer iterations; the misfit never rises."""
     smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
     """Standard deviation of the Gaussian smoothing after each iteration [voxel]; 0 switches it off."""
-    tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
-    """Stop when an iteration lowers the image residual by less than this fraction; 0 runs all iterations."""
+    floor_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1
+    """Least noise floor, as a share of the images' brightness; 0 takes the measured noise as it is."""
+    sieve_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
+    """Standard deviation of the Gaussians that the volume is a sum of [voxel]; 0 for voxels of any brightness."""
+    active_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
+    """Voxels below this share of the first guess's brightest are left out; 0 keeps all."""
+    tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
+    """Stop when an iteration lowers the misfit, a divergence, by less than this fraction; 0 runs all iterations."""
 
 
 class Correlation(Table):

@@ -5,18 +5,19 @@ from __future__ import annotations
 import enum
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 from scipy import ndimage
 
+from lfpiv.smart import View, gaussian, iterate
 from lfpiv.weights import Weights
-from lfpiv_kernels import project
 
 log = logging.getLogger(__name__)
 
 NORMALISATIONS = ("column", "paper")
+FLOOR_SHARE = 0.1
+"""Least floor, as a share of an image's brightness: voxels cannot show what is smaller than they are any better."""
 DIVERGENCE = 1.5
 """Rise of the misfit over its first value that counts as divergence; smoothing alone may raise it a little."""
 
@@ -24,20 +25,10 @@ DIVERGENCE = 1.5
 class Stop(enum.Enum):
     """Why the iteration ended; the text is the advice."""
 
+    DONE = "all iterations asked for were done"
     CONVERGED = "misfit no longer falls by more than the tolerance"
     ITERATION_LIMIT = "iteration limit reached: raise smart.iterations if the misfit still falls"
     DIVERGED = "misfit rises: lower smart.relaxation"
-
-
-@dataclass(frozen=True)
-class _Camera:
-    """One camera's padded arrays for the iteration."""
-
-    name: str
-    image: np.ndarray
-    gain: np.ndarray
-    projected: np.ndarray
-    ratio: np.ndarray
 
 
 def reconstruct(
@@ -47,8 +38,12 @@ def reconstruct(
     relaxation: float = 1.0,
     *,
     floor: float | Mapping[str, float] | None = None,
+    floor_share: float = FLOOR_SHARE,
     normalisation: str = "column",
+    accelerate: bool = True,
     smoothing_voxel: float = 0.0,
+    sieve_voxel: float = 0.0,
+    active_share: float = 0.0,
     tolerance: float = 0.0,
     first: np.ndarray | None = None,
     progress: Callable[[float], None] | None = None,
@@ -60,7 +55,9 @@ def reconstruct(
     - "column" (default): ``E *= exp(mu sum_i w log((I + b) / (P + b)) / sum_i w)``;
     - "paper": Eq. 5, ``E *= exp(mu sum_i w log((I + b) / (P + b)) / N_i)``, w scaled to a largest weight of 1.
 
-    The first guess is ``exp(sum_i w log(I + b) / sum_i w)``, less the floor's own share, scaled to the images' light.
+    For mu <= 1 the first lowers the misfit in every iteration. By default momentum speeds it up (`lfpiv.smart`): half
+    the iterations or fewer reach the same misfit, it still falls in every one, and the limit is the same. The first
+    guess is ``exp(sum_i w log(I + b) / sum_i w)``, less the floor's own share, scaled to the images' light.
 
     Parameters
     ----------
@@ -76,14 +73,27 @@ def reconstruct(
         Noise floor b [counts] added to images and projections alike: one dark pixel must not kill a voxel. Default: the
         noise of each image's background, the root mean square of its negative counts, and at least 1e-4 of its
         brightest count.
+    floor_share : float
+        The floor is at least this share of each image's brightness, sum I^2 / sum I: particles smaller than a voxel
+        light fewer pixels than it, and the dark ones beside them are no evidence against it. 0 takes `floor` as it is.
     normalisation : {"column", "paper"}
         See above.
+    accelerate : bool
+        False iterates without momentum, as the formulas above say. Only then 5 iterations and 7 more, with the first
+        ones' volume as `first`, are exactly 12: momentum starts anew with every call.
     smoothing_voxel : float
         Standard deviation [voxel] of a Gaussian that smooths the volume after each iteration but the last; 0 for none.
+        The misfit may rise by it.
+    sieve_voxel : float
+        Standard deviation [voxel] of a sieve: the volume is a sum of Gaussians of this size, and SMART iterates their
+        brightnesses c, E = G c, with w G for w. Unlike smoothing it keeps SMART's guarantee. 0 for none.
+    active_share : float
+        Voxels below this share of the first guess's brightest are zero from the start and cost nothing. 0 keeps all.
     tolerance : float
         Stop when the misfit falls by less than this fraction in an iteration; 0 runs all iterations.
     first : ndarray, shape (z, y, x), optional
-        First guess, to continue an iteration or to start from one of your own; positive.
+        First guess, to continue an iteration or to start from one of your own; with a sieve, of c. Finite and >= 0:
+        voxels that are zero stay zero and cost nothing.
     progress : callable, optional
         Called with the finished fraction.
 
@@ -99,59 +109,58 @@ def reconstruct(
     ValueError
         If an argument is out of its range, or an image is missing, has the wrong shape or holds no finite light.
     """
-    _check(iterations, relaxation, normalisation, smoothing_voxel, first, weights)
-    cameras = [_prepare(weights, images, name) for name in weights.cameras]
+    _check(
+        iterations,
+        relaxation,
+        normalisation,
+        active_share,
+        floor_share=floor_share,
+        smoothing_voxel=smoothing_voxel,
+        sieve_voxel=sieve_voxel,
+        tolerance=tolerance,
+    )
+    recorded = {name: _light(weights, images, name) for name in weights.cameras}
     floors = _floors(floor, weights, images)
+    for name, image in recorded.items():
+        floors[name] = max(floors[name], floor_share * _brightness(image))
+    views = [_view(weights, name, recorded[name], floors[name]) for name in weights.cameras]
 
+    sieve = gaussian(sieve_voxel, weights.stored.shape)
     column_sum = weights.stored.store(weights.column_sum)
     lit = column_sum > 1e-6 * column_sum.max()
     if normalisation == "column":
-        step = np.divide(relaxation, column_sum, out=np.zeros_like(column_sum), where=lit)
+        step = np.divide(relaxation, sieve(column_sum), out=np.zeros_like(column_sum), where=lit)
     else:
         pixels = weights.stored.store(weights.affected_pixels)
         step = np.divide(relaxation / weights.largest, pixels, out=np.zeros_like(column_sum), where=lit & (pixels > 0))
+    volume = _first_guess(views, column_sum, lit) if first is None else _given(first, weights) * lit
+    if active_share > 0:
+        volume[volume < active_share * volume.max()] = 0.0
 
-    if first is not None:
-        volume = weights.stored.store(first) * lit
-    else:
-        volume = _first_guess(weights, cameras, floors, column_sum, lit)
+    def smooth(volume):
+        if smoothing_voxel == 0:
+            return volume
+        shaped = volume.reshape(weights.stored.shape)
+        return ndimage.gaussian_filter(shaped, smoothing_voxel, mode="nearest", truncate=3.0).ravel() * lit
 
-    light = float(np.sqrt(sum(np.square(camera.image, dtype=np.float64).sum() for camera in cameras)))
+    norm = float(np.sqrt(sum(np.square(view.image, dtype=np.float64).sum() for view in views)))
     residual: list[float] = []
     misfit: list[float] = []
-    stop = Stop.ITERATION_LIMIT
-    exponent = np.empty_like(volume)
-    for iteration in range(iterations + 1):
-        exponent[:] = 0.0
-        squares = divergence = 0.0
-        for camera in cameras:
-            weights.projector(camera.name).project(volume, camera.projected)
-            project.log_ratio(camera.image, camera.gain, floors[camera.name], camera.projected, camera.ratio)
-            np.multiply(camera.projected, camera.gain, out=camera.projected)
-            difference = camera.image - camera.projected
-            squares += float(np.dot(difference, difference))
-            divergence += _divergence(camera, floors[camera.name], difference)
-            if iteration < iterations:
-                weights.projector(camera.name).back_project(camera.ratio, exponent, active=volume)
-        residual.append(float(np.sqrt(squares)) / light)
-        misfit.append(divergence)
+    stop = Stop.DONE if tolerance == 0 else Stop.ITERATION_LIMIT
+    steps = iterate(views, volume, step, iterations=iterations, accelerate=accelerate, sieve=sieve, smooth=smooth)
+    for count, (volume, current) in enumerate(steps):  # noqa: B007 - the last one is returned
+        residual.append(float(np.sqrt(current.squares)) / norm)
+        misfit.append(current.divergence)
         if progress is not None:
-            progress((iteration + 1) / (iterations + 1))
-        if iteration == iterations:
-            break
-        if iteration > 0 and misfit[-1] > DIVERGENCE * misfit[0]:
+            progress((count + 1) / (iterations + 1))
+        if count in (0, iterations):
+            continue
+        if misfit[-1] > DIVERGENCE * misfit[0]:
             stop = Stop.DIVERGED
             break
-        if iteration > 0 and tolerance > 0 and misfit[-2] - misfit[-1] < tolerance * misfit[-2]:
+        if tolerance > 0 and misfit[-2] - misfit[-1] < tolerance * misfit[-2]:
             stop = Stop.CONVERGED
             break
-        project.update(volume, exponent, step)
-        if smoothing_voxel > 0 and iteration + 1 < iterations:
-            shape = weights.stored.shape
-            volume = ndimage.gaussian_filter(
-                volume.reshape(shape), smoothing_voxel, mode="nearest", truncate=3.0
-            ).ravel()
-            volume *= lit
     if stop is Stop.DIVERGED:
         log.warning("SMART: %s", stop.value)
     grid = weights.grid
@@ -169,8 +178,12 @@ def reconstruct(
             "stop": stop.value,
             "iterations": len(residual) - 1,
             "relaxation": relaxation,
+            "floor": list(floors.values()),
             "normalisation": normalisation,
+            "accelerate": int(accelerate),
             "smoothing_voxel": smoothing_voxel,
+            "sieve_voxel": sieve_voxel,
+            "active_share": active_share,
         },
     )
 
@@ -189,12 +202,13 @@ def _floors(floor, weights: Weights, images: Mapping[str, np.ndarray]) -> dict[s
     if missing:
         raise ValueError(f"floor: camera {missing[0]!r} is missing; found {', '.join(floor) or 'none'}.")
     floors = {name: floor[name] if isinstance(floor, Mapping) else floor for name in weights.cameras}
-    if any(not value >= 0 for value in floors.values()):
+    if any(not (np.isfinite(value) and value >= 0) for value in floors.values()):
         raise ValueError(f"floor: expected a number >= 0, got {floor}.")
     return floors
 
 
-def _prepare(weights: Weights, images: Mapping[str, np.ndarray], name: str) -> _Camera:
+def _light(weights: Weights, images: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """One camera's image, checked, without negative counts and dead pixels."""
     camera = weights.cameras[name]
     if name not in images:
         raise ValueError(f"images: camera {name!r} is missing; found {', '.join(images) or 'none'}.")
@@ -206,46 +220,64 @@ def _prepare(weights: Weights, images: Mapping[str, np.ndarray], name: str) -> _
     image = np.where(camera.gain > 0, np.maximum(image, 0.0), 0.0)
     if not image.any():
         raise ValueError(f"images[{name!r}]: expected some light, got no positive count; check the background.")
-    flat, gain = image.reshape(-1), np.ascontiguousarray(camera.gain, np.float32).reshape(-1)
-    return _Camera(name, flat, gain, np.empty_like(flat), np.empty_like(flat))
+    return image.reshape(-1)
 
 
-def _first_guess(weights, cameras, floors, column_sum, lit) -> np.ndarray:
+def _brightness(image: np.ndarray) -> float:
+    """Mean count of an image, each count weighted by itself [counts]: dark pixels do not count, nor does a hot one."""
+    return float(np.square(image, dtype=np.float64).sum() / image.sum(dtype=np.float64))
+
+
+def _view(weights: Weights, name: str, image: np.ndarray, floor: float) -> View:
+    return View(
+        image=image,
+        gain=np.ascontiguousarray(weights.cameras[name].gain, np.float32).reshape(-1),
+        floor=floor,
+        projector=weights.projector(name),
+        projected=np.empty_like(image),
+        ratio=np.empty_like(image),
+    )
+
+
+def _first_guess(views: list[View], column_sum: np.ndarray, lit: np.ndarray) -> np.ndarray:
     """Multiplicative first guess, scaled so that its projection holds the images' light."""
     logarithm = np.zeros_like(column_sum)
-    for camera in cameras:
-        floor = max(floors[camera.name], 1e-3 * float(camera.image.max()))
-        weights.projector(camera.name).back_project(camera.gain * np.log1p(camera.image / floor), logarithm)
+    for view in views:
+        floor = max(view.floor, 1e-3 * float(view.image.max()))
+        view.projector.back_project(view.gain * np.log1p(view.image / floor), logarithm)
     guess = np.expm1(np.divide(logarithm, column_sum, out=np.zeros_like(column_sum), where=lit))
     guess = np.where(lit, np.maximum(guess, 1e-6 * guess.max()), 0.0).astype(np.float32)
     seen = light = 0.0
-    for camera in cameras:
-        weights.projector(camera.name).project(guess, camera.projected)
-        modelled = camera.gain * camera.projected
-        seen += float(camera.image[modelled > 0].sum(dtype=np.float64))
+    for view in views:
+        view.projector.project(guess, view.projected)
+        modelled = view.gain * view.projected
+        seen += float(view.image[modelled > 0].sum(dtype=np.float64))
         light += float(modelled.sum(dtype=np.float64))
     if not seen > 0:
         raise ValueError("images: no light where the volume is seen; check the volume's position and the calibration.")
     return (guess * (seen / light)).astype(np.float32)
 
 
-def _divergence(camera: _Camera, floor: float, difference: np.ndarray) -> float:
-    """Kullback-Leibler divergence of the projection from the image, the misfit that SMART lowers.
+def _given(first: np.ndarray, weights: Weights) -> np.ndarray:
+    """First guess of the caller in stored order, checked."""
+    values = np.asarray(first)
+    if values.shape != weights.grid.shape:
+        raise ValueError(f"first: expected shape {weights.grid.shape} (z, y, x), got {values.shape}.")
+    if not np.isfinite(values).all() or values.min() < 0 or not values.any():
+        raise ValueError("first: expected finite values >= 0, some above 0, got NaN, infinite, negative or only zeros.")
+    return weights.stored.store(values)
 
-    sum (P + b) log((P + b) / (I + b)) - P + I; `camera.projected` already holds P, `camera.ratio` gain * log ratio.
-    """
-    logarithm = np.divide(camera.ratio, camera.gain, out=np.zeros_like(camera.ratio), where=camera.gain > 0)
-    return float(difference.sum(dtype=np.float64) - np.dot(camera.projected + np.float32(floor), logarithm))
 
-
-def _check(iterations, relaxation, normalisation, smoothing_voxel, first, weights) -> None:
-    if isinstance(iterations, bool) or int(iterations) != iterations or iterations < 0:
+def _check(iterations, relaxation, normalisation, active_share, **not_negative) -> None:
+    whole = isinstance(iterations, (int, np.integer)) and not isinstance(iterations, bool)
+    if not (whole and iterations >= 0):
         raise ValueError(f"iterations: expected a whole number >= 0, got {iterations!r}.")
-    if not relaxation > 0:
+    if not (np.isfinite(relaxation) and relaxation > 0):
         raise ValueError(f"relaxation: expected a number > 0, got {relaxation!r}.")
     if normalisation not in NORMALISATIONS:
         raise ValueError(f"normalisation: expected one of {', '.join(NORMALISATIONS)}, got {normalisation!r}.")
-    if not smoothing_voxel >= 0:
-        raise ValueError(f"smoothing_voxel: expected a number >= 0, got {smoothing_voxel!r}.")
-    if first is not None and (np.shape(first) != weights.grid.shape or not (np.asarray(first) > 0).all()):
-        raise ValueError(f"first: expected positive values of shape {weights.grid.shape}, got shape {np.shape(first)}.")
+    if not 0 <= active_share < 1:
+        raise ValueError(f"active_share: expected a number from 0 to below 1, got {active_share!r}.")
+    for name, value in not_negative.items():
+        if not (np.isfinite(value) and value >= 0):
+            raise ValueError(f"{name}: expected a number >= 0, got {value!r}.")

@@ -271,6 +271,7 @@ def _smart(scale, iterations, form="profiles") -> Work:
     truth = 1e4 * particles(weights.grid.shape)
     images = weights(truth)
     first = np.full(weights.grid.shape, float(truth.mean()), np.float32)
+    plain = {"accelerate": False, "floor_share": 0.0}  # what the peer does; momentum costs the same per iteration
     require(bool((weights.column_sum > 0).all()), "a voxel is seen by no camera")  # all voxels active
 
     def check(volume):
@@ -279,10 +280,11 @@ def _smart(scale, iterations, form="profiles") -> Work:
         return {"residual": volume.attrs["residual"][-1], "stored_bytes": weights.memory_bytes}
 
     work = Work(
-        lambda: lfpiv.reconstruct(weights, images, iterations, first=first, floor=1.0),
+        lambda: lfpiv.reconstruct(weights, images, iterations, first=first, floor=1.0, **plain),
         check,
         {"iterations": iterations, "voxel_camera": 2 * weights.grid.size * iterations},
         read_bytes=(2 * iterations + 1) * weights.memory_bytes,
+        flops=(2 * iterations + 1) * 2 * nonzeros(weights),
     )
     if scale["voxels"] <= PEER_VOXELS:
         ours, matrices = weights.stored.store(work.run()), explicit(weights)
