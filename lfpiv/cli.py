@@ -16,6 +16,7 @@ import typer
 
 import lfpiv
 from lfpiv.errors import InputError
+from lfpiv.reproduce import CASES
 
 log = logging.getLogger("lfpiv")
 
@@ -170,6 +171,26 @@ def _demo(
     _tell(summary, out)
 
 
+@app.command("reproduce")
+def _reproduce(
+    out: Out,
+    cases: Annotated[
+        list[str] | None, typer.Argument(metavar="[CASE]...", help=f"{', '.join(CASES)}, or all (the default).")
+    ] = None,
+    scale: Annotated[
+        Literal["small", "paper"], typer.Option("--scale", help="Smaller volumes, or the paper's own sizes: hours.")
+    ] = "small",
+    seed: Annotated[int, typer.Option("--seed", help="Whole number that every random draw derives from.")] = 0,
+    debug: Debug = False,
+) -> None:
+    """Compute the paper's tables and figures, ours beside the paper's. Finished cases in DIR are kept."""
+    with _terminal() as progress:
+        from lfpiv.reproduce import reproduce
+
+        reproduce(cases or ["all"], out, scale, seed=seed, progress=progress, finished=_tell_case)
+    print(f"page: {out / 'index.html'}")
+
+
 @app.command("doctor")
 def _doctor(device: Literal["auto", "cpu", "cuda"] = "auto", debug: Debug = False) -> None:
     """Show devices, versions and memory, and test the kernels."""
@@ -300,6 +321,18 @@ def _tell(summary: dict[str, Any], out: Path) -> None:
         print(f"warning: {text}")
     print(f"{summary['timings_s']['total']:.0f} s, peak memory {summary['peak_memory_mib']:.0f} MiB")
     print(f"report: {out / 'report.html'}")
+
+
+def _tell_case(key: str, result: dict[str, Any]) -> None:
+    print(f"{key}: {result['title']}")
+    for row in result["comparison"]:
+        ours, paper = (
+            "-" if row[name] is None else f"{row[name]:.4g}" if isinstance(row[name], float) else row[name]
+            for name in ("ours", "paper")
+        )
+        unit = f" {row['unit']}" if row["unit"] else ""
+        goal = "" if row["goal"] is None else f", goal {row['goal']}: {'reached' if row['reached'] else 'NOT reached'}"
+        print(f"  {row['what']}: {ours}{unit}, paper {paper}{goal}", flush=True)
 
 
 def _tell_calibration(summary: dict[str, Any]) -> None:

@@ -242,7 +242,7 @@ def _write(scene: Scene, pairs: list[Placed], folder: Path, progress: Progress) 
     for number, camera in enumerate(scene.camera):
         for path, image in _images(scene, number, pairs):
             rng = np.random.default_rng([scene.seed, 2, number, done])
-            _write_image(folder / path, _expose(image, camera, scene.noise, rng))
+            _write_image(folder / path, expose(image, camera, scene.noise, rng))
             done += 1
             progress("simulated images", done, total)
     (folder / "truth").mkdir()
@@ -306,7 +306,7 @@ def _images(scene: Scene, number: int, pairs: list[Placed]) -> Iterator[tuple[st
             yield f"particles/{camera.name}/pair_{pair:04d}_{frame}.tif", image
 
 
-def _expose(image: np.ndarray, camera: SceneCamera, noise: Noise, rng: np.random.Generator) -> np.ndarray:
+def expose(image: np.ndarray, camera: SceneCamera, noise: Noise, rng: np.random.Generator) -> np.ndarray:
     """Turn light [count] into what the camera stores: blurred, with noise, 12 bits, mirrored if the camera does."""
     if camera.blur_px > 0:
         image = gaussian_filter(image, camera.blur_px)

@@ -1,0 +1,260 @@
+"""Figs. 20 to 22: the low-swirl injector's mean flow by light-field PIV of two cameras and by planar PIV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.patches import Rectangle
+from scipy.interpolate import RegularGridInterpolator
+
+from lfpiv.reproduce import page, plots
+from lfpiv.reproduce.injector import experimental_rig
+from lfpiv.reproduce.lsitwin import (
+    DEPTHS_D,
+    DIAMETER_MM,
+    ITERATIONS,
+    PARTICLES_PER_MICROLENS,
+    PROFILE_D,
+    TURBULENCE_SHARE,
+    WINDOWS,
+    Sizes,
+    Twin,
+    light_field_mean,
+    planar_mean,
+)
+from lfpiv.reproduce.planarpiv import require_openpiv
+from lfpiv.reproduce.rigs import Rig
+
+TITLE = "Figs. 20 to 22: low-swirl injector, light-field PIV against planar PIV"
+
+PAPER_ERROR = {"u": 0.0905, "v": 0.0989}
+NAMES = {"u": "radial velocity u", "v": "axial velocity v"}
+
+SIZES = {
+    "small": Sizes(
+        volume_mm=(3.2, 6.4, 12.0),
+        centre_x_mm=PROFILE_D * DIAMETER_MM,
+        pairs=20,
+        planar_pairs=20,
+        same_instants=True,
+        field_mm=None,
+    ),
+    "paper": Sizes(
+        volume_mm=(13.0, 10.0, 12.0),
+        centre_x_mm=3.5,
+        pairs=150,
+        planar_pairs=600,
+        same_instants=False,
+        field_mm=((-18.5, 0.0), (18.5, 29.7)),
+    ),
+}
+
+
+def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+    """Record and measure the injector's flow both ways; see the package for the arguments."""
+    require_openpiv()
+    rig = experimental_rig(work.parent / "experimental_rig", scale, seed, progress)
+    return compute(rig, SIZES[scale], work, seed=seed, progress=progress)
+
+
+def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress) -> dict:
+    """Record and measure on a calibrated rig; every finished pair is kept in `work`."""
+    require_openpiv()
+    twin = Twin(sizes, seed)
+    planar = planar_mean(twin, work, progress)
+    volume = light_field_mean(rig, twin, work, progress)
+    profiles = sample_profiles(twin, volume, planar)
+    return _result(twin, volume, planar, profiles, work)
+
+
+def sample_profiles(twin: Twin, volume: dict, planar: list[dict]) -> dict[str, np.ndarray]:
+    """Mean in-plane velocity along y at x/D = 0.2 in every plane [m/s], shape (plane, y, 2).
+
+    Returns
+    -------
+    dict of ndarray
+        ``y_mm`` (y,); ``light_field``, ``planar``; ``recorded``: the true flow at these points, mean of the instants
+        that the light field recorded; ``mean``: that of all instants.
+    """
+    y_mm = volume["axes_mm"][1]
+    to_m_s = 1 / 1000 / twin.dt_s
+    measured = RegularGridInterpolator(tuple(volume["axes_mm"]), volume["displacement_mm"])
+    sampled = {"light_field": [], "planar": [], "recorded": [], "mean": []}
+    for depth, plane in zip(twin.depths_mm, planar, strict=True):
+        points = np.stack([np.full_like(y_mm, twin.profile_x_mm), y_mm, np.full_like(y_mm, depth)], axis=1)
+        instants = [twin.instant(pair)(points) for pair in range(twin.sizes.pairs)]
+        sheet = RegularGridInterpolator((plane["y_mm"], plane["x_mm"]), plane["displacement_mm"])
+        sampled["light_field"].append(measured(points[:, ::-1])[:, :2])
+        sampled["planar"].append(sheet(points[:, 1::-1]))
+        sampled["recorded"].append(np.mean(instants, axis=0)[:, :2])
+        sampled["mean"].append(twin.mean(points)[:, :2])
+    return {"y_mm": y_mm} | {name: to_m_s * np.array(values) for name, values in sampled.items()}
+
+
+def relative_error(values: np.ndarray, reference: np.ndarray) -> float:
+    """Mean distance of values from a reference over the reference's mean magnitude; NaN are left out."""
+    good = np.isfinite(values) & np.isfinite(reference)
+    return float(np.abs(values - reference)[good].mean() / np.abs(reference)[good].mean())
+
+
+def _result(twin: Twin, volume, planar, profiles, work: Path) -> dict:
+    sizes = twin.sizes
+    pairs = {
+        "planar": ("light_field", "planar"),
+        "truth": ("light_field", "recorded"),
+        "mean_flow": ("light_field", "mean"),
+        "planar_truth": ("planar", "recorded" if sizes.same_instants else "mean"),
+        "sampling": ("recorded", "mean"),
+    }
+    errors = {
+        name: {
+            against: relative_error(profiles[first][..., number], profiles[second][..., number])
+            for against, (first, second) in pairs.items()
+        }
+        for number, name in enumerate("uv")
+    }
+    off = volume["displacement_mm"] - volume["truth_mm"]
+    voxel = [float(np.nanmean(np.abs(off[..., axis]))) / 0.1 for axis in range(3)]
+    _draw_profiles(twin, profiles, work / "fig22.png")
+    _draw_planes(twin, volume, planar, work / "fig20_21.png")
+    measured = {f"error_{name}": errors[name]["planar"] for name in "uv"}
+    measured |= {f"error_{name}_{key}": errors[name][key] for name in "uv" for key in pairs if key != "planar"}
+    instants = "the same instants" if sizes.same_instants else "other instants"
+    return page.result(
+        {
+            **measured,
+            "swirl_number": twin.mean.swirl_number,
+            "pairs": sizes.pairs,
+            "planar_pairs": sizes.planar_pairs,
+            "valid": volume["valid"],
+            "planar_valid": [plane["valid"] for plane in planar],
+            "mean_field_error_voxel": dict(zip("xyz", voxel, strict=True)),
+            "profiles_m_s": profiles,
+            "depths_mm": twin.depths_mm,
+        },
+        comparison=[
+            row
+            for name in "uv"
+            for row in (
+                page.compare(
+                    f"{NAMES[name]}, light field against planar PIV",
+                    errors[name]["planar"],
+                    paper=PAPER_ERROR[name],
+                    at_most=0.05,
+                ),
+                page.compare(
+                    f"{NAMES[name]}, light field against the true flow recorded", errors[name]["truth"], at_most=0.05
+                ),
+                page.compare(f"{NAMES[name]}, planar PIV against the true flow", errors[name]["planar_truth"]),
+            )
+        ],
+        figures=[
+            (
+                "fig22.png",
+                f"Mean velocity along the injector's axis at x/D = {PROFILE_D:g} in three depths: light-field PIV, "
+                "planar PIV and the true flow.",
+            ),
+            (
+                "fig20_21.png",
+                "Mean velocity in three depths by planar PIV (top) and light-field PIV (bottom); colours: axial "
+                "velocity, arrows: in-plane velocity. The box is the light field's volume.",
+            ),
+        ],
+        tables=[
+            {
+                "caption": "Relative errors of the profiles: mean difference over mean magnitude, all depths together",
+                "columns": ["", *(NAMES[name] for name in "uv")],
+                "rows": [
+                    ["light field against planar PIV", *(errors[n]["planar"] for n in "uv")],
+                    ["light field against the truth of its instants", *(errors[n]["truth"] for n in "uv")],
+                    ["light field against the mean flow", *(errors[n]["mean_flow"] for n in "uv")],
+                    ["planar PIV against the truth", *(errors[n]["planar_truth"] for n in "uv")],
+                    [
+                        "mean of the light field's instants against the mean flow",
+                        *(errors[n]["sampling"] for n in "uv"),
+                    ],
+                ],
+            }
+        ],
+        notes=[
+            f"The flow is the library's swirling jet with the paper's swirl number ({twin.mean.swirl_number:g}), bulk "
+            f"velocity and size, with homogeneous turbulence of {100 * TURBULENCE_SHARE:.0f} % of the bulk velocity, "
+            "another realisation for every pair. It is a model of the injector, not its measured flow.",
+            f"{sizes.pairs} pairs of {PARTICLES_PER_MICROLENS:g} particles per microlens (5 um, with camera noise), "
+            f"{ITERATIONS} SMART iterations, last window {WINDOWS[-1]} voxels. Planar PIV: {sizes.planar_pairs} pairs "
+            f"at each depth, {instants}, a light sheet 1 mm thick, OpenPIV with a last window of 32 pixels.",
+            f"Mean error of the averaged vectors over the volume, against the true flow in their windows: "
+            f"{voxel[0]:.3f}, {voxel[1]:.3f} and {voxel[2]:.3f} voxel along x, y and z; {100 * volume['valid']:.0f} % "
+            "of the vectors valid.",
+            "The relative error divides by the mean magnitude of the reference over the profiles: u is small, so that "
+            "the same error in voxels weighs more there.",
+            *(
+                [
+                    f"Cut at this scale: a volume of {' x '.join(f'{s:g}' for s in sizes.volume_mm)} mm around the "
+                    f"profiles instead of 13 x 10 x 12 mm, {sizes.pairs} pairs instead of 150 (planar: 600); both see "
+                    "the same instants, since so few would differ by their turbulence alone (last row of the table)."
+                ]
+                if sizes.same_instants
+                else []
+            ),
+        ],
+    )
+
+
+def _draw_profiles(twin: Twin, profiles, path: Path) -> None:
+    drawn = plots.figure(9, 3.6)
+    axes = drawn.subplots(1, 2, sharey=True)
+    height = (profiles["y_mm"] - twin.outlet_mm[1]) / DIAMETER_MM
+    colours = ("#2f81d6", "#e0762a", "#2ca36b")
+    for axis, number, name in zip(axes, (0, 1), "uv", strict=True):
+        for plane, (depth, colour) in enumerate(zip(DEPTHS_D, colours, strict=True)):
+            axis.plot(profiles["light_field"][plane, :, number], height, "o", color=colour, ms=4)
+            axis.plot(profiles["planar"][plane, :, number], height, "x", color=colour, ms=5)
+            axis.plot(profiles["recorded"][plane, :, number], height, "-", color=colour, lw=1, label=f"z/D = {depth:g}")
+        axis.set(xlabel=f"{NAMES[name]} [m/s]")
+        plots.plain(axis)
+    for marker, label in (("o", "light field"), ("x", "planar PIV"), ("-", "true flow")):
+        axes[1].plot([], [], marker, color="#30363c", ms=4, label=label)
+    axes[0].set_ylabel("y/D")
+    axes[1].legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    plots.save(drawn, path)
+
+
+def _draw_planes(twin: Twin, volume, planar, path: Path) -> None:
+    drawn = plots.figure(9, 6.4)
+    axes = drawn.subplots(2, 3, sharex=True, sharey=True)
+    to_m_s = 1 / 1000 / twin.dt_s
+    z_mm, y_mm, x_mm = volume["axes_mm"]
+    field = RegularGridInterpolator((z_mm,), volume["displacement_mm"])
+    slices = [field([depth])[0] for depth in twin.depths_mm]
+    top = to_m_s * max(float(np.nanmax(plane["displacement_mm"][..., 1])) for plane in planar)
+    half = np.array(twin.sizes.volume_mm) / 2
+    for number, (depth, plane) in enumerate(zip(DEPTHS_D, planar, strict=True)):
+        shown = ((plane["x_mm"], plane["y_mm"], plane["displacement_mm"]), (x_mm, y_mm, slices[number]))
+        for axis, (x, y, displacement) in zip(axes[:, number], shown, strict=True):
+            across, up = (x - twin.outlet_mm[0]) / DIAMETER_MM, (y - twin.outlet_mm[1]) / DIAMETER_MM
+            velocity = to_m_s * displacement[..., :2]
+            colours = axis.pcolormesh(across, up, velocity[..., 1], cmap="viridis", vmin=0, vmax=top, shading="nearest")
+            step = max(1, round(max(len(x), len(y)) / 14))
+            thin = (slice(None, None, step), slice(None, None, step))
+            axis.quiver(
+                across[thin[0]],
+                up[thin[0]],
+                *np.moveaxis(velocity[thin], -1, 0),
+                color="white",
+                scale=14 * top,
+                width=0.008,
+            )
+            axis.set_aspect("equal")
+            axis.tick_params(labelsize=7)
+        corner = ((-half[0] - twin.outlet_mm[0]) / DIAMETER_MM, (-half[1] - twin.outlet_mm[1]) / DIAMETER_MM)
+        axes[0, number].add_patch(
+            Rectangle(corner, 2 * half[0] / DIAMETER_MM, 2 * half[1] / DIAMETER_MM, fill=False, edgecolor="black")
+        )
+        axes[0, number].set_title(f"z/D = {depth:g}", fontsize=9)
+        axes[1, number].set_xlabel("x/D")
+    axes[0, 0].set_ylabel("planar PIV: y/D")
+    axes[1, 0].set_ylabel("light-field PIV: y/D")
+    drawn.colorbar(colours, ax=axes, label="axial velocity v [m/s]", shrink=0.7)
+    plots.save(drawn, path)

@@ -1,0 +1,229 @@
+"""What a reproduction shows: ``reproduce.json``, PNGs and a self-contained page; and the form of a case's result."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lfpiv.reproduce import store
+
+log = logging.getLogger(__name__)
+
+SHOWN = ("comparison", "figures", "tables", "notes")
+"""Keys of a case's result that the page shows; all others are its figures."""
+
+
+def compare(
+    what: str,
+    ours: float | None,
+    *,
+    paper: float | str | None = None,
+    at_most: float | None = None,
+    at_least: float | None = None,
+    unit: str = "",
+) -> dict[str, Any]:
+    """One row of ours beside the paper's: what, the figures, the goal and whether it is reached.
+
+    Without `at_most` and `at_least` there is no goal, and ``reached`` is null.
+    """
+    goal, reached = None, None
+    if at_most is not None or at_least is not None:
+        measured = ours is not None and ours == ours
+        bounds = [(at_most, "<=", measured and at_most is not None and ours <= at_most)]
+        bounds += [(at_least, ">=", measured and at_least is not None and ours >= at_least)]
+        bounds = [bound for bound in bounds if bound[0] is not None]
+        goal = ", ".join(f"{sign} {bound:g}" for bound, sign, _ in bounds)
+        reached = all(bool(good) for _, _, good in bounds)
+    return {"what": what, "ours": ours, "paper": paper, "goal": goal, "reached": reached, "unit": unit}
+
+
+def result(
+    figures_of_merit: Mapping[str, Any],
+    *,
+    comparison: Sequence[Mapping[str, Any]],
+    figures: Sequence[tuple[str, str]] = (),
+    tables: Sequence[Mapping[str, Any]] = (),
+    notes: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Put a case's result into its form.
+
+    Parameters
+    ----------
+    figures_of_merit : mapping
+        What ``reproduce.json`` promises under the case's key, such as ``{"ssim": 0.98}``.
+    comparison : sequence of mapping
+        Rows made by `compare`.
+    figures : sequence of (str, str)
+        Name of a PNG file in the case's work folder, and its caption. Names are unique over all cases, "fig10.png".
+    tables : sequence of mapping
+        Each with ``caption``, ``columns`` (list of str) and ``rows`` (list of lists: str, number or null).
+    notes : sequence of str
+        Plain sentences: how it was done, what falls short and why.
+    """
+    taken = [key for key in figures_of_merit if key in (*SHOWN, "title", "time")]
+    if taken:
+        raise ValueError(f"figures_of_merit: expected other keys than those of the page, got {taken[0]!r}.")
+    return {
+        **figures_of_merit,
+        "comparison": [dict(row) for row in comparison],
+        "figures": [{"file": name, "caption": caption} for name, caption in figures],
+        "tables": [dict(table) for table in tables],
+        "notes": list(notes),
+    }
+
+
+def write(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Write ``reproduce.json``, the PNGs and ``index.html`` from all finished cases in a folder; return the JSON.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the reproduction; finished cases are ``work/<key>/result.json``.
+    settings : mapping
+        Scale, seed and version the cases were computed with; results of others are left out.
+    """
+    from lfpiv.reproduce import CASES
+
+    content: dict[str, Any] = dict(settings)
+    for key in CASES:
+        path = out / "work" / key / "result.json"
+        if not path.exists():
+            continue
+        stored = json.loads(path.read_text("utf-8"))
+        if stored["settings"] != store.jsonable(settings):
+            continue
+        content[key] = stored["value"]
+        for figure in content[key]["figures"]:
+            shutil.copyfile(path.parent / figure["file"], out / f".{figure['file']}")
+            (out / f".{figure['file']}").replace(out / figure["file"])
+    store.write_json(out / "reproduce.json", content)
+    store.write_bytes(out / "index.html", _page(out, content).encode("utf-8"))
+    return content
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+STYLE = """
+:root { --ink: #1d2329; --dim: #5c6670; --line: #d9dee3; --paper: #fff; --good: #1f7a4d; --bad: #b3431e; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e6e9ec; --dim: #a0a9b2; --line: #3a4249; --paper: #15191d; --good: #58c58f; --bad: #f0906a; }
+}
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 1rem; max-width: 62rem; color: var(--ink); background: var(--paper);
+  font: 1rem/1.5 system-ui, sans-serif; }
+h1 { font-size: 1.5rem; line-height: 1.25; margin: .5rem 0; }
+h2 { font-size: 1.2rem; margin: 2.2rem 0 .4rem; padding-top: .8rem; border-top: 1px solid var(--line); }
+p, li, figcaption, caption { max-width: 44rem; }
+.dim, figcaption, caption { color: var(--dim); font-size: .9rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .9rem; margin: .6rem 0; }
+caption { text-align: left; padding-bottom: .3rem; }
+th, td { text-align: left; padding: .25rem .8rem .25rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+th { font-weight: 600; }
+td.what { min-width: 11rem; }
+td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+th.number { text-align: right; }
+.yes { color: var(--good); font-weight: 600; } .no { color: var(--bad); font-weight: 600; }
+figure { margin: 1rem 0; }
+@media (max-width: 30rem) { body { padding: .7rem; } table { font-size: .8rem; } th, td { padding-right: .45rem; }
+  td.what { min-width: 7.5rem; } }
+figure img { max-width: 100%; height: auto; background: #fff; display: block; }
+"""
+
+
+def _page(out: Path, content: Mapping[str, Any]) -> str:
+    from lfpiv.reproduce import CASES
+
+    present = [key for key in CASES if key in content]
+    rows = [{"case": key, **row} for key in present for row in content[key]["comparison"]]
+    judged = [row["reached"] for row in rows if row["reached"] is not None]
+    missing = [key for key in CASES if key not in content]
+    parts = [
+        "<h1>The paper's tables and figures, reproduced</h1>",
+        f"<p>Weight estimation of multi-camera light-field PIV by a back-propagation network, computed by lfpiv "
+        f"{html.escape(str(content['version']))} on simulated images: scale <b>{content['scale']}</b>, seed "
+        f"{content['seed']}. {sum(judged)} of {len(judged)} goals reached. "
+        "<a href='reproduce.json'>reproduce.json</a> holds all figures.</p>",
+    ]
+    if missing:
+        parts.append(f"<p class='dim'>Not computed yet: {', '.join(missing)}.</p>")
+    parts += [_comparison([row for row in rows if row["goal"]], cases=True)] if judged else []
+    for key in present:
+        parts.append(_section(out, key, content[key]))
+    return (
+        "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>"
+        "<meta name='viewport' content='width=device-width, initial-scale=1'>"
+        f"<title>lfpiv: the paper reproduced</title><style>{STYLE}</style></head><body>\n"
+        + "\n".join(parts)
+        + "\n</body></html>\n"
+    )
+
+
+def _section(out: Path, key: str, case: Mapping[str, Any]) -> str:
+    seconds = case["time"]
+    parts = [
+        f"<h2 id='{key}'>{html.escape(case['title'])}</h2>",
+        f"<p class='dim'>{key}; took {_duration(seconds['wall_s'])}, {_duration(seconds['cpu_s'])} of processor "
+        "time.</p>",
+        _comparison(case["comparison"]) if case["comparison"] else "",
+    ]
+    for figure in case["figures"]:
+        caption = html.escape(figure["caption"])
+        image = base64.b64encode((out / figure["file"]).read_bytes()).decode("ascii")
+        parts.append(
+            f"<figure><img alt='{html.escape(figure['caption'], quote=True)}' src='data:image/png;base64,{image}'>"
+            f"<figcaption>{caption}</figcaption></figure>"
+        )
+    parts += [_table(table["caption"], table["columns"], table["rows"]) for table in case["tables"]]
+    if case["notes"]:
+        parts.append("<ul>" + "".join(f"<li>{html.escape(note)}</li>" for note in case["notes"]) + "</ul>")
+    return "\n".join(parts)
+
+
+def _comparison(rows: Sequence[Mapping[str, Any]], *, cases: bool = False) -> str:
+    columns = (["case"] if cases else []) + ["what", "ours", "paper", "goal", "reached"]
+    body = []
+    for row in rows:
+        unit = f" {row['unit']}" if row["unit"] else ""
+        verdict = {None: "", True: "<span class='yes'>yes</span>", False: "<span class='no'>no</span>"}[row["reached"]]
+        cells = [f"<td><a href='#{row['case']}'>{row['case']}</a></td>"] if cases else []
+        cells.append(f"<td class='what'>{html.escape(row['what'] + (f' [{unit.strip()}]' if unit else ''))}</td>")
+        cells += [f"<td class='number'>{_text(row[name])}</td>" for name in ("ours", "paper", "goal")]
+        body.append(f"<tr>{''.join(cells)}<td>{verdict}</td></tr>")
+    heads = "".join(
+        f"<th{' class=number' if name in ('ours', 'paper', 'goal') else ''}>{name}</th>" for name in columns
+    )
+    return f"<div class='scroll'><table><thead><tr>{heads}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+
+
+def _table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    numeric = [all(not isinstance(row[k], str) for row in rows) for k in range(len(columns))]
+    mark = [" class='number'" if number else "" for number in numeric]
+    head = "".join(f"<th{mark[k]}>{html.escape(name)}</th>" for k, name in enumerate(columns))
+    body = "".join(
+        "<tr>" + "".join(f"<td{mark[k]}>{_text(value)}</td>" for k, value in enumerate(row)) + "</tr>" for row in rows
+    )
+    return (
+        f"<div class='scroll'><table><caption>{html.escape(caption)}</caption><thead><tr>{head}</tr></thead>"
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1e5 else f"{value:.3e}"
+    return html.escape(str(value))
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,54 @@
+"""How the figures of a reproduction look: one size of type, one set of colours, written by rename."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from lfpiv.reproduce import store
+
+DPI = 150
+COLOURS = {
+    "network": "#2f81d6",
+    "drt": "#e0762a",
+    "drt_plus_1deg": "#c2478f",
+    "sieve": "#2ca36b",
+    "truth": "#30363c",
+    "paper": "#808890",
+}
+NAMES = {
+    "network": "network",
+    "drt": "DRT",
+    "drt_plus_1deg": "DRT, angle off by 1°",
+    "drt_turned": "DRT, both cameras turned by 1° in one sense",
+    "drt_rolled": "DRT, cameras rolled by +0.5° and −0.5°",
+    "sieve": "network, volumes made of blobs",
+    "truth": "true particles",
+}
+"""What is reconstructed with, and how figures and tables call it."""
+
+
+def figure(width: float, height: float) -> Figure:
+    """Make an empty figure [inch] that draws without a display and shares no state with the caller's pyplot."""
+    with matplotlib.rc_context({"font.size": 9}):
+        drawn = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+        FigureCanvasAgg(drawn)
+    return drawn
+
+
+def plain(axes) -> None:
+    """Leave two spines and a faint grid."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(True, color="#e6e9ec", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def save(drawn: Figure, path: Path) -> None:
+    """Write a figure as PNG by rename."""
+    buffer = io.BytesIO()
+    drawn.savefig(buffer, format="png", dpi=DPI)
+    store.write_bytes(path, buffer.getvalue())

@@ -1,0 +1,202 @@
+"""The paper's numerical rig (Table 2), simulated and calibrated once for the cases that share it; particle images."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+import lfpiv
+from lfpiv import metrics
+from lfpiv.calibration import Calibration
+from lfpiv.experiment import Experiment
+from lfpiv.reproduce import store
+from lfpiv.rig import Grid
+from lfpiv.scene import Scene, true_mapping
+from lfpiv.simulate import render_camera, simulate
+from lfpiv.thinlens import thin_lens_model
+from lfpiv_kernels import render, runtime
+
+log = logging.getLogger(__name__)
+
+VOXEL_MM = 0.1
+"""Edge of the paper's voxels [mm], one microlens."""
+ANGLES_DEG = (45.0, -45.0)
+"""Separation angles of the two cameras."""
+TURNED_DEG = {
+    "drt": ((0.0, 0.0), (0.0, 0.0)),
+    "drt_plus_1deg": ((1.0, 0.0), (-1.0, 0.0)),
+    "drt_turned": ((1.0, 0.0), (1.0, 0.0)),
+    "drt_rolled": ((0.0, 0.5), (0.0, -0.5)),
+}
+"""Errors (yaw, roll) of each camera's angle that direct ray tracing is given [degree]. "drt_plus_1deg": both
+separation angles overestimated (Eqs. 11-12); "drt_turned": the same error in the same sense; "drt_rolled": the
+cameras are rolled about their axes by half a degree each, one degree between them."""
+BLOB_VOXEL = 0.7
+"""Standard deviation of the particles, Gaussian blobs, in images and in the truth [voxel]."""
+FULL_SCALE = 4095
+"""Largest count of the cameras' 12 bits."""
+PARTICLE_COUNTS = 400.0
+"""Level of a pixel lit by one particle in focus [count]: at 1 ppm the brightest pixels stay below full scale."""
+PARTICLE_RAYS = 32_768
+"""Rays per particle: a pixel of the some 1,500 that it lights receives about 20."""
+DT_S = 1e-4
+"""Time between the frames [s]; the figures are in voxels and do not depend on it."""
+
+SENSOR_PX = {"small": 1900, "paper": 4000}
+"""Edge of the sensors [pixel]; "small" is cut to what sees the smaller volumes and the board."""
+DEPTHS_MM = {"small": tuple(range(-4, 5, 2)), "paper": tuple(range(-10, 11))}
+"""Planes of the board."""
+DOTS = (7, 7)
+WHITE_RAYS = 64
+"""Rays per pixel of the white image: smooth to a percent at the edge of a microimage."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A calibrated simulated rig."""
+
+    scene: Scene
+    experiment: Experiment
+    calibration: Calibration
+
+    def weights(self, grid: Grid, mapping: str, progress: Callable[[float], None] | None = None):
+        """Weights of a grid by "network", or by direct ray tracing with a key of `TURNED_DEG`."""
+        calibration = self.calibration if mapping == "network" else self.ray_tracing(mapping)
+        return lfpiv.build_weights(calibration, grid, progress=progress)
+
+    def ray_tracing(self, mapping: str) -> Calibration:
+        """Thin lenses at the nominal angles, turned by the errors of `TURNED_DEG`."""
+        cameras = {}
+        for number, (name, camera) in enumerate(self._nominal.cameras.items()):
+            yaw, roll = TURNED_DEG[mapping][number]
+            lens = thin_lens_model(camera.optics, ANGLES_DEG[number] + yaw)
+            sine, cosine = np.sin(np.radians(roll)), np.cos(np.radians(roll))
+            about_z = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+            cameras[name] = replace(camera, baseline=replace(lens, rotation=about_z @ lens.rotation))
+        return Calibration(cameras)
+
+    @cached_property
+    def _nominal(self) -> Calibration:
+        """Thin lenses behind the microlens arrays that the white images show."""
+        return lfpiv.thin_lens(self.experiment)
+
+
+def numerical_scene(scale: str, seed: int) -> Scene:
+    """Table 2's numerical column: two ideal cameras at 45 degrees and a board of 7 x 7 dots.
+
+    Images have no noise but that of rounding to 12 bits, as in the paper: a sensor's quality does not enter the
+    comparison. "small" has the same optics on a smaller sensor and fewer planes of the board.
+    """
+    cameras = [
+        {
+            "name": f"camera{number + 1}",
+            "focal_length_mm": 100.0,
+            "magnification": -1.0,
+            "f_number": 4.0,
+            "microlens_pitch_mm": 0.1,
+            "microlens_focal_length_mm": 0.8,
+            "pixel_um": 5.5,
+            "sensor_width_px": SENSOR_PX[scale],
+            "sensor_height_px": SENSOR_PX[scale],
+            "nominal_angle_deg": angle,
+        }
+        for number, angle in enumerate(ANGLES_DEG)
+    ]
+    return Scene.model_validate(
+        {
+            "name": "table 2, numerical",
+            "seed": seed,
+            "dt_s": DT_S,
+            "camera": cameras,
+            "board": {
+                "dots": DOTS,
+                "spacing_mm": 1.0,
+                "dot_diameter_mm": 0.1,
+                "planes_mm": tuple(float(z) for z in DEPTHS_MM[scale]),
+            },
+            # the data set's own particles only complete it: each case renders its own
+            "volume": {"size_mm": (1.0, 1.0, 1.0), "voxel_mm": VOXEL_MM},
+            "particles": {"count": 8, "sigma_mm": BLOB_VOXEL * VOXEL_MM},
+            "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
+            "quality": {"pixel_rays": WHITE_RAYS},
+            "noise": {"background": 0.0, "read_noise": 0.0, "full_well_e": 0.0},
+        }
+    )
+
+
+def numerical_rig(folder: Path, scale: str, seed: int, progress: Callable[[str, float], None]) -> Rig:
+    """Simulate the board of `numerical_scene` and calibrate from it; both are kept in `folder` and taken from there."""
+    runtime.device()
+    scene = numerical_scene(scale, seed)
+    path, marker = folder / "experiment" / "experiment.toml", folder / "scene.json"
+    content = store.jsonable(scene.model_dump(mode="json"))
+    if not marker.exists() or json.loads(marker.read_text("utf-8")) != content:
+        shutil.rmtree(folder, ignore_errors=True)
+        store.write_json(marker, content)
+    if not path.exists():
+        simulate(scene, path.parent, progress=lambda what, done, total: progress(what, done / total))
+    experiment = lfpiv.open_experiment(path)
+    stored = folder / "calibration.h5"
+    if not stored.exists():
+        scratch = folder / ".calibration.h5"
+        calibration = lfpiv.calibrate(experiment, progress=lambda fraction: progress("calibration", fraction))
+        calibration.save(scratch)
+        scratch.replace(stored)
+    return Rig(scene, experiment, lfpiv.load_calibration(stored))
+
+
+def volume_grid(size_mm: tuple[float, float, float]) -> Grid:
+    """Grid of the paper's voxels around the origin, size (x, y, z) [mm]."""
+    return Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=size_mm, voxel_mm=VOXEL_MM)
+
+
+def random_particles(size_mm: tuple[float, float, float], ppm: float, seed: list[int]) -> np.ndarray:
+    """Draw positions (n, 3) [mm] evenly over a volume, `ppm` particles per microlens of its x-y face."""
+    count = round(ppm * size_mm[0] * size_mm[1] / VOXEL_MM**2)
+    return np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3)) * size_mm
+
+
+def particle_images(
+    rig: Rig, positions_mm: np.ndarray, seed: list[int], *, blob_voxel: float = BLOB_VOXEL
+) -> dict[str, np.ndarray]:
+    """Images of equally bright particles, rounded to 12 bits: camera -> (rows, columns), float32 [count]."""
+    rays = render.ray_table(PARTICLE_RAYS, "gaussian", seed[0])
+    images = {}
+    for number, camera in enumerate(rig.scene.camera):
+        eye = render_camera(camera, seed=[rig.scene.seed, 3, number])
+        counts = np.full(len(positions_mm), PARTICLE_COUNTS * eye.microimage_px)
+        rng = np.random.default_rng([*seed, number])
+        image = render.render_sources(eye, positions_mm, counts, blob_voxel * VOXEL_MM, rays, rng=rng)
+        lost = float((image > FULL_SCALE).mean())
+        if lost > 1e-4:
+            log.warning("%s: %.2f %% of the pixels saturate", camera.name, 100 * lost)
+        images[camera.name] = np.clip(np.rint(image), 0, FULL_SCALE).astype(np.float32)
+    return images
+
+
+def truth(positions_mm: np.ndarray, grid: Grid):
+    """Draw the blobs on the voxels."""
+    return metrics.truth_volume(positions_mm, None, grid, BLOB_VOXEL)
+
+
+def mapping_errors_pitch(rig: Rig, grid: Grid, seed: int) -> dict[str, float]:
+    """Mean distance between mapped and true rays over a volume [microlens pitch], each camera."""
+    rng = np.random.default_rng([seed, 77])
+    low = np.array(grid.first_centre_mm[::-1])
+    extent = grid.voxel_mm * (np.array(grid.shape[::-1]) - 1)
+    points = low + rng.random((4000, 3)) * extent
+    errors = {}
+    for camera in rig.scene.camera:
+        radius = camera.optics.pupil_radius_mm * np.sqrt(rng.random(len(points)))
+        angle = 2 * np.pi * rng.random(len(points))
+        pupil = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        miss = rig.calibration.cameras[camera.name].map(points, pupil) - true_mapping(camera)(points, pupil)
+        errors[camera.name] = float(np.linalg.norm(miss, axis=1).mean() / camera.microlens_pitch_mm)
+    return errors

@@ -1,0 +1,188 @@
+"""Table 3: how much data the mapping takes, and how long training and weights last."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+import lfpiv
+from lfpiv.board import BoardDots
+from lfpiv.network import train
+from lfpiv.reproduce import page
+from lfpiv.reproduce.rigs import Rig, numerical_rig, volume_grid
+from lfpiv.weights import compare_with_count
+from lfpiv_kernels import runtime
+
+TITLE = "Table 3: data and computing time"
+
+PAPER_SAMPLES = 197_570
+PAPER_CORES = 44
+PAPER_TRAINING_MIN, PAPER_WEIGHTS_MIN, PAPER_DRT_MIN = 15, 115, 118
+PARTS = (0.70, 0.15, 0.15)
+"""Training, validation and test."""
+EPOCHS = {"small": 300, "paper": 1000}
+"""Epochs at most; training stops earlier where the validation error no longer falls."""
+VOLUME_MM = {"small": (4.0, 4.0, 4.0), "paper": (10.0, 10.0, 10.0)}
+VIEWS = {"small": 37, "paper": 192}
+"""Rays of each dot: 192 are the paper's 197,570 samples over 21 planes of 49 dots."""
+PUPIL_PART = 0.92
+"""Rays of the dots lie within this part of the pupil's radius, as the labels do."""
+MATCH_TRAINING_S, MATCH_WEIGHTS_S = 60.0, 30.0
+"""The goals at paper scale [s]."""
+
+
+def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+    """Time training and weights; see the package for the arguments."""
+    rig = numerical_rig(work.parent / "rig", scale, seed, progress)
+    return compute(rig, scale, seed=seed, progress=progress)
+
+
+def compute(rig: Rig, scale: str, *, seed: int, progress) -> dict:
+    """Time training and weights on a calibrated rig. The kernels are compiled before the clock starts."""
+    device = runtime.device()
+    trained = {}
+    for number, (name, camera) in enumerate(rig.calibration.cameras.items()):
+        progress(f"training of {name}", number / 4)
+        points, pupil, array, dot = dense_labels(camera.dots, VIEWS[scale], camera.optics.pupil_radius_mm)
+        cpu = time.process_time()
+        training = train(
+            np.hstack([points, pupil]),
+            array,
+            epochs=EPOCHS[scale],
+            split=PARTS,
+            groups=dot,
+            seed=seed,
+            unit=camera.lattice.pitch_mm,
+        )
+        trained[name] = {
+            "samples": len(points),
+            "epochs": training.epochs,
+            "stop": training.stop.value,
+            "sigma_nor": training.sigma_nor,
+            "wall_s": training.seconds,
+            "cpu_s": time.process_time() - cpu,
+        }
+    grid = volume_grid(VOLUME_MM[scale])
+    built = {}
+    for number, mapping in enumerate(("network", "drt")):
+        progress(f"weights, {mapping}", 0.5 + number / 4)
+        calibration = rig.calibration if mapping == "network" else rig.ray_tracing(mapping)
+        lfpiv.build_weights(calibration, volume_grid((0.8, 0.8, 0.8)))  # compiles the kernels
+        wall, cpu = time.perf_counter(), time.process_time()
+        weights = lfpiv.build_weights(calibration, grid)
+        spent = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
+        errors = [error for camera in compare_with_count(weights).values() for error in camera]
+        built[mapping] = spent | {
+            "memory_mib": weights.memory_bytes / 2**20,
+            "from_counted_rays_l2": float(np.mean(errors)) if errors else float("nan"),
+        }
+        del weights
+    progress("weights", 1.0)
+    training_s = sum(camera["wall_s"] for camera in trained.values())
+    weights_s = built["network"]["wall_s"]
+    samples = max(camera["samples"] for camera in trained.values())
+    at_paper = scale == "paper"
+    voxels = " x ".join(str(n) for n in grid.shape[::-1])
+    goal = {"training": {"at_most": MATCH_TRAINING_S}, "weights": {"at_most": MATCH_WEIGHTS_S}} if at_paper else {}
+    split = ", ".join(f"{100 * part:.0f} %" for part in PARTS)
+    cores = f"{device.threads} {'threads' if device.kind == 'cpu' else 'host threads and a GPU'}"
+    return page.result(
+        {
+            "samples": samples,
+            "split": PARTS,
+            "epochs": {name: camera["epochs"] for name, camera in trained.items()},
+            "training_s": training_s,
+            "weights_s": weights_s,
+            "weights_drt_s": built["drt"]["wall_s"],
+            "voxels": grid.size,
+            "cores": device.threads,
+            "device": device.kind,
+            "training": trained,
+            "weights": built,
+        },
+        comparison=[
+            page.compare(
+                f"training, both cameras, {samples} samples each",
+                training_s,
+                paper=60.0 * PAPER_TRAINING_MIN,
+                unit="s",
+                **goal.get("training", {}),
+            ),
+            page.compare(
+                f"weights by the network, {voxels} voxels, two cameras",
+                weights_s,
+                paper=60.0 * PAPER_WEIGHTS_MIN,
+                unit="s",
+                **goal.get("weights", {}),
+            ),
+            page.compare("weights by DRT", built["drt"]["wall_s"], paper=60.0 * PAPER_DRT_MIN, unit="s"),
+        ],
+        tables=[
+            {
+                "caption": "Ours beside the paper's",
+                "columns": ["", "ours", "the paper's"],
+                "rows": [
+                    ["samples per camera", samples, PAPER_SAMPLES],
+                    ["training, validation, test", split, "70 %, 15 %, 15 %"],
+                    ["division", "whole dots at random", "random"],
+                    ["network", "one per camera, 5-20-2", "one, 7 - 15 layers of 10 - 4"],
+                    ["epochs", ", ".join(str(camera["epochs"]) for camera in trained.values()), 1000],
+                    ["training [s]", training_s, 60.0 * PAPER_TRAINING_MIN],
+                    ["voxels", voxels, "100 x 100 x 100"],
+                    ["weights, network [s]", weights_s, 60.0 * PAPER_WEIGHTS_MIN],
+                    ["weights, DRT [s]", built["drt"]["wall_s"], 60.0 * PAPER_DRT_MIN],
+                    ["CPU time of training, of weights [s]", _cpu(trained, built), ""],
+                    ["weights from counted rays, relative L2", built["network"]["from_counted_rays_l2"], ""],
+                    ["run on", cores, f"{PAPER_CORES} cores"],
+                ],
+            }
+        ],
+        notes=[
+            "Times are wall times of this run on this machine, whatever else it did; CPU time is that of all threads.",
+            *(
+                []
+                if at_paper
+                else [
+                    f"This is the small scale: {samples} samples and {voxels} voxels. The goals (training 60 s, "
+                    f"weights 30 s) are for 197,570 samples and 100 x 100 x 100 voxels; run with --scale paper."
+                ]
+            ),
+            f"Each dot gives {VIEWS[scale]} rays, evaluated from its fitted rays over the pupil; training stops by "
+            "itself where the error of the validation dots no longer falls.",
+        ],
+    )
+
+
+def _cpu(trained, built) -> str:
+    return f"{sum(camera['cpu_s'] for camera in trained.values()):.1f}, {built['network']['cpu_s']:.1f}"
+
+
+def dense_labels(dots: BoardDots, views: int, pupil_radius_mm: float) -> tuple[np.ndarray, ...]:
+    """Rays of every dot at `views` points of the pupil, from a quadratic through the dot's own labels.
+
+    Returns
+    -------
+    tuple of ndarray
+        Points (n, 3), pupil points (n, 2), array positions (n, 2) [mm], and each ray's dot (n,).
+    """
+    number = np.arange(views) + 0.5
+    radius, angle = np.sqrt(number / views), np.pi * (1 + np.sqrt(5)) * number  # sunflower: evenly over the disc
+    asked = PUPIL_PART * np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+    def terms(pupil):
+        u, v = pupil.T
+        return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+
+    points, array, names = [], [], []
+    for name in np.unique(dots.dot):
+        mine = dots.dot == name
+        if mine.sum() < 2 * terms(asked).shape[1]:
+            continue
+        fitted = np.linalg.lstsq(terms(dots.pupil_mm[mine] / pupil_radius_mm), dots.array_mm[mine], rcond=None)[0]
+        points.append(np.broadcast_to(dots.points_mm[mine][0], (views, 3)))
+        array.append(terms(asked) @ fitted)
+        names.append(np.full(views, name))
+    pupil = np.tile(pupil_radius_mm * asked, (len(points), 1))
+    return np.concatenate(points), pupil, np.concatenate(array), np.concatenate(names)

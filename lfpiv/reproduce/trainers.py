@@ -1,0 +1,201 @@
+"""The trainers of Table 1 that this software does not use itself: Bayesian regularisation, and descent with momentum.
+
+Both have the form of `lfpiv.trainers`, so that `lfpiv.network.train` takes them as its `trainer`.
+
+References
+----------
+.. [1] F. D. Foresee and M. T. Hagan, "Gauss-Newton approximation to Bayesian learning", ICNN 3, 1930-1935 (1997).
+.. [2] D. J. C. MacKay, "Bayesian interpolation", Neural Computation 4, 415-447 (1992).
+.. [3] B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR Comput. Math. Math.
+       Phys. 4, 1-17 (1964).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
+
+from lfpiv.trainers import Fit, Samples, Stop, forward, normal_equations
+
+FIRST_DAMPING, LEAST_DAMPING, LAST_DAMPING = 5e-3, 1e-20, 1e10
+"""Damping of the first step, the smallest, and where a step is too short to matter: the values customary for [1]_."""
+MOMENTUM = 0.9
+"""Part of the last step that is taken again."""
+BATCH = 64
+"""Samples whose mean gradient makes a step of descent."""
+FIRST_RATE, LAST_RATE = 0.1, 1e-5
+"""Learning rate of the first step, of the mean squared error in scaled units, and the one at which descent ends."""
+STALLED, SLOWER = 10, 0.5
+"""Epochs without a lower validation error after which the rate falls, and its factor."""
+LONGEST_GRADIENT = 1.0
+"""Longer gradients are cut to this length: on the steep walls of a deep network's error a step would lead nowhere."""
+
+
+def bayesian_regularisation(
+    layers: list[np.ndarray],
+    training: Samples,
+    validation: Samples,
+    *,
+    epochs: int,
+    patience: int,
+    tolerance: float,
+) -> Fit:
+    """Train by Levenberg-Marquardt on beta E_D + alpha E_W, alpha and beta estimated from the data ([1]_, [2]_).
+
+    E_D is the sum of squared errors, E_W that of the network's parameters. After each step alpha = gamma / 2 E_W and
+    beta = (n - gamma) / 2 E_D, with gamma = p - alpha tr (beta J^T J + alpha I)^-1 the parameters that the data
+    determine. Nothing is held back against overfitting, so the last epoch counts: the validation part is only watched.
+
+    Parameters
+    ----------
+    layers : list of ndarray
+        First weights, each (inputs + 1, nodes) with the bias in the last row.
+    training, validation : Samples
+        Scaled samples.
+    epochs : int
+        Accepted steps at most.
+    patience, tolerance
+        Training stops when the training error has fallen by less than the fraction `tolerance` in `patience` epochs.
+    """
+    pack, unpack = _packing(layers)
+    theta = pack(layers)
+    values = training.outputs.size
+    gram, gradient, squares = normal_equations(layers, training)
+    training_rms, validation_rms = [np.sqrt(squares / values)], [_rms(layers, validation)]
+    gamma, damping, stop = float(theta.size), FIRST_DAMPING, Stop.EPOCH_LIMIT
+    alpha, beta = _hyperparameters(min(gamma, 0.9 * values), values, squares, theta)
+    while len(training_rms) <= epochs:
+        objective = beta * squares + alpha * (theta @ theta)
+        while damping < LAST_DAMPING:
+            factor = _factor(beta * gram, alpha + damping)
+            if factor is not None:
+                trial = theta + cho_solve(factor, beta * gradient - alpha * theta, check_finite=False)
+                trial_squares = _sum_of_squares(unpack(trial), training)
+                if beta * trial_squares + alpha * (trial @ trial) < objective:
+                    damping = max(damping / 10, LEAST_DAMPING)
+                    break
+            damping *= 10
+        else:
+            stop = Stop.MINIMUM
+            break
+        theta = trial
+        gram, gradient, squares = normal_equations(unpack(theta), training)
+        factor = _factor(beta * gram, alpha)
+        if factor is not None:
+            inverse, failed = lapack.dpotri(factor[0], lower=factor[1])
+            if not failed:
+                gamma = float(np.clip(theta.size - alpha * np.trace(inverse), 0, 0.9 * values))
+        alpha, beta = _hyperparameters(gamma, values, squares, theta)
+        training_rms.append(np.sqrt(squares / values))
+        validation_rms.append(_rms(unpack(theta), validation))
+        if len(training_rms) > patience and training_rms[-1] > (1 - tolerance) * training_rms[-1 - patience]:
+            stop = Stop.MINIMUM
+            break
+    return Fit(layers=unpack(theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
+
+
+def gradient_descent(
+    layers: list[np.ndarray],
+    training: Samples,
+    validation: Samples,
+    *,
+    epochs: int,
+    patience: int,
+    tolerance: float,
+) -> Fit:
+    """Train by gradient descent with momentum ([3]_) on small batches of samples in random order.
+
+    The gradient of all samples at once, one step per epoch, leaves deep networks where they began after a thousand
+    epochs; batches make some hundred steps of an epoch. The rate is halved where the validation error stalls.
+
+    Parameters
+    ----------
+    layers, training, validation : as for `lfpiv.trainers.levenberg_marquardt`
+        The epoch with the lowest validation error is kept.
+    epochs : int
+        Passes over the samples at most.
+    patience, tolerance
+        Not used: descent ends by its epochs, or when the rate has fallen to `LAST_RATE`.
+    """
+    pack, unpack = _packing(layers)
+    theta = best_theta = pack(layers)
+    step, rate, stalled = np.zeros_like(theta), FIRST_RATE, 0
+    training_rms, validation_rms = [_rms(layers, training)], [_rms(layers, validation)]
+    best, stop = validation_rms[0], Stop.EPOCH_LIMIT
+    rng = np.random.default_rng(len(training.inputs))
+    for _ in range(epochs):
+        order = rng.permutation(len(training.inputs))
+        for batch in np.array_split(order, max(1, len(order) // BATCH)):
+            part = Samples(
+                inputs=training.inputs[batch], outputs=training.outputs[batch], weights=training.weights[batch]
+            )
+            gradient = pack(_gradient(unpack(theta), part))
+            gradient *= min(1.0, LONGEST_GRADIENT / max(float(np.linalg.norm(gradient)), 1e-300))
+            step = MOMENTUM * step - rate * gradient
+            theta = theta + step
+        training_rms.append(_rms(unpack(theta), training))
+        validation_rms.append(_rms(unpack(theta), validation))
+        if validation_rms[-1] < best:
+            best, best_theta, stalled = validation_rms[-1], theta, 0
+            continue
+        stalled += 1
+        if stalled == STALLED:
+            rate, stalled = rate * SLOWER, 0
+            if rate < LAST_RATE:
+                stop = Stop.VALIDATION
+                break
+    return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
+
+
+def _packing(layers):
+    """Functions from layers to one vector and back."""
+    shapes = [layer.shape for layer in layers]
+    edges = np.cumsum([layer.size for layer in layers])[:-1]
+
+    def pack(parts):
+        return np.concatenate([part.ravel() for part in parts])
+
+    def unpack(vector):
+        return [part.reshape(shape) for part, shape in zip(np.split(vector, edges), shapes, strict=True)]
+
+    return pack, unpack
+
+
+def _hyperparameters(gamma, values, squares, theta):
+    """Return alpha and beta of [2]_ for gamma determined parameters."""
+    return gamma / (2 * theta @ theta), (values - gamma) / (2 * squares)
+
+
+def _factor(matrix, shift):
+    """Cholesky factor of matrix + shift I, or None where rounding leaves it indefinite."""
+    try:
+        return cho_factor(matrix + shift * np.eye(len(matrix)), overwrite_a=True, check_finite=False)
+    except LinAlgError:
+        return None
+
+
+def _residual(outputs, samples):
+    return samples.weights * (samples.outputs - outputs)
+
+
+def _sum_of_squares(layers, samples):
+    residual = _residual(forward(layers, samples.inputs)[-1], samples)
+    return float(np.vdot(residual, residual))
+
+
+def _rms(layers, samples):
+    return np.sqrt(_sum_of_squares(layers, samples) / samples.outputs.size)
+
+
+def _gradient(layers, samples):
+    """Gradient of the mean squared error by the layers, by backpropagation."""
+    outputs = forward(layers, samples.inputs)
+    residual = _residual(outputs[-1], samples)
+    delta = -2 / residual.size * samples.weights * residual
+    gradient = []
+    for number in range(len(layers) - 1, -1, -1):
+        fed = samples.inputs if number == 0 else outputs[number - 1]
+        gradient.append(np.vstack([fed.T @ delta, delta.sum(axis=0)]))
+        if number:
+            delta = (delta @ layers[number][:-1].T) * (1 - fed**2)
+    return gradient[::-1]
