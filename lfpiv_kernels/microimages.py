@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from scipy import sparse
 
 from lfpiv_kernels import runtime
 
@@ -84,15 +85,17 @@ class RayMap:
         device = runtime.device().warp
         lit = np.flatnonzero(microimages.share > 0).astype(np.int32)
         rows, columns = microimages.sensor_shape
-        first = np.zeros(rows * columns + 1, np.int32)
-        pixel = microimages.pixel[lit]
-        np.cumsum(np.bincount(pixel, minlength=rows * columns), out=first[1:])
-        ray = lit[np.argsort(pixel, kind="stable")]
+        by_pixel = sparse.csr_array(
+            (np.ones(len(lit), np.uint8), (microimages.pixel[lit], lit)), shape=(rows * columns, microimages.size)
+        )
         self._pixels = rows * columns
         self._rays = microimages.size
         share = wp.array(microimages.share, device=device, copy=False)
         self._spread = [wp.array(microimages.pixel, device=device, copy=False), share]
-        self._collect = [wp.array(first, device=device), wp.array(ray, device=device), share]
+        self._collect = [
+            *(wp.array(np.asarray(array, np.int32), device=device) for array in (by_pixel.indptr, by_pixel.indices)),
+            share,
+        ]
         wp.load_module(sys.modules[__name__], device=device)  # before threads use it
 
     def spread(self, image: wp.array, rays_out: wp.array) -> None:

@@ -332,13 +332,13 @@ class Projector:
         return wp.array(array, dtype=dtype, device=self._device.warp, copy=False)
 
     def _span(self, part):
-        """First and last ray that a chunk of voxels touches."""
-        voxels = len(self.blocks.scale)
+        """First and last ray that a chunk of voxels can touch."""
+        voxels, rays = len(self.blocks.scale), self.blocks.microimages
         a, b = (self.blocks.first_block[voxels * k // runtime.CHUNKS] for k in (part, part + 1))
         if a == b:
             return 0, 0
-        ray, height = self.blocks.ray[a:b], np.maximum(self.blocks.height[a:b].astype(np.int32), 1)
-        return int(ray.min()), int((ray + (height - 1) * self.blocks.microimages.edge).max()) + LANES
+        first, last, tall = self.blocks.ray[a:b].min(), self.blocks.ray[a:b].max(), self.blocks.height[a:b].max()
+        return int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + LANES, rays.size)
 
     def back_project(self, image: np.ndarray, out: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
         """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
