@@ -124,12 +124,6 @@ def _in_cell(rectangles: ti.template(), a, b, wide_a, wide_b):
 
 
 @ti.func
-def _adjugate(m):
-    """Adjugate of a 2x2 matrix: its inverse times its determinant."""
-    return ti.Matrix([[m[1, 1], -m[0, 1]], [-m[1, 0], m[0, 0]]])
-
-
-@ti.func
 def _trapezium(x, width):
     """Widest smear times the probability that a position x [pitch], smeared by the widths, lies within half a pitch."""
     away = ti.abs(x)
@@ -311,11 +305,6 @@ def _fill_blocks(
                         d0, dx, dy = position(model, v, p) - centre, -pupil_pixel * k[:, 0], -pupil_pixel * k[:, 1]
                         kx = ti.Matrix([[2.0 * q[0, 0], q[0, 1]], [2.0 * q[1, 0], q[1, 1]]]) / -pupil_pixel
                         ky = ti.Matrix([[q[0, 1], 2.0 * q[0, 2]], [q[1, 1], 2.0 * q[1, 2]]]) / -pupil_pixel
-                        turn0, turnx, turny = (
-                            frame @ _adjugate(identity - k),
-                            frame @ _adjugate(-kx),
-                            frame @ _adjugate(-ky),
-                        )
                         inverse_a, inverse_b = 1.0 / wide_a[0], 1.0 / wide_b[0]
                         to_level = LEVELS / (top_a * top_b * top_area)
                         if ti.static(square):
@@ -346,16 +335,18 @@ def _fill_blocks(
                                     x = LANES * tile + n % LANES - middle_px[0]
                                     y = BATCH * part + n // LANES - middle_px[1]
                                     d = d0 + x * (dx + x * q[:, 0] + y * q[:, 1]) + y * (dy + y * q[:, 2])
-                                    t = turn0 + x * turnx + y * turny
                                     kk = k + x * kx + y * ky
-                                    area = 1.0 / ti.abs((1.0 - kk[0, 0]) * (1.0 - kk[1, 1]) - kk[0, 1] * kk[1, 0])
+                                    area = 1.0 / ((1.0 - kk[0, 0]) * (1.0 - kk[1, 1]) - kk[0, 1] * kk[1, 0])
                                     level = ti.f32(0.0)
-                                    a = (t[0, 0] * d[0] + t[0, 1] * d[1]) * area
-                                    b = (t[1, 0] * d[0] + t[1, 1] * d[1]) * area
+                                    # frame @ inverse(identity - kk) @ d
+                                    gs = ((1.0 - kk[1, 1]) * d[0] + kk[0, 1] * d[1]) * area
+                                    gt = (kk[1, 0] * d[0] + (1.0 - kk[0, 0]) * d[1]) * area
+                                    a = frame[0, 0] * gs + frame[0, 1] * gt
+                                    b = frame[1, 0] * gs + frame[1, 1] * gt
                                     if ti.static(square):
-                                        level = area * _trapezium(a, wide_a) * _trapezium(b, wide_b)
+                                        level = ti.abs(area) * _trapezium(a, wide_a) * _trapezium(b, wide_b)
                                     else:
-                                        level = area * ti.max(_in_cell(rectangles, a, b, wide_a, wide_b), 0.0)
+                                        level = ti.abs(area) * ti.max(_in_cell(rectangles, a, b, wide_a, wide_b), 0.0)
                                     level = ti.select(LANES * tile + n % LANES < columns, level * to_level, 0.0)
                                     levels[n] = ti.min(level + 0.5, LEVELS)
                                 for n in ti.static(range(BATCH)):
