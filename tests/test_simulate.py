@@ -16,7 +16,7 @@ from scipy.stats import qmc
 from lfpiv.errors import InputError
 from lfpiv.experiment import open_experiment
 from lfpiv.scene import Noise, Scene, SceneCamera
-from lfpiv.simulate import DEMO_SCENE, _expose, open_scene, render_camera, simulate, true_mapping
+from lfpiv.simulate import DEMO_SCENE, expose, open_scene, render_camera, simulate, true_mapping
 from lfpiv_kernels import collect, render
 
 ROUNDING = 1e-12  # float64, a few operations on millimetres
@@ -265,20 +265,20 @@ def test_exposure_has_the_noise_it_says():
     """Mean kept; variance = read noise^2 + signal / (electrons per count) + rounding; nothing else."""
     level = np.repeat(np.array([0.0, 300.0, 2500.0]), 200_000).reshape(600, 1000)
     noise = Noise(background=50.0, read_noise=4.0, full_well_e=8190.0)  # two electrons per count
-    image = _expose(level, camera(blur_px=0.0), noise, np.random.default_rng(0)).astype(float)
+    image = expose(level, camera(blur_px=0.0), noise, np.random.default_rng(0)).astype(float)
     for value in (0.0, 300.0, 2500.0):
         sample = image[level == value]
         variance = 4.0**2 + value / 2 + 1 / 12
         assert abs(sample.mean() - 50 - value) < MONTE_CARLO * np.sqrt(variance / len(sample))
         assert abs(sample.var() / variance - 1) < MONTE_CARLO * np.sqrt(2 / len(sample))
-    silent = _expose(
+    silent = expose(
         level,
         camera(blur_px=0.0),
         Noise(background=7.0, read_noise=0.0, full_well_e=0.0),
         np.random.default_rng(0),
     )
     assert np.array_equal(silent, level + 7)
-    assert _expose(level * 10, camera(), noise, np.random.default_rng(0)).max() == 4095
+    assert expose(level * 10, camera(), noise, np.random.default_rng(0)).max() == 4095
 
 
 SCENE = """

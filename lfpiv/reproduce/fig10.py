@@ -119,7 +119,7 @@ def _count(camera, counts: int, seed: list[int], shape: tuple[int, int]) -> tupl
     first, total, squares = None, np.zeros(shape), np.zeros(shape)
     for start in range(0, counts, BATCH):
         draw = int(np.random.default_rng([*seed, start]).integers(2**31))
-        centres = np.tile(VOXEL_AT_MM, (BATCH, 1))
+        centres = np.tile(VOXEL_AT_MM, (min(BATCH, counts - start), 1))
         windows, rays, corners = count_voxels(camera, centres, VOXEL_MM, samples=COUNT_SAMPLES_ONE, seed=draw)
         for window, number, (column, row) in zip(windows, rays, corners, strict=True):
             image = np.zeros(shape)

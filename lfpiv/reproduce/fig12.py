@@ -16,7 +16,7 @@ from lfpiv.settings import Correlation, Smart
 
 TITLE = "Fig. 12: reconstructed particles; Fig. 11: at 0.1 particles per microlens"
 
-SIZE_MM = {"small": (6.0, 6.0, 6.0), "paper": (10.0, 10.0, 10.0)}
+SIZE_MM = {"small": (5.0, 5.0, 5.0), "paper": (10.0, 10.0, 10.0)}
 PPM = {"small": (0.1, 0.3, 0.5, 0.7, 1.0), "paper": tuple(round(0.1 * n, 1) for n in range(1, 11))}
 MAPPINGS = ("network", "drt")
 SCATTER_PPM = 0.1
@@ -34,10 +34,11 @@ VARIANTS = {
     "points": {},
     "from_truth": {},
     "paper": {"iterations": 10, "relaxation": 1.0, "accelerate": False, "floor_share": 0.0, "tolerance": 0.0},
-    "sieve": {"sieve_voxel": 0.6, "floor_share": 0.0},
+    "sieve": {"sieve_voxel": 0.6},
 }
 """SMART settings of each kind of run that differ from this software's own. "paper": the paper's number of iterations
-and relaxation; "sieve": volumes made of blobs, none smaller than a voxel; both by the network. Particles are blobs but in "points"."""
+and relaxation; "sieve": volumes made of blobs; both by the network. Particles are blobs, but
+points in "points"."""
 CORRELATED_VOXEL = Correlation().smoothing_voxel
 """Smoothing of a volume before it is correlated, with which Q is reported as well [voxel]."""
 

@@ -132,7 +132,7 @@ th.number { text-align: right; }
 .yes { color: var(--good); font-weight: 600; } .no { color: var(--bad); font-weight: 600; }
 figure { margin: 1rem 0; }
 @media (max-width: 30rem) { body { padding: .7rem; } table { font-size: .8rem; } th, td { padding-right: .45rem; }
-  td.what { min-width: 7.5rem; } }
+  td.what { min-width: 6.5rem; } td.number { white-space: normal; } }
 figure img { max-width: 100%; height: auto; background: #fff; display: block; }
 """
 
