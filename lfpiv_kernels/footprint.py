@@ -254,30 +254,50 @@ def _fill_blocks(
                     ) / r
                     lens_row = (j - first_lens[1]) * LAYERS
                     along = (box[2] - first[1]) * stride + box[0] - first[0]
-                    if ti.static(profiles):
-                        middle_px = 0.5 * ti.Vector([columns - 1, rows - 1])
-                        ab = turn @ (position(model, v, p0 - middle_px * pupil_pixel) - centre)
-                        to_a, to_b = LEVELS * area / (top_a * top_area * wide_a[0]), LEVELS / (top_b * wide_b[0])
-                        for tile in range(tiles):
-                            layer = _layer(
-                                model,
-                                v,
-                                centre,
-                                p0,
-                                tile,
-                                columns,
-                                rows,
-                                radius,
-                                pupil_pixel,
-                                frame,
-                                jacobian,
-                                wide_a,
-                                wide_b,
-                            )
-                            lens_block = (lens_row + layer) * corner.shape[1] + i - first_lens[0]
-                            ray_out[block] = lens_block * stride * stride + along + LANES * tile
-                            height_out[block] = ti.cast(rows, ti.u16)
-                            block += 1
+                    middle_px = 0.5 * ti.Vector([columns - 1, rows - 1])
+                    # what either form needs: the compiler drops the other's
+                    ab = turn @ (position(model, v, p0 - middle_px * pupil_pixel) - centre)
+                    to_a, to_b = LEVELS * area / (top_a * top_area * wide_a[0]), LEVELS / (top_b * wide_b[0])
+                    p = p0 - middle_px * pupil_pixel
+                    k = slope(model, v, p)
+                    # slopes are linear in the pixel offset (x, y), the offset from the lens centre is quadratic
+                    q = (
+                        pupil_pixel
+                        * pupil_pixel
+                        * ti.Matrix(
+                            [
+                                [model[v, 3], model[v, 4], model[v, 5]],
+                                [model[v, 9], model[v, 10], model[v, 11]],
+                            ]
+                        )
+                    )  # xx, xy, yy
+                    d0, dx, dy = position(model, v, p) - centre, -pupil_pixel * k[:, 0], -pupil_pixel * k[:, 1]
+                    kx = ti.Matrix([[2.0 * q[0, 0], q[0, 1]], [2.0 * q[1, 0], q[1, 1]]]) / -pupil_pixel
+                    ky = ti.Matrix([[q[0, 1], 2.0 * q[0, 2]], [q[1, 1], 2.0 * q[1, 2]]]) / -pupil_pixel
+                    to_level = LEVELS / (top_a * top_b * top_area)
+                    if ti.static(square):
+                        to_level *= (1.0 / wide_a[0]) * (1.0 / wide_b[0])
+                    for tile in range(tiles):
+                        layer = _layer(
+                            model,
+                            v,
+                            centre,
+                            p0,
+                            tile,
+                            columns,
+                            rows,
+                            radius,
+                            pupil_pixel,
+                            frame,
+                            jacobian,
+                            wide_a,
+                            wide_b,
+                        )
+                        lens_block = (lens_row + layer) * corner.shape[1] + i - first_lens[0]
+                        ray_out[block] = lens_block * stride * stride + along + LANES * tile
+                        height_out[block] = ti.cast(rows, ti.u16)
+                        block += 1
+                        if ti.static(profiles):
                             _write_profile(
                                 value_out, row, ab[0], step[0, 0], middle_px[0], LANES * tile, columns, wide_a, to_a
                             )
@@ -287,48 +307,7 @@ def _fill_blocks(
                                     value_out, row, ab[1], step[1, 1], middle_px[1], LANES * part, rows, wide_b, to_b
                                 )
                                 row += 1
-                    else:
-                        middle_px = 0.5 * ti.Vector([columns - 1, rows - 1])
-                        p = p0 - middle_px * pupil_pixel
-                        k = slope(model, v, p)
-                        # slopes are linear in the pixel offset (x, y), the offset from the lens centre is quadratic
-                        q = (
-                            pupil_pixel
-                            * pupil_pixel
-                            * ti.Matrix(
-                                [
-                                    [model[v, 3], model[v, 4], model[v, 5]],
-                                    [model[v, 9], model[v, 10], model[v, 11]],
-                                ]
-                            )
-                        )  # xx, xy, yy
-                        d0, dx, dy = position(model, v, p) - centre, -pupil_pixel * k[:, 0], -pupil_pixel * k[:, 1]
-                        kx = ti.Matrix([[2.0 * q[0, 0], q[0, 1]], [2.0 * q[1, 0], q[1, 1]]]) / -pupil_pixel
-                        ky = ti.Matrix([[q[0, 1], 2.0 * q[0, 2]], [q[1, 1], 2.0 * q[1, 2]]]) / -pupil_pixel
-                        inverse_a, inverse_b = 1.0 / wide_a[0], 1.0 / wide_b[0]
-                        to_level = LEVELS / (top_a * top_b * top_area)
-                        if ti.static(square):
-                            to_level *= inverse_a * inverse_b
-                        for tile in range(tiles):
-                            layer = _layer(
-                                model,
-                                v,
-                                centre,
-                                p0,
-                                tile,
-                                columns,
-                                rows,
-                                radius,
-                                pupil_pixel,
-                                frame,
-                                jacobian,
-                                wide_a,
-                                wide_b,
-                            )
-                            lens_block = (lens_row + layer) * corner.shape[1] + i - first_lens[0]
-                            ray_out[block] = lens_block * stride * stride + along + LANES * tile
-                            height_out[block] = ti.cast(rows, ti.u16)
-                            block += 1
+                        else:
                             for part in range((rows + BATCH - 1) // BATCH):
                                 levels = ti.Vector.zero(ti.f32, BATCH * LANES)
                                 for n in range(BATCH * LANES):  # on local values only: the compiler makes it vectors

@@ -2,7 +2,7 @@
 
 A pixel at the edge of two microimages sees two parts of the pupil through two lenses; its rays are kept apart, each
 with the share of the pixel's cell that lies inside the pupil. So a voxel's weights need no coverage of their own, and a
-microimage lies in one piece of memory. Twin: ``reference.collect``.
+microimage lies in one piece of memory. Twin: ``reference.dense``.
 """
 
 import sys
