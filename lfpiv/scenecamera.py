@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from lfpiv.rig import LensLattice, Optics
-from lfpiv.settings import Count, Flag, Number, Positive, Table
+from lfpiv.settings import Count, Flag, NominalCamera, Number, Positive, Table
 from lfpiv_kernels import raytrace
 
 NonNegative = Annotated[float, Field(strict=True, ge=0)]
@@ -85,20 +85,11 @@ class Aberrations(Table):
     then has coma on its axis [mm]."""
 
 
-class SceneCamera(Table):
+class SceneCamera(NominalCamera):
     """Table ``[[camera]]``: nominal optics, which the user is told, and what is true, which the user is not."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
-    focal_length_mm: Positive
-    magnification: Number
-    f_number: Positive
-    microlens_pitch_mm: Positive
-    microlens_focal_length_mm: Positive
-    pixel_um: Positive
     sensor_width_px: Count
     sensor_height_px: Count
-    microlens_layout: Literal["square", "hexagonal"] = "square"
-    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
     true_yaw_deg: Number | None = None
     """True camera angle about y [degree]; absent: the nominal one."""
     true_pitch_deg: Number = 0.0
@@ -121,19 +112,10 @@ class SceneCamera(Table):
     """Standard deviation of the microlenses' transmission."""
     dark_image: Flag = False
     """Whether a dark image is recorded."""
-    image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
-    """How the recorded images are mirrored."""
     window: Windows | None = None
     """Windows this camera looks through, from the particles outwards; absent: the scene's."""
     aberrations: Aberrations | None = None
     """Aberrations of this camera's main lens; absent: the scene's."""
-
-    @field_validator("magnification")
-    @classmethod
-    def _not_zero(cls, value: float) -> float:
-        if value == 0:
-            raise ValueError("a number other than 0")
-        return value
 
     @model_validator(mode="after")
     def _windows_face_the_camera(self) -> SceneCamera:
