@@ -10,16 +10,11 @@ import xarray as xr
 
 import lfpiv
 from lfpiv.calibration import Calibration
-from lfpiv.reproduce.rigs import Rig
-from lfpiv.rig import Grid
+from lfpiv.reproduce.rigs import VOXEL_MM, Rig, calibrated_rig
 from lfpiv.scene import Scene
 from lfpiv.settings import Smart
-from lfpiv.simulate import simulate
 from lfpiv.weights import Weights
-from lfpiv_kernels import runtime
 
-VOXEL_MM = 0.1
-"""Edge of the voxels [mm]."""
 SENSOR_PX = {"small": (1728, 2208), "paper": (2208, 2752)}
 """Rows and columns; at "small" the sensor is cut to what sees the smaller volume."""
 PLANES_MM = tuple(np.arange(-6.0, 6.5, 1.0).tolist())
@@ -87,19 +82,7 @@ def experimental_scene(scale: str, seed: int) -> Scene:
 
 def experimental_rig(folder: Path, scale: str, seed: int, progress: Callable[[str, float], None]) -> Rig:
     """Simulate the boards of `experimental_scene` and calibrate from them; kept in `folder` and taken from there."""
-    runtime.device()
-    scene = experimental_scene(scale, seed)
-    path = folder / "experiment" / "experiment.toml"
-    if not path.exists():
-        simulate(scene, path.parent, progress=lambda what, done, total: progress(what, done / total))
-    experiment = lfpiv.open_experiment(path)
-    stored = folder / "calibration.h5"
-    if not stored.exists():
-        scratch = folder / ".calibration.h5"
-        calibration = lfpiv.calibrate(experiment, progress=lambda fraction: progress("calibration", fraction))
-        calibration.save(scratch)
-        scratch.replace(stored)
-    return Rig(scene, experiment, lfpiv.load_calibration(stored))
+    return calibrated_rig(experimental_scene(scale, seed), folder, progress)
 
 
 def reconstruct_images(
@@ -123,8 +106,3 @@ def reconstruct_images(
         level, noise[name] = calibration.cameras[name].decoder.background(image)
         light[name] = image - np.float32(level)
     return lfpiv.reconstruct(weights, light, floor=noise, **Smart(iterations=iterations).model_dump())
-
-
-def centred_grid(size_mm: tuple[float, float, float]) -> Grid:
-    """Grid of 0.1 mm voxels around the point that both cameras look at, size (x, y, z) [mm]."""
-    return Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=size_mm, voxel_mm=VOXEL_MM)

@@ -12,9 +12,9 @@ import lfpiv
 from lfpiv.calibration import warn_outside
 from lfpiv.flows import SwirlingJet, window_mean
 from lfpiv.reproduce import store
-from lfpiv.reproduce.injector import VOXEL_MM, centred_grid, reconstruct_images
+from lfpiv.reproduce.injector import reconstruct_images
 from lfpiv.reproduce.planarpiv import SheetCamera, correlate_frames, sheet_images
-from lfpiv.reproduce.rigs import Rig
+from lfpiv.reproduce.rigs import VOXEL_MM, Rig, volume_grid
 from lfpiv.rig import Grid
 from lfpiv.scene import Noise
 from lfpiv.settings import Correlation
@@ -149,7 +149,7 @@ def particle_frames(rig: Rig, twin: Twin, pair: int) -> list[dict[str, np.ndarra
 
 def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Callable[[str, float], None]) -> dict:
     """Mean vectors of all pairs, the true ones over their windows, and the axes."""
-    grid = centred_grid(twin.sizes.volume_mm)
+    grid = volume_grid(twin.sizes.volume_mm)
     weights, total = None, None
     for pair in range(twin.sizes.pairs):
         progress("light-field PIV", pair / twin.sizes.pairs)

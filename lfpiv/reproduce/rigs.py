@@ -133,8 +133,12 @@ def numerical_scene(scale: str, seed: int) -> Scene:
 
 def numerical_rig(folder: Path, scale: str, seed: int, progress: Callable[[str, float], None]) -> Rig:
     """Simulate the board of `numerical_scene` and calibrate from it; both are kept in `folder` and taken from there."""
+    return calibrated_rig(numerical_scene(scale, seed), folder, progress)
+
+
+def calibrated_rig(scene: Scene, folder: Path, progress: Callable[[str, float], None]) -> Rig:
+    """Simulate the board of a scene and calibrate from it; both are kept in `folder` while the scene stays the same."""
     runtime.device()
-    scene = numerical_scene(scale, seed)
     path, marker = folder / "experiment" / "experiment.toml", folder / "scene.json"
     content = store.jsonable(scene.model_dump(mode="json"))
     if not marker.exists() or json.loads(marker.read_text("utf-8")) != content:
