@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv.microimages import lay_out, microimage_edge, plain
+from lfpiv.raylayout import lay_out, microimage_edge, plain
 from lfpiv.raymodel import fit_rays, grid_models
 from lfpiv.rig import Grid
 from lfpiv_kernels import footprint, runtime

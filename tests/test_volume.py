@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 import lfpiv
 from lfpiv import smart
-from lfpiv.microimages import plain
+from lfpiv.raylayout import plain
 from lfpiv.weightblocks import StoredGrid
 from lfpiv.weights import Weights
 from lfpiv_kernels import raymodel, reference, runtime

@@ -7,7 +7,7 @@ import pytest
 from ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
-from lfpiv.microimages import lay_out
+from lfpiv.raylayout import lay_out
 from lfpiv.raymodel import ray_models
 from lfpiv.weightblocks import count_voxels
 from lfpiv.weights import compare_with_count, estimate_memory
