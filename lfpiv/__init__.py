@@ -6,6 +6,7 @@ Public names load their module on first use, so that importing the package start
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 __version__ = "0.1.0"
 
@@ -53,7 +54,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """Load the module of a public name on first use."""
     if name in _SUBMODULES:
         return importlib.import_module(f"lfpiv.{name}")

@@ -8,6 +8,7 @@ consistent with the flow to second order. Points and displacements are ordered (
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -21,6 +22,8 @@ from lfpiv.swirl import injector_profiles
 from lfpiv.turbulence import TurbulentFlow
 
 Point = tuple[Number, Number, Number]
+TracerMap = tuple[Point, Point, tuple[Point, Point] | None, float | None]
+"""Size and centre of the box that tracers fill, the same box in their file, and their peak displacement."""
 Axis = Literal["x", "y", "z"]
 
 LAMB_OSEEN = 1.2564312086261697
@@ -246,7 +249,7 @@ class Tracers(Table):
         ]
         return np.concatenate([np.empty((0, 3)), *found])
 
-    def _map(self) -> tuple:
+    def _map(self) -> TracerMap:
         return self.size_mm, self.centre_mm, self.box, self.peak_mm
 
 
@@ -256,7 +259,7 @@ KINDS = {model.model_fields["kind"].default: model for model in (Uniform, Shear,
 
 
 @functools.lru_cache(maxsize=4)
-def _load_tracers(file: str, first: str, second: str, mapping: tuple) -> tuple[np.ndarray, np.ndarray, cKDTree]:
+def _load_tracers(file: str, first: str, second: str, mapping: TracerMap) -> tuple[np.ndarray, np.ndarray, cKDTree]:
     size, centre, box, peak = mapping
     try:
         with np.load(Path(file), allow_pickle=False) as data:
@@ -281,7 +284,7 @@ def _load_tracers(file: str, first: str, second: str, mapping: tuple) -> tuple[n
     if not (np.isfinite(start).all() and np.isfinite(end).all()):
         raise InputError(f"{file}: expected finite tracer positions, found NaN or infinity. Remove those tracers.")
     middle, displacement = (start + end) / 2, end - start
-    low, high = (np.asarray(corner, float) for corner in (box or (middle.min(0), middle.max(0))))
+    low, high = (np.asarray(corner, float) for corner in (box if box is not None else (middle.min(0), middle.max(0))))
     if not (high > low).all():
         raise InputError(f"{file}: expected tracers that fill a volume, found them in a plane. Set flow.box.")
     scale = np.asarray(size) / (high - low)
@@ -321,7 +324,11 @@ def _window(window_mm: float | tuple[float, float, float]) -> np.ndarray:
 
 
 def window_mean(
-    flow: Flow | TurbulentFlow, centres_mm: np.ndarray, window_mm: float | tuple[float, float, float], *, order: int = 6
+    flow: Callable[[np.ndarray], np.ndarray],
+    centres_mm: np.ndarray,
+    window_mm: float | tuple[float, float, float],
+    *,
+    order: int = 6,
 ) -> np.ndarray:
     """Mean displacement of a flow over interrogation windows: what an ideal correlation would measure.
 
@@ -344,7 +351,8 @@ def window_mean(
     centres_mm, window = _points(centres_mm), _window(window_mm)
     if isinstance(flow, TurbulentFlow):
         turbulent = flow.fluctuation.window_mean(centres_mm, tuple(window))
-        return window_mean(flow.mean, centres_mm, tuple(window), order=order) + turbulent
+        mean: np.ndarray = window_mean(flow.mean, centres_mm, tuple(window), order=order) + turbulent
+        return mean
     node, weight = np.polynomial.legendre.leggauss(order)
     nodes = np.stack(np.meshgrid(node, node, node, indexing="ij"), -1).reshape(-1, 3) * window / 2
     weights = np.einsum("i,j,k->ijk", weight, weight, weight).ravel() / 8

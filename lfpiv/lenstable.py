@@ -29,8 +29,9 @@ class LensTable:
     ):
         frequency = [fft.fftfreq(TABLE, step_mm)[:, None], fft.rfftfreq(TABLE, step_mm)[None]]
 
-        def along(vector):
-            return vector[0] * frequency[0] + vector[1] * frequency[1]
+        def along(vector: np.ndarray) -> np.ndarray:
+            product: np.ndarray = vector[0] * frequency[0] + vector[1] * frequency[1]
+            return product
 
         axes = [2 * np.pi * along(ellipse[:, axis]) for axis in (0, 1)]
         phase = np.hypot(*axes)
@@ -85,12 +86,15 @@ def cell_spectrum(basis: np.ndarray, step_mm: float) -> np.ndarray:
     inside = np.ones((fine.size, fine.size), bool)
     for vector in _voronoi_neighbours(basis):
         inside &= fine[:, None] * vector[0] + fine[None] * vector[1] < vector @ vector / 2
-    return fft.rfft2(fft.ifftshift(inside.reshape(TABLE, _RASTER, TABLE, _RASTER).mean((1, 3))))
+    share = inside.reshape(TABLE, _RASTER, TABLE, _RASTER).mean((1, 3))
+    spectrum: np.ndarray = fft.rfft2(fft.ifftshift(share))
+    return spectrum
 
 
 def _voronoi_neighbours(basis: np.ndarray) -> np.ndarray:
     steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)], float)
-    return steps @ basis
+    neighbours: np.ndarray = steps @ basis
+    return neighbours
 
 
 def cell_corners(basis: np.ndarray) -> np.ndarray:

@@ -109,7 +109,8 @@ def _neighbours_light(microimage: np.ndarray, column: np.ndarray, row: np.ndarra
     light = np.where(heart, 0, np.maximum(microimage - microimage[heart].max(), 0))
     offsets = np.array([i * basis[0] + j * basis[1] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
     distance = (column - offsets[:, 0, None, None]) ** 2 + (row - offsets[:, 1, None, None]) ** 2
-    return light * offsets[distance.argmin(0)].transpose(2, 0, 1)
+    weighted: np.ndarray = light * offsets[distance.argmin(0)].transpose(2, 0, 1)
+    return weighted
 
 
 def _cell_window(column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:

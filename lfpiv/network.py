@@ -49,7 +49,7 @@ class Network:
     output_scale: np.ndarray
     """Output difference that belongs to 1 in the last layer, shape (m,) [output unit]."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         sizes = [self.input_centre.size, *(bias.size for bias in self.biases)]
         shapes = [weight.shape for weight in self.weights]
         if len(shapes) < 2 or shapes != list(pairwise(sizes)):
@@ -245,13 +245,13 @@ def split_samples(
     middle = (np.cumsum(size) - size / 2) / max(count, 1)  # a group goes where its middle falls
     part_of = np.empty(number, int)
     part_of[order] = np.searchsorted(np.cumsum(parts)[:2], middle)
-    result = tuple(np.flatnonzero(part_of[member] == part) for part in range(3))
-    if min(map(len, result)) == 0:
+    training, validation, test = (np.flatnonzero(part_of[member] == part) for part in range(3))
+    if 0 in (training.size, validation.size, test.size):
         raise ValueError(
             f"split: {count} samples in {number} groups are too few for shares of {tuple(parts)}: a part would be "
             "empty; give more samples or groups."
         )
-    return result
+    return training, validation, test
 
 
 def train(
@@ -320,7 +320,7 @@ def train(
     output_scale = np.full_like(output_scale, output_scale.max())  # one unit, one scale: the loss is Eq. 8's distance
     weights = np.ones(len(inputs)) if std is None else 1 / np.asarray(std, float)
 
-    def samples(index):
+    def samples(index: np.ndarray) -> Samples:
         root_mean_square = np.sqrt(np.mean(weights[index] ** 2))
         return Samples(
             inputs=(inputs[index] - centre) / scale,
@@ -371,7 +371,9 @@ def train(
     )
 
 
-def _check(inputs, outputs, hidden, std, unit):
+def _check(
+    inputs: np.ndarray, outputs: np.ndarray, hidden: tuple[int, ...], std: np.ndarray | None, unit: float
+) -> None:
     if inputs.ndim != 2 or outputs.ndim != 2 or len(inputs) != len(outputs) or 0 in inputs.shape + outputs.shape:
         raise ValueError(
             f"inputs, outputs: expected shapes (n, d) and (n, m) with one row per sample, got {inputs.shape} and "
@@ -391,7 +393,7 @@ def _check(inputs, outputs, hidden, std, unit):
         raise ValueError(f"unit: expected a positive length, got {unit}.")
 
 
-def _unit_range(values):
+def _unit_range(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centre and half range of each column; a constant column gets the scale 1."""
     low, high = values.min(axis=0), values.max(axis=0)
     half = (high - low) / 2

@@ -91,9 +91,9 @@ class Grid:
         cls, *, centre_mm: tuple[float, float, float], size_mm: tuple[float, float, float], voxel_mm: float
     ) -> Grid:
         """Grid of n = round(size / voxel) voxels per axis around a centre; both in the order (x, y, z)."""
-        counts = [round(size / voxel_mm) for size in size_mm]
-        first = [centre - (n - 1) / 2 * voxel_mm for centre, n in zip(centre_mm, counts, strict=True)]
-        return cls(shape=tuple(counts[::-1]), voxel_mm=voxel_mm, first_centre_mm=tuple(first[::-1]))
+        nx, ny, nz = (round(size / voxel_mm) for size in size_mm)
+        x, y, z = (centre - (n - 1) / 2 * voxel_mm for centre, n in zip(centre_mm, (nx, ny, nz), strict=True))
+        return cls(shape=(nz, ny, nx), voxel_mm=voxel_mm, first_centre_mm=(z, y, x))
 
     @property
     def size(self) -> int:
@@ -132,12 +132,13 @@ class LensLattice:
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
         """Lens centres (s, t) [mm] of lattice indices (i, j), shape (..., 2)."""
-        return np.asarray(self.origin_mm) + np.asarray(index, float) @ np.asarray(self.basis_mm)
+        centres: np.ndarray = np.asarray(self.origin_mm) + np.asarray(index, float) @ np.asarray(self.basis_mm)
+        return centres
 
     def nearest(self, position_mm: np.ndarray) -> np.ndarray:
         """Lattice index (i, j) of the lens nearest to each position (s, t) [mm], shape (..., 2)."""
         offset = np.asarray(position_mm, float) - np.asarray(self.origin_mm)
-        guess = np.rint(offset @ np.linalg.inv(np.asarray(self.basis_mm)))
+        guess: np.ndarray = np.rint(offset @ np.linalg.inv(np.asarray(self.basis_mm)))
         best, best_distance = guess.copy(), np.full(guess.shape[:-1], np.inf)
         for i in (-1, 0, 1):
             for j in (-1, 0, 1):

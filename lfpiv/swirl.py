@@ -104,7 +104,9 @@ def injector_profiles(
     return axial / bulk, spin * swirl / (raw_swirl * bulk)
 
 
-def _raw_profiles(square, radius_ratio, mass_ratio, shear_layer):
+def _raw_profiles(
+    square: np.ndarray, radius_ratio: float, mass_ratio: float, shear_layer: float
+) -> tuple[np.ndarray, np.ndarray]:
     channel = mass_ratio * (1 / radius_ratio**2 - 1)  # velocity of the channel over that of the annulus
     swirled = (1 + np.tanh((square - radius_ratio**2) / (2 * radius_ratio * shear_layer))) / 2
     inside = (1 - np.tanh((square - 1) / (2 * shear_layer))) / 2
@@ -112,7 +114,7 @@ def _raw_profiles(square, radius_ratio, mass_ratio, shear_layer):
 
 
 @functools.lru_cache(maxsize=16)
-def _profile_scales(radius_ratio, mass_ratio, shear_layer):
+def _profile_scales(radius_ratio: float, mass_ratio: float, shear_layer: float) -> tuple[float, float]:
     """Bulk velocity and swirl number of the raw profiles."""
     node, weight = np.polynomial.legendre.leggauss(QUADRATURE)
     outer = 1 + 12 * shear_layer  # where the jet has faded below 1e-10

@@ -6,7 +6,8 @@ residual of the fitted closed form keeps both: aberrations where there are dots,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -47,10 +48,10 @@ class ThinLensModel:
     """Focal length of the main lens [mm]."""
     pupil_scale: float = 1.0
     """True over nominal pupil coordinate; differs from 1 where f_m / s_i of the data sheet is off."""
-    array_offset_mm: np.ndarray = (0.0, 0.0)
+    array_offset_mm: np.ndarray = field(default_factory=lambda: np.zeros(2))
     """Where the optical axis meets the array (s, t), shape (2,) [mm]."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, shape in (("rotation", (3, 3)), ("offset_mm", (3,)), ("array_offset_mm", (2,))):
             value = np.array(getattr(self, name), float)
             if value.shape != shape:
@@ -75,7 +76,8 @@ class ThinLensModel:
         camera = (np.asarray(points, float) - self.offset_mm) @ self.rotation.T
         magnification = self.image_distance_mm / (self.object_distance_mm - camera[:, 2:])
         gain = self.pupil_scale * (1 - self.image_distance_mm / self.focal_length_mm + magnification)
-        return self.array_offset_mm + gain * np.asarray(pupil, float) - magnification * camera[:, :2]
+        array: np.ndarray = self.array_offset_mm + gain * np.asarray(pupil, float) - magnification * camera[:, :2]
+        return array
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the model as named arrays, for files and kernels; `from_arrays` is the inverse."""
@@ -94,7 +96,8 @@ class ThinLensModel:
         if missing:
             raise ValueError(f"thin lens: expected arrays as ThinLensModel.to_arrays writes them; missing {missing}.")
         values = {name: np.asarray(arrays[f"thin_lens_{name}"], float) for name in cls.__dataclass_fields__}
-        return cls(**{name: float(value) if value.ndim == 0 else value for name, value in values.items()})
+        fields: dict[str, Any] = {name: float(value) if value.ndim == 0 else value for name, value in values.items()}
+        return cls(**fields)
 
 
 def thin_lens_model(optics: Optics, angle_deg: float) -> ThinLensModel:
@@ -173,8 +176,9 @@ def fit_thin_lens(
     std = np.ones(len(chosen)) if std is None else std[chosen] / np.median(std)
     start = _linear_start(points, pupil, array, optics)
 
-    def misfit(parameters):
-        return ((_moved(start, optics, parameters)(points, pupil) - array) / std[:, None]).ravel()
+    def misfit(parameters: np.ndarray) -> np.ndarray:
+        deviation: np.ndarray = _moved(start, optics, parameters)(points, pupil) - array
+        return (deviation / std[:, None]).ravel()
 
     parameters = np.zeros(11)
     residual = misfit(parameters)
@@ -207,7 +211,7 @@ def _moved(start: ThinLensModel, optics: Optics, p: np.ndarray) -> ThinLensModel
     )
 
 
-def _linear_start(points, pupil, array, optics):
+def _linear_start(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, optics: Optics) -> ThinLensModel:
     """Pose from the bilinear fit, optics from the data sheet."""
     count, middle = len(points), points.mean(axis=0)
     centred = points - middle
@@ -247,15 +251,18 @@ def _linear_start(points, pupil, array, optics):
     return start
 
 
-def _rotation_y(angle):
+def _rotation_y(angle: float) -> np.ndarray:
     """Return the rotation of Eqs. 1-3."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
 
 
-def _rotation(vector):
+def _rotation(vector: np.ndarray) -> np.ndarray:
     """Rotation about `vector` by its length, Rodrigues."""
     x, y, z = vector
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.linalg.norm(vector)
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross
+    rotation: np.ndarray = (
+        np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross
+    )
+    return rotation

@@ -14,7 +14,9 @@ References
 from __future__ import annotations
 
 import enum
+import math
 import os
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -33,6 +35,10 @@ LEAST_DAMPING, FIRST_DAMPING, LAST_DAMPING = 1e-15, 1e-3, 1e12
 diagonal of J^T J."""
 LONGEST_CORRECTION = 0.375
 """Second-order correction above which a step is not trusted, as a share of the step ([3]_: 2 |a| / |v| <= 0.75)."""
+
+
+Terms = tuple[np.ndarray, ...]
+"""Arrays to be summed over the samples."""
 
 
 class Stop(enum.Enum):
@@ -65,7 +71,7 @@ class Fit:
     stop: Stop
 
 
-def forward(layers, inputs):
+def forward(layers: Sequence[np.ndarray], inputs: np.ndarray) -> list[np.ndarray]:
     """Return the outputs of every layer; the last one is linear."""
     outputs = []
     for layer in layers:
@@ -76,18 +82,18 @@ def forward(layers, inputs):
     return outputs
 
 
-def _add_up(job, size, rows):
+def _add_up(job: Callable[[int, int], Terms], size: int, rows: int) -> Terms:
     """Sum of ``job(first, last)``, a tuple of arrays, over blocks of `rows` samples, on the cores of this process.
 
     The samples are cut into a fixed number of ranges, each summed by one thread, and the ranges are added in order: the
     result does not depend on the number of threads. BLAS should run on one thread meanwhile (`train` sees to that).
     """
 
-    def add_range(edge):
-        total = None
-        for first in range(edge[0], edge[1], rows):
-            terms = job(first, min(first + rows, edge[1]))
-            total = terms if total is None else tuple(np.add(a, b, out=a) for a, b in zip(total, terms, strict=True))
+    def add_range(edge: tuple[int, int]) -> Terms:
+        total = job(edge[0], min(edge[0] + rows, edge[1]))
+        for first in range(edge[0] + rows, edge[1], rows):
+            for a, b in zip(total, job(first, min(first + rows, edge[1])), strict=True):
+                a += b
         return total
 
     edges = [size * part // RANGES for part in range(RANGES + 1)]
@@ -96,10 +102,10 @@ def _add_up(job, size, rows):
     return tuple(sum(terms[1:], terms[0]) for terms in zip(*totals, strict=True))
 
 
-def _sum_of_squares(layers, samples):
+def _sum_of_squares(layers: Sequence[np.ndarray], samples: Samples) -> float:
     """Weighted sum of squared residuals."""
 
-    def squares(first, last):
+    def squares(first: int, last: int) -> Terms:
         part = slice(first, last)
         residual = samples.weights[part] * (samples.outputs[part] - forward(layers, samples.inputs[part])[-1])
         return (np.vdot(residual, residual).reshape(1),)
@@ -128,7 +134,7 @@ def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.nda
     hidden_size = layers[-2].size
     shared_size = hidden_size + nodes + 1
 
-    def products(first, last):
+    def products(first: int, last: int) -> Terms:
         inputs, weight = samples.inputs[first:last], samples.weights[first:last]
         count = len(weight)
         activations = forward(layers, inputs)
@@ -149,8 +155,8 @@ def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.nda
                 size, width = layers[number].size, layers[number].shape[1]
                 delta = (delta.reshape(count * outputs, -1) @ layers[number + 1][:-1].T).reshape(count, outputs, width)
                 delta *= slopes[number][:, None, :]
-                block = deep[:, :, end - size : end].reshape(count, outputs, -1, width)
-                np.multiply(fed[number][:, None, :, None], delta[:, :, None, :], out=block)
+                products_out = deep[:, :, end - size : end].reshape(count, outputs, -1, width)
+                np.multiply(fed[number][:, None, :, None], delta[:, :, None, :], out=products_out)
                 end -= size
             flat = deep.reshape(count * outputs, deep_size)
             sums += [flat.T @ flat, flat.T @ residual.ravel()]
@@ -171,8 +177,8 @@ def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.nda
     gram[h, o] = (block * output_layer[:, None, :]).reshape(hidden_size, -1)
     gram[o, h] = gram[h, o].T
     gram[o, o] = np.kron(shared[hidden_size:, hidden_size:], np.eye(outputs))
-    block = shared_gradient[:hidden_size].reshape(fan_in, nodes, outputs)
-    gradient[h] = (block * output_layer).sum(axis=2).ravel()
+    by_output = shared_gradient[:hidden_size].reshape(fan_in, nodes, outputs)
+    gradient[h] = (by_output * output_layer).sum(axis=2).ravel()
     gradient[o] = shared_gradient[hidden_size:].ravel()
     if deep_size:
         gram[d, d], gradient[d], deep_shared = rest
@@ -183,10 +189,10 @@ def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.nda
     return gram, gradient, float(squares[0])
 
 
-def _bending(layers, steps, samples):
+def _bending(layers: Sequence[np.ndarray], steps: Sequence[np.ndarray], samples: Samples) -> np.ndarray:
     """J^T f'' for the second derivative f'' of the weighted outputs along a step of the layers, exactly."""
 
-    def products(first, last):
+    def products(first: int, last: int) -> Terms:
         weight = samples.weights[first:last]
         value = samples.inputs[first:last]
         velocity = acceleration = np.zeros((len(value), 0))  # derivatives of the layer's inputs along the step
@@ -205,7 +211,7 @@ def _bending(layers, steps, samples):
             velocity = slopes[-1] * sums[1]
             acceleration = slopes[-1] * sums[2] - 2 * value * velocity * sums[1]
         delta = weight**2 * sums[2]
-        gradient = []
+        gradient: list[np.ndarray] = []
         for number in range(len(layers) - 1, -1, -1):
             gradient.insert(0, np.vstack([fed[number].T @ delta, delta.sum(axis=0)]).ravel())
             if number:
@@ -248,11 +254,11 @@ def levenberg_marquardt(
     edges = np.cumsum([layer.size for layer in layers])[:-1]
     theta = np.concatenate([layer.ravel() for layer in layers])
 
-    def unpack(vector):
+    def unpack(vector: np.ndarray) -> list[np.ndarray]:
         return [part.reshape(shape) for part, shape in zip(np.split(vector, edges), shapes, strict=True)]
 
-    def validation_error(vector):
-        return np.sqrt(_sum_of_squares(unpack(vector), validation) / validation.outputs.size)
+    def validation_error(vector: np.ndarray) -> float:
+        return math.sqrt(_sum_of_squares(unpack(vector), validation) / validation.outputs.size)
 
     gram, gradient, squares = normal_equations(layers, training)
     training_rms, validation_rms = [np.sqrt(squares / training.outputs.size)], [validation_error(theta)]
@@ -297,6 +303,6 @@ def levenberg_marquardt(
     return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 
 
-def _cores():
+def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -107,7 +107,8 @@ class TurbulentFlow:
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Displacement (n, 3) at points (n, 3) [mm]."""
-        return self.mean(points_mm) + self.fluctuation(points_mm)
+        moved: np.ndarray = self.mean(points_mm) + self.fluctuation(points_mm)
+        return moved
 
 
 @functools.lru_cache(maxsize=16)
