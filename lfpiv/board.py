@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -125,11 +126,12 @@ def measure_board(
     return _collect(labels, board, detection.in_field)
 
 
-class _Signals(Sequence):
+class _Signals(Sequence[np.ndarray]):
     """The planes' images above their dark levels, nan where saturated; only the last one asked for is kept as float."""
 
     def __init__(self, images: Sequence[np.ndarray], decoder: LightFieldDecoder):
-        self._images, self._last = images, (-1, None)
+        self._images = images
+        self._plane, self._signal = -1, np.empty((0, 0), np.float32)
         levels = []
         for plane, image in enumerate(images):
             if np.shape(image) != tuple(decoder.optics.sensor_shape):
@@ -147,16 +149,22 @@ class _Signals(Sequence):
     def __len__(self) -> int:
         return len(self._images)
 
-    def __getitem__(self, plane: int) -> np.ndarray:
-        if plane != self._last[0]:
+    @overload
+    def __getitem__(self, plane: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, plane: slice) -> Sequence[np.ndarray]: ...
+    def __getitem__(self, plane: int | slice) -> np.ndarray | Sequence[np.ndarray]:
+        if isinstance(plane, slice):
+            return [self[n] for n in range(*plane.indices(len(self)))]
+        if plane != self._plane:
             image = np.asarray(self._images[plane])
             level, sigma = self._levels[plane]
             signal = image.astype(np.float32) - np.float32(level)
             top = image == image.max()
             if np.count_nonzero(top) >= _SATURATED_PIXELS and signal[top][0] > _SATURATED_SIGMA * sigma:
                 signal[top] = np.nan
-            self._last = plane, signal
-        return self._last[1]
+            self._plane, self._signal = plane, signal
+        return self._signal
 
 
 def _collect(labels: Labels, board: DotBoard, in_field: np.ndarray) -> BoardDots:

@@ -8,6 +8,7 @@ which is fitted from the plane nearest to z = 0 outwards. The board's edges that
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,11 +86,13 @@ class Detection:
     """Dots of which at least half of the light falls on the sensor, shape (plane, dot)."""
 
 
-def find_dots(signals, decoder: LightFieldDecoder, board: DotBoard, nominal_angle_deg: float) -> Detection:
+def find_dots(
+    signals: Sequence[np.ndarray], decoder: LightFieldDecoder, board: DotBoard, nominal_angle_deg: float
+) -> Detection:
     """Find and name the dots: lattice in the first plane that shows one, then plane by plane with the fitted pose."""
     optics = decoder.optics
-    half_width = tuple((n / 2 + MARGIN + 0.5) * board.spacing_mm for n in board.dots)
-    rectify = Rectifier(decoder, half_width, board.diameter_mm)
+    half_x, half_y = ((n / 2 + MARGIN + 0.5) * board.spacing_mm for n in board.dots)
+    rectify = Rectifier(decoder, (half_x, half_y), board.diameter_mm)
     order = np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
     plan = CameraPose.from_plan(optics, nominal_angle_deg)
 
@@ -124,7 +127,8 @@ def find_dots(signals, decoder: LightFieldDecoder, board: DotBoard, nominal_angl
         at_plane = np.column_stack([found[place], np.full(len(place), board.planes_mm[plane])])
         seen[plane] = place, pose.rays(at_plane)[0]
         known = [(board.points_mm(p, MARGIN)[places], rays) for p, (places, rays) in seen.items()]
-        pose = pose.fitted(*(np.concatenate(part) for part in zip(*known, strict=True)), optics)
+        all_points, all_rays = (np.concatenate(part) for part in zip(*known, strict=True))
+        pose = pose.fitted(all_points, all_rays, optics)
 
     shift = _shift_to_edges([seen[plane][0] for plane in range(len(signals))], pose, decoder, board)
     dots, chiefs = [], []
@@ -196,7 +200,9 @@ def _on_lattice(miss: np.ndarray, targets: np.ndarray, board: DotBoard, bin_mm: 
     return bool(np.median(distance) < _CHANCE * radius)
 
 
-def _near_lattice(rectified: Rectified, targets: np.ndarray, board: DotBoard, sign: int):
+def _near_lattice(
+    rectified: Rectified, targets: np.ndarray, board: DotBoard, sign: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Blobs nearest to their predicted places; a common shift of all is allowed for first."""
     radius = search_radius_mm(board.spacing_mm)
     found, contrast = rectified.near(targets, radius, sign)
@@ -241,14 +247,17 @@ def _lit_share(pose: CameraPose, points: np.ndarray, decoder: LightFieldDecoder)
     rows, columns = decoder.optics.sensor_shape
     on_sensor = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     at = np.where(on_sensor, row, 0).astype(int), np.where(on_sensor, column, 0).astype(int)
-    return (on_sensor & (decoder.smooth_gain[at] > _LIT_GAIN)).mean(1)
+    share: np.ndarray = (on_sensor & (decoder.smooth_gain[at] > _LIT_GAIN)).mean(1)
+    return share
 
 
 def _in_field(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray:
     """Dots of which at least half of the light falls on the sensor."""
     position = _light_px(pose, points, optics)
     rows, columns = optics.sensor_shape
-    return ((position > -0.5) & (position < np.array([columns, rows]) - 0.5)).all(-1).mean(1) >= 0.5
+    inside = (position > -0.5) & (position < np.array([columns, rows]) - 0.5)
+    half: np.ndarray = np.all(inside, axis=-1).mean(1) >= 0.5
+    return half
 
 
 def _light_px(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray:

@@ -54,7 +54,8 @@ class CameraPose:
         turn = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
         tilt = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
         roll = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
-        return roll @ tilt @ turn
+        rotation: np.ndarray = roll @ tilt @ turn
+        return rotation
 
     def rays(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Array positions of the rays through the pupil's centre [mm], (n, 2), and slopes k = ds/du, (n,)."""
@@ -84,20 +85,26 @@ class CameraPose:
         """Where the rays (s, t), (u, v) cross the world plane z, as (x, y) [mm], shape (n, 2)."""
         magnification, distance, slope = self._lens
         rotation, dtype = self.rotation, array_mm.dtype
-        near = array_mm @ (-rotation[:2] / magnification).astype(dtype)  # the ray at the camera's focal plane z_c = 0
+        near: np.ndarray = array_mm @ (-rotation[:2] / magnification).astype(
+            dtype
+        )  # the ray at the camera's focal plane z_c = 0
         far = pupil_mm @ (slope * rotation[:2]).astype(dtype) + (distance * rotation[2]).astype(dtype)
         z = dtype.type(z_mm - self.parameters[5])
         share = (z - near[:, 2]) / (far[:, 2] - near[:, 2])
-        return near[:, :2] + share[:, None] * (far[:, :2] - near[:, :2]) + np.array(self.parameters[3:5], dtype)
+        offset = np.array(self.parameters[3:5], dtype)
+        crossing: np.ndarray = near[:, :2] + share[:, None] * (far[:, :2] - near[:, :2]) + offset
+        return crossing
 
-    def fitted(self, points_mm: np.ndarray, array_mm: np.ndarray, optics: Optics, slope=None) -> CameraPose:
+    def fitted(
+        self, points_mm: np.ndarray, array_mm: np.ndarray, optics: Optics, slope: np.ndarray | None = None
+    ) -> CameraPose:
         """Pose that best explains the chief rays (and slopes) of named dots, held near the nominal rig by a prior."""
         angle, tilt = np.radians(_PRIOR["angle_deg"]), np.radians(_PRIOR["tilt_deg"])
         sigma = np.array([angle, tilt, tilt] + 3 * [_PRIOR["offset_mm"]] + 3 * [_PRIOR["relative"]])
         mean = np.array((self.nominal[0],) + 8 * (0.0,))
         accuracy = _ROBUST_PITCHES * optics.microlens_pitch_mm
 
-        def residuals(parameters):
+        def residuals(parameters: np.ndarray) -> np.ndarray:
             chief, k = CameraPose(parameters=tuple(parameters), nominal=self.nominal).rays(points_mm)
             misses = [((chief - array_mm) / accuracy).ravel(), 0.1 * (parameters - mean) / sigma]
             if slope is not None:
@@ -132,7 +139,8 @@ class Rectified:
         """Strongest blob within `radius_mm` of each position: positions (x, y) [mm] and contrasts; 0 where none is."""
         response = np.pad(polarity * self.contrast, 1, constant_values=-np.inf)
         reach = int(np.ceil(radius_mm / self.bin_mm))
-        step = np.stack(np.mgrid[-reach : reach + 1, -reach : reach + 1], -1).reshape(-1, 2)
+        along = np.arange(-reach, reach + 1)
+        step = np.stack(np.meshgrid(along, along, indexing="ij"), -1).reshape(-1, 2)
         step = step[np.hypot(*step.T) * self.bin_mm <= radius_mm]
         at = np.rint((position_mm - self.corner_mm) / self.bin_mm).astype(int)[:, ::-1] + 1
         where = np.clip(at[:, None] + step, 1, np.array(response.shape) - 2)
@@ -143,7 +151,7 @@ class Rectified:
         inside = np.clip(best - 1, 1, np.array(self.contrast.shape) - 2)
         return self._refined(polarity * self.contrast, *inside.T), contrast
 
-    def _refined(self, response, row, col):
+    def _refined(self, response: np.ndarray, row: np.ndarray, col: np.ndarray) -> np.ndarray:
         """Peak of the parabola through three elements per axis."""
         centre, shift = response[row, col], []
         for ahead, behind in (
@@ -153,7 +161,8 @@ class Rectified:
             bend = 2 * centre - ahead - behind
             half = np.divide(ahead - behind, 2 * bend, out=np.zeros(len(row)), where=bend > 0)
             shift.append(np.clip(half, -0.5, 0.5))
-        return self.corner_mm + (np.stack([col, row], -1) + np.stack(shift, -1)) * self.bin_mm
+        peak: np.ndarray = self.corner_mm + (np.stack([col, row], -1) + np.stack(shift, -1)) * self.bin_mm
+        return peak
 
 
 class Rectifier:

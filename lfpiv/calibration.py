@@ -65,7 +65,7 @@ def calibrate(experiment: Experiment, progress: Progress | None = None) -> Calib
     cameras = {}
     for number, setup in enumerate(experiment.cameras):
 
-        def step(fraction, number=number):
+        def step(fraction: float, number: int = number) -> None:
             if progress is not None:
                 progress((number + fraction) / len(experiment.cameras))
 
@@ -174,7 +174,7 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
             images,
             decoder,
             DotBoard(
-                dots=tuple(board.dots),
+                dots=board.dots,
                 spacing_mm=board.spacing_mm,
                 diameter_mm=board.dot_diameter_mm,
                 planes_mm=tuple(board.planes_mm),
@@ -292,7 +292,8 @@ def _agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) -
     bad = misfit > max(OUTLIER * 1.4826 * float(np.median(misfit)), OUTLIER_PITCH * pitch_mm)
     if bad.any():
         log.info("%d dots disagree with their neighbours and are left out: %s", bad.sum(), number[bad].tolist())
-    return ~bad[inverse]
+    good: np.ndarray = ~bad[inverse]
+    return good
 
 
 def _warn(camera: CalibratedCamera) -> None:

@@ -15,7 +15,7 @@ from lfpiv.board import BoardDots
 from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
 from lfpiv.network import Network
-from lfpiv.rig import LensLattice, Optics
+from lfpiv.rig import LensLattice, Optics, pair
 from lfpiv.thinlens import ThinLensModel
 from lfpiv_kernels import mapping
 
@@ -78,7 +78,7 @@ class CalibratedCamera:
             raise ValueError(
                 f"points_mm, pupil_mm: expected shapes (n, 3) and (n, 2), got {points.shape} and {pupil.shape}."
             )
-        rays = 0.0 if self.baseline is None else self.baseline(points, pupil)
+        rays = np.zeros((len(points), 2)) if self.baseline is None else self.baseline(points, pupil)
         return rays if self.network is None else rays + self.network(np.hstack([points, pupil]))
 
     def map_fan(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
@@ -170,21 +170,20 @@ def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:
 
 
 def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
-    def values(prefix):
-        found = {}
+    def values(prefix: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
         for key, value in group.attrs.items():
             if key.startswith(prefix):
                 found[key[len(prefix) :]] = value.item() if isinstance(value, np.generic) else value
         return found
 
-    optics = values("optics.")
-    optics["sensor_shape"] = tuple(int(n) for n in optics["sensor_shape"])
-    lattice = values("lattice.")
-    lattice["origin_mm"] = tuple(float(x) for x in lattice["origin_mm"])
-    lattice["basis_mm"] = tuple(tuple(float(x) for x in row) for row in lattice["basis_mm"])
-    optics, lattice = Optics(**optics), LensLattice(**lattice)
+    nominal = values("optics.")
+    nominal["sensor_shape"] = tuple(int(n) for n in nominal["sensor_shape"])
+    cell = values("lattice.")
+    cell["origin_mm"], cell["basis_mm"] = pair(cell["origin_mm"]), tuple(pair(row) for row in cell["basis_mm"])
+    optics, lattice = Optics(**nominal), LensLattice(**cell)
 
-    def arrays(label):
+    def arrays(label: str) -> dict[str, Any]:
         part = group[label]
         return {key: value[()] for key, value in part.items()} | {
             key: value.item() for key, value in part.attrs.items()

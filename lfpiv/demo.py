@@ -13,7 +13,7 @@ import numpy as np
 
 from lfpiv import dataset, pipeline
 from lfpiv.flows import window_mean
-from lfpiv.job import Folder
+from lfpiv.folder import Folder
 from lfpiv.scene import Scene, open_scene
 from lfpiv.simulate import simulate
 

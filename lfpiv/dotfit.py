@@ -110,7 +110,8 @@ class LensIntegral:
     def support_mm(self, board_jacobian: np.ndarray, slope: np.ndarray) -> np.ndarray:
         """Half extent (s, t) of F [mm]: beyond it the dot sends no light through a lens, shape (2,)."""
         ellipse, pixel = self._blur(board_jacobian, slope)
-        return self._reach + np.hypot(*ellipse.T) + np.abs(pixel).sum(1) * (0.5 + 2 * self._blur_px)
+        extent: np.ndarray = self._reach + np.hypot(*ellipse.T) + np.abs(pixel).sum(1) * (0.5 + 2 * self._blur_px)
+        return extent
 
     def table(self, board_jacobian: np.ndarray, tilt: np.ndarray, slope: np.ndarray) -> LensTable:
         """Tabulate F and its derivatives for one dot."""
@@ -123,7 +124,7 @@ class LensIntegral:
             self._cells[size] = cell_spectrum(self._basis, step)
         return LensTable(self._cells[size], step, ellipse, pixel, self._blur_px, change)
 
-    def _blur(self, board_jacobian, slope):
+    def _blur(self, board_jacobian: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half axes of the dot's image, and the sides of a pupil pixel's image, as columns [mm]."""
         inverse = np.linalg.inv(np.eye(2) - slope)
         return inverse @ board_jacobian * self._radius, inverse @ slope * self._pixel_on_pupil
@@ -203,13 +204,22 @@ class LensIntegral:
                 break
         return self._summary(pixels, state, prior_information, converged)
 
-    def _variance(self, pixels, state):
+    def _variance(self, pixels: DotPixels, state: _State) -> np.ndarray:
         """Variance of each pixel: read noise, shot noise, the model's own error."""
         shot = self._counts_per_photon * np.maximum(pixels.signal - state.misfit, 0)
         shape = (_MODEL_ERROR * state.linear[1] * pixels.response) ** 2 * np.clip(state.share, 0, 1)
-        return self._noise_variance + shot + shape
+        variance: np.ndarray = self._noise_variance + shot + shape
+        return variance
 
-    def _state(self, pixels, terms, theta, table, linear, sign) -> _State:
+    def _state(
+        self,
+        pixels: DotPixels,
+        terms: np.ndarray,
+        theta: np.ndarray,
+        table: LensTable,
+        linear: np.ndarray | None,
+        sign: int,
+    ) -> _State:
         offset, inverse = lens_offset_mm(terms, theta, pixels.lens_mm, self.pupil_radius_mm)
         share, gradient, growth = table(offset, terms[:, 1:3])
         if linear is None:
@@ -218,7 +228,7 @@ class LensIntegral:
         misfit = pixels.signal - pixels.response * (linear[0] + linear[1] * share)
         return _State(theta, linear, terms, pixels.response, share, growth, along, misfit)
 
-    def _linear_start(self, pixels, share, sign):
+    def _linear_start(self, pixels: DotPixels, share: np.ndarray, sign: int) -> np.ndarray:
         """Find base and amplitude by weighted least squares; the amplitude keeps its sign."""
         weight = 1 / (self._noise_variance + self._counts_per_photon * np.maximum(pixels.signal, 0))
         design = pixels.response[:, None] * np.stack([np.ones_like(share), share], 1)
@@ -226,7 +236,7 @@ class LensIntegral:
         base, amplitude = np.linalg.solve(normal, design.T @ (weight * pixels.signal))
         return np.array([base, amplitude if sign * amplitude > 0 else 0.1 * sign])
 
-    def _summary(self, pixels, state, prior_information, converged) -> DotFit:
+    def _summary(self, pixels: DotPixels, state: _State, prior_information: np.ndarray, converged: bool) -> DotFit:
         weight = 1 / self._variance(pixels, state)
         normal, gradient = state.normal_equations(weight)
         normal[:12, :12] += prior_information

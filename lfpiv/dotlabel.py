@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfpiv.boardfind import FEWEST_DOTS, Detection, DotBoard
+from lfpiv.boardpose import CameraPose
 from lfpiv.dotfit import (
     FEWEST_PIXELS,
     TERMS,
@@ -96,18 +97,19 @@ def label_by_integral(
     response = decoder.coverage * decoder.shrunk_gain(share) * np.float32(decoder.white_counts)
 
     good = [k for k, fit in enumerate(fits) if fit is not None and fit.converged]
+    sure = [fit for fit in fits if fit is not None and fit.converged]
     if len(good) < min(FEWEST_DOTS, board.size):
         raise InputError(
             f"board: {len(dot)} blobs look like dots, but only {len(good)} of them fit a dot of diameter "
             f"{board.diameter_mm:g} mm. Check the board images and [board]."
         )
-    slopes = np.array([np.trace(slope_of(fits[k].coefficients, radius)) / 2 for k in good])
-    chief = np.array([fits[k].coefficients[0] for k in good])
+    slopes = np.array([np.trace(slope_of(fit.coefficients, radius)) / 2 for fit in sure])
+    chief = np.array([fit.coefficients[0] for fit in sure])
     rounds.pose = pose = detection.pose.fitted(points[good], chief, optics, slopes)
     candidates = _candidates(detection, board)
     wanted = board.of_dots_mm(candidates)
-    change = np.stack([fits[k].coefficients for k in good]) - _pose_terms(pose, points[good], radius)
-    spread = np.stack([_spread(fits[k]) for k in good])
+    change = np.stack([fit.coefficients for fit in sure]) - _pose_terms(pose, points[good], radius)
+    spread = np.stack([_spread(fit) for fit in sure])
     smooth, scatter = _smooth(points[good], change, spread, wanted, board)
     mean = _pose_terms(pose, wanted, radius) + smooth
     floor = np.take(_FLOOR_PITCHES, _ORDER)[:, None] * pitch
@@ -135,12 +137,22 @@ def _candidates(detection: Detection, board: DotBoard) -> np.ndarray:
 class _Rounds:
     """What both rounds of fits share."""
 
-    def __init__(self, signals, decoder, board, detection):
+    def __init__(
+        self, signals: Sequence[np.ndarray], decoder: LightFieldDecoder, board: DotBoard, detection: Detection
+    ):
         self.signals, self.decoder, self.board, self.sign = signals, decoder, board, detection.sign
         self.pose = detection.pose
         self.usable = (decoder.coverage > _FIT_COVERAGE) & (decoder.gain > 0)
 
-    def run(self, model, response, dots, mean, information, margin_mm):
+    def run(
+        self,
+        model: LensIntegral,
+        response: np.ndarray,
+        dots: np.ndarray,
+        mean: np.ndarray,
+        information: np.ndarray,
+        margin_mm: float,
+    ) -> tuple[list[DotFit | None], list[np.ndarray]]:
         """Fit dots; returns the fits, None where a dot has too few pixels, and where their pixels lie on the sensor."""
         points = self.board.of_dots_mm(dots)
         jacobians, tilts = self.pose.board_jacobian(points, model.pupil_radius_mm)
@@ -167,7 +179,9 @@ class _Rounds:
             taken.append(where)
         return fits, taken
 
-    def dot_and_blur(self, noise, response, dots, mean, information):
+    def dot_and_blur(
+        self, noise: float, response: np.ndarray, dots: np.ndarray, mean: np.ndarray, information: np.ndarray
+    ) -> tuple[float, float]:
         """Diameter the dots show [mm], and blur of the pixels [pixel]: what a sample of dots fits best.
 
         A dot drawn too large or too small is fitted in the wrong place wherever its light is cut by a lens's edge. The
@@ -182,8 +196,8 @@ class _Rounds:
             model = LensIntegral(
                 self.decoder, nominal * np.exp(size), np.sqrt(blur2), noise, self.decoder.counts_per_photon
             )
-            fits = self.run(model, response, dots[chosen], mean[chosen], prior, margin)[0]
-            fits = [fit for fit in fits if fit is not None and fit.converged]
+            tried = self.run(model, response, dots[chosen], mean[chosen], prior, margin)[0]
+            fits = [fit for fit in tried if fit is not None and fit.converged]
             if not fits:
                 break
             typical = np.median([fit.reduced_chi2 for fit in fits])
@@ -200,7 +214,14 @@ class _Rounds:
             log.warning("the board's dots look %.3g mm wide, not %.3g mm", nominal * np.exp(size), nominal)
         return float(nominal * np.exp(size)), float(np.sqrt(blur2))
 
-    def _pixels(self, model, theta, board_jacobian, neighbours_mm, margin_mm):
+    def _pixels(
+        self,
+        model: LensIntegral,
+        theta: np.ndarray,
+        board_jacobian: np.ndarray,
+        neighbours_mm: np.ndarray,
+        margin_mm: float,
+    ) -> np.ndarray:
         """Rows and columns of the usable pixels that may see a dot and none of its neighbours, shape (n, 2)."""
         decoder, optics = self.decoder, self.decoder.optics
         slope = slope_of(theta, model.pupil_radius_mm)
@@ -221,10 +242,11 @@ class _Rounds:
         for neighbour in neighbours_mm @ inverse.T:
             if (np.abs(neighbour) < 2 * support + margin_mm).all():
                 take &= (np.abs(offset - neighbour) > support).any(1)
-        return np.stack(at, axis=1)[take]
+        chosen: np.ndarray = np.stack(at, axis=1)[take]
+        return chosen
 
 
-def _pose_terms(pose, points, pupil_radius_mm):
+def _pose_terms(pose: CameraPose, points: np.ndarray, pupil_radius_mm: float) -> np.ndarray:
     """Ray models of the pose, shape (n, TERMS, 2) [mm]."""
     chief, slope = pose.rays(points)
     theta = np.zeros((len(points), TERMS, 2))
@@ -235,16 +257,19 @@ def _pose_terms(pose, points, pupil_radius_mm):
 
 def _spread(fit: DotFit) -> np.ndarray:
     """Return the standard errors of the ray model [mm], wider where the fit is poor, (TERMS, 2)."""
-    return np.sqrt(np.diag(fit.covariance) * max(fit.reduced_chi2, 1)).reshape(2, TERMS).T
+    error: np.ndarray = np.sqrt(np.diag(fit.covariance) * max(fit.reduced_chi2, 1))
+    return error.reshape(2, TERMS).T
 
 
-def _noise_and_response(fits, taken, decoder) -> tuple[float, float]:
+def _noise_and_response(
+    fits: Sequence[DotFit | None], taken: Sequence[np.ndarray], decoder: LightFieldDecoder
+) -> tuple[float, float]:
     """Shot noise of the images [counts], and the part of the white image's scatter that is pixel response.
 
     Where a dot is bright, light over fit minus 1 follows white over smooth white minus 1 for true response, and does
     not for noise of the white image; the slope between the two is the best weight for that scatter.
     """
-    deviation, relative, expected, miss = [], [], [], []
+    deviations, lights, misses = [], [], []
     for fit, where in zip(fits, taken, strict=True):
         if fit is None or not fit.converged:
             continue
@@ -253,12 +278,12 @@ def _noise_and_response(fits, taken, decoder) -> tuple[float, float]:
         light = (fit.base + fit.amplitude * fit.share[fit.share > _NOISE_SHARE]) * smooth
         light = light * decoder.coverage[at] * decoder.white_counts
         use = (smooth > 0) & (light > 0)
-        expected.append(light[use])
-        miss.append(fit.misfit[fit.share > _NOISE_SHARE][use])
-        deviation.append((decoder.gain[at] / np.maximum(smooth, 1e-3) - 1)[use])
-    if not expected:
+        lights.append(light[use])
+        misses.append(fit.misfit[fit.share > _NOISE_SHARE][use])
+        deviations.append((decoder.gain[at] / np.maximum(smooth, 1e-3) - 1)[use])
+    if not lights:
         return decoder.counts_per_photon, 1.0
-    deviation, expected, miss = (np.concatenate(part).astype(float) for part in (deviation, expected, miss))
+    deviation, expected, miss = (np.concatenate(part).astype(float) for part in (deviations, lights, misses))
     relative = miss / expected
     limit = 4 * _NORMAL_MAD * np.median(np.abs(relative))
     calm = (np.abs(relative) < limit) & (np.abs(deviation) < 0.5)
@@ -267,7 +292,9 @@ def _noise_and_response(fits, taken, decoder) -> tuple[float, float]:
     return max(float(np.median(left)) * _NORMAL_MAD**2, 1e-3), share
 
 
-def _smooth(points, change, spread, wanted, board) -> tuple[np.ndarray, np.ndarray]:
+def _smooth(
+    points: np.ndarray, change: np.ndarray, spread: np.ndarray, wanted: np.ndarray, board: DotBoard
+) -> tuple[np.ndarray, np.ndarray]:
     """Robust polynomial in (x, y, z), at most cubic, through each coefficient of the ray models.
 
     Returns its values at `wanted`, (n, TERMS, 2), and its standard deviation there: the scatter of the dots about it
@@ -281,7 +308,7 @@ def _smooth(points, change, spread, wanted, board) -> tuple[np.ndarray, np.ndarr
             break
     centre, half = points.mean(0), np.maximum(np.ptp(points, axis=0) / 2, 1e-9)
 
-    def design(where):
+    def design(where: np.ndarray) -> np.ndarray:
         scaled = (where - centre) / half
         return np.stack([np.prod(scaled ** np.array(p), axis=1) for p in powers], axis=1)
 
@@ -306,7 +333,9 @@ def _smooth(points, change, spread, wanted, board) -> tuple[np.ndarray, np.ndarr
     return values, sigma
 
 
-def _trusted(fits, plane, mean, sigma, pitch, sign) -> np.ndarray:
+def _trusted(
+    fits: Sequence[DotFit | None], plane: np.ndarray, mean: np.ndarray, sigma: np.ndarray, pitch: float, sign: int
+) -> np.ndarray:
     """Which fits are dots: converged, as good, as bright and as well placed as the others."""
     fitted = np.array([fit is not None and fit.converged and len(fit.pupil_mm) >= FEWEST_PIXELS for fit in fits])
     if not fitted.any():
@@ -318,29 +347,39 @@ def _trusted(fits, plane, mean, sigma, pitch, sign) -> np.ndarray:
     for p in np.unique(plane):
         typical = np.median(light[(plane == p) & fitted]) if ((plane == p) & fitted).any() else np.inf
         fitted &= (plane != p) | ((light > typical / _OUTLIER_LIGHT) & (light < typical * _OUTLIER_LIGHT))
-    for k in np.flatnonzero(fitted):
-        miss = np.abs(fits[k].coefficients[0] - mean[k, 0])
+    for k, fit in enumerate(fits):
+        if fit is None or not fitted[k]:
+            continue
+        miss = np.abs(fit.coefficients[0] - mean[k, 0])
         fitted[k] = (miss < np.maximum(_OUTLIER_SIGMA * sigma[k, 0], _OUTLIER_PITCHES * pitch)).all()
     return fitted
 
 
-def _integral_labels(fits, dots, trusted, rejected, decoder, share, diameter, blur) -> Labels:
+def _integral_labels(
+    fits: Sequence[DotFit | None],
+    dots: np.ndarray,
+    trusted: np.ndarray,
+    rejected: np.ndarray,
+    decoder: LightFieldDecoder,
+    share: float,
+    diameter: float,
+    blur: float,
+) -> Labels:
     """Sample the fitted ray models at pupil points near which each dot was seen."""
     optics = decoder.optics
     views = spread_over_pupil(PUPIL_PART * optics.pupil_radius_mm)
     terms = ray_terms(views, optics.pupil_radius_mm)
     near = (1.5 * optics.pupil_pixel_mm) ** 2
     pupil, array, std, owner = [], [], [], []
-    for k in np.flatnonzero(trusted):
-        fit = fits[k]
+    kept = [(dot, fit) for dot, fit, sure in zip(dots, fits, trusted, strict=True) if sure and fit is not None]
+    for dot, fit in kept:
         seen = (((views[:, None] - fit.pupil_mm[None]) ** 2).sum(-1) < near).any(1)
         covariance = fit.covariance[:TERMS, :TERMS] + fit.covariance[TERMS:, TERMS:]
         variance = np.einsum("va,ab,vb->v", terms[seen], covariance, terms[seen]) / 2
         pupil.append(views[seen])
         array.append(terms[seen] @ fit.coefficients)
         std.append(np.sqrt(variance * max(fit.reduced_chi2, 1)))
-        owner.append(np.full(seen.sum(), dots[k]))
-    kept = [fits[k] for k in np.flatnonzero(trusted)]
+        owner.append(np.full(seen.sum(), dot))
     return Labels(
         pupil_mm=np.concatenate(pupil) if pupil else np.empty((0, 2)),
         array_mm=np.concatenate(array) if array else np.empty((0, 2)),
@@ -348,9 +387,9 @@ def _integral_labels(fits, dots, trusted, rejected, decoder, share, diameter, bl
         dot=np.concatenate(owner) if owner else np.empty(0, int),
         rejected_dot=dots[rejected],
         measured_dot=dots[trusted],
-        chief_mm=np.array([fit.coefficients[0] for fit in kept]).reshape(-1, 2),
-        slope=np.array([slope_of(fit.coefficients, optics.pupil_radius_mm) for fit in kept]).reshape(-1, 2, 2),
-        reduced_chi2=np.array([fit.reduced_chi2 for fit in kept]),
+        chief_mm=np.array([fit.coefficients[0] for _, fit in kept]).reshape(-1, 2),
+        slope=np.array([slope_of(fit.coefficients, optics.pupil_radius_mm) for _, fit in kept]).reshape(-1, 2, 2),
+        reduced_chi2=np.array([fit.reduced_chi2 for _, fit in kept]),
         response_share=share,
         diameter_mm=diameter,
         blur_px=blur,

@@ -391,9 +391,12 @@ def _grid_of(volume: xr.DataArray, name: str) -> Grid:
         raise ValueError(
             f"{name}: expected evenly spaced cubic voxels, got steps of {steps.min()} to {steps.max()} mm."
         )
-    return Grid(shape=volume.shape, voxel_mm=voxel_mm, first_centre_mm=tuple(float(axis[0]) for axis in axes))
+    nz, ny, nx = volume.shape
+    z, y, x = (float(axis[0]) for axis in axes)
+    return Grid(shape=(nz, ny, nx), voxel_mm=voxel_mm, first_centre_mm=(z, y, x))
 
 
 def _voxel_place(points_mm: np.ndarray, grid: Grid) -> np.ndarray:
     """Points (x, y, z) [mm] as fractional voxel indices (z, y, x)."""
-    return (points_mm[:, ::-1] - np.asarray(grid.first_centre_mm)) / grid.voxel_mm
+    place: np.ndarray = (points_mm[:, ::-1] - np.asarray(grid.first_centre_mm)) / grid.voxel_mm
+    return place

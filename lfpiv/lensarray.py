@@ -16,7 +16,7 @@ import numpy as np
 from lfpiv.errors import InputError
 from lfpiv.lensbasis import cell_angle_deg, find_basis, find_phase, indices_inside, lattice_pitch
 from lfpiv.microimage import BLUR_REACH_PX, cut_patches, measure, robust_fit
-from lfpiv.rig import LAYOUTS, LensLattice, Optics
+from lfpiv.rig import LAYOUTS, LensLattice, Optics, pair
 
 log = logging.getLogger(__name__)
 
@@ -86,9 +86,7 @@ class LensArray:
         scale = 1 + optics.sensor_per_pupil
         origin = optics.sensor_mm(np.asarray(self.origin_px)) / scale
         basis = np.asarray(self.basis_px) * optics.pixel_mm / scale
-        return LensLattice(
-            origin_mm=tuple(origin.tolist()), basis_mm=tuple(map(tuple, basis.tolist())), layout=self.layout
-        )
+        return LensLattice(origin_mm=pair(origin), basis_mm=(pair(basis[0]), pair(basis[1])), layout=self.layout)
 
 
 def find_lens_array(
@@ -132,8 +130,8 @@ def find_lens_array(
     array = LensArray(
         centres_px=centres,
         index=index,
-        origin_px=tuple(origin.tolist()),
-        basis_px=tuple(map(tuple, basis.tolist())),
+        origin_px=pair(origin),
+        basis_px=(pair(basis[0]), pair(basis[1])),
         layout=layout,
         rms_px=rms,
         measured=measured,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import fft, ndimage
 
 from lfpiv.errors import InputError
@@ -69,10 +70,11 @@ def _evened(tile: np.ndarray, width: float) -> np.ndarray:
     """Tile less its local mean in units of its local contrast: unequal and dead lenses must not outweigh the gaps."""
     size = 2 * round(width / 2) + 1
     mean = ndimage.uniform_filter(tile, size)
-    even = tile / np.maximum(mean, 0.1 * max(mean.max(), 1e-30)) - 1
+    even: np.ndarray = tile / np.maximum(mean, 0.1 * max(mean.max(), 1e-30)) - 1
     contrast = np.sqrt(np.maximum(ndimage.uniform_filter(even**2, 2 * size + 1), 0))
     even /= np.maximum(contrast, max(np.median(contrast), 1e-30))
-    return even - even.mean()
+    even -= even.mean()
+    return even
 
 
 def _autocorrelation(tile: np.ndarray) -> np.ndarray:
@@ -104,8 +106,9 @@ def _overlap_sums(tile: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray,
     rows, columns = tile.shape
     left, right = np.maximum(-c, 0), columns - np.maximum(c, 0)  # columns that have a partner at column + c
 
-    def box(top, bottom, first, last):
-        return total[bottom, last] - total[top, last] - total[bottom, first] + total[top, first]
+    def box(top: np.ndarray, bottom: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+        inside: np.ndarray = total[bottom, last] - total[top, last] - total[bottom, first] + total[top, first]
+        return inside
 
     return box(0 * r, rows - r, left, right), box(r, rows + 0 * r, left + c, right + c)
 
@@ -161,8 +164,9 @@ def _standard_basis(lag: np.ndarray, layout: str) -> np.ndarray:
     """Lattice vectors, ordered and signed as `LensArray.basis_px` says, of the lattice that one of them spans."""
     turn, lowest = (60.0, -15.0) if layout == "hexagonal" else (90.0, -45.0)
     angle = math.degrees(math.atan2(lag[1], lag[0]))
-    angle = np.radians(lowest + (angle - lowest) % turn + np.array([0, turn]))
-    return np.hypot(*lag) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    angles = np.radians(lowest + (angle - lowest) % turn + np.array([0, turn]))
+    basis: np.ndarray = np.hypot(*lag) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return basis
 
 
 def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np.ndarray:
@@ -192,16 +196,17 @@ def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np
         reach *= 2
 
 
-def indices_inside(origin: np.ndarray, basis: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def indices_inside(origin: np.ndarray, basis: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
     """List the indices (i, j) of all lattice nodes with low <= node < high, row after row, shape (node, 2)."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
     reach = (corners - origin) @ np.linalg.inv(basis)
     first, last = np.floor(reach.min(0)).astype(int), np.ceil(reach.max(0)).astype(int)
     j, i = (a.ravel() for a in np.mgrid[first[1] : last[1] + 1, first[0] : last[0] + 1])
-    index = np.stack([i, j], axis=1)
+    index: np.ndarray = np.stack([i, j], axis=1)
     node = origin + index @ basis
-    return index[((node >= low) & (node < high)).all(1)]
+    inside: np.ndarray = index[((node >= low) & (node < high)).all(1)]
+    return inside
 
 
 # Phase from the symmetry of the mean cell ----------------------------------------------------------------------------
@@ -230,7 +235,8 @@ def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
         brightness = [(cell.ravel()[disc[:, c[0] * bins + c[1]]]).mean() for c in (centre, (centre + bins // 2) % bins)]
         centre = centre if brightness[0] >= brightness[1] else (centre + bins // 2) % bins
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape[::-1]]
-    return centre / bins @ basis + start
+    phase: np.ndarray = centre / bins @ basis + start
+    return phase
 
 
 def _mean_cell(crop: np.ndarray, basis: np.ndarray, bins: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from lfpiv.errors import InputError
@@ -123,7 +124,8 @@ class LightFieldDecoder:
         The rest is noise of the white image. 1 gives `gain`, 0 gives `smooth_gain`; a measured board tells the best
         share (`lfpiv.board.BoardDots.response_share`).
         """
-        return self.smooth_gain + np.float32(response_share) * (self.gain - self.smooth_gain)
+        gain: np.ndarray = self.smooth_gain + np.float32(response_share) * (self.gain - self.smooth_gain)
+        return gain
 
     def sub_aperture(
         self, image: np.ndarray, pupil_mm: tuple[float, float], *, level: float | None = None
@@ -154,7 +156,7 @@ class LightFieldDecoder:
         index = self.lens_grid()
         return self.sample(image - np.float32(level), index, pupil_mm), self.lattice.centres_mm(index)
 
-    def sample(self, signal: np.ndarray, lens_index: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+    def sample(self, signal: np.ndarray, lens_index: np.ndarray, pupil_mm: ArrayLike) -> np.ndarray:
         """White-normalised light of chosen lenses at chosen pupil points; nan where they are not seen.
 
         Parameters
@@ -183,7 +185,8 @@ class LightFieldDecoder:
         """Lattice indices (i, j) of a rectangle of lenses that covers the sensor, shape (I, J, 2)."""
         low = self.lens_index.min((0, 1)).astype(int)
         high = self.lens_index.max((0, 1)).astype(int)
-        return np.stack(np.mgrid[low[0] : high[0] + 1, low[1] : high[1] + 1], axis=-1)
+        along = [np.arange(first, last + 1) for first, last in zip(low, high, strict=True)]
+        return np.stack(np.meshgrid(*along, indexing="ij"), axis=-1)
 
 
 def _checked(name: str, image: np.ndarray, optics: Optics) -> np.ndarray:
@@ -220,12 +223,14 @@ def _assign_lenses(optics: Optics, lattice: LensLattice) -> tuple[np.ndarray, np
 def _neighbours(lattice: LensLattice) -> np.ndarray:
     """Vectors to the lenses around a lens [mm], shape (n, 2)."""
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    vectors = np.asarray(steps, float) @ np.asarray(lattice.basis_mm)
-    return vectors[np.hypot(*vectors.T) < 1.6 * lattice.pitch_mm]  # drops the far corners of a hexagonal lattice
+    vectors: np.ndarray = np.asarray(steps, float) @ np.asarray(lattice.basis_mm)
+    near: np.ndarray = vectors[np.hypot(*vectors.T) < 1.6 * lattice.pitch_mm]  # not a hexagon's far corners
+    return near
 
 
 def _neighbour_distances(lattice: LensLattice) -> np.ndarray:
-    return np.hypot(*_neighbours(lattice).T)
+    distances: np.ndarray = np.linalg.norm(_neighbours(lattice), axis=1)
+    return distances
 
 
 def _cover(optics: Optics, lattice: LensLattice, offset_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -256,8 +261,9 @@ def disc_fraction(offset: np.ndarray, radius: float) -> tuple[np.ndarray, np.nda
     reach = -(outside[edge] + 1 / (24 * max(radius, 1.0)))  # the pixel's centre inside the edge
     half_sum, half_gap = (normal[:, 0] + normal[:, 1]) / 2, (normal[:, 0] - normal[:, 1]) / 2
 
-    def ramp(x):
-        return np.maximum(x, 0) ** 2
+    def ramp(x: np.ndarray) -> np.ndarray:
+        square: np.ndarray = np.maximum(x, 0) ** 2
+        return square
 
     share = ramp(reach + half_sum) - ramp(reach + half_gap) - ramp(reach - half_gap) + ramp(reach - half_sum)
     fraction[edge] = np.clip(share / (2 * normal[:, 0] * normal[:, 1]), 0, 1)

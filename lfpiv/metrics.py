@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from skimage.metrics import structural_similarity
 
 from lfpiv.ghosts import (
@@ -267,10 +268,14 @@ def dot_error(positions_mm: np.ndarray, spacing_mm: float, planes_mm: Sequence[f
 def _row_means(values: np.ndarray) -> np.ndarray:
     """Mean of each row without its NaN; NaN where nothing is left."""
     count = np.isfinite(values).sum(1)
-    return np.divide(np.nansum(values, axis=1), count, out=np.full(len(values), np.nan), where=count > 0)
+    means = np.full(len(values), np.nan)
+    np.divide(np.nansum(values, axis=1), count, out=means, where=count > 0)
+    return means
 
 
-def _checked_pair(first, second, names=("image", "reference")) -> tuple[np.ndarray, np.ndarray]:
+def _checked_pair(
+    first: ArrayLike, second: ArrayLike, names: tuple[str, str] = ("image", "reference")
+) -> tuple[np.ndarray, np.ndarray]:
     first, second = np.asarray(first, float), np.asarray(second, float)
     if first.shape != second.shape or first.size == 0:
         raise ValueError(f"{names[1]}: expected the shape of {names[0]}, {first.shape}, got {second.shape}.")

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lfpiv_kernels.trace import POWERS
+
+if TYPE_CHECKING:
+    from lfpiv.camera import CalibratedCamera
 
 RINGS = ((0.0, 1), (0.5, 6), (0.97, 12))
 """Pupil points at which the mapping is evaluated: (radius / pupil radius, points on the ring)."""
@@ -14,7 +18,7 @@ CHUNK_POINTS = 100_000
 """Object points per evaluation: bounds the scratch memory."""
 
 
-def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
+def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
     """Fit polynomials of the pupil point to the rays of object points.
 
     Parameters
@@ -39,7 +43,7 @@ def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
     pupil = (unit * radius).astype(np.float32)
     both = np.zeros((len(unit), 2, 2, len(powers)), np.float32)  # one product for s and t: their rays lie side by side
     both[:, 0, 0], both[:, 1, 1] = solve.T, solve.T
-    both = both.reshape(2 * len(unit), -1)
+    product = both.reshape(2 * len(unit), -1)
     out = np.empty((len(points_mm), 2, len(powers)), np.float32)
     for first in range(0, len(points_mm), CHUNK_POINTS):
         part = points_mm[first : first + CHUNK_POINTS]
@@ -47,12 +51,12 @@ def fit_rays(camera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
         middle = rays[:, :2].copy()
         for axis in range(2):  # differences keep single precision where it matters
             rays[:, axis::2] -= middle[:, axis, None]
-        out[first : first + len(part)] = (rays @ both).reshape(-1, 2, len(powers))
+        out[first : first + len(part)] = (rays @ product).reshape(-1, 2, len(powers))
         out[first : first + len(part), :, 0] += middle
     return out
 
 
-def ray_models(camera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
+def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
     """Ray models of voxels for the footprint kernels, see ``lfpiv_kernels.raymodel.MODEL_SIZE``.
 
     The projected edges are differences of the mapping between opposite faces of the voxel.
@@ -73,7 +77,10 @@ def ray_models(camera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
 
 
 def grid_models(
-    camera, shape: tuple[int, int, int], centres_mm: Callable[[np.ndarray], np.ndarray], axes: tuple[int, int, int]
+    camera: CalibratedCamera,
+    shape: tuple[int, int, int],
+    centres_mm: Callable[[np.ndarray], np.ndarray],
+    axes: tuple[int, int, int],
 ) -> Iterator[np.ndarray]:
     """Ray models of a grid's voxels, plane by plane of its outermost axis.
 
@@ -99,7 +106,7 @@ def grid_models(
     outer, rows, columns = shape
     inner = np.stack(np.meshgrid(np.arange(-1, rows + 1), np.arange(-1, columns + 1), indexing="ij"), -1).reshape(-1, 2)
 
-    def fits(plane):
+    def fits(plane: int) -> np.ndarray:
         index = np.column_stack([np.full(len(inner), plane), inner])
         return fit_rays(camera, centres_mm(index), degree=2).reshape(rows + 2, columns + 2, 2, 6)
 
@@ -122,4 +129,5 @@ def grid_models(
 
 def _finite(model: np.ndarray) -> np.ndarray:
     """Send a voxel in the lens's own plane far off the sensor."""
-    return np.nan_to_num(model, copy=False, nan=1e9, posinf=1e9, neginf=-1e9)
+    finite: np.ndarray = np.nan_to_num(model, copy=False, nan=1e9, posinf=1e9, neginf=-1e9)
+    return finite

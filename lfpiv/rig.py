@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 LAYOUTS = ("square", "hexagonal")
 
@@ -108,6 +109,12 @@ class Grid:
         """All voxel centres in C order of (z, y, x), as (x, y, z) points [mm], shape (voxel, 3)."""
         z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in range(3)), indexing="ij")
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+
+
+def pair(values: ArrayLike) -> tuple[float, float]:
+    """Return two numbers as a tuple of Python floats."""
+    first, second = np.asarray(values, float).tolist()
+    return first, second
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,9 +22,13 @@ class SceneBoard(Table):
     """Table ``[board]``: the calibration board and its depths."""
 
     dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
+    """Dots along x and y."""
     spacing_mm: Positive
+    """Distance of neighbouring dots [mm]."""
     dot_diameter_mm: Positive
+    """Diameter of a dot [mm]."""
     planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
+    """Depth z of each plane [mm]."""
     inverted: Flag = False
     """Dark dots on a bright board."""
 
@@ -45,8 +49,11 @@ class SceneVolume(Table):
     """Table ``[volume]``: the volume to reconstruct, (x, y, z) order."""
 
     centre_mm: Point = (0.0, 0.0, 0.0)
+    """Centre (x, y, z) of the volume [mm]."""
     size_mm: tuple[Positive, Positive, Positive]
+    """Size (x, y, z) of the volume [mm]."""
     voxel_mm: Positive
+    """Edge of a voxel [mm]."""
 
 
 class SceneParticles(Table):
@@ -57,6 +64,7 @@ class SceneParticles(Table):
     count: Count | None = None
     """Particles of each pair."""
     pairs: Count = 1
+    """Number of image pairs, each with particles of its own."""
     fill: Positive = 1.0
     """Edges of the seeded region relative to the volume's; above 1 there are particles outside the volume too."""
     intensity_sd: NonNegative = 0.0
@@ -112,8 +120,11 @@ class Scene(Table):
     """The whole scene file. `smart`, `correlation`, `network`, `compute` are copied into the experiment file."""
 
     name: Annotated[str, Field(min_length=1)]
+    """Name of the experiment."""
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Whole number that every random draw derives from."""
     dt_s: Positive
+    """Time between the two frames of a pair [s]."""
     camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1)]
     window: Windows = ()
     """Windows of the cameras that name none of their own."""
@@ -144,7 +155,7 @@ class Scene(Table):
     @field_validator("window", "aberrations")
     @classmethod
     def _suit_every_camera(cls, value: Any, info: ValidationInfo) -> Any:
-        optics = {"window": (), "aberrations": None} | {info.field_name: value}
+        optics: dict[str, Any] = {"window": (), "aberrations": None} | {str(info.field_name): value}
         try:
             for camera in info.data.get("camera", ()):
                 camera.with_optics(**optics)

@@ -89,12 +89,15 @@ class SceneCamera(NominalCamera):
     """Table ``[[camera]]``: nominal optics, which the user is told, and what is true, which the user is not."""
 
     sensor_width_px: Count
+    """Columns of the sensor."""
     sensor_height_px: Count
+    """Rows of the sensor."""
     true_yaw_deg: Number | None = None
     """True camera angle about y [degree]; absent: the nominal one."""
     true_pitch_deg: Number = 0.0
+    """Right-handed rotation about the camera's x axis, after the yaw [degree]."""
     true_roll_deg: Number = 0.0
-    """Right-handed rotations about the camera's x and z axis, after the yaw [degree]."""
+    """Right-handed rotation about the camera's z axis, after the pitch [degree]."""
     true_offset_mm: Point = (0.0, 0.0, 0.0)
     """World point imaged in focus at the sensor's centre (x, y, z) [mm], as if the camera had been set up through its
     windows."""
@@ -169,7 +172,8 @@ class SceneCamera(NominalCamera):
         about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
         about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
         about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        return about_z @ about_x @ about_y
+        rotation: np.ndarray = about_z @ about_x @ about_y
+        return rotation
 
     @property
     def axis_point_mm(self) -> np.ndarray:
@@ -180,7 +184,7 @@ class SceneCamera(NominalCamera):
         focused = np.asarray(self.true_offset_mm, float)
         if not self.window:
             return focused
-        optics, axis_point = self.optics, focused
+        optics, axis_point = self.optics, focused.copy()
         radius, so = optics.pupil_radius_mm / np.sqrt(2), optics.object_distance_mm
         pupil = radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         for _ in range(FOCUS_STEPS):
@@ -190,7 +194,7 @@ class SceneCamera(NominalCamera):
             crossing = (seen[:, :2] * so - pupil * seen[:, 2:]) / (so - seen[:, 2:])
             defocus = so * (crossing * pupil).sum() / (pupil**2).sum()
             step = np.array([*crossing[0], -defocus])
-            axis_point = axis_point + step @ self.rotation
+            axis_point += step @ self.rotation
             if np.abs(step).max() < FOCUS_MM:
                 return axis_point
         raise ValueError(f"camera {self.name!r}: window: no place found from which true_offset_mm is in focus.")
@@ -200,9 +204,9 @@ class SceneCamera(NominalCamera):
         return raytrace.pack_plates(
             np.array([window.normal for window in windows]).reshape(-1, 3) @ self.rotation.T,
             (np.array([window.point_mm for window in windows]).reshape(-1, 3) - axis_point_mm) @ self.rotation.T,
-            [window.thickness_mm for window in windows],
-            [window.index for window in windows],
-            [window.medium_index for window in windows],
+            np.array([window.thickness_mm for window in windows]),
+            np.array([window.index for window in windows]),
+            np.array([window.medium_index for window in windows]),
             object_distance_mm=self.optics.object_distance_mm,
         )
 
@@ -228,7 +232,9 @@ class SceneCamera(NominalCamera):
         roll = np.radians(self.true_array_roll_deg)
         second = np.radians(60 if self.microlens_layout == "hexagonal" else 90)
         basis = [(pitch * np.cos(angle + roll), pitch * np.sin(angle + roll)) for angle in (0.0, second)]
-        return LensLattice(origin_mm=self.true_array_offset_mm, basis_mm=tuple(basis), layout=self.microlens_layout)
+        return LensLattice(
+            origin_mm=self.true_array_offset_mm, basis_mm=(basis[0], basis[1]), layout=self.microlens_layout
+        )
 
 
 def true_mapping(camera: SceneCamera | Mapping[str, Any]) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -256,7 +262,9 @@ def true_mapping(camera: SceneCamera | Mapping[str, Any]) -> Callable[[np.ndarra
             seen = raytrace.apparent_points(seen, pupil_mm, optics.object_distance_mm, plates)
         m = optics.image_distance_mm / (optics.object_distance_mm - seen[..., 2:])
         k = m * seen[..., 2:] / optics.object_distance_mm
-        array = k * np.asarray(pupil_mm, float) - m * seen[..., :2]
-        return array + raytrace.aberration_mm(array, pupil_mm, seidel) if np.any(seidel[4:]) else array
+        array: np.ndarray = k * np.asarray(pupil_mm, float) - m * seen[..., :2]
+        if np.any(seidel[4:]):
+            array += raytrace.aberration_mm(array, pupil_mm, seidel)
+        return array
 
     return mapping

@@ -83,14 +83,18 @@ def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
     optics, points_mm = camera.optics, np.asarray(points_mm, float)
     if not camera.window and camera.aberrations is None:
         seen = (points_mm - camera.axis_point_mm) @ camera.rotation.T
-        return abs(camera.rotation[2, 2]) * (optics.image_distance_mm / (optics.object_distance_mm - seen[:, 2])) ** 2
+        scale: np.ndarray = (
+            abs(camera.rotation[2, 2]) * (optics.image_distance_mm / (optics.object_distance_mm - seen[:, 2])) ** 2
+        )
+        return scale
     ring, angle = np.meshgrid(np.sqrt((np.arange(4) + 0.5) / 4), 2 * np.pi * np.arange(8) / 8)
     pupil = optics.pupil_radius_mm * np.stack([ring * np.cos(angle), ring * np.sin(angle)], -1).reshape(-1, 2)
     mapping, step = true_mapping(camera), AREA_STEP_MM * np.eye(3)[:2]
     at, pupil = np.repeat(points_mm, len(pupil), axis=0), np.tile(pupil, (len(points_mm), 1))
     along_x, along_y = ((mapping(at + h, pupil) - mapping(at - h, pupil)) / (2 * AREA_STEP_MM) for h in step)
-    area = np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0])
-    return area.reshape(len(points_mm), -1).mean(axis=1)
+    area: np.ndarray = np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0])
+    mean: np.ndarray = area.reshape(len(points_mm), -1).mean(axis=1)
+    return mean
 
 
 def place_particles(scene: Scene, pair: int) -> Placed:
@@ -246,7 +250,7 @@ def _write(scene: Scene, pairs: list[Placed], folder: Path, progress: Progress) 
             done += 1
             progress("simulated images", done, total)
     (folder / "truth").mkdir()
-    truth = {}
+    truth: dict[str, Any] = {}
     for pair, (position, displacement, intensity) in enumerate(pairs):
         truth[f"pair_{pair:04d}_positions_mm"] = position
         truth[f"pair_{pair:04d}_displacement_mm"] = displacement

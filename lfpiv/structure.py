@@ -59,7 +59,8 @@ def _clipped(values: np.ndarray, core: np.ndarray) -> np.ndarray:
     """Clip to a few robust standard deviations about the median, so that no hot pixels outweigh the rest."""
     median = float(np.median(values[core]))
     reach = _CLIP * max(1.4826 * float(np.median(np.abs(values[core] - median))), _SMALLEST_COUNT)
-    return np.clip(values, median - reach, median + reach)
+    clipped: np.ndarray = np.clip(values, median - reach, median + reach)
+    return clipped
 
 
 def _correlation(values: np.ndarray, core: np.ndarray, lens_index: np.ndarray, down: int, aside: int) -> float:

@@ -76,7 +76,7 @@ def validate(
         prediction = predict(first, valid, todo)
         judged = prediction.count >= needed[todo]
         agrees = _agrees(first[todo], prediction, search)
-        if predicted is not None:
+        if predicted is not None and peak_ratio is not None:
             step = first - predicted
             agrees |= (peak_ratio[todo] >= CLEAR_RATIO) & _agrees(step[todo], predict(step, valid, todo), search)
         passed = valid.copy()

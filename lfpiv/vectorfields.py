@@ -82,7 +82,7 @@ def displacement_difference(
     counted = np.ones(fields[0].shape[:3], bool) if where is None else np.asarray(where)
     if counted.shape != fields[0].shape[:3] or counted.dtype != bool:
         raise ValueError(f"where: expected bool of shape {fields[0].shape[:3]}, got {counted.dtype} {counted.shape}.")
-    difference = (fields[0] - fields[1])[counted]
+    difference: np.ndarray = (fields[0] - fields[1])[counted]
     bad = len(difference) - int(np.isfinite(difference).all(1).sum())
     if bad or not len(difference):
         found = f"{bad} that are not" if bad else "no vector"
@@ -208,7 +208,7 @@ def vorticity(vectors: xr.Dataset | np.ndarray, *, grid: Grid | None = None) -> 
     curl = {}
     for axis, (one, two) in {"x": ("wy", "vz"), "y": ("uz", "wx"), "z": ("vx", "uy")}.items():
         curl[f"vorticity_{axis}"] = _of(g, *one) - _of(g, *two)
-    curl["magnitude"] = np.sqrt(sum(part**2 for part in curl.values()))
+    curl["magnitude"] = sum(part**2 for part in curl.values()) ** 0.5
     names = {name: f"vorticity along {name[-1]}" for name in curl} | {"magnitude": "magnitude of the vorticity"}
     return xr.Dataset({name: part.assign_attrs(units="1/s", long_name=names[name]) for name, part in curl.items()})
 

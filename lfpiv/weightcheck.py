@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from lfpiv.raymodel import ray_models
 from lfpiv.weightblocks import StoredGrid, count_voxels, fill, measure, pack_camera
 from lfpiv_kernels.project import Blocks
 from lfpiv_kernels.raymodel import LANES
+
+if TYPE_CHECKING:
+    from lfpiv.camera import CalibratedCamera
 
 VOXELS = 6
 """Voxels counted per camera."""
@@ -23,7 +27,7 @@ three quarters of the project's goals, for a small sample may miss the worst; st
 class CountedVoxels:
     """A few random voxels of one camera, counted twice with independent rays."""
 
-    def __init__(self, stored: StoredGrid, camera, seed: int = 0):
+    def __init__(self, stored: StoredGrid, camera: CalibratedCamera, seed: int = 0):
         self.camera = camera
         rng = np.random.default_rng(seed)
         self.voxels = np.sort(rng.choice(stored.grid.size, min(VOXELS, stored.grid.size), replace=False))
@@ -91,7 +95,7 @@ class CountedVoxels:
 
 def profiles_serve(errors: Sequence[float]) -> bool:
     """Whether profiles are near enough to counted rays."""
-    return not errors or (np.mean(errors) <= PROFILES_MEAN and max(errors) <= PROFILES_WORST)
+    return not errors or bool(np.mean(errors) <= PROFILES_MEAN and max(errors) <= PROFILES_WORST)
 
 
 def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
@@ -102,7 +106,7 @@ def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
     np.add.at(image.ravel(), blocks.microimages.pixel[ray[lit]], weight[lit] * share[lit])
 
 
-def _cut(image: np.ndarray, corner, shape) -> np.ndarray:
+def _cut(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Cut a window out of a sensor image, zero outside it."""
     out = np.zeros(shape, image.dtype)
     column, row = (int(c) for c in corner)

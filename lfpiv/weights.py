@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,6 +31,9 @@ from lfpiv.weightcheck import CountedVoxels, add_entries, profiles_serve
 from lfpiv_kernels import footprint, runtime
 from lfpiv_kernels.project import Projector
 from lfpiv_kernels.raymodel import LANES, LEVELS, MODEL_SIZE
+
+if TYPE_CHECKING:
+    from lfpiv.camera import CalibratedCamera, Calibration
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +56,7 @@ class Weights:
 
     def __init__(
         self,
-        cameras: Mapping[str, object],
+        cameras: Mapping[str, CalibratedCamera],
         grid: Grid,
         method: str,
         form: str = "auto",
@@ -137,7 +141,8 @@ class Weights:
             _add_window(image, counts[0] / max(int(total[0]), 1), corner[0])
         else:
             add_entries(image, self.projector(camera).blocks, index)
-        return image * setup.gain
+        weights: np.ndarray = image * setup.gain
+        return weights
 
     @property
     def column_sum(self) -> np.ndarray:
@@ -186,7 +191,7 @@ class Weights:
             self._counted[name] = CountedVoxels(self.stored, self.cameras[name])
         return self._counted[name]
 
-    def _camera(self, name: str):
+    def _camera(self, name: str) -> CalibratedCamera:
         if name not in self.cameras:
             raise ValueError(f"camera: expected one of {', '.join(self.cameras)}, got {name!r}.")
         return self.cameras[name]
@@ -197,7 +202,7 @@ class Weights:
         runtime.device()
         for number, (name, camera) in enumerate(self.cameras.items()):
 
-            def step(fraction, number=number):
+            def step(fraction: float, number: int = number) -> None:
                 if progress is not None:
                     progress((number + fraction) / len(self.cameras))
 
@@ -229,7 +234,7 @@ class Weights:
 
         return allow
 
-    def _choose(self, name: str, camera) -> str:
+    def _choose(self, name: str, camera: CalibratedCamera) -> str:
         """Form of a camera's weights: profiles where counted rays say that they serve."""
         if self._asked != "auto":
             return self._asked
@@ -290,7 +295,7 @@ class Adjoint:
 
 
 def build_weights(
-    calibration,
+    calibration: Calibration,
     grid: Grid,
     method: str = "footprint",
     *,
@@ -346,7 +351,7 @@ def build_weights(
     return weights
 
 
-def estimate_memory(calibration, grid: Grid, form: str = "auto") -> int:
+def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") -> int:
     """Memory that the weights of a grid will need [byte], from a sample of its voxels; nothing large is allocated.
 
     With the form "auto" that of profiles where the microlens layout allows them: what will do for straight rays.
@@ -385,7 +390,7 @@ def _add_window(image: np.ndarray, window: np.ndarray, corner: np.ndarray) -> No
         ]
 
 
-def _checked_image(images: Mapping[str, np.ndarray], name: str, camera) -> np.ndarray:
+def _checked_image(images: Mapping[str, np.ndarray], name: str, camera: CalibratedCamera) -> np.ndarray:
     if name not in images:
         raise ValueError(f"images: camera {name!r} is missing; found {', '.join(images) or 'none'}.")
     image = np.asarray(images[name])
@@ -394,7 +399,7 @@ def _checked_image(images: Mapping[str, np.ndarray], name: str, camera) -> np.nd
     return image
 
 
-def _checked_out(images: Mapping[str, np.ndarray], name: str, camera) -> np.ndarray:
+def _checked_out(images: Mapping[str, np.ndarray], name: str, camera: CalibratedCamera) -> np.ndarray:
     image = _checked_image(images, name, camera)
     if image is not images[name] or image.dtype != np.float32 or not image.flags.c_contiguous:
         raise ValueError(f"out[{name!r}]: expected a C-contiguous float32 array to write into.")
