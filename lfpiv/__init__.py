@@ -21,17 +21,19 @@ _MODULES = {
     "build_weights": "lfpiv.weights",
     "calibrate": "lfpiv.calibration",
     "correlate": "lfpiv.vectors",
+    "export_results": "lfpiv.export",
     "find_lens_array": "lfpiv.lensarray",
     "load_calibration": "lfpiv.calibration",
     "open_experiment": "lfpiv.experiment",
+    "open_results": "lfpiv.results",
     "reconstruct": "lfpiv.volume",
     "run": "lfpiv.pipeline",
     "thin_lens": "lfpiv.calibration",
     "write_report": "lfpiv.report",
 }
 
-_SUBMODULES = ("metrics",)
-"""Modules that are public as a whole: `lfpiv.metrics`."""
+_SUBMODULES = ("derived", "metrics", "statistics")
+"""Modules that are public as a whole, such as `lfpiv.metrics`."""
 
 __all__ = [
     "Calibration",
@@ -44,9 +46,11 @@ __all__ = [
     "build_weights",
     "calibrate",
     "correlate",
+    "export_results",
     "find_lens_array",
     "load_calibration",
     "open_experiment",
+    "open_results",
     "reconstruct",
     "run",
     "thin_lens",

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import importlib.metadata
+import io
 import json
 import math
 import os
 import platform
+import secrets
+import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,10 +21,11 @@ import numpy as np
 import xarray as xr
 
 import lfpiv
+from lfpiv.davis import split_frame
 from lfpiv.errors import InputError
 
-SCHEMA_VERSION = 1
-"""Version of the form of the files; readers refuse newer ones."""
+SCHEMA_VERSION = 2
+"""Version of the form of the files; readers refuse newer ones. 2: the group has dimensions of its own."""
 
 VECTOR_UNITS = {
     "u": "m/s",
@@ -35,19 +40,43 @@ VECTOR_UNITS = {
 }
 """Variables of a vector dataset and their units."""
 
+RECONSTRUCTION = "reconstruction"
+"""NetCDF group beside the vectors of a pair: projections and residuals of its two volumes."""
+
 _AXES = ("z", "y", "x")
-_RECONSTRUCTION = "reconstruction"  # NetCDF group beside the vectors: projections and residuals of the two volumes
+_GROUP_AXES = {axis: f"voxel_{axis}" for axis in _AXES}  # the group's axes in the file, where z, y, x are the vectors'
+_DESCRIPTIONS: dict[str, dict[str, Any]] = {
+    "z": {"axis": "Z"},
+    "y": {"axis": "Y"},
+    "x": {"axis": "X"},
+    "valid": {
+        "standard_name": "quality_flag",
+        "flag_values": np.array([0, 1], np.int8),
+        "flag_meanings": "replaced measured",
+    },
+}  # attributes of the CF conventions, which plotting and geometry tools look for
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a scratch path in the folder of `path`; renamed to `path` at the end, removed on any failure."""
-    scratch = path.with_name(f".{path.name}.tmp")
+    """Give a scratch path in the folder of `path`; renamed to `path` at the end, removed on any failure.
+
+    The path is new each time, so that two processes may write one file; what a killed one leaves ends in ``.tmp``.
+    """
+    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield scratch
+        with scratch.open("rb") as file:
+            os.fsync(file.fileno())  # the name must not outlive a power failure without its bytes
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
+
+
+def write_bytes(content: bytes | memoryview, path: Path) -> None:
+    """Write a file, whole or not at all; HDF5 files too: HDF5's own writing crashes the process on a full disk."""
+    with replacing(path) as scratch:
+        scratch.write_bytes(content)
 
 
 def write_text(text: str, path: Path) -> None:
@@ -83,13 +112,14 @@ def settings_hash(**parts: Any) -> str:
 
 
 def content_hash(paths: Iterable[Path]) -> str:
-    """Hash of the bytes of several files, in order."""
+    """Hash of the bytes of several images, in order; a frame of a file that holds several counts, too."""
     digest = hashlib.blake2b(digest_size=16)
     for path in paths:
-        with path.open("rb") as file:
+        image, frame = split_frame(path)
+        with image.open("rb") as file:
             for block in iter(lambda file=file: file.read(1 << 20), b""):
                 digest.update(block)
-        digest.update(b"end of file")
+        digest.update(b"end of file" + frame.encode())
     return digest.hexdigest()
 
 
@@ -188,10 +218,10 @@ def write_vectors(
     """
     check_vectors(vectors)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as scratch:
-        _write(vectors, scratch, {**attributes, "versions": versions()}, mode="w")
-        if reconstruction is not None:
-            _write(reconstruction, scratch, {}, mode="a", group=_RECONSTRUCTION)
+    groups = {"": _packed(vectors, {**attributes, "versions": versions()})}
+    if reconstruction is not None:
+        groups[RECONSTRUCTION] = _packed(reconstruction.rename(_GROUP_AXES), {})
+    _write(groups, path)
 
 
 def read_vectors(path: Path) -> xr.Dataset:
@@ -213,16 +243,16 @@ def read_vectors(path: Path) -> xr.Dataset:
 def read_reconstruction(path: Path) -> xr.Dataset | None:
     """Read the projections and residuals stored beside the vectors of a pair; None where there are none."""
     try:
-        return _read(path, _RECONSTRUCTION)
+        stored = _read(path, RECONSTRUCTION)
     except InputError:
         return None
+    return stored.rename({name: axis for axis, name in _GROUP_AXES.items() if name in stored.dims})
 
 
 def write_volume(volume: xr.DataArray, path: Path, *, attributes: Mapping[str, Any]) -> None:
     """Write one volume (z, y, x) [counts] as NetCDF4, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as scratch:
-        _write(volume.rename("intensity").to_dataset(), scratch, {**attributes, "versions": versions()}, mode="w")
+    _write({"": _packed(volume.rename("intensity").to_dataset(), {**attributes, "versions": versions()})}, path)
 
 
 def read_volume(path: Path) -> xr.DataArray:
@@ -253,16 +283,45 @@ def read_attributes(path: Path) -> dict[str, Any]:
     return {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in found.items()}
 
 
-def _write(dataset: xr.Dataset, path: Path, attributes: Mapping[str, Any], **where: Any) -> None:
+def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, Any] | None = None) -> None:
+    """Write a dataset of any form as NetCDF4, whole or not at all; attributes that NetCDF does not know become JSON.
+
+    Raises
+    ------
+    OSError
+        If the disk has less space than the dataset takes uncompressed: HDF5 does not survive a disk that fills up.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if dataset.nbytes > shutil.disk_usage(path.parent).free:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    with replacing(path) as scratch:  # straight to disk: it may be larger than the memory
+        _packed(dataset, attributes or {}).to_netcdf(scratch, engine="h5netcdf")
+
+
+def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
+    """Give a dataset the attributes and the compression it has in a file."""
     dataset = dataset.copy()
     dataset.attrs = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
+    for name, item in dataset.variables.items():
+        item.attrs = {**item.attrs, **_DESCRIPTIONS.get(str(name), {})}
     for item in (dataset, *dataset.variables.values()):
         item.attrs = {key: _attribute(value) for key, value in item.attrs.items()}
     packed = {"zlib": True, "complevel": 1, "shuffle": True}
-    encoding = {
-        name: packed for name, item in dataset.data_vars.items() if item.ndim >= 2 and item.dtype.kind in "fiub"
-    }
-    dataset.to_netcdf(path, engine="h5netcdf", encoding=encoding, **where)
+    for item in dataset.data_vars.values():
+        item.encoding = packed if item.ndim >= 2 and item.dtype.kind in "fiub" else {}
+    return dataset
+
+
+def _write(groups: Mapping[str, xr.Dataset], path: Path) -> None:
+    """Write datasets as the groups of a NetCDF4 file; "" is its root. Put together in memory: see `write_bytes`."""
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    content = io.BytesIO()
+    with h5netcdf.File(content, "w") as file:
+        for group, dataset in groups.items():
+            dataset.dump_to_store(H5NetCDFStore(file.create_group(group) if group else file))
+    write_bytes(content.getbuffer(), path)
 
 
 def _attribute(value: Any) -> Any:

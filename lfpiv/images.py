@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lfpiv import davis
+from lfpiv.davis import NotOneImage
 from lfpiv.errors import InputError
 
-SUFFIXES = (".tif", ".tiff", ".png")
+SUFFIXES = (".tif", ".tiff", ".png", *davis.SUFFIXES)
 DTYPES = ("uint8", "uint16", "uint32", "int16", "int32", "float32", "float64")
 FLIPS = {
     "none": (slice(None), slice(None)),
@@ -38,7 +40,7 @@ def read_header(path: Path, label: str) -> Header:
     Parameters
     ----------
     path : Path
-        A TIFF or PNG file.
+        A TIFF or PNG file, or a DaVis image, which is decoded to be checked (see `lfpiv.davis`).
     label : str
         What the file is, for messages: the key and the camera it belongs to.
 
@@ -52,17 +54,26 @@ def read_header(path: Path, label: str) -> Header:
         If the file is missing, truncated, unreadable, or not one single-channel image of real numbers.
     """
     place = f"{path} ({label})"
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
+    file, _ = davis.split_frame(path)
+    if not file.is_file():
+        found = "a folder" if file.is_dir() else "no such file"
         raise InputError(f"{place}: expected an image file, found {found}. Check the path in the experiment file.")
-    if path.suffix.lower() not in SUFFIXES:
+    kind = file.suffix.lower()
+    if kind not in SUFFIXES:
+        found = "a file of vectors" if kind in davis.VECTOR_SUFFIXES else repr(file.suffix or "no suffix")
         raise InputError(
-            f"{place}: expected a TIFF or PNG image ({', '.join(SUFFIXES)}), found {path.suffix or 'no suffix'!r}. "
+            f"{place}: expected a TIFF, PNG or DaVis image ({', '.join(SUFFIXES)}), found {found}. "
             "Convert the image without loss."
         )
     try:
-        header = _png_header(path) if path.suffix.lower() == ".png" else _tiff_header(path)
-    except _NotOneImage as error:
+        if kind in davis.SUFFIXES:
+            pixels = davis.read(path, place)
+            header = Header(pixels.shape, str(pixels.dtype))
+        else:
+            header = _png_header(path) if kind == ".png" else _tiff_header(path)
+    except InputError:
+        raise
+    except NotOneImage as error:
         raise InputError(f"{place}: expected one single-channel image, found {error}.") from None
     except PermissionError:
         raise InputError(f"{place}: the file may not be read. Change its permissions.") from None
@@ -98,7 +109,9 @@ def read_image(path: Path, label: str, *, flip: str = "none") -> np.ndarray:
     header = read_header(path, label)
     place = f"{path} ({label})"
     try:
-        pixels = _decode(path)
+        pixels = _decode(path, place)
+    except InputError:
+        raise
     except Exception as error:  # as above
         raise InputError(_damaged(place, error)) from None
     if pixels.shape != header.shape:
@@ -123,10 +136,6 @@ def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
         raise InputError(f"{path} ({label}): expected an exposed image, found one that {what}. Take the image again.")
 
 
-class _NotOneImage(Exception):
-    """The file holds something else than one single-channel image; the text says what."""
-
-
 def _damaged(place: str, error: Exception) -> str:
     text = " ".join(str(error).split()) or type(error).__name__
     return f"{place}: expected a complete image file, found a truncated or damaged one ({text}). Copy it again."
@@ -140,15 +149,15 @@ def _tiff_header(path: Path) -> Header:
         raise ValueError("the file is empty")
     with tifffile.TiffFile(path) as tiff:
         if len(tiff.pages) != 1:
-            raise _NotOneImage(f"{len(tiff.pages)} pages; save one image per file")
+            raise NotOneImage(f"{len(tiff.pages)} pages; save one image per file")
         page = tiff.pages[0]
         end = max(
             (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0
         )
         if len(page.shape) != 2 or page.samplesperpixel != 1:
-            raise _NotOneImage(f"pixels of shape {page.shape}, such as a colour image; save raw grey values")
+            raise NotOneImage(f"pixels of shape {page.shape}, such as a colour image; save raw grey values")
         if page.photometric.name not in ("MINISBLACK",):
-            raise _NotOneImage(f"{page.photometric.name} pixels; save raw grey values, 0 = black")
+            raise NotOneImage(f"{page.photometric.name} pixels; save raw grey values, 0 = black")
         if page.dtype is None:
             raise ValueError("unknown pixel type")
         shape, dtype = page.shape, str(page.dtype)
@@ -169,11 +178,13 @@ def _png_header(path: Path) -> Header:
     columns, rows = (int.from_bytes(start[at : at + 4], "big") for at in (16, 20))
     depth, colour = start[24], start[25]
     if colour != 0:
-        raise _NotOneImage("a colour, palette or transparent image; save raw grey values")
+        raise NotOneImage("a colour, palette or transparent image; save raw grey values")
     return Header((rows, columns), "uint16" if depth == 16 else "uint8" if depth == 8 else f"uint{depth}")
 
 
-def _decode(path: Path) -> np.ndarray:
+def _decode(path: Path, place: str) -> np.ndarray:
+    if davis.split_frame(path)[0].suffix.lower() in davis.SUFFIXES:
+        return davis.read(path, place)
     if path.suffix.lower() == ".png":
         import imagecodecs
 
