@@ -1,6 +1,8 @@
-"""Shared fixtures: the kernels' device, and the sample data beside the checkout."""
+"""Shared fixtures: the kernels' device, the sample data beside the checkout, and a browser."""
 
+import importlib.util
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -26,6 +28,22 @@ def device(request):
 
 
 @pytest.fixture(scope="session")
+def small_run(tmp_path_factory, device):
+    """Return a small simulated experiment, run from images to vectors: see `small_run.SmallRun`."""
+    from small_run import make_small_run
+
+    return make_small_run(tmp_path_factory.mktemp("small"), device.kind)
+
+
+@pytest.fixture(scope="session")
+def reported(tmp_path_factory, device):
+    """Return a small finished run, and its report under `page`."""
+    from report_run import make_run
+
+    return make_run(tmp_path_factory.mktemp("reported"))
+
+
+@pytest.fixture(scope="session")
 def sample_data():
     """Folder of the sample data; its tests are skipped where it is absent, unless it is required."""
     if SAMPLE_DATA.is_dir():
@@ -34,6 +52,43 @@ def sample_data():
     if os.environ.get("LFPIV_REQUIRE_SAMPLE_DATA") == "1":
         pytest.fail(message)
     pytest.skip(message)
+
+
+CHROMIUM_OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)
+"""No network, no profile, and WebGL in software."""
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    """Headless Chromium with WebGL; its tests are skipped where it is absent, unless it is required."""
+    missing = [name for name in ("chromium", "chromedriver") if shutil.which(name) is None]
+    missing += ["selenium"] if importlib.util.find_spec("selenium") is None else []
+    if missing:
+        message = f"no browser: {', '.join(missing)} not installed"
+        if os.environ.get("LFPIV_REQUIRE_BROWSER") == "1":
+            pytest.fail(message)
+        pytest.skip(message)
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = shutil.which("chromium")
+    for option in (*CHROMIUM_OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+        options.add_argument(option)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
+    yield driver
+    driver.quit()
 
 
 TINY_EXPERIMENT = """

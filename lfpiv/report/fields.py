@@ -1,0 +1,198 @@
+"""Vector fields for the page: a sample of the pairs, their mean and fluctuation, in a compact form for the scripts.
+
+However many pairs there are, at most `MOST_READ` files are read and `MOST_VECTORS` vectors put into the page.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import matplotlib
+import numpy as np
+import xarray as xr
+
+from lfpiv import dataset, derived
+from lfpiv.errors import InputError
+
+log = logging.getLogger(__name__)
+
+MOST_READ = 500
+"""Files that mean and fluctuation are taken over: the mean is then good to 4.5 % of the fluctuation, for seconds of
+reading."""
+MOST_SHOWN = 6
+"""Pairs that can be chosen on the page."""
+MOST_VECTORS = 240_000
+"""Vectors of all fields in the page: about 3 MB of it."""
+MOST_IN_FIELD = 40_000
+"""Vectors of one field; larger ones are thinned out along x and y."""
+
+NO_NUMBER = -32768
+"""Stands for not-a-number among the whole numbers that the page stores."""
+STEPS = 32767
+"""Steps from zero to the largest value: values are stored to 1 in 65,000 of their range."""
+
+COLOUR_STOPS = 33
+"""Colours that a colour map is given by; between them the page interpolates."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """What was read of the finished pairs."""
+
+    shown: dict[int, xr.Dataset]
+    """Pair -> vectors, of the pairs that can be chosen."""
+    mean: xr.Dataset | None
+    """Mean ``u``, ``v``, ``w`` [m/s] of the valid vectors and ``valid`` where there are any; None for a single pair."""
+    fluctuation: xr.Dataset | None
+    """Their standard deviations over the pairs [m/s], `valid` where two or more pairs are; None for a single pair."""
+    read: int
+    """Pairs that mean and fluctuation were taken over."""
+
+
+def survey(vectors: Mapping[int, Path]) -> Survey:
+    """Read an even sample of the pairs, one file after the other.
+
+    Parameters
+    ----------
+    vectors : dict
+        Pair -> file of its vectors; at least one.
+
+    Raises
+    ------
+    InputError
+        If a file that is read cannot be read or holds no vectors.
+    """
+    chosen = evenly(list(vectors), MOST_READ)
+    first = dataset.read_vectors(vectors[chosen[0]])
+    most = max(min(MOST_VECTORS // min(first["u"].size, MOST_IN_FIELD) - 2, MOST_SHOWN), 1)
+    shown = {pair: dataset.read_vectors(vectors[pair]) for pair in evenly(chosen, most)}
+    total = np.zeros((3, *first["u"].shape))
+    square, count, read = np.zeros_like(total), np.zeros(first["u"].shape, int), 0
+    for pair in chosen:
+        velocity, valid, axes = _read_velocity(vectors[pair])
+        if any(not np.array_equal(axis, first[name]) for name, axis in axes.items()):
+            log.warning("pair %d: its vectors lie elsewhere than pair %d's; it is not in the mean", pair, chosen[0])
+            continue
+        good = valid & np.isfinite(velocity).all(0)
+        velocity = np.where(good, velocity, 0.0)
+        total, square, count, read = total + velocity, square + velocity**2, count + good, read + 1
+    if read < 2:
+        return Survey(shown=shown, mean=None, fluctuation=None, read=read)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(count > 0, total / count, np.nan)
+        spread = np.where(count > 1, np.sqrt(np.maximum(square - count * mean**2, 0) / (count - 1)), np.nan)
+    build = {"mean": (mean, count > 0), "fluctuation": (spread, count > 1)}
+    fields = {name: _like(first, values, valid) for name, (values, valid) in build.items()}
+    return Survey(shown=shown, read=read, **fields)
+
+
+def _read_velocity(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Velocity (component, z, y, x) [m/s], validity and axes [mm] of a file: 20 times faster than as a dataset."""
+    try:
+        with h5py.File(path, "r") as file:
+            velocity = np.stack([file[name][()] for name in "uvw"]).astype(float)
+            return velocity, file["valid"][()].astype(bool), {axis: file[axis][()] for axis in "zyx"}
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: expected a file of vectors, found {error}. Remove it and run again.") from None
+
+
+def evenly(items: Sequence[int], most: int) -> list[int]:
+    """At most so many items, spread evenly, the first and the last among them."""
+    if len(items) <= most:
+        return list(items)
+    return [items[place] for place in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+
+def _like(first: xr.Dataset, velocity: np.ndarray, valid: np.ndarray) -> xr.Dataset:
+    variables = {name: (("z", "y", "x"), part, {"units": "m/s"}) for name, part in zip("uvw", velocity, strict=True)}
+    coordinates = {axis: first[axis].variable for axis in "zyx"}
+    return xr.Dataset({**variables, "valid": (("z", "y", "x"), valid)}, coordinates)
+
+
+# What the scripts read -----------------------------------------------------------------------------------------------
+
+
+def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
+    """Put the fields of a survey into the page.
+
+    Values are whole numbers of two bytes times a scale, little-endian, all fields in one block; the block is gzipped
+    and written in base64. A JSON text beside it says what lies where.
+
+    Parameters
+    ----------
+    found : Survey
+        From `survey`.
+    names : dict
+        Pair -> what the page calls it.
+
+    Returns
+    -------
+    html : str
+        Two script elements that hold data.
+    thinning : int
+        Every how many vectors along x and y are in the page.
+    """
+    fields = [(names[pair], vectors, "velocity") for pair, vectors in found.shown.items()]
+    if found.mean is not None:
+        fields += [(f"mean of {found.read:,} pairs", found.mean, "velocity")]
+        fields += [(f"fluctuation (standard deviation), {found.read:,} pairs", found.fluctuation, "fluctuation")]
+    block, described, thinning = bytearray(), [], 1
+    for label, vectors, kind in fields:
+        derivatives = _derivatives(vectors) if kind == "velocity" else {}
+        step = max(math.ceil(math.sqrt(vectors["u"].size / MOST_IN_FIELD)), 1)
+        thinning = max(thinning, step)
+        cut = {"x": slice(None, None, step), "y": slice(None, None, step)}
+        entry = {"label": label, "kind": kind, "values": {}}
+        thin = vectors.isel(cut)
+        for name, values in {**{name: thin[name] for name in "uvw"}, **derivatives}.items():
+            values = values.isel(cut) if name in derivatives else values
+            stored, scale = quantise(values.values)
+            entry["values"][name] = {"at": len(block), "scale": scale}
+            block += stored.tobytes()
+        entry["valid"] = len(block)
+        block += thin["valid"].values.astype("<i2").tobytes()
+        entry |= {axis: [round(float(value), 6) for value in thin[axis].values] for axis in "xyz"}
+        described.append(entry)
+    meta = {"fields": described, "colours": {name: colour_stops(map_) for name, map_ in _COLOUR_MAPS.items()}}
+    text = json.dumps(meta, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    data = base64.b64encode(gzip.compress(bytes(block), 9, mtime=0)).decode()
+    return (
+        f'<script type="application/json" id="field-list">{text}</script>\n'
+        f'<script type="text/plain" id="field-values">{data}</script>',
+        thinning,
+    )
+
+
+_COLOUR_MAPS = {"signed": "RdBu_r", "positive": "viridis"}
+
+
+def quantise(values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Whole numbers of two bytes and the scale that turns them back into values."""
+    values = np.asarray(values, float)
+    finite = np.isfinite(values)
+    largest = float(np.abs(values[finite]).max(initial=0.0))
+    scale = largest / STEPS if largest > 0 else 1.0
+    stored = np.full(values.shape, NO_NUMBER, "<i2")
+    stored[finite] = np.rint(values[finite] / scale)
+    return stored, scale
+
+
+def colour_stops(name: str) -> list[str]:
+    """Colours of a matplotlib colour map at even places, as #rrggbb."""
+    colours = matplotlib.colormaps[name](np.linspace(0, 1, COLOUR_STOPS))
+    return [matplotlib.colors.to_hex(colour) for colour in colours]
+
+
+def _derivatives(vectors: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Magnitude of the vorticity [1/s] and Q [1/s^2]; nothing where a field is too thin to be differentiated."""
+    if min(vectors.sizes[axis] for axis in "zyx") < 3:
+        return {}
+    return {"vorticity": derived.vorticity(vectors)["vorticity_magnitude"], "q": derived.q_criterion(vectors)}

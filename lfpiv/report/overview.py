@@ -1,0 +1,170 @@
+"""The report's plain sections: what was run, what went wrong, time and memory, settings and versions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lfpiv.experiment import Experiment
+from lfpiv.report import markup
+from lfpiv.report.markup import number, percent
+
+WARNINGS_SHOWN, WARNINGS_MOST = 12, 300
+"""Warnings that are shown at once, and with those folded away; `summary.json` holds all."""
+
+
+def head(experiment: Experiment, summary: Mapping[str, Any]) -> str:
+    """Name the experiment and its main figures."""
+    finished, failed = len(summary["pairs"]), len(summary.get("failed", ()))
+    cards = [(f"{finished:,}", f"image {'pair' if finished == 1 else 'pairs'} finished")]
+    if failed:
+        cards.append((f"{failed:,}", f"image {'pair' if failed == 1 else 'pairs'} failed"))
+    if finished:
+        cards.append((percent(summary["valid_fraction"]), "valid vectors"))
+        uncertainty = [item["uncertainty_voxel"] for item in summary["pairs"] if item["uncertainty_voxel"] is not None]
+        if uncertainty:
+            cards.append((number(float(np.mean(uncertainty)), 2), "voxel, median uncertainty"))
+    reports = summary["calibration"].values()
+    sigma = [report["sigma_nor_test"] for report in reports if report.get("sigma_nor_test") is not None]
+    if sigma:
+        cards.append((number(max(sigma), 4), "pitch, error on held-out dots, worst camera"))
+    found, expected = (sum(report.get(key) or 0 for report in reports) for key in ("dots_found", "dots_expected"))
+    if expected:
+        cards.append((f"{found:,} / {expected:,}", "board dots measured"))
+    boxes = "".join(
+        f"<div><dt>{markup.escape(label)}</dt><dd>{markup.escape(value)}</dd></div>" for value, label in cards
+    )
+    return (
+        f"<h1>{markup.escape(experiment.name)}</h1>"
+        + markup.paragraph(
+            f"Multi-camera light-field PIV, {markup.count(len(experiment.cameras), 'camera')}, "
+            f"lfpiv {summary['versions']['lfpiv']}",
+            "quiet",
+        )
+        + f'<dl class="cards">{boxes}</dl>'
+    )
+
+
+def warnings(summary: Mapping[str, Any]) -> str:
+    """List what went wrong, failed pairs first."""
+    failed = [f"Pair {entry['pair']} failed: {entry['reason']}" for entry in summary.get("failed", ())]
+    texts = [*failed, *summary["warnings"]]
+    if not texts:
+        return ""
+    shown = _list(texts[:WARNINGS_SHOWN])
+    rest = texts[WARNINGS_SHOWN:WARNINGS_MOST]
+    if rest:
+        left = len(texts) - WARNINGS_MOST
+        more = markup.paragraph(f"{left:,} more are in summary.json.") if left > 0 else ""
+        shown += markup.details(f"{len(texts) - WARNINGS_SHOWN:,} more", _list(rest) + more)
+    return f'<section class="warnings" aria-labelledby="warnings"><h2 id="warnings">Warnings</h2>{shown}</section>'
+
+
+def _list(texts: Sequence[str]) -> str:
+    return "<ul>" + "".join(f"<li>{markup.escape(text)}</li>" for text in texts) + "</ul>"
+
+
+def contents(sections: Mapping[str, str]) -> str:
+    """Link the sections that are there."""
+    names = {
+        "run": "What was run",
+        "calibration": "Calibration",
+        "volumes": "Volumes",
+        "vectors": "Vectors",
+        "pairs": "All pairs",
+        "time": "Time and memory",
+        "settings": "Settings",
+    }
+    links = "".join(f'<a href="#{key}">{name}</a>' for key, name in names.items() if sections[key])
+    return f'<nav aria-label="Sections">{links}</nav>'
+
+
+def what_was_run(experiment: Experiment, summary: Mapping[str, Any]) -> str:
+    """Say what the experiment file states and what the run chose."""
+    nz, ny, nx = experiment.grid.shape
+    voxel, size = experiment.grid.voxel_mm, [n * experiment.grid.voxel_mm for n in (nx, ny, nz)]
+    board = experiment.board
+    device = summary["device"]
+    optics = experiment.cameras[0].optics
+    same = all(camera.optics == optics for camera in experiment.cameras)
+    rows = [
+        ("Experiment file", str(experiment.path)),
+        ("Volume", f"{size[0]:g} × {size[1]:g} × {size[2]:g} mm (x, y, z), {nx} × {ny} × {nz} voxels of {voxel:g} mm"),
+        ("Time between frames", f"{experiment.dt_s:g} s: 1 voxel is {voxel / 1000 / experiment.dt_s:g} m/s"),
+        (
+            "Cameras",
+            ", ".join(f"{camera.name} at {markup.general(camera.nominal_angle_deg)}°" for camera in experiment.cameras)
+            + f" (nominal); {'each' if same else 'the first'} f = {optics.focal_length_mm:g} mm, "
+            f"f/{optics.f_number:g}, magnification {abs(optics.magnification):g}, "
+            f"{optics.sensor_shape[1]} × {optics.sensor_shape[0]} pixels of {1000 * optics.pixel_mm:g} µm, "
+            f"{optics.layout} microlenses of {1000 * optics.microlens_pitch_mm:g} µm",
+        ),
+        (
+            "Board",
+            f"{board.dots[0]} × {board.dots[1]} dots, {board.spacing_mm:g} mm apart, in {len(board.planes_mm)} planes "
+            f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm",
+        ),
+        ("Image pairs", f"{len(summary['pairs']):,} of {experiment.pairs:,} finished"),
+        ("Weights", _weights(summary.get("weights") or {})),
+        ("Computed on", f"{device['kind']}, {device['threads']} threads"),
+    ]
+    return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
+
+
+def _weights(report: Mapping[str, Any]) -> str:
+    """How the weights were made and how far they are from counted rays."""
+    if not report:
+        return ""
+    text = f"{report['method']}, {report['memory_mib']:.0f} MiB"
+    forms = sorted(set(report.get("form", {}).values()))
+    text += f", stored as {' and '.join(forms)}" if forms else ""
+    errors = report.get("count_check_l2")
+    if errors:
+        text += (
+            f"; {percent(float(np.mean(errors)), 1)} (mean of {len(errors)} voxels), at most "
+            f"{percent(max(errors), 1)}, from counted rays"
+        )
+    return text
+
+
+def timings(summary: Mapping[str, Any]) -> str:
+    """Tabulate what each stage took."""
+    names = {
+        "calibration": "calibration, network training included",
+        "network_training": "of it network training",
+        "weights": "weights",
+        "reconstruction": "reconstruction, all volumes",
+        "correlation": "correlation, all pairs",
+        "total": "this invocation, until the report",
+    }
+    rows = [[text, number(summary["timings_s"].get(key), 1)] for key, text in names.items()]
+    reused = list(summary["reused"])
+    kept = ""
+    if reused:
+        named = ", ".join(reused[:WARNINGS_SHOWN])
+        more = f" and {len(reused) - WARNINGS_SHOWN:,} more" if len(reused) > WARNINGS_SHOWN else ""
+        kept = markup.paragraph(f"Kept from an earlier invocation: {named}{more}.", "quiet")
+    memory = markup.paragraph(f"Peak memory: {number(summary['peak_memory_mib'], 0)} MiB.")
+    table = markup.table(["stage", "time [s]"], rows, caption="Time of each stage")
+    return f'<h2 id="time">Time and memory</h2>{table}{memory}{kept}'
+
+
+def small_print(summary: Mapping[str, Any]) -> str:
+    """Tabulate settings and versions, folded away."""
+    settings = [
+        [f"{table}.{key}", "default" if value is None else str(value)]
+        for table, values in summary["settings"].items()
+        for key, value in values.items()
+    ]
+    versions = [[name, version] for name, version in summary["versions"].items()]
+    return (
+        '<h2 id="settings">Settings and versions</h2>'
+        + markup.details(
+            "Settings", markup.table(["key", "value"], settings, caption="Settings of the run", words=True)
+        )
+        + markup.details(
+            "Versions", markup.table(["package", "version"], versions, caption="Versions of packages", words=True)
+        )
+    )

@@ -1,0 +1,166 @@
+"""Panels of the report: small matplotlib figures as SVG inside the page, in the page's own colours and type.
+
+A panel is as wide as a phone's screen, so that its text is read at the size it was set in; wider screens show several
+side by side. Ink and series colours are stand-ins that become ``currentColor`` and CSS variables: one picture serves
+light and dark pages.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import itertools
+import re
+from collections.abc import Sequence
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.path import Path
+
+INK = "#7b8a91"
+"""Stands for the colour of the page's text."""
+SERIES = ("#2f81d7", "#e0762b", "#2ca36c", "#c24790", "#8a6fd2", "#9a8d2b")
+"""Stand for the page's colours of lines and marks, ``--series-0`` to ``--series-5``."""
+
+WIDTH_INCH = 3.6
+"""Width of a panel: 346 CSS pixels, what a phone's page holds."""
+TEXT_POINT, SMALL_POINT = 9.0, 8.5
+"""Sizes of titles and labels, and of tick labels [point]."""
+
+PHOTO_PIXELS = 20_000
+"""Grey pictures of more pixels are stored as JPEG; small ones and colour maps exactly."""
+JPEG_QUALITY = 82
+
+_numbers = itertools.count(1)  # tells the identifiers of a page's panels apart
+
+
+def new_panel(height_inch: float = 2.6, *, rows: int = 1, columns: int = 1) -> tuple[Figure, np.ndarray]:
+    """Make an empty panel.
+
+    Parameters
+    ----------
+    height_inch : float
+        Height of the panel [inch].
+    rows, columns : int
+        Axes in it.
+
+    Returns
+    -------
+    figure : Figure
+    axes : ndarray of Axes, shape (rows * columns,)
+    """
+    figure = Figure(figsize=(WIDTH_INCH, height_inch), layout="constrained")
+    FigureCanvasSVG(figure)
+    figure.patch.set_alpha(0)
+    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
+
+
+def style(axes, *, title: str = "", xlabel: str = "", ylabel: str = "", legend: bool = False) -> None:
+    """Give axes the page's ink and type, and their names."""
+    axes.patch.set_alpha(0)
+    axes.set_title(title, color=INK, fontsize=TEXT_POINT)
+    axes.set_xlabel(xlabel, color=INK, fontsize=TEXT_POINT)
+    axes.set_ylabel(ylabel, color=INK, fontsize=TEXT_POINT)
+    axes.tick_params(colors=INK, labelsize=SMALL_POINT)
+    for offset in (axes.xaxis.get_offset_text(), axes.yaxis.get_offset_text()):
+        offset.set(color=INK, fontsize=SMALL_POINT)
+    for spine in axes.spines.values():
+        spine.set(color=INK, linewidth=0.6)
+    if legend:
+        axes.legend(fontsize=SMALL_POINT, labelcolor=INK, frameon=False, handlelength=1.4, borderaxespad=0.2)
+
+
+def colour_bar(figure: Figure, shown, axes, label: str, *, location: str = "right") -> None:
+    """Put a colour bar beside axes, as high as they are, or below them."""
+    place = {"cax": axes.inset_axes((1.04, 0, 0.05, 1))} if location == "right" else {"ax": axes, "location": location}
+    bar = figure.colorbar(shown, **place, **({} if location == "right" else {"fraction": 0.06, "pad": 0.03}))
+    bar.ax.locator_params(nbins=5 if location == "right" else 3)
+    bar.set_label(label, color=INK, fontsize=TEXT_POINT)
+    bar.ax.tick_params(colors=INK, labelsize=SMALL_POINT)
+    bar.outline.set(color=INK, linewidth=0.6)
+
+
+def arrows(start: np.ndarray, step: np.ndarray, head: float) -> Path:
+    """Arrows as one path: shafts from `start` by `step`, heads of the length `head` or a third of a short shaft.
+
+    Parameters
+    ----------
+    start, step : ndarray, shape (arrow, 2)
+        In the units of the axes; arrows that are not finite are left out.
+    head : float
+        Length of a head in the same units.
+    """
+    good = np.isfinite(step).all(1) & (np.hypot(*step.T) > 0)
+    start, step = start[good], step[good]
+    length = np.hypot(*step.T)[:, None]
+    along = step / np.maximum(length, 1e-30)
+    aside = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    tip, barb = start + step, np.minimum(head, length / 2.5)
+    back = tip - barb * along
+    points = np.stack([start, tip, back + 0.45 * barb * aside, tip, back - 0.45 * barb * aside], axis=1)
+    codes = np.tile([Path.MOVETO, Path.LINETO, Path.MOVETO, Path.LINETO, Path.LINETO], len(points))
+    return Path(points.reshape(-1, 2), codes)
+
+
+def to_svg(figure: Figure, alt: str) -> str:
+    """Turn a panel into an SVG element for the page, `alt` standing for it where it is not seen."""
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lfpiv"}):
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)
+    text = re.sub(r"<style.*?</style>\s*", "", text, flags=re.DOTALL)  # would hold for the whole page; see report.css
+    text = _own_identifiers(text)
+    text = re.sub(r'href="data:image/png;base64,\s*([^"]+)"', _smaller_picture, text)
+    text = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text)
+    text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
+    text = text.replace(INK, "currentColor")
+    for number, colour in enumerate(SERIES):
+        text = text.replace(colour, f"var(--series-{number})")
+    width, height = (float(value) for value in re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', text).groups())
+    head = (
+        f'<svg class="panel" role="img" aria-label="{html.escape(alt)}" viewBox="0 0 {width:g} {height:g}" '
+        f'width="{width / 0.75:.0f}" height="{height / 0.75:.0f}">'
+    )
+    return head + re.sub(r"\s*\n\s*", "\n", text[text.index(">") + 1 :]).strip()
+
+
+def _own_identifiers(text: str) -> str:
+    """Keep the identifiers that are referred to, with a number of their own; drop the others."""
+    used = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
+    mark = f"svg{next(_numbers)}-"
+
+    def keep(match: re.Match) -> str:
+        return f' id="{mark}{match[1]}"' if match[1] in used else ""
+
+    text = re.sub(r' id="([^"]+)"', keep, text)
+    return re.sub(r'(url\(#|href="#)', rf"\g<1>{mark}", text).replace("xlink:href", "href")
+
+
+def _smaller_picture(match: re.Match) -> str:
+    """Store an opaque grey picture as grey, large ones as JPEG."""
+    data = base64.b64decode(re.sub(r"\s", "", match[1]))
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    kind = "png"
+    opaque = picture.ndim == 3 and (picture.shape[2] == 3 or (picture[..., 3] == 255).all())
+    if opaque and (picture[..., 0] == picture[..., 1]).all() and (picture[..., 1] == picture[..., 2]).all():
+        grey = picture[..., 0]
+        if grey.size > PHOTO_PIXELS:
+            kind, data = "jpeg", cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+        else:
+            data = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+    elif opaque:
+        data = cv2.imencode(".png", picture[..., :3], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+    return f'href="data:image/{kind};base64,{base64.b64encode(data).decode()}"'
+
+
+def spread_ticks(axes, count: Sequence[int] = (5, 5)) -> None:
+    """At most so many ticks along x and y."""
+    axes.locator_params(axis="x", nbins=count[0])
+    axes.locator_params(axis="y", nbins=count[1])

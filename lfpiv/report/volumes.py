@@ -1,0 +1,199 @@
+"""The report's section on the volumes: projections, residual per iteration, brightness over the depth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.colors import Normalize
+
+from lfpiv import dataset
+from lfpiv.report import markup
+from lfpiv.report.markup import number, percent
+from lfpiv.report.svg import INK, SERIES, colour_bar, new_panel, spread_ticks, style, to_svg
+
+FEW_VOLUMES = 6
+"""So many volumes have a line of their own; of more, the median and the range are drawn."""
+BAND = (5, 95)
+"""Percentiles between which the range over many volumes lies."""
+END_SHARE = 0.1
+"""Part of the depth at either end that the brightness at the ends is taken over."""
+
+
+def section(summary: Mapping[str, Any], vectors: Mapping[int, Path]) -> str:
+    """Write the section on the volumes; nothing where the first file says nothing of its own.
+
+    Parameters
+    ----------
+    summary : dict
+        The content of ``summary.json``.
+    vectors : dict
+        Pair -> file of its vectors; the volumes of the first are shown.
+    """
+    histories = {
+        f"pair {item['pair']}, {frame}": np.asarray(residual, float)
+        for item in summary["pairs"]
+        for frame, residual in item.get("residual", {}).items()
+        if len(residual)
+    }
+    pair = next(iter(vectors))
+    first = dataset.read_reconstruction(vectors[pair])
+    if first is None:
+        return ""
+    parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(pair, first)]
+    parts.append(_quality_figure(pair, first, histories))
+    stops = _stops(summary)
+    if stops:
+        parts.append(
+            markup.table(["volumes", "why the iteration ended"], stops, caption="Why the iterations ended", words=True)
+        )
+    return "\n".join(parts)
+
+
+def _projection_figure(pair: int, first: xr.Dataset) -> str:
+    frame = str(first["frame"].values[0])
+    names = (("z", "x", "y"), ("y", "x", "z"), ("x", "y", "z"))
+    top = float(np.percentile(first["projection_z"].values[0], 99.7)) or 1.0
+    shown = [_projection(first, *axes, top) for axes in names]
+    values = [first[f"projection_{axis}"].values[0] for axis, _, _ in names]
+    rows = [
+        [
+            f"along {axis}",
+            *(number(float(np.percentile(value, share)), 0) for share in (50, 90, 99)),
+            f"{value.max():.0f}",
+        ]
+        for (axis, _, _), value in zip(names, values, strict=True)
+    ]
+    table = markup.table(
+        ["brightest voxel [counts]", "median line", "90 %", "99 %", "largest"],
+        rows,
+        caption="Brightness of the projections",
+    )
+    return markup.figure(
+        shown,
+        f"Brightest voxel along each axis, pair {pair}, frame {frame}. Particles should be round in x and y; along z "
+        "they are longer, the more so the smaller the angle between the cameras.",
+        table,
+    )
+
+
+def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float) -> str:
+    values = first[f"projection_{along}"].isel(frame=0).transpose(up, across).values
+    edges = [_edges(first[axis].values) for axis in (across, up)]
+    spans = [high - low for low, high in edges]
+    figure, (axes,) = new_panel(float(np.clip(2.8 * spans[1] / spans[0], 0.5, 3.4)) + 1.35)
+    shown = axes.imshow(
+        values,
+        cmap="magma",
+        norm=Normalize(0, top),
+        extent=(*edges[0], *edges[1]),
+        origin="lower",
+        interpolation="none",
+    )
+    style(axes, title=f"along {along}", xlabel=f"{across} [mm]", ylabel=f"{up} [mm]")
+    spread_ticks(axes)
+    colour_bar(figure, shown, axes, "largest intensity [counts]", location="bottom")
+    return to_svg(figure, f"Largest intensity of the volume along {along}, over {across} and {up}.")
+
+
+def _quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray]) -> str:
+    shown, tables = [], []
+    if histories:
+        panel, table = _residuals(histories)
+        shown.append(panel)
+        tables.append(table)
+    panel, table, ends = _brightness(first)
+    shown.append(panel)
+    tables.append(table)
+    caption = "What the projections of the volume leave unexplained of the images, per iteration of SMART. " * bool(
+        histories
+    )
+    caption += (
+        f"Brightness over the depth, pair {pair}: mean over all lines along x and along y of their brightest voxel. "
+        f"At its ends the volume is {percent(ends[0])} (low z) and {percent(ends[1])} (high z) as bright as in its "
+        "middle half. Where a light sheet ends inside the volume, what is left beyond its edges is ghosts; well above "
+        "100 %, the ends take up light from outside the volume."
+    )
+    return markup.figure(shown, caption, "".join(tables))
+
+
+def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
+    """Residual over the iterations: each volume's line, or of many the median and the range."""
+    length = max(map(len, histories.values()))
+    every = np.full((len(histories), length), np.nan)
+    for row, history in zip(every, histories.values(), strict=True):
+        row[: len(history)] = history
+        row[len(history) :] = history[-1]  # an ended iteration keeps what it reached
+    iteration = np.arange(length)
+    figure, (axes,) = new_panel()
+    if len(histories) <= FEW_VOLUMES:
+        for k, (label, history) in enumerate(histories.items()):
+            dashes = "-" if k % 2 == 0 else "--"
+            axes.plot(np.arange(len(history)), history, dashes, color=SERIES[k // 2 % len(SERIES)], lw=1.4, label=label)
+        columns = {label: every[k] for k, label in enumerate(histories)}
+    else:
+        low, high = np.percentile(every, BAND, axis=0)
+        axes.fill_between(
+            iteration, low, high, color=SERIES[0], alpha=0.25, linewidth=0, label=f"{BAND[0]} to {BAND[1]} %"
+        )
+        axes.plot(iteration, np.median(every, axis=0), color=SERIES[0], lw=1.4, label=f"median of {len(histories):,}")
+        columns = {"median": np.median(every, axis=0), f"{BAND[0]} %": low, f"{BAND[1]} %": high}
+    axes.set(ylim=(0, None))
+    style(axes, title="residual", xlabel="iteration", ylabel="||image − projection|| / ||image||", legend=True)
+    spread_ticks(axes)
+    ends = every[:, -1]
+    svg = to_svg(
+        figure, f"Residual over the iterations: {np.median(every[:, 0]):.3f} to {np.median(ends):.3f} (median)."
+    )
+    lengths = np.array([len(history) for history in histories.values()])
+    rows = []
+    for k in iteration:
+        cells = [number(values[k], 4) for values in columns.values()]
+        if len(histories) <= FEW_VOLUMES:
+            cells = [cell if k < lengths[j] else markup.NONE for j, cell in enumerate(cells)]
+        rows.append([str(k), *cells])
+    return svg, markup.table(["iteration", *columns], rows, caption="Residual per iteration of SMART")
+
+
+def _brightness(first: xr.Dataset) -> tuple[str, str, tuple[float, float]]:
+    """Brightness over the depth in both frames; at the ends over that in the middle half, of the first frame."""
+    z = first["z"].values
+    profiles = {}
+    for k, frame in enumerate(first["frame"].values):
+        along_y, along_x = (first[f"projection_{axis}"].isel(frame=k) for axis in "yx")
+        profiles[str(frame)] = (along_y.mean("x").values + along_x.mean("y").values) / 2
+    figure, (axes,) = new_panel()
+    for k, (frame, profile) in enumerate(profiles.items()):
+        axes.plot(
+            z, profile, "-" if k % 2 == 0 else "--", color=SERIES[k % len(SERIES)], lw=1.4, label=f"frame {frame}"
+        )
+    axes.axhline(0, color=INK, linewidth=0.6)
+    axes.set(ylim=(0, None))
+    style(axes, title="brightness over the depth", xlabel="z [mm]", ylabel="intensity [counts]", legend=True)
+    spread_ticks(axes)
+    profile = next(iter(profiles.values()))
+    end, quarter = max(round(END_SHARE * len(z)), 1), len(z) // 4
+    middle = max(float(profile[quarter : len(z) - quarter].mean()), 1e-30)
+    ends = float(profile[:end].mean() / middle), float(profile[-end:].mean() / middle)
+    svg = to_svg(figure, f"Brightness over z; the ends have {percent(ends[0])} and {percent(ends[1])} of the middle.")
+    rows = [[number(depth, 3), *(f"{profile[k]:.0f}" for profile in profiles.values())] for k, depth in enumerate(z)]
+    titles = ["z [mm]", *(f"frame {frame} [counts]" for frame in profiles)]
+    return svg, markup.table(titles, rows, caption="Brightness over the depth"), ends
+
+
+def _stops(summary: Mapping[str, Any]) -> list[list[str]]:
+    """How many volumes ended for which reason."""
+    reasons: dict[str, int] = {}
+    for item in summary["pairs"]:
+        for stop in item.get("stop", {}).values():
+            reasons[stop] = reasons.get(stop, 0) + 1
+    return [[f"{count:,}", reason] for reason, count in sorted(reasons.items(), key=lambda entry: -entry[1])]
+
+
+def _edges(axis: np.ndarray) -> tuple[float, float]:
+    """Edges of the outermost voxels [mm]."""
+    half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
+    return float(axis[0] - half), float(axis[-1] + half)
