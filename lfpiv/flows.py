@@ -347,6 +347,17 @@ def window_mean(
     -------
     ndarray, shape (n, 3)
         Mean displacement (x, y, z) [mm].
+
+    Examples
+    --------
+    A window of 1 mm rounds off the peak of a vortex with a core of 0.5 mm:
+
+    >>> from lfpiv.flows import Swirl, window_mean
+    >>> vortex = Swirl(peak_mm=0.2, core_mm=0.5, axis="z")
+    >>> vortex([(0.5, 0, 0)]).round(3).tolist()
+    [[0.0, 0.2, 0.0]]
+    >>> (window_mean(vortex, [(0.5, 0, 0)], 1.0) + 0).round(3).tolist()
+    [[0.0, 0.134, 0.0]]
     """
     centres_mm, window = _points(centres_mm), _window(window_mm)
     if isinstance(flow, TurbulentFlow):

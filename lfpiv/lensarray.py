@@ -112,6 +112,18 @@ def find_lens_array(
     ------
     InputError
         If an argument is not of the kind above, or the image shows no such array of microimages.
+
+    Examples
+    --------
+    A made-up white image: round microimages every 12.3 pixels, one of them centred at column 100, row 80:
+
+    >>> import numpy as np, lfpiv
+    >>> row, column = np.mgrid[:160, :200]
+    >>> offset = [(axis - start + 6.15) % 12.3 - 6.15 for axis, start in ((column, 100), (row, 80))]
+    >>> white = 1000 / (1 + np.exp(3 * (np.hypot(*offset) - 5)))
+    >>> array = lfpiv.find_lens_array(white, nominal_pitch_px=12)
+    >>> round(array.pitch_px, 2), [round(place) for place in array.origin_px]
+    (12.3, [100, 80])
     """
     image = _checked_image(white, dark)
     if layout not in LAYOUTS:

@@ -34,12 +34,12 @@ class Optics:
 
     @property
     def object_distance_mm(self) -> float:
-        """Main lens to the focal plane, s_o = f (1 + 1/|M|) [mm]."""
+        """Main lens to the focal plane, ``s_o = f (1 + 1/|M|)`` [mm]."""
         return self.focal_length_mm * (1 + 1 / abs(self.magnification))
 
     @property
     def image_distance_mm(self) -> float:
-        """Main lens to the microlens array, s_i = f (1 + |M|) [mm]."""
+        """Main lens to the microlens array, ``s_i = f (1 + |M|)`` [mm]."""
         return self.focal_length_mm * (1 + abs(self.magnification))
 
     @property
@@ -91,7 +91,17 @@ class Grid:
     def from_extent(
         cls, *, centre_mm: tuple[float, float, float], size_mm: tuple[float, float, float], voxel_mm: float
     ) -> Grid:
-        """Grid of n = round(size / voxel) voxels per axis around a centre; both in the order (x, y, z)."""
+        """Grid of n = round(size / voxel) voxels per axis around a centre; both in the order (x, y, z).
+
+        Examples
+        --------
+        >>> from lfpiv import Grid
+        >>> grid = Grid.from_extent(centre_mm=(0, 0, 1), size_mm=(0.6, 0.4, 0.2), voxel_mm=0.1)
+        >>> grid.shape
+        (2, 4, 6)
+        >>> grid.axis_mm(0).round(3).tolist()  # z
+        [0.95, 1.05]
+        """
         nx, ny, nz = (round(size / voxel_mm) for size in size_mm)
         x, y, z = (centre - (n - 1) / 2 * voxel_mm for centre, n in zip(centre_mm, (nx, ny, nz), strict=True))
         return cls(shape=(nz, ny, nx), voxel_mm=voxel_mm, first_centre_mm=(z, y, x))
@@ -143,7 +153,15 @@ class LensLattice:
         return centres
 
     def nearest(self, position_mm: np.ndarray) -> np.ndarray:
-        """Lattice index (i, j) of the lens nearest to each position (s, t) [mm], shape (..., 2)."""
+        """Lattice index (i, j) of the lens nearest to each position (s, t) [mm], shape (..., 2).
+
+        Examples
+        --------
+        >>> from lfpiv import LensLattice
+        >>> lattice = LensLattice(origin_mm=(0.0, 0.0), basis_mm=((0.1, 0.0), (0.0, 0.1)))
+        >>> lattice.nearest([[0.12, -0.04], [0.26, 0.0]]).tolist()
+        [[1, 0], [3, 0]]
+        """
         offset = np.asarray(position_mm, float) - np.asarray(self.origin_mm)
         guess: np.ndarray = np.rint(offset @ np.linalg.inv(np.asarray(self.basis_mm)))
         best, best_distance = guess.copy(), np.full(guess.shape[:-1], np.inf)

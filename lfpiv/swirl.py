@@ -63,6 +63,12 @@ def injector_swirl_number(vane_angle_deg: float, radius_ratio: float, mass_ratio
         Radius of the central channel over that of the injector, r.
     mass_ratio : float
         Mass flow of the central channel over that of the annulus, m.
+
+    Examples
+    --------
+    >>> from lfpiv.swirl import injector_swirl_number
+    >>> round(injector_swirl_number(vane_angle_deg=37, radius_ratio=12 / 17, mass_ratio=0.42), 2)
+    0.55
     """
     if not (0 < radius_ratio < 1 and mass_ratio >= 0 and abs(vane_angle_deg) < 90):
         raise ValueError(

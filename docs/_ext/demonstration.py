@@ -1,0 +1,36 @@
+"""Run ``lfpiv demo`` once, before the gallery is: its scripts read the results, the pages show its scene and report."""
+
+import importlib.resources
+import logging
+import os
+import shutil
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parents[1]
+DEMO = DOCS / "gallery" / "lfpiv-demo"
+EXTRA = DOCS / "generated" / "extra"
+
+
+def prepare(app):
+    """Run the demonstration where it is not finished, and copy its report beside the pages."""
+    from lfpiv import demo
+
+    if not (DEMO / "report.html").exists():
+        here = os.getcwd()
+        os.chdir(DEMO.parent)  # the report names the files as a reader of the tutorial will see them
+        try:
+            demo.run(DEMO.name)
+        finally:
+            os.chdir(here)
+    shutil.copy(DEMO / "report.html", EXTRA / "demo-report.html")
+
+
+def setup(app):
+    """Copy the scene, and register the run before that of the gallery."""
+    logging.getLogger("lfpiv").setLevel(logging.ERROR)  # the scripts make bad figures on purpose
+    logging.getLogger("lfpiv_kernels").setLevel(logging.ERROR)
+    EXTRA.mkdir(parents=True, exist_ok=True)
+    scene = importlib.resources.files("lfpiv") / "demo_scene.toml"
+    (DOCS / "generated" / "demo_scene.toml").write_text(scene.read_text("utf-8"), "utf-8")
+    app.connect("builder-inited", prepare, priority=100)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,46 @@
+"""Run an experiment on a SLURM cluster: every job is one worker that does pairs; needs `pip install dask-jobqueue`.
+
+    python docs/slurm.py experiment.toml results --jobs 8 --cores 16 --memory 32GB --queue normal
+
+The same command again goes on where an interrupted one stopped. The exit status is that of `lfpiv run`.
+"""
+
+import argparse
+import logging
+import sys
+
+from dask_jobqueue import SLURMCluster
+
+import lfpiv
+
+
+def main() -> int:
+    """Ask SLURM for workers, do all pairs, and end the workers."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("experiment", help="experiment file, where all nodes see it")
+    parser.add_argument("out", help="folder for the results, where all nodes see it")
+    parser.add_argument("--jobs", type=int, default=4, help="jobs of SLURM, one worker each")
+    parser.add_argument("--cores", type=int, default=8, help="cores of each job")
+    parser.add_argument("--memory", default="16GB", help="memory of each job; `lfpiv run` logs what a worker needs")
+    parser.add_argument("--queue", help="partition of SLURM")
+    parser.add_argument("--walltime", default="04:00:00", help="time of each job; a pair cut off is done again")
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+
+    with SLURMCluster(
+        cores=arguments.cores,
+        processes=1,
+        memory=arguments.memory,
+        queue=arguments.queue,
+        walltime=arguments.walltime,
+        worker_extra_args=["--nthreads", "1"],  # a worker does one pair at a time, with all cores of its job
+    ) as cluster:
+        cluster.scale(jobs=arguments.jobs)
+        summary = lfpiv.run(arguments.experiment, arguments.out, scheduler=cluster.scheduler_address)
+    for failed in summary["failed"]:
+        print(f"pair {failed['pair']}: {failed['reason']}")
+    return 3 if summary["failed"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

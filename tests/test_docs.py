@@ -1,0 +1,278 @@
+"""Documentation that cannot rot: its Python runs, its commands are understood, its keys are described, its links lead
+somewhere. The gallery's scripts run when the pages are built."""
+
+import ast
+import doctest
+import importlib
+import importlib.util
+import logging
+import pkgutil
+import re
+import shlex
+import shutil
+import sys
+import typing
+from pathlib import Path
+
+import matplotlib
+import pytest
+import typer
+from pydantic import BaseModel
+
+import lfpiv
+from lfpiv import cli, pipeline
+from lfpiv.scene import Scene
+from lfpiv.settings import ExperimentTable
+from lfpiv.simulate import simulate
+from lfpiv.toml import tomllib
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
+SCRIPTS = sorted((DOCS / "gallery").glob("plot_*.py"))
+
+LONG = ("demo", "reproduce", "simulate")
+"""Commands that are checked to be understood, and not run: each has tests of its own."""
+
+SCENE = {
+    "name": "demo",
+    "seed": 3,
+    "dt_s": 1e-4,
+    "camera": [
+        {
+            "name": name,
+            "focal_length_mm": 100.0,
+            "magnification": -1.0,
+            "f_number": 4.0,
+            "microlens_pitch_mm": 0.1,
+            "microlens_focal_length_mm": 0.8,
+            "pixel_um": 8.0,
+            "sensor_width_px": 400,
+            "sensor_height_px": 400,
+            "nominal_angle_deg": angle,
+            "true_yaw_deg": angle - 0.5,
+        }
+        for name, angle in (("left", 45.0), ("right", -45.0))
+    ],
+    "board": {"dots": [5, 5], "spacing_mm": 0.5, "dot_diameter_mm": 0.1, "planes_mm": [-1.0, 0.0, 1.0]},
+    "volume": {"size_mm": [2.0, 2.0, 1.8], "voxel_mm": 0.1},
+    "particles": {"count": 150, "pairs": 2, "sigma_mm": 0.05},
+    "flow": {"kind": "uniform", "displacement_mm": [0.08, -0.06, 0.04]},
+    "correlation": {"windows": [[12, 16, 16], [8, 8, 8]]},
+    "smart": {"iterations": 8},
+    "network": {"hidden": [12], "epochs": 60},
+}
+"""A rig with the names and files of the demonstration, of a tenth of its work."""
+
+
+def blocks(page):
+    """Language, text and line of each fenced block of a page."""
+    text = page.read_text("utf-8")
+    for match in re.finditer(r"^```([^\n]*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        yield match[1].strip(), match[2], text.count("\n", 0, match.start()) + 2
+
+
+def commands_of(page):
+    """Commands of this package in the shell blocks of a page, as lists of words."""
+    for language, text, _ in blocks(page):
+        if language in ("", "sh", "bash"):
+            for line in re.split(r"\n|&&", text):
+                words = shlex.split(line, comments=True)
+                if words[:1] == ["lfpiv"]:
+                    yield words[1:]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, device):
+    """Folder as a reader has it: the demonstration's, finished, and an experiment of one's own beside it."""
+    folder = tmp_path_factory.mktemp("docs")
+    experiment = simulate(Scene.model_validate(SCENE), folder / "lfpiv-demo" / "experiment")
+    pipeline.run(experiment, folder / "lfpiv-demo")
+    shutil.copytree(experiment.parent, folder, dirs_exist_ok=True)
+    shutil.copytree(folder / "lfpiv-demo", folder / "results", ignore=shutil.ignore_patterns("experiment"))
+    return folder
+
+
+@pytest.fixture
+def reader(place, monkeypatch):
+    """A process in that folder; what a snippet does to plots and logging is undone."""
+    monkeypatch.chdir(place)
+    backend, handlers, level = matplotlib.get_backend(), logging.root.handlers[:], logging.root.level
+    matplotlib.use("agg")
+    yield place
+    import matplotlib.pyplot as plt
+
+    plt.close("all")
+    matplotlib.use(backend)
+    logging.root.handlers[:] = handlers
+    logging.root.setLevel(level)
+
+
+@pytest.mark.parametrize("name", [n for n, page in PAGES.items() if any(b[0] == "python" for b in blocks(page))])
+def test_the_python_of_a_page_runs_from_top_to_bottom(reader, name):
+    module = type(sys)("snippets")  # dataclasses look their module up
+    sys.modules["snippets"] = module
+    try:
+        for language, text, line in blocks(PAGES[name]):
+            if language == "python":
+                code = compile("\n" * (line - 1) + text, name, "exec", dont_inherit=True)
+                exec(code, module.__dict__)
+    finally:
+        del sys.modules["snippets"]
+
+
+@pytest.mark.parametrize("name", [n for n, page in PAGES.items() if any(commands_of(page))])
+def test_commands_are_understood_and_quick_ones_succeed(reader, name, capfd):
+    known = typer.main.get_command(cli.app).commands
+    for words in commands_of(PAGES[name]):
+        if words[0] in known:
+            known[words[0]].make_context(words[0], list(words[1:]))  # raises on what it does not understand
+        run = words[0].startswith("-") or (words[0] not in LONG and not {"--workers", "--scheduler"} & set(words))
+        assert not run or cli.call(words) == 0, (words, capfd.readouterr().err)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_named_commands_and_options_exist(name):
+    known = typer.main.get_command(cli.app).commands
+    for spoken in re.findall(r"`lfpiv ([a-z][^`]*)`", PAGES[name].read_text("utf-8")):
+        command, *rest = spoken.split()
+        assert command in known, spoken
+        options = {option for parameter in known[command].params for option in parameter.opts} | {"--help"}
+        assert {word for word in rest if word.startswith("--")} <= options, spoken
+
+
+def uncommented(text):
+    """An example with its optional keys, `# key = value`, in force."""
+    return re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_experiment_files_are_valid_with_their_optional_keys(name):
+    for language, text, _ in blocks(PAGES[name]):
+        if language != "toml":
+            continue
+        for version in (text, uncommented(text)):
+            table = tomllib.loads(version)
+            if "camera" in table:
+                ExperimentTable.model_validate(table)
+            else:  # a part: its tables alone
+                for key, values in table.items():
+                    ExperimentTable.model_fields[key].annotation.model_validate(values)
+
+
+def test_the_annotated_experiment_shows_every_key_and_its_default():
+    text = next(text for language, text, _ in blocks(PAGES["experiment.md"]) if language == "toml")
+    shown = ExperimentTable.model_validate(tomllib.loads(uncommented(text)))
+    for path, model in models(ExperimentTable):
+        part = shown
+        for key in path:
+            part = getattr(part, key)[0] if key == "camera" else getattr(part, key)
+        assert part.model_fields_set == set(type(part).model_fields), path
+        for key, field in model.model_fields.items():
+            if not field.is_required() and field.default is not None and not isinstance(field.default, BaseModel):
+                assert getattr(part, key) == field.default, (path, key)
+
+
+def models(model, path=()):
+    """All tables of a file: where they are and their models."""
+    yield path, model
+    for key, field in model.model_fields.items():
+        for part in parts(field.annotation):
+            yield from models(part, (*path, key))
+
+
+def parts(annotation):
+    """Models inside an annotation such as ``tuple[CameraTable, ...]``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in typing.get_args(annotation):
+        yield from parts(argument)
+
+
+@pytest.fixture(scope="module")
+def tables():
+    """The module that makes the tables of the pages."""
+    spec = importlib.util.spec_from_file_location("docs_tables", DOCS / "_ext" / "tables.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("file", [ExperimentTable, Scene])
+def test_every_key_is_described(tables, file):
+    page = PAGES["settings.md"].read_text("utf-8")
+    shown = {tables.find(name) for name in re.findall(r"^```\{keys\} (\S+)", page, re.MULTILINE)}
+    for path, model in models(file):
+        assert model in shown, f"{'.'.join(path)}: no table of {model.__name__} in docs/settings.md"
+        undescribed = [key for key, _, _, meaning in tables.key_rows(model) if not meaning and key != "kind"]
+        assert not undescribed, f"{model.__name__}: {undescribed} without a text below them"
+
+
+def test_every_command_has_its_help_in_the_pages(tables):
+    page = PAGES["cli.md"].read_text("utf-8")
+    assert set(re.findall(r"^```\{command\} (\S+)", page, re.MULTILINE)) == set(tables.commands())
+    for name in tables.commands():
+        assert tables.help_text(name).startswith(f"Usage: lfpiv {name}")
+
+
+def test_every_extra_is_explained():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    section = PAGES["install.md"].read_text("utf-8").partition("## Extras")[2].partition("\n## ")[0]
+    assert set(extras) <= set(re.findall(r"^\| `(\w+)`", section, re.MULTILINE))
+
+
+def test_every_public_name_has_its_reference():
+    pages = "".join(page.read_text("utf-8") for page in PAGES.values())
+    listed = re.findall(r"^\.\. auto(?:function|class|exception|module):: (\S+)", pages, re.MULTILINE)
+    assert set(lfpiv.__all__) <= set(listed)
+    assert {f"lfpiv.{name}" for name in lfpiv._SUBMODULES} <= set(listed)
+
+
+def slugs(page):
+    """Anchors of a page's headings, as GitHub and the pages' builder make them."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    heads = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads} | set(
+        re.findall(r"^\((\S+)\)=$", text, re.MULTILINE)
+    )
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_lead_somewhere(name):
+    page = PAGES[name]
+    text = re.sub(r"`[^`\n]*`", "", page.read_text("utf-8"))
+    entries = re.findall(r"^```\{toctree\}\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    targets = [line for entry in entries for line in entry.split("\n") if line and not line.startswith(":")]
+    made = {f"generated/gallery/images/sphx_glr_{script.stem}" for script in SCRIPTS} | {"generated/gallery/index"}
+    for target in [t + ".md" for t in targets] + re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        file, _, anchor = target.partition("#")
+        if file.startswith("generated/"):
+            assert re.sub(r"(_\d{3}\.png|\.rst|\.md)$", "", file) in made, target
+            continue
+        path = page.parent / file if file else page
+        assert path.exists(), target
+        assert not anchor or anchor in slugs(path), target
+
+
+def test_scripts_use_names_that_exist():
+    for script in SCRIPTS:
+        for node in ast.walk(ast.parse(script.read_text("utf-8"))):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "lfpiv":
+                assert hasattr(lfpiv, node.attr), f"{script.name}: lfpiv.{node.attr}"
+
+
+def with_examples():
+    """Modules whose docstrings hold examples."""
+    for package in ("lfpiv", "lfpiv_kernels"):
+        for module in pkgutil.walk_packages([str(ROOT / package)], f"{package}."):
+            source = Path(importlib.util.find_spec(module.name).origin)
+            if ">>> " in source.read_text("utf-8"):
+                yield module.name
+
+
+@pytest.mark.parametrize("name", [*with_examples()])
+def test_examples_in_docstrings(name, reader):
+    failed, tried = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS)
+    assert tried and not failed
