@@ -8,8 +8,9 @@ import numpy as np
 
 from lfpiv.lightfield import disc_fraction
 from lfpiv.rig import LensLattice, Optics
-from lfpiv_kernels.footprint import LANES, LAYER_FALL, LAYERS, SIDE_LAYERS
+from lfpiv_kernels.footprint_source import LAYER_FALL, LAYERS, SIDE_LAYERS
 from lfpiv_kernels.microimages import Microimages
+from lfpiv_kernels.raymodel import LANES
 
 
 def microimage_edge(optics: Optics) -> int:

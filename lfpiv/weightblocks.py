@@ -7,12 +7,13 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lfpiv.raylayout import lay_out, microimage_edge, plain
-from lfpiv.raymodel import fit_rays, grid_models
+from lfpiv.raymodel import fit_rays, grid_models, ray_models
 from lfpiv.rig import Grid
 from lfpiv_kernels import footprint, runtime
 from lfpiv_kernels.lattice import cell_frame, cell_rectangles, pack_lattice
@@ -25,14 +26,20 @@ log = logging.getLogger(__name__)
 
 Progress = Callable[[float], None]
 
-CHUNK_VOXELS = 32768
-"""Voxels per kernel launch: keeps every index below 2^31 and the scratch memory small."""
+CHUNK_VOXELS = 16384
+"""Voxels whose ray models are held at once."""
+SAMPLED_VOXELS = 1024
+"""Voxels from which the memory of all is estimated."""
+BLOCK_BYTES, VOXEL_BYTES = 6, 16
+"""Memory of a block beside its values, and of a voxel beside its blocks [byte]."""
 COUNT_POINTS = 8
 """Object points per voxel edge: 512 per voxel, the paper has 500."""
 COUNT_SAMPLES = 36
 """Pupil points per axis when every voxel is counted, about 1,000 per object point."""
 COUNT_CHUNK = 64
 """Voxels counted at once: each has a window of the sensor."""
+COUNT_TALLEST = 128
+"""Rows of a block of counts at most."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +119,18 @@ class CameraKernels:
         """How the rays lie in memory."""
         return lay_out(self.setup.optics, self.setup.lattice)
 
+    def footprints(self, form: str) -> footprint.Footprints:
+        """Return what computes this camera's blocks of a form."""
+        return footprint.Footprints(
+            self.camera,
+            self.lattice,
+            self.cell_mm,
+            self.microimages,
+            frame=self.frame,
+            rectangles=self.rectangles,
+            form=form,
+        )
+
 
 def pack_camera(camera) -> CameraKernels:
     """Pack a camera for the kernels."""
@@ -137,77 +156,99 @@ def pack_camera(camera) -> CameraKernels:
     )
 
 
+class _Growing:
+    """An array of unknown length, filled piece by piece; memory that nobody wrote to yet costs nothing."""
+
+    def __init__(self, dtype: type, expected: int):
+        self._array = np.empty(max(expected, 1), dtype)
+        self._used = 0
+
+    def take(self, count: int) -> np.ndarray:
+        """Return the next `count` entries, to be written before the next call."""
+        first, self._used = self._used, self._used + count
+        if self._used > len(self._array):
+            self._array.resize(self._used + self._used // 8, refcheck=False)  # moves pages where the system can
+        return self._array[first : self._used]
+
+    def done(self) -> np.ndarray:
+        """Return all entries taken."""
+        self._array.resize(self._used, refcheck=False)
+        return self._array
+
+
 def footprint_blocks(
     stored: StoredGrid, camera, form: str, progress: Progress, allow: Callable[[int], None] = lambda _: None
 ) -> Blocks:
-    """Compute the blocks of one camera: count them, allocate once, fill chunk by chunk.
+    """Compute the blocks of one camera.
 
-    `allow` is called with the memory they take [byte] before it is allocated, and may raise.
+    `allow` is called with the memory they will take [byte], known from a sample of the voxels, and may raise.
     """
-    pack, size = pack_camera(camera), stored.grid.size
+    size = stored.grid.size
     plane = size // stored.shape[0]
-    first_block, first_row = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
-    models = []
+    pack = pack_camera(camera)
+    blocks, values = sample_blocks(pack, stored, form)
+    allow(int(size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)))
     axes = tuple(2 - axis for axis in stored.order)
-    with threadpool_limits(1, "blas"):  # products of a plane each: BLAS's own threads cost more than they bring
-        for model in grid_models(camera, stored.shape, stored.positions_mm, axes):
-            models.append(model)
-            progress(0.3 * len(models) / stored.shape[0])
-    step = max(1, CHUNK_VOXELS // plane)
-    chunks = [(a, np.concatenate(models[a : a + step])) for a in range(0, len(models), step)]
-    del models
-    for a, model in chunks:
-        part = slice(a * plane + 1, a * plane + len(model) + 1)
-        first_block[part], first_row[part] = measure(pack, model, form)
-    np.cumsum(first_block, out=first_block)
-    np.cumsum(first_row, out=first_row)
-    allow(int(6 * first_block[-1] + LANES * first_row[-1] + 16 * size))
-    blocks = Blocks(
+    planes = grid_models(camera, stored.shape, stored.positions_mm, axes)
+
+    def batches():
+        step = max(1, CHUNK_VOXELS // plane)
+        with threadpool_limits(1, "blas"):  # products of a plane each: BLAS's own threads cost more than they bring
+            for first in range(0, stored.shape[0], step):
+                yield np.concatenate(list(islice(planes, step)))
+                progress(min(first + step, stored.shape[0]) / stored.shape[0])
+
+    return blocks_of(pack, batches(), form, (int(size * blocks), int(size * values)))
+
+
+def sample_blocks(pack: CameraKernels, stored: StoredGrid, form: str) -> tuple[float, float]:
+    """Blocks and values per voxel, from a sample of a grid's voxels."""
+    sample = np.unique(np.linspace(0, stored.grid.size - 1, SAMPLED_VOXELS).astype(np.int64))
+    model = ray_models(pack.setup, stored.centres_mm(sample), stored.grid.voxel_mm)
+    blocks, values = (np.concatenate(counts) for counts in zip(*pack.footprints(form).compute(model), strict=True))
+    return float(blocks.mean()), float(values.mean())
+
+
+def blocks_of(pack: CameraKernels, models: Iterable[np.ndarray], form: str, expected: tuple[int, int]) -> Blocks:
+    """Compute the blocks of voxels from their ray models, batch by batch.
+
+    Parameters
+    ----------
+    pack : CameraKernels
+        The camera.
+    models : iterable of ndarray, shape (voxel, 30), float32
+        Ray models, one batch after the other.
+    form : {"profiles", "pixels"}
+        Form of the blocks.
+    expected : tuple of int
+        Blocks and values to be expected: what is reserved at first.
+    """
+    footprints = pack.footprints(form)
+    blocks, values = (int(1.02 * count) + LANES for count in expected)
+    ray, height, width = (_Growing(dtype, blocks) for dtype in (np.int32, np.uint8, np.uint8))
+    value = _Growing(np.uint8, values)
+    counts, scales = [], []
+    for model in models:
+        for count in footprints.compute(model):
+            some, scale = int(count[0].sum(dtype=np.int64)), np.empty(len(count[0]), np.float32)
+            room = value.take(int(count[1].sum(dtype=np.int64)))
+            footprints.write(ray.take(some), height.take(some), width.take(some), room, scale)
+            counts.append(count)
+            scales.append(scale)
+    value.take(LANES)[:] = 0
+    first_block, first_value = (
+        np.concatenate([[0], *(count[k] for count in counts)]).cumsum(dtype=np.int64) for k in range(2)
+    )
+    return Blocks(
         form=form,
         first_block=first_block.astype(np.int32),
-        first_row=first_row,
-        ray=np.zeros(first_block[-1], np.int32),
-        height=np.zeros(first_block[-1], np.uint16),
-        value=np.zeros((first_row[-1], LANES), np.uint8),
-        scale=np.zeros(size, np.float32),
+        first_value=first_value,
+        ray=ray.done(),
+        height=height.done(),
+        width=width.done(),
+        value=value.done(),
+        scale=np.concatenate(scales),
         microimages=pack.microimages,
-    )
-    for number in range(len(chunks)):
-        a, model = chunks[number]
-        chunks[number] = None
-        fill(pack, model, blocks, a * plane, first_block)
-        progress(0.4 + 0.6 * (number + 1) / len(chunks))
-    return blocks
-
-
-def measure(pack: CameraKernels, model: np.ndarray, form: str) -> tuple[np.ndarray, np.ndarray]:
-    """Blocks and rows of each voxel."""
-    return footprint.measure_blocks(model, pack.camera, pack.lattice, pack.cell_mm, pack.microimages, form=form)
-
-
-def fill(pack: CameraKernels, model: np.ndarray, blocks: Blocks, first: int, first_block) -> None:
-    """Fill the blocks of the voxels from `first` on."""
-    voxels = slice(first, first + len(model))
-    edges = slice(first, first + len(model) + 1)
-    block = slice(first_block[first], first_block[voxels.stop])
-    row = slice(blocks.first_row[first], blocks.first_row[voxels.stop])
-    if block.start == block.stop:
-        return
-    footprint.fill_blocks(
-        model,
-        pack.camera,
-        pack.lattice,
-        pack.cell_mm,
-        pack.microimages,
-        frame=pack.frame,
-        rectangles=pack.rectangles,
-        form=blocks.form,
-        first_block=first_block[edges],
-        first_row=blocks.first_row[edges],
-        ray=blocks.ray[block],
-        height=blocks.height[block],
-        value=blocks.value[row],
-        scale=blocks.scale[voxels],
     )
 
 
@@ -280,15 +321,16 @@ def count_blocks(stored: StoredGrid, camera, progress: Progress) -> Blocks:
         )
         parts.append(_pack_windows(counts / total[:, None, None], corner, camera.optics.sensor_shape, rays.edge))
         progress(last / size)
-    blocks, rows = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    blocks, rows, ray, height, value, scale = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return Blocks(
         form="pixels",
         first_block=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
-        first_row=np.concatenate([[0], np.cumsum(rows)]).astype(np.int64),
-        ray=np.concatenate([part[2] for part in parts]),
-        height=np.concatenate([part[3] for part in parts]),
-        value=np.concatenate([part[4] for part in parts]),
-        scale=np.concatenate([part[5] for part in parts]),
+        first_value=np.concatenate([[0], LANES * np.cumsum(rows)]).astype(np.int64),
+        ray=ray,
+        height=height,
+        width=np.full(len(ray), LANES, np.uint8),
+        value=np.append(value, np.zeros(LANES, np.uint8)),
+        scale=scale,
         microimages=rays,
     )
 
@@ -307,8 +349,9 @@ def _pack_windows(windows: np.ndarray, corner: np.ndarray, sensor_shape, stride:
     tiles = windows.reshape(*windows.shape[:2], -1, lanes).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
     scale = tiles.max((1, 2, 3)) / LEVELS
     lit = tiles.any(-1)
-    starts = np.argwhere(lit & ~np.pad(lit, ((0, 0), (0, 0), (1, 0)))[:, :, :-1])
-    ends = np.argwhere(lit & ~np.pad(lit, ((0, 0), (0, 0), (0, 1)))[:, :, 1:])
+    place = np.arange(lit.shape[2]) % COUNT_TALLEST
+    starts = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (1, 0)))[:, :, :-1] & (place > 0)))
+    ends = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (0, 1)))[:, :, 1:] & (place < COUNT_TALLEST - 1)))
     voxel, tile, first = starts.T
     # a tile may begin left of the sensor: its block's pixel then lies at the end of the row above, where weights are 0
     pixel = (corner[voxel, 1] + first) * stride + corner[voxel, 0] + tile * lanes
@@ -325,7 +368,7 @@ def _pack_windows(windows: np.ndarray, corner: np.ndarray, sensor_shape, stride:
         np.bincount(voxel, minlength=len(windows)),
         np.bincount(voxel, weights=ends[:, 2] - first + 1, minlength=len(windows)).astype(np.int64),
         pixel.astype(np.int32),
-        (ends[:, 2] - first + 1).astype(np.uint16),
+        (ends[:, 2] - first + 1).astype(np.uint8),
         value,
         scale.astype(np.float32),
     )

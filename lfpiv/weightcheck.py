@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.raymodel import ray_models
-from lfpiv.weightblocks import StoredGrid, count_voxels, fill, measure, pack_camera
+from lfpiv.weightblocks import StoredGrid, blocks_of, count_voxels, pack_camera
 from lfpiv_kernels.project import Blocks
-from lfpiv_kernels.raymodel import LANES
 
 if TYPE_CHECKING:
     from lfpiv.camera import CalibratedCamera
@@ -78,18 +77,7 @@ class CountedVoxels:
         """Errors of the footprint in a form, of the counted voxels alone."""
         pack = pack_camera(self.camera)
         model = ray_models(self.camera, self.centres_mm, voxel_mm)
-        first_block, first_row = (np.concatenate([[0], np.cumsum(n)]) for n in measure(pack, model, form))
-        blocks = Blocks(
-            form=form,
-            first_block=first_block.astype(np.int32),
-            first_row=first_row,
-            ray=np.zeros(first_block[-1], np.int32),
-            height=np.zeros(first_block[-1], np.uint16),
-            value=np.zeros((first_row[-1], LANES), np.uint8),
-            scale=np.zeros(len(model), np.float32),
-            microimages=pack.microimages,
-        )
-        fill(pack, model, blocks, 0, first_block)
+        blocks = blocks_of(pack, [model], form, (0, 0))
         return self.errors(blocks, range(len(model)))
 
 
@@ -104,6 +92,17 @@ def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
     share = blocks.microimages.share[ray]
     lit = share > 0
     np.add.at(image.ravel(), blocks.microimages.pixel[ray[lit]], weight[lit] * share[lit])
+
+
+def add_window(image: np.ndarray, window: np.ndarray, corner: np.ndarray) -> None:
+    """Add a window whose first pixel is `corner` (column, row) to a sensor image, in place."""
+    column, row = (int(c) for c in corner)
+    rows = slice(max(row, 0), min(row + window.shape[0], image.shape[0]))
+    columns = slice(max(column, 0), min(column + window.shape[1], image.shape[1]))
+    if rows.start < rows.stop and columns.start < columns.stop:
+        image[rows, columns] += window[
+            rows.start - row : rows.stop - row, columns.start - column : columns.stop - column
+        ]
 
 
 def _cut(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -16,21 +16,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.raymodel import ray_models
 from lfpiv.rig import Grid
 from lfpiv.weightblocks import (
+    BLOCK_BYTES,
     CHUNK_VOXELS,
+    VOXEL_BYTES,
     StoredGrid,
     count_blocks,
     count_voxels,
     footprint_blocks,
-    measure,
     pack_camera,
+    sample_blocks,
 )
-from lfpiv.weightcheck import CountedVoxels, add_entries, profiles_serve
+from lfpiv.weightcheck import CountedVoxels, add_entries, add_window, profiles_serve
 from lfpiv_kernels import footprint, runtime
-from lfpiv_kernels.project import Projector
-from lfpiv_kernels.raymodel import LANES, LEVELS, MODEL_SIZE
+from lfpiv_kernels.project import Blocks, Projector
+from lfpiv_kernels.raymodel import LEVELS, MODEL_SIZE
 
 if TYPE_CHECKING:
     from lfpiv.camera import CalibratedCamera, Calibration
@@ -41,8 +42,6 @@ METHODS = ("footprint", "count")
 FORMS = ("auto", *footprint.FORMS)
 COUNT_SAMPLES_ONE = 144
 """Pupil points per axis for one voxel's image: the paper's 0.05 degrees."""
-SAMPLED_VOXELS = 4096
-"""Voxels from which the memory of all is estimated."""
 
 Images = dict[str, np.ndarray]
 Progress = Callable[[float], None]
@@ -77,6 +76,22 @@ class Weights:
         self._column_sum: np.ndarray | None = None
         if method == "footprint":  # counting a whole grid takes long: it waits until the operator is applied
             self._build(progress)
+
+    @classmethod
+    def from_blocks(
+        cls,
+        cameras: Mapping[str, CalibratedCamera],
+        stored: StoredGrid,
+        method: str,
+        blocks: Mapping[str, Blocks],
+        column_sum: np.ndarray | None = None,
+    ) -> Weights:
+        """Weights of blocks that were built before, one per camera: see `lfpiv.weightstore`."""
+        weights = cls(cameras, stored.grid, "count")  # builds nothing yet
+        weights.stored, weights.method, weights._column_sum = stored, method, column_sum
+        weights.forms = {name: part.form for name, part in blocks.items()}
+        weights._projectors = {name: Projector(part) for name, part in blocks.items()}
+        return weights
 
     # -- the operator ----------------------------------------------------------------------------------------------
 
@@ -138,7 +153,7 @@ class Weights:
         if self.method == "count" and not self._projectors:
             centre = self.stored.centres_mm(np.array([index]))
             counts, total, corner = count_voxels(setup, centre, self.grid.voxel_mm, samples=COUNT_SAMPLES_ONE)
-            _add_window(image, counts[0] / max(int(total[0]), 1), corner[0])
+            add_window(image, counts[0] / max(int(total[0]), 1), corner[0])
         else:
             add_entries(image, self.projector(camera).blocks, index)
         weights: np.ndarray = image * setup.gain
@@ -358,16 +373,13 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
     """
     runtime.device()
     total = 0.0
-    sample = np.unique(np.linspace(0, grid.size - 1, SAMPLED_VOXELS).astype(np.int64))
-    centres = StoredGrid(grid, (0, 1, 2)).centres_mm(sample)
+    stored = StoredGrid(grid, (0, 1, 2))
     for camera in calibration.cameras.values():
-        pack = pack_camera(camera)
-        model = ray_models(camera, centres, grid.voxel_mm)
         chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
-        blocks, rows = measure(pack, model, chosen)
-        per_voxel = 6 * blocks.mean() + LANES * rows.mean() + 16 + 4 * MODEL_SIZE
+        pack = pack_camera(camera)
+        blocks, values = sample_blocks(pack, stored, chosen)
         rays = 4 * (5 + 2) * pack.microimages.size + 24 * runtime.CHUNKS
-        total += per_voxel * grid.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
+        total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * grid.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
     return int(total)
 
 
@@ -377,17 +389,6 @@ def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     Returns camera name -> one figure per voxel that the camera sees; the count's own noise is subtracted.
     """
     return {name: weights.counted(name).errors(weights.projector(name).blocks) for name in weights.cameras}
-
-
-def _add_window(image: np.ndarray, window: np.ndarray, corner: np.ndarray) -> None:
-    """Add a window whose first pixel is `corner` (column, row) to a sensor image, in place."""
-    column, row = (int(c) for c in corner)
-    rows = slice(max(row, 0), min(row + window.shape[0], image.shape[0]))
-    columns = slice(max(column, 0), min(column + window.shape[1], image.shape[1]))
-    if rows.start < rows.stop and columns.start < columns.stop:
-        image[rows, columns] += window[
-            rows.start - row : rows.stop - row, columns.start - column : columns.stop - column
-        ]
 
 
 def _checked_image(images: Mapping[str, np.ndarray], name: str, camera: CalibratedCamera) -> np.ndarray:

@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 class Microimages:
     """How the rays of a camera's lenses lie in memory: blocks of edge x edge pixels, row by row.
 
-    Every row of lenses comes in layers, of which each holds a block per lens, see ``footprint.LAYERS``.
+    Every row of lenses comes in layers, of which each holds a block per lens, see ``footprint_source.LAYERS``.
     """
 
     first_lens: tuple[int, int]

@@ -1,10 +1,10 @@
 """Warp: forward projection and its adjoint on weights stored as 8-bit blocks of rays.
 
-A block is LANES rays wide and some rows high; its row is one vector. It holds one value per ray, or a profile along the
-columns and one along the rows, whose products are the values. The backward pass gathers per voxel. The forward pass
-scatters: on the CPU every chunk of voxels adds into rays of its own, which are summed in a fixed order, so results do
-not depend on the number of threads; on CUDA it adds atomically. The innermost loops are C++: as Warp's vectors they
-take two to three times as long on the CPU. Twin: ``reference.dense``.
+A block is at most LANES rays wide, so that its row is one vector, and some rows high. It holds one value per ray, or a
+profile along the columns and one along the rows, whose products are the values. The backward pass gathers per voxel.
+The forward pass scatters: on the CPU every chunk of voxels adds into rays of its own, which are summed in a fixed
+order, so results do not depend on the number of threads; on CUDA it adds atomically. The innermost loops are C++: as
+Warp's vectors they take two to three times as long on the CPU. Twin: ``reference.dense``.
 """
 
 import sys
@@ -24,22 +24,25 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 class Blocks:
     """Weights of all voxels for one camera; twin of a sparse matrix with 8-bit values and a scale per column.
 
-    In the form "pixels" a block of n rows has n rows of values. In the form "profiles" it has a row of column values A
-    and ceil(n / LANES) rows of row values B; the value of column c and row k is A[c] B[k].
+    A block is `width` rays wide and `height` rows high. In the form "pixels" its values are those of its rays, row by
+    row. In the form "profiles" they are `width` column values A, then `height` row values B; the value of column c and
+    row k is A[c] B[k].
     """
 
     form: str
     """"profiles" or "pixels"."""
     first_block: np.ndarray
     """Index of each voxel's first block, shape (voxel + 1,), int32."""
-    first_row: np.ndarray
-    """Index of each voxel's first row of values, shape (voxel + 1,), int64."""
+    first_value: np.ndarray
+    """Index of each voxel's first value, shape (voxel + 1,), int64."""
     ray: np.ndarray
     """Index of each block's first ray, shape (block,), int32."""
     height: np.ndarray
-    """Rows of rays of each block, shape (block,), uint16."""
+    """Rows of rays of each block, shape (block,), uint8."""
+    width: np.ndarray
+    """Rays in a row of each block, at most LANES, shape (block,), uint8."""
     value: np.ndarray
-    """Weights in levels, shape (row, LANES), uint8."""
+    """Weights in levels, shape (value + LANES,), uint8: a vector may be read past the last one."""
     scale: np.ndarray
     """Weight of one level, shape (voxel,), float32."""
     microimages: Microimages
@@ -49,24 +52,23 @@ class Blocks:
     def nbytes(self) -> int:
         """Memory of all arrays [byte]."""
         return sum(
-            getattr(self, name).nbytes for name in ("first_block", "first_row", "ray", "height", "value", "scale")
+            getattr(self, name).nbytes
+            for name in ("first_block", "first_value", "ray", "height", "width", "value", "scale")
         )
 
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Rays of one voxel and their weights, shapes (entry,): a ray may occur twice."""
-        row, lane = int(self.first_row[voxel]), np.arange(LANES)
-        rays, weights = [], []
+        value, rays, weights = int(self.first_value[voxel]), [], []
         for block in range(self.first_block[voxel], self.first_block[voxel + 1]):
-            rows = int(self.height[block])
-            rays.append(self.ray[block] + np.arange(rows)[:, None] * self.microimages.edge + lane)
+            width, height = int(self.width[block]), int(self.height[block])
+            rays.append(self.ray[block] + np.arange(height)[:, None] * self.microimages.edge + np.arange(width))
             if self.form == "profiles":
-                tall = 1 + -(-rows // LANES)
-                down = self.value[row + 1 : row + tall].ravel()[:rows]
-                weights.append(down[:, None] * self.value[row].astype(np.float64))
+                across, down = np.split(self.value[value : value + width + height].astype(np.float64), [width])
+                weights.append(down[:, None] * across)
+                value += width + height
             else:
-                tall = rows
-                weights.append(self.value[row : row + rows].astype(np.float64))
-            row += tall
+                weights.append(self.value[value : value + width * height].astype(np.float64))
+                value += width * height
         if not rays:
             return np.zeros(0, np.int64), np.zeros(0)
         return np.concatenate(rays, axis=None), np.concatenate(weights, axis=None) * float(self.scale[voxel])
@@ -77,22 +79,25 @@ class Matrix:
     """The arrays of `Blocks` on the device."""
 
     first_block: wp.array(dtype=int)
-    first_row: wp.array(dtype=wp.int64)
+    first_value: wp.array(dtype=wp.int64)
     ray: wp.array(dtype=int)
-    height: wp.array(dtype=wp.uint16)
-    level: wp.array2d(dtype=wp.uint8)
+    height: wp.array(dtype=wp.uint8)
+    width: wp.array(dtype=wp.uint8)
+    level: wp.array(dtype=wp.uint8)
     scale: wp.array(dtype=float)
     stride: int
     profiles: bool
 
 
-# A row of 8 floats or bytes in C++: a vector of the compiler on the CPU, a plain loop on a GPU.
+# A row of 8 floats or bytes in C++: a vector of the compiler on the CPU, a plain loop on a GPU. What lies in a row
+# beyond its block is another block's: `within` puts 0 there.
 _ROWS = """
 #if defined(__CUDA_ARCH__)
     struct row { float x[8]; };
     auto zero = []() { row r; for (int i = 0; i < 8; ++i) r.x[i] = 0.0f; return r; };
     auto load = [](const float* p) { row r; for (int i = 0; i < 8; ++i) r.x[i] = p[i]; return r; };
     auto levels = [](const unsigned char* p) { row r; for (int i = 0; i < 8; ++i) r.x[i] = p[i]; return r; };
+    auto within = [](row a, int width) { for (int i = width; i < 8; ++i) a.x[i] = 0.0f; return a; };
     auto add = [](row a, row b, float c) { for (int i = 0; i < 8; ++i) a.x[i] += b.x[i] * c; return a; };
     auto add_product = [](row a, row b, row c) { for (int i = 0; i < 8; ++i) a.x[i] += b.x[i] * c.x[i]; return a; };
     auto sum = [](row a) {
@@ -101,9 +106,11 @@ _ROWS = """
 #else
     typedef float row __attribute__((vector_size(32), aligned(4)));
     typedef unsigned char bytes __attribute__((vector_size(8), aligned(1)));
+    typedef int lanes __attribute__((vector_size(32)));
     auto zero = []() { return row{0, 0, 0, 0, 0, 0, 0, 0}; };
     auto load = [](const float* p) { return *(const row*)p; };
     auto levels = [](const unsigned char* p) { return __builtin_convertvector(*(const bytes*)p, row); };
+    auto within = [](row a, int width) { return (lanes{0, 1, 2, 3, 4, 5, 6, 7} < width) ? a : row{}; };
     auto add = [](row a, row b, float c) { return a + b * c; };
     auto add_product = [](row a, row b, row c) { return a + b * c; };
     auto sum = [](row a) { return ((a[0] + a[4]) + (a[1] + a[5])) + ((a[2] + a[6]) + (a[3] + a[7])); };
@@ -113,31 +120,32 @@ _ROWS = """
 _GATHER = (
     _ROWS
     + """
-    const unsigned char* level = levels_in.data + 8 * (size_t)first_row;
-    row even = zero(), odd = zero();
+    const unsigned char* level = levels_in.data + first_value;
+    row total = zero();
     for (int block = first; block < last; ++block) {
         const float* at = rays.data + ray.data[block];
-        const int rows = height.data[block];
+        const int rows = height.data[block], columns = width.data[block];
+        row even = zero(), odd = zero();
         int k = 0;
         if (profiles) {
-            const row across = levels(level);
-            row column = zero();
-            level += 8;
-            for (; k < rows; ++k, at += stride) column = add(column, load(at), (float)level[k]);
-            even = add_product(even, column, across);
-            level += (rows + 7) / 8 * 8;
+            const row across = within(levels(level), columns);
+            level += columns;
+            for (; k < rows; ++k, at += stride) even = add(even, load(at), (float)level[k]);
+            level += rows;
+            total = add_product(total, even, across);
         } else {
-            for (; k + 1 < rows; k += 2, at += 2 * stride, level += 16) {
+            for (; k + 1 < rows; k += 2, at += 2 * stride, level += 2 * columns) {
                 even = add_product(even, load(at), levels(level));
-                odd = add_product(odd, load(at + stride), levels(level + 8));
+                odd = add_product(odd, load(at + stride), levels(level + columns));
             }
             if (k < rows) {
                 even = add_product(even, load(at), levels(level));
-                level += 8;
+                level += columns;
             }
+            total = add(total, within(add(even, odd, 1.0f), columns), 1.0f);
         }
     }
-    return sum(add(even, odd, 1.0f));
+    return sum(total);
 """
 )
 
@@ -145,14 +153,15 @@ _SCATTER = (
     _ROWS
     + """
 #if !defined(__CUDA_ARCH__)  // rays of its own: not for two threads at once
-    const unsigned char* level = levels_in.data + 8 * (size_t)first_row;
+    const unsigned char* level = levels_in.data + first_value;
     for (int block = first; block < last; ++block) {
         float* at = rays_out.data + ray.data[block];
-        const int rows = height.data[block];
+        const int rows = height.data[block], columns = width.data[block];
+        const row light = within(zero() + intensity, columns);
         int k = 0;
         if (profiles) {
-            const row across = levels(level) * intensity;
-            level += 8;
+            const row across = levels(level) * light;
+            level += columns;
             for (; k + 1 < rows; k += 2, at += 2 * stride) {  // load two rows, then store two
                 const row even = add(load(at), across, (float)level[k]);
                 const row odd = add(load(at + stride), across, (float)level[k + 1]);
@@ -160,17 +169,17 @@ _SCATTER = (
                 *(row*)(at + stride) = odd;
             }
             if (k < rows) *(row*)at = add(load(at), across, (float)level[k]);
-            level += (rows + 7) / 8 * 8;
+            level += rows;
         } else {
-            for (; k + 1 < rows; k += 2, at += 2 * stride, level += 16) {
-                const row even = add(load(at), levels(level), intensity);
-                const row odd = add(load(at + stride), levels(level + 8), intensity);
+            for (; k + 1 < rows; k += 2, at += 2 * stride, level += 2 * columns) {
+                const row even = add_product(load(at), levels(level), light);
+                const row odd = add_product(load(at + stride), levels(level + columns), light);
                 *(row*)at = even;
                 *(row*)(at + stride) = odd;
             }
             if (k < rows) {
-                *(row*)at = add(load(at), levels(level), intensity);
-                level += 8;
+                *(row*)at = add_product(load(at), levels(level), light);
+                level += columns;
             }
         }
     }
@@ -183,10 +192,11 @@ _SCATTER = (
 def _gather(
     first: int,
     last: int,
-    first_row: wp.int64,
+    first_value: wp.int64,
     ray: wp.array(dtype=int),
-    height: wp.array(dtype=wp.uint16),
-    levels_in: wp.array2d(dtype=wp.uint8),
+    height: wp.array(dtype=wp.uint8),
+    width: wp.array(dtype=wp.uint8),
+    levels_in: wp.array(dtype=wp.uint8),
     stride: int,
     profiles: bool,
     rays: wp.array(dtype=float),
@@ -197,10 +207,11 @@ def _gather(
 def _scatter(
     first: int,
     last: int,
-    first_row: wp.int64,
+    first_value: wp.int64,
     ray: wp.array(dtype=int),
-    height: wp.array(dtype=wp.uint16),
-    levels_in: wp.array2d(dtype=wp.uint8),
+    height: wp.array(dtype=wp.uint8),
+    width: wp.array(dtype=wp.uint8),
+    levels_in: wp.array(dtype=wp.uint8),
     stride: int,
     profiles: bool,
     intensity: float,
@@ -222,8 +233,8 @@ def _back_project(
     if active[voxel] == 0.0:
         return
     total = _gather(
-        matrix.first_block[voxel], matrix.first_block[voxel + 1], matrix.first_row[voxel],
-        matrix.ray, matrix.height, matrix.level, matrix.stride, matrix.profiles, rays,
+        matrix.first_block[voxel], matrix.first_block[voxel + 1], matrix.first_value[voxel],
+        matrix.ray, matrix.height, matrix.width, matrix.level, matrix.stride, matrix.profiles, rays,
     )  # fmt: skip
     volume_out[voxel] = volume_out[voxel] + matrix.scale[voxel] * total
 
@@ -241,24 +252,25 @@ def _project(
     intensity = volume[voxel] * matrix.scale[voxel]
     if intensity != 0.0:
         _scatter(
-            matrix.first_block[voxel], matrix.first_block[voxel + 1], matrix.first_row[voxel],
-            matrix.ray, matrix.height, matrix.level, matrix.stride, matrix.profiles, intensity, rays_out,
+            matrix.first_block[voxel], matrix.first_block[voxel + 1], matrix.first_value[voxel],
+            matrix.ray, matrix.height, matrix.width, matrix.level, matrix.stride, matrix.profiles, intensity, rays_out,
         )  # fmt: skip
 
 
 @wp.func
-def _level(matrix: Matrix, row: int, k: int, lane: int):
-    """Level of the block's ray in row k and column `lane`; its values begin at `row`."""
+def _level(matrix: Matrix, value: wp.int64, width: int, row: int, column: int):
+    """Level of a block's ray; its values begin at `value`."""
     if matrix.profiles:
-        return float(matrix.level[row, lane]) * float(matrix.level[row + 1 + k / LANES, k % LANES])
-    return float(matrix.level[row + k, lane])
+        return float(matrix.level[value + wp.int64(column)]) * float(matrix.level[value + wp.int64(width + row)])
+    return float(matrix.level[value + wp.int64(row * width + column)])
 
 
 @wp.func
-def _rows_of_values(matrix: Matrix, rows: int):
+def _values(matrix: Matrix, width: int, height: int):
+    """Values of a block."""
     if matrix.profiles:
-        return 1 + (rows + LANES - 1) / LANES
-    return rows
+        return wp.int64(width + height)
+    return wp.int64(width * height)
 
 
 @wp.kernel
@@ -273,15 +285,15 @@ def _project_atomic(
     intensity = volume[voxel] * matrix.scale[voxel]
     if intensity == 0.0:
         return
-    row = int(matrix.first_row[voxel])
+    value = matrix.first_value[voxel]
     for block in range(matrix.first_block[voxel], matrix.first_block[voxel + 1]):
-        rows = int(matrix.height[block])
-        for k in range(rows):
-            for lane in range(LANES):
-                level = _level(matrix, row, k, lane)
+        width, height = int(matrix.width[block]), int(matrix.height[block])
+        for row in range(height):
+            for column in range(width):
+                level = _level(matrix, value, width, row, column)
                 if level > 0.0:
-                    wp.atomic_add(rays_out, matrix.ray[block] + k * matrix.stride + lane, intensity * level)
-        row += _rows_of_values(matrix, rows)
+                    wp.atomic_add(rays_out, matrix.ray[block] + row * matrix.stride + column, intensity * level)
+        value += _values(matrix, width, height)
 
 
 @wp.kernel
@@ -294,14 +306,15 @@ def _count_lit(
     count_out: wp.array(dtype=int),
 ):
     voxel = first_voxel + wp.tid()
-    row = int(matrix.first_row[voxel])
+    value = matrix.first_value[voxel]
     for block in range(matrix.first_block[voxel], matrix.first_block[voxel + 1]):
-        rows = int(matrix.height[block])
-        for k in range(rows):
-            for lane in range(LANES):
-                if share[matrix.ray[block] + k * matrix.stride + lane] > 0.0 and _level(matrix, row, k, lane) > 0.0:
+        width, height = int(matrix.width[block]), int(matrix.height[block])
+        for row in range(height):
+            for column in range(width):
+                ray = matrix.ray[block] + row * matrix.stride + column
+                if share[ray] > 0.0 and _level(matrix, value, width, row, column) > 0.0:
                     count_out[voxel] = count_out[voxel] + 1
-        row += _rows_of_values(matrix, rows)
+        value += _values(matrix, width, height)
 
 
 class Projector:
@@ -316,9 +329,10 @@ class Projector:
         self._map = RayMap(blocks.microimages)
         self._matrix = Matrix()
         self._matrix.first_block = self._put(blocks.first_block, int)
-        self._matrix.first_row = self._put(blocks.first_row, wp.int64)
+        self._matrix.first_value = self._put(blocks.first_value, wp.int64)
         self._matrix.ray = self._put(blocks.ray, int)
-        self._matrix.height = self._put(blocks.height, wp.uint16)
+        self._matrix.height = self._put(blocks.height, wp.uint8)
+        self._matrix.width = self._put(blocks.width, wp.uint8)
         self._matrix.level = self._put(blocks.value, wp.uint8)
         self._matrix.scale = self._put(blocks.scale, float)
         self._matrix.stride = blocks.microimages.edge

@@ -1,9 +1,13 @@
-"""Taichi functions on a voxel's ray model: where its rays go, how wide they smear, which pixels they can reach."""
+"""A voxel's ray model in C++: where its rays go, how wide they smear, which pixels under which lenses they can reach.
+
+The functions are lambdas for the body of a ``wp.func_native``, on floats or on vectors `V` of `W` lenses side by side:
+as many as the CPU's registers hold, one on a GPU, where every thread has a voxel of its own.
+"""
 
 import taichi as ti
 
 LANES = 8
-"""Pixels in a row of a block: one vector load."""
+"""Largest width of a block [pixel]: one vector load."""
 MODEL_SIZE = 30
 """Floats of a voxel's ray model: 6 polynomial coefficients (1, u, v, uu, uv, vv) of s, 6 of t [mm], the projected
 voxel edges along x, y, z as (s, t) [mm], and their change with the pupil point, (s_u, s_v, t_u, t_v) along x, y, z."""
@@ -14,192 +18,237 @@ NARROWEST = 1e-4
 
 Camera = ti.types.vector(8, ti.f32)
 """r = f_m/s_i, pixel [mm], columns / 2, rows / 2, pupil radius [mm], columns, rows, edge of a microimage [pixel]."""
-Lenses = ti.types.vector(2, ti.i32)
-"""Lattice indices (i, j) of the first lens that has a microimage."""
 
+GEOMETRY_SIZE = 23
+"""Floats of a camera's geometry: `Camera`, ``lattice.Lattice``, half extent of a lens's cell along s and t [mm], and
+the matrix ``lattice.cell_frame``, row by row."""
 
-@ti.func
-def ramp(x, narrow):
-    """Integral of the step function smoothed by a box of width `narrow`."""
-    bent = ti.min(ti.max(x + 0.5 * narrow, 0.0), narrow)
-    return bent * bent * (0.5 / narrow) + ti.max(x - 0.5 * narrow, 0.0)
+VECTORS = """
+#if defined(__CUDA_ARCH__)
+    typedef float V;
+    typedef int M;
+    enum { W = 1 };
+    auto splat = [](float x) { return x; };
+    auto any = [](M m) { return m != 0; };
+    auto put = [](V& v, int k, float x) { v = x; };
+    auto at = [](V v, int k) { return v; };
+    auto size = [](float x) { return fabsf(x); };
+    auto root = [](float x) { return sqrtf(x); };
+    auto down = [](float x) { return floorf(x); };
+    auto up = [](float x) { return ceilf(x); };
+#else
+#if defined(__AVX512F__)
+    enum { W = 16 };
+#else
+    enum { W = 8 };
+#endif
+    typedef float V __attribute__((vector_size(4 * W)));
+    typedef int M __attribute__((vector_size(4 * W)));
+    auto splat = [](float x) { return V{} + x; };
+    auto any = [](M m) { return __builtin_reduce_or(m) != 0; };
+    auto put = [](V& v, int k, float x) { v[k] = x; };
+    auto at = [](V v, int k) { return v[k]; };
+    auto size = [](auto x) { return __builtin_elementwise_abs(x); };
+    auto root = [](auto x) { return __builtin_elementwise_sqrt(x); };
+    auto down = [](auto x) { return __builtin_elementwise_floor(x); };
+    auto up = [](auto x) { return __builtin_elementwise_ceil(x); };
+#endif
+    auto least = [](auto a, auto b) { return a < b ? a : b; };
+    auto most = [](auto a, auto b) { return a > b ? a : b; };
+"""
+"""Vectors `V` of `W` floats and masks `M`; `size` is the absolute value, `put` and `at` reach one of the floats."""
 
-
-@ti.func
-def cumulative(x, wide, narrow):
-    """Probability that the sum of two centred boxes lies below x."""
-    return (ramp(x + 0.5 * wide, narrow) - ramp(x - 0.5 * wide, narrow)) / wide
-
-
-@ti.func
-def two_widths(a, b, c, d, e):
-    """Return the widest of five smears, and one box with the variance of the other four."""
-    widest = ti.max(ti.max(ti.abs(a), ti.abs(b)), ti.max(ti.max(ti.abs(c), ti.abs(d)), ti.abs(e)))
-    rest = ti.sqrt(ti.max(a * a + b * b + c * c + d * d + e * e - widest * widest, 0.0))
-    return ti.Vector([ti.max(widest, rest, NARROWEST), ti.max(ti.min(widest, rest), NARROWEST)])
-
-
-@ti.func
-def position(model: ti.template(), v, p):
-    """(s, t) of the ray of voxel v through the pupil point p [mm]."""
-    st = ti.Vector([0.0, 0.0])
-    for axis in ti.static(range(2)):
-        c = 6 * axis
-        st[axis] = (
-            model[v, c]
-            + p[0] * (model[v, c + 1] + p[0] * model[v, c + 3] + p[1] * model[v, c + 4])
-            + p[1] * (model[v, c + 2] + p[1] * model[v, c + 5])
-        )
-    return st
-
-
-@ti.func
-def slope(model: ti.template(), v, p):
-    """K = d(s, t)/d(u, v) at the pupil point p."""
-    k = ti.Matrix([[0.0, 0.0], [0.0, 0.0]])
-    for axis in ti.static(range(2)):
-        c = 6 * axis
-        k[axis, 0] = model[v, c + 1] + 2.0 * model[v, c + 3] * p[0] + model[v, c + 4] * p[1]
-        k[axis, 1] = model[v, c + 2] + model[v, c + 4] * p[0] + 2.0 * model[v, c + 5] * p[1]
-    return k
-
-
-@ti.func
-def inverse(m):
-    """Inverse of a 2x2 matrix whose determinant is kept away from zero."""
-    det = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-    det = ti.select(ti.abs(det) < 1e-12, 1e-12, det)
-    return ti.Matrix([[m[1, 1], -m[0, 1]], [-m[1, 0], m[0, 0]]]) / det
-
-
-@ti.func
-def edge(model: ti.template(), v, axis, p):
-    """Projected voxel edge along one axis for the pupil point p, (s, t) [mm]."""
-    k = 18 + 4 * axis
-    return ti.Vector(
-        [
-            model[v, 12 + 2 * axis] + model[v, k] * p[0] + model[v, k + 1] * p[1],
-            model[v, 13 + 2 * axis] + model[v, k + 2] * p[0] + model[v, k + 3] * p[1],
-        ]
-    )
-
-
-@ti.func
-def reach(model: ti.template(), v, p, cell, pupil_pixel):
-    """Half extent of (s, t) around a lens centre within which a ray can still reach the lens [mm].
-
-    Less the tail, a parabola of width b, whose weights round to zero anyway.
+RAYS = (
     """
-    k = slope(model, v, p)
-    x, y, z = edge(model, v, 0, p), edge(model, v, 1, p), edge(model, v, 2, p)
-    half = ti.Vector([0.0, 0.0])
-    for axis in ti.static(range(2)):
-        width = two_widths(x[axis], y[axis], z[axis], k[axis, 0] * pupil_pixel, k[axis, 1] * pupil_pixel)
-        box = cell * (ti.abs(1.0 - k[axis, axis]) + ti.abs(k[axis, 1 - axis]))
-        tail = ti.sqrt(2.0 * width[0] * width[1] * ti.min(1.0, 2.0 * box / width[0]) / (2.0 * LEVELS))
-        half[axis] = box + 0.5 * (width[0] + width[1]) - ti.min(tail, 0.5 * width[1])
-    return half
+    const float* g = geometry.data;
+    const float r = g[0], pixel = g[1], half_columns = g[2], half_rows = g[3], radius = g[4];
+    const float* lattice = g + 8;
+    const float cell = g[18];
+    const float* frame = g + 19;
+    const float pupil_pixel = pixel / r;
+    const float* m = model.data + (int64_t)MODEL_SIZE * voxel;
 
+    // (s, t) of the ray through the pupil point (u, v)
+    auto position = [&](auto u, auto v, auto& s, auto& t) {
+        s = m[0] + u * (m[1] + u * m[3] + v * m[4]) + v * (m[2] + v * m[5]);
+        t = m[6] + u * (m[7] + u * m[9] + v * m[10]) + v * (m[8] + v * m[11]);
+    };
+    // K = d(s, t)/d(u, v), row by row
+    auto slope = [&](auto u, auto v, auto* k) {
+        k[0] = m[1] + 2.0f * m[3] * u + m[4] * v;
+        k[1] = m[2] + m[4] * u + 2.0f * m[5] * v;
+        k[2] = m[7] + 2.0f * m[9] * u + m[10] * v;
+        k[3] = m[8] + m[10] * u + 2.0f * m[11] * v;
+    };
+    // inverse of a 2x2 matrix whose determinant is kept away from zero; returns the inverse's determinant
+    auto invert = [&](const auto* k, auto* out) {
+        auto det = k[0] * k[3] - k[1] * k[2];
+        det = size(det) < 1e-12f ? decltype(det){} + 1e-12f : det;
+        const auto inverse = 1.0f / det;
+        out[0] = k[3] * inverse;
+        out[1] = -k[1] * inverse;
+        out[2] = -k[2] * inverse;
+        out[3] = k[0] * inverse;
+        return inverse;
+    };
+    // the same of a slope, whose diagonal is kept away from zero
+    auto invert_slope = [&](auto* k, auto* out) {
+        for (int n = 0; n < 4; n += 3) k[n] = size(k[n]) < 1e-6f ? k[n] + 1e-6f : k[n];
+        invert(k, out);
+    };
+    // projected voxel edge along one axis for the pupil point (u, v)
+    auto voxel_edge = [&](int axis, auto u, auto v, auto& s, auto& t) {
+        const float* k = m + 18 + 4 * axis;
+        s = m[12 + 2 * axis] + k[0] * u + k[1] * v;
+        t = m[13 + 2 * axis] + k[2] * u + k[3] * v;
+    };
+    // the widest of five smears, and one box with the variance of the other four
+    auto two_widths = [&](auto a, auto b, auto c, auto d, auto e, auto& wide, auto& narrow) {
+        a = size(a), b = size(b), c = size(c), d = size(d), e = size(e);
+        const auto widest = most(most(most(a, b), most(c, d)), e);
+        const auto variance = a * a + b * b + c * c + d * d + e * e - widest * widest;
+        const decltype(a) none = {};
+        const auto rest = root(most(variance, none));
+        wide = most(most(widest, rest), none + NARROWEST);
+        narrow = most(least(widest, rest), none + NARROWEST);
+    };
+    // half extent of (s, t) around a lens centre within which a ray can still reach the lens,
+    // less the tail, a parabola of width b, whose weights round to zero anyway
+    auto reach = [&](auto u, auto v, const auto* k, auto* half) {
+        auto s = u, t = v;
+        decltype(s) edge[2][3];
+        for (int axis = 0; axis < 3; ++axis) {
+            voxel_edge(axis, u, v, s, t);
+            edge[0][axis] = s, edge[1][axis] = t;
+        }
+        for (int n = 0; n < 2; ++n) {
+            auto wide = u, narrow = v;
+            const auto *e = edge[n], *along = k + 2 * n;
+            two_widths(e[0], e[1], e[2], along[0] * pupil_pixel, along[1] * pupil_pixel, wide, narrow);
+            const auto box = cell * (size(1.0f - along[n]) + size(along[1 - n]));
+            const auto inner = least(wide, 2.0f * box);
+            const auto tail = root(narrow * inner * (1.0f / LEVELS));
+            half[n] = box + 0.5f * (wide + narrow) - least(tail, 0.5f * narrow);
+        }
+    };
 
-@ti.func
-def bend(model: ti.template(), v):
-    """Bound of the second-order terms of (s, t) per squared distance on the pupil [1/mm]."""
-    return ti.Vector(
-        [
-            ti.abs(model[v, 3]) + ti.abs(model[v, 4]) + ti.abs(model[v, 5]),
-            ti.abs(model[v, 9]) + ti.abs(model[v, 10]) + ti.abs(model[v, 11]),
-        ]
-    )
+    // rays to first order about the pupil's centre, and bounds of the rest: the inverse slope, the half extent of
+    // (s, t) around a lens centre within which a ray can reach the lens, how far the rays spread over the array
+    float centre_slope[4], back[4], half[2], spread[2];
+    slope(0.0f, 0.0f, centre_slope);
+    reach(0.0f, 0.0f, centre_slope, half);
+    for (int axis = 0; axis < 3; ++axis) {
+        const float* k = m + 18 + 4 * axis;
+        half[0] += 0.5f * radius * (size(k[0]) + size(k[1]));
+        half[1] += 0.5f * radius * (size(k[2]) + size(k[3]));
+    }
+    // bounds of the second-order terms per squared distance on the pupil
+    const float bend[2] = {size(m[3]) + size(m[4]) + size(m[5]), size(m[9]) + size(m[10]) + size(m[11])};
+    float fixed_slope[4];
+    for (int n = 0; n < 4; ++n) fixed_slope[n] = centre_slope[n];
+    invert_slope(fixed_slope, back);
+    for (int n = 0; n < 2; ++n) {
+        const float* k = centre_slope + 2 * n;
+        half[n] += radius * radius * bend[n];
+        spread[n] = radius * root(k[0] * k[0] + k[1] * k[1]);
+    }
 
+    // lens indices (i0, i1, j0, j1), ends included, of those the rays can reach; i1 < i0 or j1 < j0 where none are
+    int i0 = 0, i1 = -1, j0 = 0, j1 = -1;
+    {
+        // only as far as the sensor reaches, and one microimage more
+        const float margin = 2.0f * r * radius + 2.0f * cell;
+        const float limit_s = half_columns * pixel + margin, limit_t = half_rows * pixel + margin;
+        const float low_s = most(m[0] - half[0] - spread[0], -limit_s);
+        const float high_s = least(m[0] + half[0] + spread[0], limit_s);
+        const float low_t = most(m[6] - half[1] - spread[1], -limit_t);
+        const float high_t = least(m[6] + half[1] + spread[1], limit_t);
+        if (low_s <= high_s && low_t <= high_t) {
+            const float s = 0.5f * (low_s + high_s) - lattice[0], t = 0.5f * (low_t + high_t) - lattice[1];
+            const float half_s = 0.5f * (high_s - low_s), half_t = 0.5f * (high_t - low_t);
+            const float i = lattice[6] * s + lattice[7] * t, j = lattice[8] * s + lattice[9] * t;
+            const float di = size(lattice[6]) * half_s + size(lattice[7]) * half_t;
+            const float dj = size(lattice[8]) * half_s + size(lattice[9]) * half_t;
+            i0 = (int)most(up(i - di), (float)lenses[0]);
+            i1 = (int)least(down(i + di), (float)(lenses[0] + lenses[2] - 1));
+            j0 = (int)most(up(j - dj), (float)lenses[1]);
+            j1 = (int)least(down(j + dj), (float)(lenses[1] + lenses[3] - 1));
+        }
+    }
 
-@ti.func
-def affine(model: ti.template(), v, cell, pupil_pixel, radius):
-    """Rays of voxel v to first order about the pupil's centre, and bounds of the rest.
+    // the next W lenses of the range, which begins again behind its last: their indices, centres and first pixels
+    const int reached = i1 < i0 || j1 < j0 ? 0 : (i1 - i0 + 1) * (j1 - j0 + 1);
+    int next_i = i0, next_j = j0;
+    auto take_lenses = [&](int* lens, int* corner, V& centre_s, V& centre_t, V& first_column, V& first_row) {
+        V i, j;
+        for (int k = 0; k < W; ++k) {
+            const int* at_lens =
+                corners.data + 2 * ((int64_t)(next_j - lenses[1]) * lenses[2] + next_i - lenses[0]);
+            lens[2 * k] = next_i, lens[2 * k + 1] = next_j;
+            corner[2 * k] = at_lens[0], corner[2 * k + 1] = at_lens[1];
+            put(i, k, (float)next_i);
+            put(j, k, (float)next_j);
+            put(first_column, k, (float)at_lens[0]);
+            put(first_row, k, (float)at_lens[1]);
+            if (++next_i > i1) {
+                next_i = i0;
+                if (++next_j > j1) next_j = j0;
+            }
+        }
+        centre_s = lattice[0] + i * lattice[2] + j * lattice[4];
+        centre_t = lattice[1] + i * lattice[3] + j * lattice[5];
+    };
 
-    Returns the chief ray (s, t) [mm], the inverse slope [1], the half extent of (s, t) around a lens centre within
-    which a ray can reach the lens, and how far the rays spread over the array.
-    """
-    middle = ti.Vector([0.0, 0.0])
-    k = slope(model, v, middle)
-    half = reach(model, v, middle, cell, pupil_pixel)
-    for axis in ti.static(range(3)):
-        c = 18 + 4 * axis
-        half[0] += 0.5 * radius * (ti.abs(model[v, c]) + ti.abs(model[v, c + 1]))
-        half[1] += 0.5 * radius * (ti.abs(model[v, c + 2]) + ti.abs(model[v, c + 3]))
-    half += radius * radius * bend(model, v)
-    spread = radius * ti.Vector(
-        [ti.sqrt(k[0, 0] * k[0, 0] + k[0, 1] * k[0, 1]), ti.sqrt(k[1, 0] * k[1, 0] + k[1, 1] * k[1, 1])]
-    )
-    for axis in ti.static(range(2)):
-        k[axis, axis] += ti.select(ti.abs(k[axis, axis]) < 1e-6, 1e-6, 0.0)
-    return ti.Vector([model[v, 0], model[v, 6]]), inverse(k), half, spread
-
-
-@ti.func
-def lens_range(chief, extent, camera, lattice, cell, first, lenses_i, lenses_j):
-    """Lattice indices (i0, i1, j0, j1), ends included, of the lenses within `extent` of `chief` [mm]."""
-    # only as far as the sensor reaches, and one microimage more
-    margin = 2.0 * camera[0] * camera[4] + 2.0 * cell
-    sensor = ti.Vector([camera[2] * camera[1] + margin, camera[3] * camera[1] + margin])
-    low, high = ti.max(chief - extent, -sensor), ti.min(chief + extent, sensor)
-    ds, dt = 0.5 * (low[0] + high[0]) - lattice[0], 0.5 * (low[1] + high[1]) - lattice[1]
-    half = ti.max(0.5 * (high - low), 0.0)
-    i, j = lattice[6] * ds + lattice[7] * dt, lattice[8] * ds + lattice[9] * dt
-    di = ti.abs(lattice[6]) * half[0] + ti.abs(lattice[7]) * half[1]
-    dj = ti.abs(lattice[8]) * half[0] + ti.abs(lattice[9]) * half[1]
-    lens = ti.Vector(
-        [
-            ti.max(ti.cast(ti.ceil(i - di), ti.i32), first[0]),
-            ti.min(ti.cast(ti.floor(i + di), ti.i32), first[0] + lenses_i - 1),
-            ti.max(ti.cast(ti.ceil(j - dj), ti.i32), first[1]),
-            ti.min(ti.cast(ti.floor(j + dj), ti.i32), first[1] + lenses_j - 1),
-        ]
-    )
-    if low[0] > high[0] or low[1] > high[1]:
-        lens = ti.Vector([0, -1, 0, -1])
-    return lens
-
-
-@ti.func
-def pixel_box(
-    model: ti.template(), v, chief, back, half, camera, centre, corner, cell, pupil_pixel, bends: ti.template()
-):
-    """Pixels (column0, column1, row0, row1), ends included, under the lens at `centre` that voxel v can light.
-
-    `chief`, `back` and `half` are the chief ray, the inverse slope and the reach from `affine`, `corner` the first
-    pixel of the lens's block. Also the pupil point in the middle of the box, inside the pupil. The box is empty where
-    column0 > column1 or row0 > row1.
-    """
-    radius = camera[4]
-    edge_mm = radius + 0.5 * pupil_pixel
-    at = back @ (centre - chief)
-    spread = ti.abs(back) @ half
-    low, high = ti.max(at - spread, -edge_mm), ti.min(at + spread, edge_mm)
-    if ti.static(bends):  # once more about the middle of what is left
-        p = 0.5 * (low + high)
-        k = slope(model, v, p)
-        for axis in ti.static(range(2)):
-            k[axis, axis] += ti.select(ti.abs(k[axis, axis]) < 1e-6, 1e-6, 0.0)
-        local = inverse(k)
-        near = reach(model, v, p, cell, pupil_pixel) + bend(model, v) * 0.25 * (high - low).norm_sqr()
-        spread = ti.abs(local) @ near
-        p -= local @ (position(model, v, p) - centre)
-        low, high = ti.max(low, p - spread), ti.min(high, p + spread)
-    r, pixel = camera[0], camera[1]
-    first = ((1.0 + r) * centre - r * high) / pixel - 0.5
-    last = ((1.0 + r) * centre - r * low) / pixel - 0.5
-    block = ti.cast(camera[7], ti.i32)
-    column0 = ti.max(ti.cast(ti.ceil(first[0] + camera[2]), ti.i32), 0, corner[0])
-    column1 = ti.min(
-        ti.cast(ti.floor(last[0] + camera[2]), ti.i32), ti.cast(camera[5], ti.i32) - 1, corner[0] + block - 1
-    )
-    row0 = ti.max(ti.cast(ti.ceil(first[1] + camera[3]), ti.i32), 0, corner[1])
-    row1 = ti.min(ti.cast(ti.floor(last[1] + camera[3]), ti.i32), ti.cast(camera[6], ti.i32) - 1, corner[1] + block - 1)
-    nearest = ti.min(ti.max(ti.Vector([0.0, 0.0]), low), high)
-    if low[0] > high[0] or low[1] > high[1] or nearest.norm() > radius + pupil_pixel:
-        column1 = column0 - 1
-    middle = 0.5 * (low + high)
-    length = middle.norm()
-    if length > radius:
-        middle *= radius / length
-    return ti.Vector([column0, column1, row0, row1]), middle
+    // Pixels (column0, column1, row0, row1), ends included, under the lenses that the voxel can light, and the pupil
+    // point in their middle, inside the pupil. Returns for which lenses, of the first `some`, there are any.
+    auto pixel_box = [&](int some, V centre_s, V centre_t, V first_column, V first_row, V* box, V* middle) {
+        const float rim = radius + 0.5f * pupil_pixel;
+        const V ds = centre_s - m[0], dt = centre_t - m[6];
+        const V at_u = back[0] * ds + back[1] * dt, at_v = back[2] * ds + back[3] * dt;
+        const float wide_u = size(back[0]) * half[0] + size(back[1]) * half[1];
+        const float wide_v = size(back[2]) * half[0] + size(back[3]) * half[1];
+        V low_u = most(at_u - wide_u, splat(-rim)), high_u = least(at_u + wide_u, splat(rim));
+        V low_v = most(at_v - wide_v, splat(-rim)), high_v = least(at_v + wide_v, splat(rim));
+        if (!profiles) {  // once more about the middle of what is left
+            V k[4], local[4], near[2], s, t;
+            const V u = 0.5f * (low_u + high_u), v = 0.5f * (low_v + high_v);
+            const V extent = (high_u - low_u) * (high_u - low_u) + (high_v - low_v) * (high_v - low_v);
+            slope(u, v, k);
+            reach(u, v, k, near);
+            invert_slope(k, local);
+            for (int n = 0; n < 2; ++n) near[n] += bend[n] * 0.25f * extent;
+            const V about_u = size(local[0]) * near[0] + size(local[1]) * near[1];
+            const V about_v = size(local[2]) * near[0] + size(local[3]) * near[1];
+            position(u, v, s, t);
+            const V middle_u = u - (local[0] * (s - centre_s) + local[1] * (t - centre_t));
+            const V middle_v = v - (local[2] * (s - centre_s) + local[3] * (t - centre_t));
+            low_u = most(low_u, middle_u - about_u), high_u = least(high_u, middle_u + about_u);
+            low_v = most(low_v, middle_v - about_v), high_v = least(high_v, middle_v + about_v);
+        }
+        const V from_s = (1.0f + r) * centre_s, from_t = (1.0f + r) * centre_t, zero = splat(0.0f);
+        const float last = g[7] - 1.0f;
+        box[0] = most(most(up((from_s - r * high_u) / pixel - 0.5f + half_columns), zero), first_column);
+        box[1] = least(down((from_s - r * low_u) / pixel - 0.5f + half_columns), splat(g[5] - 1.0f));
+        box[1] = least(box[1], first_column + last);
+        box[2] = most(most(up((from_t - r * high_v) / pixel - 0.5f + half_rows), zero), first_row);
+        box[3] = least(down((from_t - r * low_v) / pixel - 0.5f + half_rows), splat(g[6] - 1.0f));
+        box[3] = least(box[3], first_row + last);
+        const V near_u = least(most(zero, low_u), high_u), near_v = least(most(zero, low_v), high_v);
+        const float outside = radius + pupil_pixel;
+        V turn = zero;
+        for (int k = 0; k < W; ++k) put(turn, k, (float)k);
+        M lit = (turn < (float)some) & (low_u <= high_u) & (low_v <= high_v) & (box[0] <= box[1]) & (box[2] <= box[3]);
+        lit &= near_u * near_u + near_v * near_v <= outside * outside;
+        const V u = 0.5f * (low_u + high_u), v = 0.5f * (low_v + high_v);
+        const V away = root(u * u + v * v);
+        const V shorter = away > radius ? radius / away : zero + 1.0f;
+        middle[0] = u * shorter, middle[1] = v * shorter;
+        return lit;
+    };
+""".replace("MODEL_SIZE", str(MODEL_SIZE))
+    .replace("NARROWEST", f"{NARROWEST}f")
+    .replace("LEVELS", f"{LEVELS}f")
+)
+"""The ray model of `voxel` as functions, and the lenses its rays can reach. Reads the arguments `model` (voxel,
+MODEL_SIZE), `geometry` (GEOMETRY_SIZE,), `lenses` (first i, first j, lenses along i, along j), `corners` (lens along j,
+along i, 2), `voxel` and `profiles`."""

@@ -140,21 +140,19 @@ def dense(blocks) -> np.ndarray:
     rays = blocks.microimages
     matrix = np.zeros((rays.sensor_shape[0] * rays.sensor_shape[1], len(blocks.scale)))
     for voxel in range(len(blocks.scale)):
-        row = blocks.first_row[voxel]
+        value = blocks.first_value[voxel]
         for block in range(blocks.first_block[voxel], blocks.first_block[voxel + 1]):
-            values = row
-            if blocks.form == "profiles":
-                row += 1
-            for y in range(blocks.height[block]):
-                for x in range(blocks.value.shape[1]):
+            width, height = int(blocks.width[block]), int(blocks.height[block])
+            for y in range(height):
+                for x in range(width):
                     if blocks.form == "profiles":
-                        level = float(blocks.value[values, x]) * float(blocks.value[row + y // 8, y % 8])
+                        level = float(blocks.value[value + x]) * float(blocks.value[value + width + y])
                     else:
-                        level = float(blocks.value[row + y, x])
+                        level = float(blocks.value[value + width * y + x])
                     ray = blocks.ray[block] + y * rays.edge + x
                     if rays.share[ray] > 0:
                         matrix[rays.pixel[ray], voxel] += level * blocks.scale[voxel] * rays.share[ray]
-            row += -(-int(blocks.height[block]) // 8) if blocks.form == "profiles" else int(blocks.height[block])
+            value += width + height if blocks.form == "profiles" else width * height
     return matrix
 
 

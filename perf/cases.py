@@ -141,23 +141,22 @@ def _rows_of(blocks, first: int, last: int) -> sparse.csr_array:
     """Rows of the explicit matrix (voxel, pixel) of some voxels."""
     rays, profiles = blocks.microimages, blocks.form == "profiles"
     part = slice(blocks.first_block[first], blocks.first_block[last])
-    height = blocks.height[part].astype(np.int64)
-    tall = np.concatenate([[0], np.cumsum(1 + -(-height // 8) if profiles else height)])
-    start = blocks.first_block[first : last + 1] - blocks.first_block[first]
-    head = tall[:-1] + np.repeat(blocks.first_row[first:last] - tall[start[:-1]], np.diff(start))
-    block = np.repeat(np.arange(len(height)), height)
-    row = np.arange(len(block)) - np.repeat(np.cumsum(height) - height, height)
+    height, width = blocks.height[part].astype(np.int64), blocks.width[part].astype(np.int64)
+    size = width + height if profiles else width * height
+    start = np.cumsum(size) - size + blocks.first_value[first]  # blocks lie one after the other
+    block = np.repeat(np.arange(len(height)), width * height)
+    row, column = np.divmod(
+        np.arange(len(block)) - np.repeat(np.cumsum(width * height) - width * height, width * height), width[block]
+    )
     if profiles:
-        level = (
-            blocks.value[head[block]] * blocks.value[head[block] + 1 + row // 8, row % 8].astype(np.float32)[:, None]
-        )
+        level = blocks.value[start[block] + column] * blocks.value[start[block] + width[block] + row].astype(np.float32)
     else:
-        level = blocks.value[head[block] + row].astype(np.float32)
-    ray = blocks.ray[part][block, None] + row[:, None] * rays.edge + np.arange(8)
-    voxel = np.repeat(np.arange(last - first), np.diff(start))[block]
+        level = blocks.value[start[block] + width[block] * row + column].astype(np.float32)
+    ray = blocks.ray[part][block] + row * rays.edge + column
+    voxel = np.repeat(np.arange(last - first), np.diff(blocks.first_block[first : last + 1]))[block]
     lit = (level > 0) & (rays.share[ray] > 0)
-    data = (level * blocks.scale[first + voxel, None] * rays.share[ray])[lit]
-    index = np.broadcast_to(voxel[:, None], lit.shape)[lit], rays.pixel[ray[lit]]
+    data = (level * blocks.scale[first + voxel] * rays.share[ray])[lit]
+    index = voxel[lit], rays.pixel[ray[lit]]
     return sparse.csr_array((data, index), shape=(last - first, rays.sensor_shape[0] * rays.sensor_shape[1]))
 
 

@@ -35,10 +35,11 @@ def random_system(seed, voxels=(3, 4, 5), rows=4, lit=0.4):
         blocks = Blocks(
             form="pixels",
             first_block=np.arange(grid.size + 1, dtype=np.int32),
-            first_row=np.arange(grid.size + 1, dtype=np.int64) * rows,
+            first_value=np.arange(grid.size + 1, dtype=np.int64) * rows * 8,
             ray=np.zeros(grid.size, np.int32),
-            height=np.full(grid.size, rows, np.uint16),
-            value=value.astype(np.uint8),
+            height=np.full(grid.size, rows, np.uint8),
+            width=np.full(grid.size, 8, np.uint8),
+            value=np.append(value, np.zeros(8)).astype(np.uint8),
             scale=rng.uniform(0.5, 1.5, grid.size).astype(np.float32) / raymodel.LEVELS,
             microimages=plain((rows, 8)),
         )

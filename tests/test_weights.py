@@ -1,17 +1,20 @@
 """Weights: kernels against their twins, footprint against counted rays, and the invariants of a linear operator."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 from ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
+from lfpiv import weightblocks
 from lfpiv.raylayout import lay_out
 from lfpiv.raymodel import ray_models
 from lfpiv.weightblocks import count_voxels
 from lfpiv.weights import compare_with_count, estimate_memory
-from lfpiv_kernels import footprint, raymodel, reference, runtime, trace
+from lfpiv_kernels import footprint, footprint_source, project, raymodel, reference, runtime, trace
 from lfpiv_kernels.lattice import cell_frame, cell_rectangles, pack_lattice
 
 VOXEL_MM = 0.1
@@ -88,6 +91,43 @@ def test_footprint_kernel_equals_its_twin(name, form):
     levels = (1 if form == "pixels" else 2) * LEVEL  # a product of two rounded profiles
     assert np.abs(image - twin)[whole].max() <= (levels + TOLERANCE_TWIN) * twin.max()
     assert np.linalg.norm(image - twin) <= TOLERANCE_EDGE * np.linalg.norm(twin)
+
+
+@pytest.mark.parametrize("form", footprint.FORMS)
+def test_microimages_may_be_higher_than_a_block(form):
+    fine = replace(optics(700, 700), pixel_mm=0.0014)  # 71 pixels across a microimage
+    grid = lfpiv.Grid(shape=(1, 1, 2), voxel_mm=VOXEL_MM, first_centre_mm=(0.05, 0.0, 0.0))
+    weights = lfpiv.build_weights(
+        IdealRig({"fine": IdealCamera("fine", rotation(0, 3, 2), optics=fine)}), grid, form=form
+    )
+    blocks = weights.projector("fine").blocks
+    assert blocks.height.max() == footprint_source.TALLEST and blocks.microimages.edge > footprint_source.TALLEST
+    rays, _ = blocks.entries(0)
+    assert len(np.unique(rays)) == len(rays)  # blocks do not overlap
+    assert weights.image("fine", (0, 0, 0)).sum() == pytest.approx(1.0, rel=0.01)
+    assert np.max(compare_with_count(weights)["fine"]) <= FOOTPRINT_WORST
+
+
+@pytest.mark.parametrize("form", footprint.FORMS)
+def test_blocks_do_not_depend_on_how_the_voxels_are_cut(form, monkeypatch):
+    grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.6, 0.5, 0.4), voxel_mm=VOXEL_MM)
+    rig = IdealRig({"mild coma": RIGS["mild coma"]})
+    whole = lfpiv.build_weights(rig, grid, form=form).projector("mild coma").blocks
+    monkeypatch.setattr(footprint, "SCRATCH_BYTES", 5000)  # a few voxels
+    monkeypatch.setattr(weightblocks, "CHUNK_VOXELS", 1)  # a plane of them
+    monkeypatch.setattr(weightblocks, "SAMPLED_VOXELS", 1)  # far from the mean: the arrays have to grow
+    cut = lfpiv.build_weights(rig, grid, form=form).projector("mild coma").blocks
+    for name in ("first_block", "first_value", "ray", "height", "width", "value", "scale"):
+        assert getattr(cut, name).tobytes() == getattr(whole, name).tobytes(), name
+
+
+@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
+@pytest.mark.parametrize("module", [footprint, project], ids=lambda module: module.__name__.rpartition(".")[2])
+def test_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):
+    runtime.device()
+    (compiled,) = wp.compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
+    entries = compiled.read_text().count(".visible .entry")
+    assert entries == len(wp.get_module(module.__name__).kernels)
 
 
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
