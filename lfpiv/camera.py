@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -49,9 +50,10 @@ class CalibratedCamera:
         """White-image gain of every pixel, shape (rows, columns), float32.
 
         The board's dots tell how much of the white image's scatter from pixel to pixel is response and how much is
-        noise; without them it is taken as noise.
+        noise; without them, or where the estimator of the dots does not measure it, it is taken as noise.
         """
-        return self.decoder.shrunk_gain(0.0 if self.dots is None else self.dots.response_share)
+        share = 0.0 if self.dots is None else self.dots.response_share
+        return self.decoder.shrunk_gain(0.0 if math.isnan(share) else share)
 
     def map(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
         """Trace rays to the microlens array (Eqs. 6-7).

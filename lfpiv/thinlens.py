@@ -20,7 +20,9 @@ PRIOR = np.repeat([1e3, 0.05], [6, 5])
 to speak of for the pose, 5 % of the data sheet (0.5 mm for the axis) for the optics. Dots in a thin volume hardly tell
 some of them apart; where they do, thousands of labels outweigh it."""
 ITERATIONS, STEP, CONVERGED = 50, 1e-6, 1e-9
-"""Gauss-Newton steps at most, the difference step, and the step that ends the fit (numbers of order 0.01)."""
+"""Steps at most, the difference step, and the step that ends the fit (numbers of order 0.01)."""
+FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-12
+"""Damping of the first step, and the least, relative to the diagonal of the normal equations (Levenberg, Marquardt)."""
 OUTLIER = 4.0
 """Residual, in robust standard deviations, at which a label counts a quarter."""
 SMALLEST_STD_MM = 1e-7
@@ -132,7 +134,7 @@ def fit_thin_lens(
     """Fit the thin-lens camera to labels of rays; needs no angle, any pose is found.
 
     A fit of s, t = a + A (x, y, z) + (k + b (x, y, z)) (u, v) by linear least squares starts it: A's rows are the
-    camera's axes times the magnification, b its optical axis times s_i / s_o^2. A robust Gauss-Newton fit of
+    camera's axes times the magnification, b its optical axis times s_i / s_o^2. A robust Levenberg-Marquardt fit of
     pose, image distance, focal length, pupil scale and axis follows, held near the data sheet only where the labels
     leave it open; mislabelled dots drop out of it.
 
@@ -180,19 +182,29 @@ def fit_thin_lens(
         deviation: np.ndarray = _moved(start, optics, parameters)(points, pupil) - array
         return (deviation / std[:, None]).ravel()
 
-    parameters = np.zeros(11)
+    def cost(residual: np.ndarray, parameters: np.ndarray, sigma: float) -> float:
+        robust = residual**2 / (1 + (residual / (OUTLIER * sigma)) ** 2)  # Geman and McClure: mislabelled dots drop out
+        return float(robust.sum() + ((sigma / PRIOR * parameters) ** 2).sum())
+
+    parameters, damping = np.zeros(11), FIRST_DAMPING
     residual = misfit(parameters)
     for _ in range(ITERATIONS):
         sigma = max(1.4826 * float(np.median(np.abs(residual))), SMALLEST_STD_MM)
-        weight = 1 / (1 + (residual / (OUTLIER * sigma)) ** 2) ** 2  # Geman and McClure: mislabelled dots drop out
+        weight = 1 / (1 + (residual / (OUTLIER * sigma)) ** 2) ** 2
         columns = np.stack([(misfit(parameters + nudge) - residual) / STEP for nudge in STEP * np.eye(11)], axis=1)
         weighted = columns * weight[:, None]
         gram = weighted.T @ columns + np.diag((sigma / PRIOR) ** 2)
         gradient = weighted.T @ residual + (sigma / PRIOR) ** 2 * parameters
-        step = np.linalg.solve(gram, -gradient)
-        parameters = parameters + step
-        residual = misfit(parameters)
-        if np.abs(step).max() < CONVERGED:
+        present = cost(residual, parameters, sigma)
+        while True:  # numbers the labels hardly tell apart invite steps far beyond where the fit is linear
+            step = np.linalg.solve(gram + damping * np.diag(gram.diagonal()), -gradient)
+            trial = misfit(parameters + step)
+            small = bool(np.abs(step).max() < CONVERGED)
+            if small or cost(trial, parameters + step, sigma) <= present:
+                break
+            damping *= 10
+        parameters, residual, damping = parameters + step, trial, max(damping / 10, LEAST_DAMPING)
+        if small:
             break
     return _moved(start, optics, parameters)
 

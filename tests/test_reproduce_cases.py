@@ -188,7 +188,7 @@ def test_profiles_of_exact_fields_are_exact(scale):
         planar.append(
             {"y_mm": axes[1], "x_mm": axes[2], "displacement_mm": twin.mean(points)[:, :2].reshape(*x.shape, 2)}
         )
-    profiles = lsi.sample_profiles(twin, {"axes_mm": axes, "displacement_mm": field}, planar)
+    profiles = lsi.sample_profiles(twin, {"axes_mm": axes, "displacement_mm": field, "truth_mm": field}, planar)
     for number in range(2):
         reference = profiles["mean"][..., number]
         assert lsi.relative_error(profiles["light_field"][..., number], reference) < INTERPOLATION

@@ -1,4 +1,4 @@
-"""The paper's tables and figures, computed by this software and shown beside the paper's own.
+"""The paper's tables and figures, computed by this software and shown beside the paper's own; and what it did not show.
 
 A case is a module of this package named by its key in `CASES`. It provides
 
@@ -28,12 +28,16 @@ from typing import Any
 import lfpiv
 from lfpiv.errors import InputError
 
-__all__ = ["CASES", "SCALES", "reproduce"]
+__all__ = ["BEYOND", "CASES", "PAPER", "SCALES", "reproduce"]
 
 log = logging.getLogger(__name__)
 
-CASES = ("table1", "table3", "fig10", "fig12", "fig14", "fig19", "lsi")
-"""Keys of the cases, in the order of the paper."""
+PAPER = ("table1", "table3", "fig10", "fig12", "fig14", "fig19", "lsi")
+"""Keys of the paper's cases, in its order."""
+BEYOND = ("optics", "cameras", "sweeps", "choices")
+"""Keys of the cases that the paper did not show."""
+CASES = (*PAPER, *BEYOND)
+"""All of them, in the order of the page."""
 
 SCALES = ("small", "paper")
 
@@ -49,7 +53,7 @@ def reproduce(
     progress: Progress | None = None,
     finished: Callable[[str, dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
-    """Compute cases of the paper into ``out``: ``reproduce.json``, one PNG per figure, ``index.html``.
+    """Compute cases into ``out``: ``reproduce.json``, one PNG per figure, ``index.html``.
 
     Parameters
     ----------
@@ -114,7 +118,7 @@ def reproduce(
 
 
 def _checked_cases(cases: Sequence[str]) -> list[str]:
-    """Keys asked for, each once, in the order of the paper."""
+    """Keys asked for, each once, in the order of the page."""
     asked = [cases] if isinstance(cases, str) else list(cases)
     unknown = [key for key in asked if key not in (*CASES, "all")]
     if unknown or not asked:

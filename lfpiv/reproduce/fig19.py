@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from matplotlib.ticker import MaxNLocator
 from scipy import ndimage
 
 from lfpiv import metrics
 from lfpiv.reproduce import page, plots, store
-from lfpiv.reproduce.injector import experimental_rig, reconstruct_images
-from lfpiv.reproduce.rigs import Rig
+from lfpiv.reproduce.injector import experimental_rig
+from lfpiv.reproduce.rigs import Rig, reconstruct_images
 from lfpiv.rig import Grid
+from lfpiv.settings import Smart
 
 TITLE = "Figs. 18 and 19: board dots reconstructed at every plane"
 
@@ -137,7 +139,7 @@ def reconstruct_plane(rig: Rig, plane: int, *, seed: int) -> np.ndarray:
         voxel_mm=voxel,
     )
     images = {name: rig.experiment.board_image(name, plane) for name in rig.calibration.cameras}
-    volume = reconstruct_images(rig.weights(grid, "network"), rig.calibration, images, iterations=ITERATIONS)
+    volume = reconstruct_images(rig.weights(grid, "network"), images, Smart(iterations=ITERATIONS))
     return locate_dots(volume, board.dots, board.spacing_mm, board.dot_diameter_mm)
 
 
@@ -190,14 +192,17 @@ def locate_dots(volume: xr.DataArray, dots: tuple[int, int], spacing_mm: float, 
 
 
 def _draw_dots(positions, planes_mm, path: Path) -> None:
-    drawn = plots.figure(8, 4.2)
+    drawn = plots.figure(8, 3.8)
     axes = drawn.add_subplot(projection="3d")
     x, y, z = positions.reshape(-1, 3).T
     shown = axes.scatter(z, x, y, c=z, cmap="turbo", s=7, depthshade=False, vmin=min(planes_mm), vmax=max(planes_mm))
     axes.set(xlabel="z [mm]", ylabel="x [mm]", zlabel="y [mm]")
-    axes.set_box_aspect((2.2, 1, 1), zoom=1.15)
-    axes.view_init(elev=18, azim=-62)
-    drawn.colorbar(shown, ax=axes, shrink=0.7, label="z [mm]")
+    axes.set_box_aspect((2.4, 1.2, 1.1), zoom=1.3)
+    axes.view_init(elev=20, azim=-56)
+    for axis in (axes.yaxis, axes.zaxis):  # short axes, seen from the side
+        axis.set_major_locator(MaxNLocator(3, steps=(1, 2, 5, 10)))
+    axes.xaxis.labelpad = 12
+    drawn.colorbar(shown, ax=axes, shrink=0.7, pad=0.1, label="z [mm]")
     plots.save(drawn, path)
 
 

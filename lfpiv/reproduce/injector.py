@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
-import lfpiv
-from lfpiv.calibration import Calibration
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, calibrated_rig
 from lfpiv.scene import Scene
-from lfpiv.settings import Smart
-from lfpiv.weights import Weights
 
 SENSOR_PX = {"small": (1728, 2208), "paper": (2208, 2752)}
 """Rows and columns; at "small" the sensor is cut to what sees the smaller volume."""
@@ -83,26 +78,3 @@ def experimental_scene(scale: str, seed: int) -> Scene:
 def experimental_rig(folder: Path, scale: str, seed: int, progress: Callable[[str, float], None]) -> Rig:
     """Simulate the boards of `experimental_scene` and calibrate from them; kept in `folder` and taken from there."""
     return calibrated_rig(experimental_scene(scale, seed), folder, progress)
-
-
-def reconstruct_images(
-    weights: Weights, calibration: Calibration, images: Mapping[str, np.ndarray], *, iterations: int
-) -> xr.DataArray:
-    """Reconstruct a volume from raw images by SMART, with its default settings as `lfpiv run` does.
-
-    Parameters
-    ----------
-    weights : Weights
-        The operator.
-    calibration : Calibration
-        Its decoders give each image's background level and noise.
-    images : mapping of str to ndarray
-        Camera name -> raw image, shape (rows, columns) [count].
-    iterations : int
-        SMART iterations.
-    """
-    light, noise = {}, {}
-    for name, image in images.items():
-        level, noise[name] = calibration.cameras[name].decoder.background(image)
-        light[name] = image - np.float32(level)
-    return lfpiv.reconstruct(weights, light, floor=noise, **Smart(iterations=iterations).model_dump())

@@ -10,15 +10,14 @@ import numpy as np
 
 import lfpiv
 from lfpiv.calibration import warn_outside
-from lfpiv.flows import SwirlingJet, window_mean
+from lfpiv.flows import SwirlingJet
 from lfpiv.reproduce import store
-from lfpiv.reproduce.injector import reconstruct_images
 from lfpiv.reproduce.planarpiv import SheetCamera, correlate_frames, sheet_images
-from lfpiv.reproduce.rigs import VOXEL_MM, Rig, volume_grid
+from lfpiv.reproduce.rigs import VOXEL_MM, Rig, reconstruct_images, recorded_images, true_field, volume_grid
 from lfpiv.rig import Grid
 from lfpiv.scene import Noise
-from lfpiv.settings import Correlation
-from lfpiv.simulate import LEAST_INTENSITY, expose, render_camera
+from lfpiv.settings import Correlation, Smart
+from lfpiv.simulate import LEAST_INTENSITY
 from lfpiv.turbulence import Turbulence, TurbulentFlow
 from lfpiv_kernels import render
 
@@ -134,23 +133,25 @@ def particle_frames(rig: Rig, twin: Twin, pair: int) -> list[dict[str, np.ndarra
     intensity = np.maximum(LEAST_INTENSITY, 1 + 0.2 * rng.standard_normal(count))
     displacement = twin.instant(pair)(position)
     rays = render.ray_table(PARTICLE_RAYS, "ball", pair)
-    frames = [{}, {}]
-    for number, camera in enumerate(rig.scene.camera):
-        eye = render_camera(camera, seed=[rig.scene.seed, 3, number])
-        counts = rig.scene.exposure.particle_counts * eye.microimage_px * intensity
-        for frame, sign in enumerate((-0.5, 0.5)):
-            draw = np.random.default_rng([twin.seed, 22, pair, number, frame])
-            image = render.render_sources(
-                eye, position + sign * displacement, counts, PARTICLE_RADIUS_MM, rays, rng=draw
-            )
-            frames[frame][camera.name] = expose(image, camera, rig.scene.noise, draw).astype(np.float32)
-    return frames
+    counts = rig.scene.exposure.particle_counts * intensity
+    return [
+        recorded_images(
+            rig,
+            position + sign * displacement,
+            counts,
+            rays,
+            PARTICLE_RADIUS_MM,
+            seed=[twin.seed, 22, pair],
+            frame=frame,
+        )
+        for frame, sign in enumerate((-0.5, 0.5))
+    ]
 
 
 def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Callable[[str, float], None]) -> dict:
-    """Mean vectors of all pairs, the true ones over their windows, and the axes."""
+    """Mean vectors of all pairs, the true ones over their windows, each pair's departure from these, and the axes."""
     grid = volume_grid(twin.sizes.volume_mm)
-    weights, total = None, None
+    weights, total, departures = None, None, []
     for pair in range(twin.sizes.pairs):
         progress("light-field PIV", pair / twin.sizes.pairs)
 
@@ -160,7 +161,7 @@ def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Callable[[str, 
                 warn_outside(rig.calibration, grid)
                 weights = rig.weights(grid, "network")
             volumes = [
-                reconstruct_images(weights, rig.calibration, images, iterations=ITERATIONS)
+                reconstruct_images(weights, images, Smart(iterations=ITERATIONS))
                 for images in particle_frames(rig, twin, pair)
             ]
             return _measure(volumes, twin, grid, pair)
@@ -169,27 +170,30 @@ def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Callable[[str, 
         usable = np.where(found["valid"][..., None], found["displacement_mm"], np.nan)
         terms = np.nan_to_num(usable), np.isfinite(usable[..., 0]).astype(int), found["truth_mm"]
         total = terms if total is None else tuple(a + b for a, b in zip(total, terms, strict=True))
+        departures.append((usable - found["truth_mm"]).astype(np.float32))
     displacement, count, truth = total
     return {
         "axes_mm": [found[f"{axis}_mm"] for axis in "zyx"],
         "displacement_mm": displacement / np.where(count > 0, count, np.nan)[..., None],
         "truth_mm": truth / twin.sizes.pairs,
+        "departures_mm": np.array(departures),
         "valid": count.sum() / (count.size * twin.sizes.pairs),
     }
+
+
+def window_mm(twin: Twin) -> tuple[float, float, float]:
+    """Edges (x, y, z) of the light field's last windows [mm]."""
+    return tuple(min(WINDOWS[-1] * VOXEL_MM, edge) for edge in twin.sizes.volume_mm)
 
 
 def _measure(volumes, twin: Twin, grid: Grid, pair: int) -> dict[str, np.ndarray]:
     settings = Correlation(windows=WINDOWS).model_dump()
     vectors = lfpiv.correlate(*volumes, dt_s=twin.dt_s, **settings)
-    z, y, x = np.meshgrid(*(vectors[axis].values for axis in "zyx"), indexing="ij")
-    centres = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    edge = tuple(min(WINDOWS[-1], n) * grid.voxel_mm for n in grid.shape[::-1])
-    truth = window_mean(twin.instant(pair), centres, edge)
     displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "xyz"], axis=-1)
     return {
         "displacement_mm": displacement * grid.voxel_mm,
         "valid": vectors["valid"].values,
-        "truth_mm": truth.reshape(displacement.shape),
+        "truth_mm": true_field(twin.instant(pair), [vectors[axis].values for axis in "zyx"], window_mm(twin)),
         **{f"{axis}_mm": vectors[axis].values for axis in "zyx"},
     }
 

@@ -69,6 +69,13 @@ def result(
     taken = [key for key in figures_of_merit if key in (*SHOWN, "title", "time")]
     if taken:
         raise ValueError(f"figures_of_merit: expected other keys than those of the page, got {taken[0]!r}.")
+    for table in tables:
+        widths = {len(row) for row in table["rows"]} - {len(table["columns"])}
+        if widths:
+            raise ValueError(
+                f"tables: expected rows of {len(table['columns'])} values as {table['caption'][:40]!r} has columns, "
+                f"got {widths.pop()}."
+            )
     return {
         **figures_of_merit,
         "comparison": [dict(row) for row in comparison],
@@ -107,6 +114,9 @@ def write(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     return content
 
 
+ROUNDING = 1e-12
+"""Figures below this are zero but for rounding."""
+
 # -- the page ----------------------------------------------------------------------------------------------------------
 
 STYLE = """
@@ -119,26 +129,48 @@ body { margin: 0 auto; padding: 1rem; max-width: 62rem; color: var(--ink); backg
   font: 1rem/1.5 system-ui, sans-serif; }
 h1 { font-size: 1.5rem; line-height: 1.25; margin: .5rem 0; }
 h2 { font-size: 1.2rem; margin: 2.2rem 0 .4rem; padding-top: .8rem; border-top: 1px solid var(--line); }
-p, li, figcaption, caption { max-width: 44rem; }
-.dim, figcaption, caption { color: var(--dim); font-size: .9rem; }
+h1.part { margin-top: 3rem; padding-top: 1rem; border-top: 3px solid var(--line); }
+p, li, figcaption, dd { max-width: 44rem; }
+.dim, figcaption, .caption { color: var(--dim); font-size: .9rem; }
+.caption { margin: 1.1rem 0 .2rem; }
+nav { font-size: .9rem; margin: 1rem 0; }
+nav ul { margin: .2rem 0; padding-left: 1.1rem; }
+details { margin: 1rem 0; } summary { cursor: pointer; }
+dl { font-size: .9rem; margin: .5rem 0; } dt { font-weight: 600; } dd { margin: 0 0 .4rem; }
 .scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .9rem; margin: .6rem 0; }
-caption { text-align: left; padding-bottom: .3rem; }
+table { border-collapse: collapse; font-size: .9rem; margin: .4rem 0 .6rem; }
 th, td { text-align: left; padding: .25rem .8rem .25rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { font-weight: 600; }
+td:first-child:not(.number, .case) { min-width: 7rem; }
 td.what { min-width: 11rem; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 th.number { text-align: right; }
 .yes { color: var(--good); font-weight: 600; } .no { color: var(--bad); font-weight: 600; }
 figure { margin: 1rem 0; }
-@media (max-width: 30rem) { body { padding: .7rem; } table { font-size: .8rem; } th, td { padding-right: .45rem; }
-  td.what { min-width: 6.5rem; } td.number { white-space: normal; } }
 figure img { max-width: 100%; height: auto; background: #fff; display: block; }
+@media (max-width: 40rem) { body { padding: .7rem; } table { font-size: .8rem; } th, td { padding-right: .45rem; }
+  td.what, td:first-child:not(.number, .case) { min-width: 6.5rem; }
+  figure img { max-width: none; width: 44rem; } }
 """
 
 
+TERMS = {
+    "pitch, voxel": "One microlens, and one voxel of 0.1 mm: as large as a microlens seen in the volume.",
+    "ppm": "Particles per microlens of the volume's x-y face.",
+    "network, DRT": "Rays by the trained network; by direct ray tracing through ideal thin lenses at stated angles.",
+    "sigma_nor": "Mean distance of mapped from measured rays of dots that training did not see, in pitches (Eq. 8).",
+    "Q": "Agreement of a reconstructed volume with the true particles, drawn as blobs: 1 is perfect.",
+    "R_acc, R_g": "Part of the true particles that is found; particles found for each true one (Eqs. 13 and 14).",
+    "error of vectors": "Mean length of the difference from the true displacement, in voxels, all vectors; along x, y, "
+    "z its mean absolute components. z is the depth axis between the cameras.",
+    "took": "Of the run that finished the case; what an earlier, interrupted one had done is not in it.",
+    "goal": "What this software set out to reach; where there is none, the figure is told for itself.",
+}
+"""Words of the page, explained on it."""
+
+
 def _page(out: Path, content: Mapping[str, Any]) -> str:
-    from lfpiv.reproduce import CASES
+    from lfpiv.reproduce import BEYOND, CASES
 
     present = [key for key in CASES if key in content]
     rows = [{"case": key, **row} for key in present for row in content[key]["comparison"]]
@@ -148,13 +180,23 @@ def _page(out: Path, content: Mapping[str, Any]) -> str:
         "<h1>The paper's tables and figures, reproduced</h1>",
         f"<p>Weight estimation of multi-camera light-field PIV by a back-propagation network, computed by lfpiv "
         f"{html.escape(str(content['version']))} on simulated images: scale <b>{content['scale']}</b>, seed "
-        f"{content['seed']}. {sum(judged)} of {len(judged)} goals reached. "
+        f"{content['seed']}. {sum(judged)} of {len(judged)} goals reached. Images are simulated, cameras calibrated "
+        "from them, volumes reconstructed and measured; the truth is known to the simulator alone. "
         "<a href='reproduce.json'>reproduce.json</a> holds all figures.</p>",
     ]
     if missing:
         parts.append(f"<p class='dim'>Not computed yet: {', '.join(missing)}.</p>")
+    links = "".join(f"<li><a href='#{key}'>{html.escape(content[key]['title'])}</a></li>" for key in present)
+    parts.append(f"<nav aria-label='contents'><ul>{links}</ul></nav>")
+    terms = "".join(f"<dt>{html.escape(word)}</dt><dd>{html.escape(text)}</dd>" for word, text in TERMS.items())
+    parts.append(f"<details><summary>What the words mean</summary><dl>{terms}</dl></details>")
     parts += [_comparison([row for row in rows if row["goal"]], cases=True)] if judged else []
-    for key in present:
+    for number, key in enumerate(present):
+        if key in BEYOND and (number == 0 or present[number - 1] not in BEYOND):
+            parts.append(
+                "<h1 class='part'>Beyond the paper</h1><p>What the paper did not show, on rigs of the same main and "
+                "microlenses with smaller volumes and noisy images.</p>"
+            )
         parts.append(_section(out, key, content[key]))
     return (
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>"
@@ -177,8 +219,8 @@ def _section(out: Path, key: str, case: Mapping[str, Any]) -> str:
         caption = html.escape(figure["caption"])
         image = base64.b64encode((out / figure["file"]).read_bytes()).decode("ascii")
         parts.append(
-            f"<figure><img alt='{html.escape(figure['caption'], quote=True)}' src='data:image/png;base64,{image}'>"
-            f"<figcaption>{caption}</figcaption></figure>"
+            f"<figure><div class='scroll'><img alt='{html.escape(figure['caption'], quote=True)}' "
+            f"src='data:image/png;base64,{image}'></div><figcaption>{caption}</figcaption></figure>"
         )
     parts += [_table(table["caption"], table["columns"], table["rows"]) for table in case["tables"]]
     if case["notes"]:
@@ -187,15 +229,18 @@ def _section(out: Path, key: str, case: Mapping[str, Any]) -> str:
 
 
 def _comparison(rows: Sequence[Mapping[str, Any]], *, cases: bool = False) -> str:
-    columns = (["case"] if cases else []) + ["what", "ours", "paper", "goal", "reached"]
+    shown = [name for name in ("paper", "goal") if any(row[name] is not None for row in rows)]
+    columns = (["case"] if cases else []) + ["what", "ours", *shown] + (["met"] if "goal" in shown else [])
     body = []
     for row in rows:
-        unit = f" {row['unit']}" if row["unit"] else ""
+        unit = f" [{row['unit']}]" if row["unit"] else ""
         verdict = {None: "", True: "<span class='yes'>yes</span>", False: "<span class='no'>no</span>"}[row["reached"]]
-        cells = [f"<td><a href='#{row['case']}'>{row['case']}</a></td>"] if cases else []
-        cells.append(f"<td class='what'>{html.escape(row['what'] + (f' [{unit.strip()}]' if unit else ''))}</td>")
-        cells += [f"<td class='number'>{_text(row[name])}</td>" for name in ("ours", "paper", "goal")]
-        body.append(f"<tr>{''.join(cells)}<td>{verdict}</td></tr>")
+        cells = [f"<td class='case'><a href='#{row['case']}'>{row['case']}</a></td>"] if cases else []
+        cells.append(f"<td class='what'>{html.escape(row['what'] + unit)}</td>")
+        figures = [_text(row[name]).replace("&lt;=", "≤").replace("&gt;=", "≥") for name in ("ours", *shown)]
+        cells += [f"<td class='number'>{figure}</td>" for figure in figures]
+        cells += [f"<td>{verdict}</td>"] if "goal" in shown else []
+        body.append(f"<tr>{''.join(cells)}</tr>")
     heads = "".join(
         f"<th{' class=number' if name in ('ours', 'paper', 'goal') else ''}>{name}</th>" for name in columns
     )
@@ -210,7 +255,8 @@ def _table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) 
         "<tr>" + "".join(f"<td{mark[k]}>{_text(value)}</td>" for k, value in enumerate(row)) + "</tr>" for row in rows
     )
     return (
-        f"<div class='scroll'><table><caption>{html.escape(caption)}</caption><thead><tr>{head}</tr></thead>"
+        f"<p class='caption'>{html.escape(caption)}</p><div class='scroll'>"
+        f"<table aria-label='{html.escape(caption, quote=True)}'><thead><tr>{head}</tr></thead>"
         f"<tbody>{body}</tbody></table></div>"
     )
 
@@ -220,8 +266,10 @@ def _text(value: Any) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if isinstance(value, float) and abs(value) < ROUNDING:
+        return "0"
     if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) < 1e5 else f"{value:.3e}"
+        return f"{value:.{4 if abs(value) >= 0.1 else 3}g}" if abs(value) < 1e5 else f"{value:.3e}"
     return html.escape(str(value))
 
 

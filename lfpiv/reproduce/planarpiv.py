@@ -5,6 +5,8 @@ OpenPIV is GPL and optional (extra ``piv2d``): it is imported where it is used, 
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -157,7 +159,8 @@ def correlate_frames(
 
     settings = PIVSettings()
     settings.windowsizes, settings.overlap, settings.num_iterations = (64, 32, 32), (32, 16, 16), 3
-    x, y, u, v, flags = windef.simple_multipass(first.astype(np.float32), second.astype(np.float32), settings)
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints what its validation finds
+        x, y, u, v, flags = windef.simple_multipass(first.astype(np.float32), second.astype(np.float32), settings)
     pixel = camera.pixel_in_sheet_mm
     # OpenPIV gives v upwards, vectors from the top row down, and their rows in reverse
     row = np.asarray(y)[::-1, 0]

@@ -1,26 +1,30 @@
-"""The paper's numerical rig (Table 2), simulated and calibrated once for the cases that share it; particle images."""
+"""Simulated rigs, calibrated once for the cases that share them, the paper's (Table 2) first; what they record."""
 
 from __future__ import annotations
 
 import json
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 import lfpiv
 from lfpiv import metrics
 from lfpiv.calibration import Calibration
 from lfpiv.experiment import Experiment
+from lfpiv.flows import Ring, window_mean
 from lfpiv.reproduce import store
 from lfpiv.rig import Grid
 from lfpiv.scene import Scene, true_mapping
-from lfpiv.simulate import render_camera, simulate
+from lfpiv.settings import Smart
+from lfpiv.simulate import expose, render_camera, simulate
 from lfpiv.thinlens import thin_lens_model
+from lfpiv.weights import Weights
 from lfpiv_kernels import render, runtime
 
 log = logging.getLogger(__name__)
@@ -48,6 +52,11 @@ PARTICLE_RAYS = 32_768
 """Rays per particle: a pixel of the some 1,500 that it lights receives about 20."""
 DT_S = 1e-4
 """Time between the frames [s]; the figures are in voxels and do not depend on it."""
+RADIUS, CORE, PEAK = 0.25, 1 / 7, 0.3 / 14
+"""Of the paper's ring vortex: radius of the ring's core line, distance of the largest displacement from it, and that
+displacement, as parts of the volume's x edge: 3.5, 2 and 0.3 mm in the paper's volume of 14 mm, so that 0.12
+voxel/voxel makes a torus within the depth. A smaller volume has the same flow at its size, so gradients, in voxels per
+voxel, are the same."""
 
 SENSOR_PX = {"small": 1900, "paper": 4000}
 """Edge of the sensors [pixel]; "small" is cut to what sees the smaller volumes and the board."""
@@ -161,6 +170,12 @@ def volume_grid(size_mm: tuple[float, float, float]) -> Grid:
     return Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=size_mm, voxel_mm=VOXEL_MM)
 
 
+def ring(size_mm: tuple[float, float, float]) -> Ring:
+    """Return the paper's ring vortex in a volume of a size (x, y, z) [mm]."""
+    edge = size_mm[0]
+    return Ring(radius_mm=RADIUS * edge, core_mm=CORE * edge, peak_mm=PEAK * edge)
+
+
 def random_particles(size_mm: tuple[float, float, float], ppm: float, seed: list[int]) -> np.ndarray:
     """Draw positions (n, 3) [mm] evenly over a volume, `ppm` particles per microlens of its x-y face."""
     count = round(ppm * size_mm[0] * size_mm[1] / VOXEL_MM**2)
@@ -185,22 +200,117 @@ def particle_images(
     return images
 
 
+def recorded_images(
+    rig: Rig,
+    positions_mm: np.ndarray,
+    counts: np.ndarray,
+    rays: np.ndarray,
+    size_mm: float,
+    *,
+    seed: list[int],
+    frame: int,
+    cameras: Sequence[str] | None = None,
+) -> dict[str, np.ndarray]:
+    """Images as the cameras store them, with blur, noise and 12 bits: camera -> (rows, columns), float32 [count].
+
+    Parameters
+    ----------
+    rig : Rig
+        The cameras and their noise.
+    positions_mm : ndarray, shape (n, 3)
+        Particles (x, y, z) [mm].
+    counts : ndarray, shape (n,)
+        Level of a pixel lit by each one alone and in focus [count].
+    rays : ndarray
+        From `render.ray_table`.
+    size_mm : float
+        Radius or standard deviation of the particles, as `rays` has it [mm].
+    seed : list of int
+        Of the noise, together with the camera and
+    frame : int
+        the number of the frame.
+    cameras : sequence of str, optional
+        Cameras that record; default: all.
+    """
+    images = {}
+    for number, camera in enumerate(rig.scene.camera):
+        if cameras is not None and camera.name not in cameras:
+            continue
+        eye = render_camera(camera, seed=[rig.scene.seed, 3, number])
+        draw = np.random.default_rng([*seed, number, frame])
+        image = render.render_sources(eye, positions_mm, counts * eye.microimage_px, size_mm, rays, rng=draw)
+        images[camera.name] = expose(image, camera, rig.scene.noise, draw).astype(np.float32)
+    return images
+
+
+def reconstruct_images(
+    weights: Weights,
+    images: Mapping[str, np.ndarray],
+    smart: Smart,
+    *,
+    floor: float | None = None,
+    first: np.ndarray | None = None,
+) -> xr.DataArray:
+    """Reconstruct a volume from raw images by SMART, as `lfpiv run` does.
+
+    Parameters
+    ----------
+    weights : Weights
+        The operator; its cameras' decoders give each image's background level and noise.
+    images : mapping of str to ndarray
+        Camera name -> raw image, shape (rows, columns) [count]; those of other cameras are ignored.
+    smart : Smart
+        SMART's settings.
+    floor : float, optional
+        Noise floor [count] in place of each image's own.
+    first : ndarray, shape (z, y, x), optional
+        First guess in place of SMART's own.
+    """
+    light, noise = {}, {}
+    for name, camera in weights.cameras.items():
+        level, noise[name] = camera.decoder.background(images[name])
+        light[name] = images[name] - np.float32(level)
+    return lfpiv.reconstruct(weights, light, floor=noise if floor is None else floor, first=first, **smart.model_dump())
+
+
 def truth(positions_mm: np.ndarray, grid: Grid):
     """Draw the blobs on the voxels."""
     return metrics.truth_volume(positions_mm, None, grid, BLOB_VOXEL)
 
 
+def true_field(
+    flow: Callable[[np.ndarray], np.ndarray], axes_mm: list[np.ndarray], edge_mm: float | tuple[float, float, float]
+) -> np.ndarray:
+    """Mean displacement of a flow over windows centred on axes (z, y, x) [mm], shape (z, y, x, 3) [mm].
+
+    `edge_mm` is the windows' edge, or their edges (x, y, z).
+    """
+    z, y, x = np.meshgrid(*axes_mm, indexing="ij")
+    centres = np.stack([x, y, z], axis=-1)
+    return window_mean(flow, centres.reshape(-1, 3), edge_mm).reshape(centres.shape)
+
+
 def mapping_errors_pitch(rig: Rig, grid: Grid, seed: int) -> dict[str, float]:
     """Mean distance between mapped and true rays over a volume [microlens pitch], each camera."""
+    return {name: float(error.mean()) for name, error in ray_errors_pitch(rig, rig.calibration, grid, seed).items()}
+
+
+def ray_errors_pitch(rig: Rig, calibration: Calibration, grid: Grid, seed: int) -> dict[str, np.ndarray]:
+    """Distances of a calibration's rays from the true ones [microlens pitch], shape (ray,), each of its cameras.
+
+    The rays start anywhere in a volume and go anywhere through the pupil.
+    """
     rng = np.random.default_rng([seed, 77])
     low = np.array(grid.first_centre_mm[::-1])
     extent = grid.voxel_mm * (np.array(grid.shape[::-1]) - 1)
     points = low + rng.random((4000, 3)) * extent
     errors = {}
     for camera in rig.scene.camera:
+        if camera.name not in calibration.cameras:
+            continue
         radius = camera.optics.pupil_radius_mm * np.sqrt(rng.random(len(points)))
         angle = 2 * np.pi * rng.random(len(points))
         pupil = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-        miss = rig.calibration.cameras[camera.name].map(points, pupil) - true_mapping(camera)(points, pupil)
-        errors[camera.name] = float(np.linalg.norm(miss, axis=1).mean() / camera.microlens_pitch_mm)
+        miss = calibration.cameras[camera.name].map(points, pupil) - true_mapping(camera)(points, pupil)
+        errors[camera.name] = np.linalg.norm(miss, axis=1) / camera.microlens_pitch_mm
     return errors
