@@ -27,38 +27,25 @@ from lfpiv.ghosts import (
     truth_volume,
 )
 from lfpiv.rig import Grid
-from lfpiv.vectorfields import (
-    DisplacementError,
-    derivatives,
-    displacement_difference,
-    displacement_error,
-    divergence,
-    empirical_cdf,
-    q_criterion,
-    vorticity,
-)
+from lfpiv.vectorfields import DisplacementError, displacement_difference, displacement_error, empirical_cdf
 
 __all__ = [
     "DisplacementError",
     "DotError",
     "ParticleQuality",
     "Particles",
-    "derivatives",
     "displacement_difference",
     "displacement_error",
-    "divergence",
     "dot_error",
     "elongation",
     "empirical_cdf",
     "find_particles",
     "match_particles",
     "particle_quality",
-    "q_criterion",
     "reconstruction_accuracy",
     "reconstruction_quality",
     "relative_l2",
     "truth_volume",
-    "vorticity",
     "weight_ssim",
 ]
 

@@ -1,4 +1,4 @@
-"""Displacement fields against the truth, and what their derivatives say: vorticity, divergence, Q-criterion.
+"""Displacement fields against the truth.
 
 Arrays are ordered (z, y, x), components (x, y, z). Equation numbers are the paper's.
 """
@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-
-from lfpiv.rig import Grid
 
 PERCENTILES = (50, 75, 90, 95, 99)
 """Percentiles of the displacement error that are reported."""
@@ -142,97 +140,6 @@ def empirical_cdf(values: np.ndarray, at: np.ndarray | None = None) -> tuple[np.
         raise ValueError(f"values: expected finite numbers, at least one, got {len(ordered)} with NaN or none at all.")
     at = ordered if at is None else np.asarray(at, float)
     return at, np.searchsorted(ordered, at, side="right") / len(ordered)
-
-
-def derivatives(vectors: xr.Dataset | np.ndarray, *, grid: Grid | None = None) -> xr.DataArray:
-    """Velocity gradients [1/s] by central differences, one-sided of second order at the border.
-
-    Truncation is of second order in the vector spacing. Nothing is smoothed: noise of the vectors is carried over, by
-    1 / (sqrt(2) spacing) of their standard deviation in the interior.
-
-    Parameters
-    ----------
-    vectors : Dataset or ndarray
-        From `correlate`: ``u``, ``v``, ``w`` [m/s] on z, y, x [mm]. Or an array (z, y, x, 3) of velocities (u, v, w)
-        [m/s].
-    grid : Grid, optional
-        Positions of an array's vectors.
-
-    Returns
-    -------
-    DataArray, dims (component, direction, z, y, x)
-        d(component)/d(direction) [1/s]; component: u, v, w, direction: x, y, z. Times dt: voxel per voxel.
-
-    Raises
-    ------
-    ValueError
-        If components or coordinates are missing, values are not finite, or an axis has fewer than 3 vectors.
-    """
-    if isinstance(vectors, xr.Dataset):
-        missing = [name for name in (*_DIMS, "u", "v", "w") if name not in vectors.variables]
-        if missing:
-            raise ValueError(f"vectors: expected u, v, w on z, y, x, found no {', '.join(missing)}.")
-        velocity = np.stack([vectors[name].transpose(*_DIMS).values for name in "uvw"]).astype(float)
-        axes = [np.asarray(vectors[axis], float) for axis in _DIMS]
-    else:
-        velocity = np.moveaxis(_checked_field(vectors, "vectors"), -1, 0)
-        if grid is None or velocity.shape[1:] != tuple(grid.shape):
-            fault = "no grid" if grid is None else f"a grid of shape {grid.shape}"
-            raise ValueError(f"vectors: an array of shape {np.shape(vectors)} needs its vectors' grid, got {fault}.")
-        axes = [grid.axis_mm(axis) for axis in range(3)]
-    if min(velocity.shape) < 3:
-        raise ValueError(f"vectors: expected at least 3 along each axis, got {velocity.shape[1:]} (z, y, x).")
-    if not np.isfinite(velocity).all() or any(not (np.diff(axis) > 0).all() for axis in axes):
-        raise ValueError("vectors: expected finite velocities on increasing coordinates, found others.")
-    gradient = [np.gradient(velocity, 1e-3 * axes[2 - d], axis=3 - d, edge_order=2) for d in range(3)]
-    return xr.DataArray(
-        np.stack(gradient, axis=1),
-        dims=("component", "direction", *_DIMS),
-        coords={"component": list("uvw"), "direction": list("xyz")}
-        | {name: (name, axis, {"units": "mm"}) for name, axis in zip(_DIMS, axes, strict=True)},
-        name="gradient",
-        attrs={"units": "1/s", "long_name": "velocity gradient"},
-    )
-
-
-def vorticity(vectors: xr.Dataset | np.ndarray, *, grid: Grid | None = None) -> xr.Dataset:
-    """Vorticity, the curl of the velocity [1/s]; arguments and errors as in `derivatives`.
-
-    Returns
-    -------
-    Dataset
-        ``vorticity_x``, ``_y``, ``_z`` and their ``magnitude`` on the vectors' z, y, x. Times dt: voxel per voxel, the
-        unit of the paper's iso-surface (Fig. 13, 0.12).
-    """
-    g = derivatives(vectors, grid=grid)
-    curl = {}
-    for axis, (one, two) in {"x": ("wy", "vz"), "y": ("uz", "wx"), "z": ("vx", "uy")}.items():
-        curl[f"vorticity_{axis}"] = _of(g, *one) - _of(g, *two)
-    curl["magnitude"] = sum(part**2 for part in curl.values()) ** 0.5
-    names = {name: f"vorticity along {name[-1]}" for name in curl} | {"magnitude": "magnitude of the vorticity"}
-    return xr.Dataset({name: part.assign_attrs(units="1/s", long_name=names[name]) for name, part in curl.items()})
-
-
-def divergence(vectors: xr.Dataset | np.ndarray, *, grid: Grid | None = None) -> xr.DataArray:
-    """Divergence of the velocity [1/s], zero in incompressible flow; arguments and errors as in `derivatives`."""
-    g = derivatives(vectors, grid=grid)
-    total = _of(g, "u", "x") + _of(g, "v", "y") + _of(g, "w", "z")
-    return total.rename("divergence").assign_attrs(units="1/s", long_name="divergence of the velocity")
-
-
-def q_criterion(vectors: xr.Dataset | np.ndarray, *, grid: Grid | None = None) -> xr.DataArray:
-    """Q-criterion (||Omega||^2 - ||S||^2) / 2 [1/s^2], Omega and S the antisymmetric and symmetric gradient.
-
-    Positive where rotation outweighs strain: inside vortices. Arguments and errors as in `derivatives`.
-    """
-    g = derivatives(vectors, grid=grid)
-    # (||Omega||^2 - ||S||^2) / 2 = -sum_ij g_ij g_ji / 2
-    q = -(g.values * g.values.swapaxes(0, 1)).sum((0, 1)) / 2
-    return _of(g, "u", "x").copy(data=q).rename("q_criterion").assign_attrs(units="1/s^2", long_name="Q-criterion")
-
-
-def _of(gradient: xr.DataArray, component: str, direction: str) -> xr.DataArray:
-    return gradient.sel(component=component, direction=direction, drop=True)
 
 
 def _displacement(vectors: xr.Dataset | np.ndarray, name: str) -> np.ndarray:

@@ -9,7 +9,6 @@ from scipy.stats import norm
 
 import lfpiv
 from lfpiv import metrics
-from lfpiv.flows import Shear, Swirl
 
 ROUNDING = 1e-12  # float64 sums of at most 1e4 terms
 FLOAT32 = 1e-6  # volumes are float32: a sum over a blob's 9 x 9 x 9 voxels is this exact
@@ -25,14 +24,6 @@ def points_in(grid, count, rng, margin=0.0):
     """Random points (x, y, z) [mm] at least `margin` voxels inside the grid's faces."""
     place = rng.uniform(margin - 0.5, np.array(grid.shape) - 0.5 - margin, (count, 3))
     return (np.asarray(grid.first_centre_mm) + place * grid.voxel_mm)[:, ::-1]
-
-
-def vector_set(function, shape=(5, 6, 7), step=(0.3, 0.2, 0.5)):
-    """Dataset as `correlate` gives it, of a velocity function of (x, y, z) [mm] -> (u, v, w) [m/s]."""
-    axes = {name: s * np.arange(n) - 0.4 for name, n, s in zip("zyx", shape, step, strict=True)}
-    z, y, x = np.meshgrid(*axes.values(), indexing="ij")
-    velocity = function(np.stack([x.ravel(), y.ravel(), z.ravel()], 1)).reshape(*shape, 3)
-    return xr.Dataset({name: (("z", "y", "x"), velocity[..., k]) for k, name in enumerate("uvw")}, axes)
 
 
 # -- true particles ----------------------------------------------------------------------------------------------------
@@ -318,38 +309,6 @@ def test_displacement_errors_per_axis_and_their_distribution():
     assert metrics.displacement_error(measured, truth, where=np.isfinite(truth).all(-1)).count == 59
 
 
-@pytest.mark.parametrize("axis", "xyz")
-def test_solid_rotation_has_twice_its_rate_as_vorticity(axis):
-    rate = 3.0  # rad/s; the flow moves by mm, velocities are in m/s
-    flow = Swirl(peak_mm=rate, core_mm=1.0, profile="solid", axis=axis)
-    vectors = vector_set(lambda points: 1e-3 * flow(points))
-    curl = metrics.vorticity(vectors)
-    for other in "xyz":
-        assert np.allclose(curl[f"vorticity_{other}"], 2 * rate if other == axis else 0, atol=1e-9)
-    assert np.allclose(curl.magnitude, 2 * rate) and curl.magnitude.attrs["units"] == "1/s"
-    assert np.allclose(metrics.divergence(vectors), 0, atol=1e-9)
-    assert np.allclose(metrics.q_criterion(vectors), rate**2)
-    assert metrics.q_criterion(vectors).dims == ("z", "y", "x") and metrics.divergence(vectors).x.equals(vectors.x)
-
-
-def test_gradients_of_shear_expansion_and_quadratic_flow():
-    shear = vector_set(lambda p: 1e-3 * Shear(along="z", across="y", rate=0.7)(p))
-    assert np.allclose(metrics.vorticity(shear).vorticity_x, 0.7) and np.allclose(
-        metrics.q_criterion(shear), 0, atol=1e-9
-    )
-    expansion = vector_set(lambda p: 1e-3 * p * [1.0, 2.0, -4.0])
-    assert np.allclose(metrics.divergence(expansion), -1) and np.allclose(metrics.q_criterion(expansion), -21 / 2)
-    # differences of second order are exact for parabolas, at the border too
-    curved = vector_set(lambda p: 1e-3 * np.stack([p[:, 0] ** 2, p[:, 2] ** 2, p[:, 0] * p[:, 1]], 1))
-    z, y, x = np.meshgrid(curved.z, curved.y, curved.x, indexing="ij")
-    assert np.allclose(metrics.divergence(curved), 2 * x)
-    curl = metrics.vorticity(curved)
-    assert np.allclose(curl.vorticity_x, x - 2 * z) and np.allclose(curl.vorticity_y, -y)
-    grid = lfpiv.Grid(shape=(4, 5, 6), voxel_mm=0.4, first_centre_mm=(0.0, 1.0, 2.0))
-    field = 1e-3 * (grid.centres_mm() * [1.0, 2.0, -4.0]).reshape(4, 5, 6, 3)
-    assert np.allclose(metrics.divergence(field, grid=grid), -1)
-
-
 # -- refusals ----------------------------------------------------------------------------------------------------------
 
 _GRID = box((4, 4, 4))
@@ -382,8 +341,6 @@ _POINT = np.array([[1.1, 0.3, -0.2]])
         (lambda: metrics.displacement_error(np.zeros((2, 2, 2)), np.zeros((2, 2, 2, 3))), "vectors.*shape"),
         (lambda: metrics.displacement_error(xr.Dataset(), xr.Dataset()), "displacement_x"),
         (lambda: metrics.empirical_cdf([]), "values"),
-        (lambda: metrics.vorticity(np.zeros((4, 4, 4, 3))), "grid"),
-        (lambda: metrics.divergence(np.zeros((4, 2, 4, 3)), grid=box((4, 2, 4))), "at least 3"),
     ],
 )
 def test_bad_input_is_refused_by_name(call, words):

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from skimage.measure import marching_cubes
 
 import lfpiv
-from lfpiv import metrics
+from lfpiv import derived, metrics
 from lfpiv.flows import Ring
 from lfpiv.reproduce import page, plots, rigs, store
 from lfpiv.settings import Correlation, Smart
@@ -350,7 +350,8 @@ def _draw_surface(axes, packed: dict[str, np.ndarray], largest: float) -> None:
     positions = [packed[f"8_{axis}"] for axis in "zyx"]
     coords = dict(zip("zyx", positions, strict=True))
     velocity = {name: (("z", "y", "x"), field[..., k] * rigs.VOXEL_MM * 1e-3) for k, name in enumerate("uvw")}
-    magnitude = metrics.vorticity(xr.Dataset(velocity, coords))["magnitude"].values  # dt = 1 s: voxel per voxel
+    curl = derived.vorticity(xr.Dataset(velocity, coords))  # dt = 1 s: voxel per voxel
+    magnitude = curl["vorticity_magnitude"].values
     step = [float(p[1] - p[0]) for p in positions]
     if magnitude.max() > ISO_VORTICITY > magnitude.min():
         corners, faces, _, _ = marching_cubes(magnitude, ISO_VORTICITY)
