@@ -6,7 +6,25 @@ Public names load their module on first use, so that importing the package start
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what the names below stand for
+    from lfpiv import derived as derived
+    from lfpiv import metrics as metrics
+    from lfpiv import statistics as statistics
+    from lfpiv.calibration import Calibration, calibrate, load_calibration, thin_lens
+    from lfpiv.errors import InputError
+    from lfpiv.experiment import Experiment, open_experiment
+    from lfpiv.export import export_results
+    from lfpiv.lensarray import LensArray, find_lens_array
+    from lfpiv.motion import reconstruct_pair
+    from lfpiv.pipeline import run
+    from lfpiv.report import write_report
+    from lfpiv.results import open_results
+    from lfpiv.rig import Grid, LensLattice, Optics
+    from lfpiv.vectors import correlate
+    from lfpiv.volume import reconstruct
+    from lfpiv.weights import build_weights
 
 __version__ = "0.1.0"
 
@@ -27,6 +45,7 @@ _MODULES = {
     "open_experiment": "lfpiv.experiment",
     "open_results": "lfpiv.results",
     "reconstruct": "lfpiv.volume",
+    "reconstruct_pair": "lfpiv.motion",
     "run": "lfpiv.pipeline",
     "thin_lens": "lfpiv.calibration",
     "write_report": "lfpiv.report",
@@ -52,6 +71,7 @@ __all__ = [
     "open_experiment",
     "open_results",
     "reconstruct",
+    "reconstruct_pair",
     "run",
     "thin_lens",
     "write_report",

@@ -6,3 +6,10 @@ class InputError(ValueError):
 
     The command line prints it without a traceback and exits with status 2.
     """
+
+
+class StorageError(OSError):
+    """Results cannot be written, for want of space or rights; the message names the file and says how to go on.
+
+    What was written before is whole. The command line exits with status 1.
+    """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import string
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,10 +94,14 @@ class Experiment:
         return images.read_image(self.board_path(name, plane), label, flip=self.camera(name).image_flip)
 
     def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
-        """Particle image of a camera, float32 (rows, columns); InputError where it holds one value everywhere."""
-        label = f"particles.images, camera {name!r}, pair {pair}, frame {frame!r}"
-        path = self.particle_path(name, pair, frame)
-        image = images.read_image(path, label, flip=self.camera(name).image_flip)
+        """Particle image of a camera, float32 (rows, columns); InputError where it is no such image, or even."""
+        label, path, camera = (
+            _particle_label(name, pair, frame),
+            self.particle_path(name, pair, frame),
+            self.camera(name),
+        )
+        image = images.read_image(path, label, flip=camera.image_flip)
+        _require_shape(image.shape, path, label, camera)
         images.require_contrast(image, path, label)
         return image
 
@@ -123,7 +127,7 @@ def open_experiment(path: str | Path) -> Experiment:
     """Read an experiment file and check everything it says and names, before any work.
 
     White, dark and board images are decoded, and particle images up to `DECODED_PIXELS`; of the others the header and
-    the length are checked.
+    the length are checked. `lfpiv.run` asks less: there only the first pair must be whole, see `check_pairs`.
 
     Parameters
     ----------
@@ -140,6 +144,14 @@ def open_experiment(path: str | Path) -> Experiment:
         If a key is unknown, missing or out of range, an image is missing, damaged, or does not fit the others, or the
         nominal cameras certainly see nothing of the volume.
     """
+    experiment = read_experiment(path)
+    for _, reason in check_pairs(experiment, range(experiment.pairs)):
+        raise InputError(reason)
+    return experiment
+
+
+def read_experiment(path: str | Path) -> Experiment:
+    """Read and check an experiment as `open_experiment` does, all but its particle images."""
     path = Path(path)
     table = read_toml(path, ExperimentTable)
     names = [camera.name for camera in table.camera]
@@ -175,8 +187,40 @@ def open_experiment(path: str | Path) -> Experiment:
     for camera in experiment.cameras:
         view.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)
         view.require_volume(path, grid, camera.name, camera.optics, camera.nominal_angle_deg)
-    _check_images(experiment)
+    _check_calibration_images(experiment)
     return experiment
+
+
+def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:
+    """Check the particle images of some pairs; yield each pair that cannot be used, and why.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        From `read_experiment`.
+    pairs : sequence of int
+        Pairs to check: decoded up to `DECODED_PIXELS`, the first one at any rate, the others by header and length.
+
+    Yields
+    ------
+    pair : int
+    reason : str
+        Names the file, what was expected, what was found.
+    """
+    decoded = 0
+    for number, pair in enumerate(pairs):
+        try:
+            for camera in experiment.cameras:
+                for frame in experiment.frames:
+                    label = _particle_label(camera.name, pair, frame)
+                    _check_shape(experiment.particle_path(camera.name, pair, frame), label, camera)
+            decoded += 2 * sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
+            if number == 0 or decoded <= DECODED_PIXELS:
+                for camera in experiment.cameras:
+                    for frame in experiment.frames:
+                        experiment.particle_image(camera.name, pair, frame)
+        except InputError as error:
+            yield pair, str(error)
 
 
 def _check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any]) -> None:
@@ -250,16 +294,14 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
     )
 
 
-def _check_images(experiment: Experiment) -> None:
-    """Check that every image is there, fits its camera's white image and can be decoded."""
+def _check_calibration_images(experiment: Experiment) -> None:
+    """Check that every image of the calibration is there, fits its camera's white image and can be decoded."""
     for camera in experiment.cameras:
-        for path, label in _other_images(experiment, camera):
-            shape = images.read_header(path, label).shape
-            if shape != camera.optics.sensor_shape:
-                raise InputError(
-                    f"{path} ({label}): expected {camera.optics.sensor_shape} pixels (rows, columns) as in the white "
-                    f"image {camera.white_path}, found {shape}. All images of a camera have one size."
-                )
+        if camera.dark_path is not None:
+            _check_shape(camera.dark_path, f"dark_image of camera {camera.name!r}", camera)
+        for plane in range(len(experiment.board.planes_mm)):
+            label = f"board.images, camera {camera.name!r}, plane {plane}"
+            _check_shape(experiment.board_path(camera.name, plane), label, camera)
     for camera in experiment.cameras:
         white, dark = experiment.white(camera.name), experiment.dark(camera.name)
         label = f"white_image of camera {camera.name!r}"
@@ -273,23 +315,20 @@ def _check_images(experiment: Experiment) -> None:
             board = experiment.board_image(camera.name, plane)
             label = f"board.images, camera {camera.name!r}, plane {plane}"
             images.require_contrast(board, experiment.board_path(camera.name, plane), label)
-    decoded = 0
-    for pair in range(experiment.pairs):
-        for camera in experiment.cameras:
-            decoded += 2 * math.prod(camera.optics.sensor_shape)
-            if decoded > DECODED_PIXELS and pair > 0:
-                return
-            for frame in experiment.frames:
-                experiment.particle_image(camera.name, pair, frame)
 
 
-def _other_images(experiment: Experiment, camera: CameraSetup) -> Iterator[tuple[Path, str]]:
-    """Paths and labels of a camera's images beside the white one."""
-    if camera.dark_path is not None:
-        yield camera.dark_path, f"dark_image of camera {camera.name!r}"
-    for plane in range(len(experiment.board.planes_mm)):
-        yield experiment.board_path(camera.name, plane), f"board.images, camera {camera.name!r}, plane {plane}"
-    for pair in range(experiment.pairs):
-        for frame in experiment.frames:
-            label = f"particles.images, camera {camera.name!r}, pair {pair}, frame {frame!r}"
-            yield experiment.particle_path(camera.name, pair, frame), label
+def _check_shape(path: Path, label: str, camera: CameraSetup) -> None:
+    """Refuse an image that is missing, damaged, or of another shape than its camera's white image."""
+    _require_shape(images.read_header(path, label).shape, path, label, camera)
+
+
+def _require_shape(shape: tuple[int, ...], path: Path, label: str, camera: CameraSetup) -> None:
+    if shape != camera.optics.sensor_shape:
+        raise InputError(
+            f"{path} ({label}): expected {camera.optics.sensor_shape} pixels (rows, columns) as in the white image "
+            f"{camera.white_path}, found {shape}. All images of a camera have one size."
+        )
+
+
+def _particle_label(camera: str, pair: int, frame: str) -> str:
+    return f"particles.images, camera {camera!r}, pair {pair}, frame {frame!r}"

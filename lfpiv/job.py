@@ -1,25 +1,23 @@
-"""One invocation on one experiment and one output folder: its steps, what they depend on, its clock, its warnings."""
+"""One invocation on one experiment and one output folder: what is done once for all pairs, its clock, its warnings."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+import io
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from threadpoolctl import threadpool_limits
 
-import lfpiv
-from lfpiv import dataset, memory, summary
+from lfpiv import dataset, memory, stamp, summary
 from lfpiv.errors import InputError
-from lfpiv.experiment import Experiment, open_experiment
-from lfpiv.folder import Folder, make_writable
-from lfpiv.structure import structure
+from lfpiv.experiment import Experiment, check_pairs, read_experiment
+from lfpiv.folder import Folder, make_writable, writing
+from lfpiv.pair import Outcome, PairWork
 from lfpiv_kernels import runtime
 
 if TYPE_CHECKING:
@@ -31,8 +29,8 @@ log = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
 """Called as ``progress(step, fraction)``, fraction from 0 to 1."""
 
-FRAME_SHARE = 0.45
-"""Part of a pair's work that one of its volumes takes, for progress bars."""
+NAMED = 5
+"""Pairs that a message names one by one."""
 
 
 @contextlib.contextmanager
@@ -42,11 +40,16 @@ def open_job(
     device: str | None,
     progress: Progress | None,
     pairs: tuple[int, int | None] | None = None,
+    *,
+    writes_results: bool = True,
 ) -> Iterator[Job]:
-    """Check everything, start the device, collect the warnings; leave no empty folder behind on failure."""
+    """Check everything, start the device, collect the warnings; leave no empty folder behind on failure.
+
+    Jobs that write results hold the folder for themselves; `writes_results` is False for one that only reports.
+    """
     start = time.perf_counter()
     if not isinstance(experiment, Experiment):
-        experiment = open_experiment(experiment)
+        experiment = read_experiment(experiment)
     folder = Folder(Path(out))
     numbers = _select(experiment, pairs)
     memory.require(memory.least_bytes(experiment), experiment, "volumes of")
@@ -56,12 +59,18 @@ def open_job(
     for logger in loggers:
         logger.addHandler(collector)
     try:
-        try:
-            running = runtime.start(device or experiment.compute.device, threads=experiment.compute.threads)
-        except (RuntimeError, ValueError) as error:
-            raise InputError(str(error)) from None
-        with threadpool_limits(running.threads):
-            yield Job(experiment, folder, numbers, progress, running, collector.texts, start)
+        with contextlib.ExitStack() as stack:
+            if writes_results:
+                stack.enter_context(folder.held())
+                folder.sweep()
+                stack.callback(folder.sweep)
+            try:
+                running = runtime.start(device or experiment.compute.device, threads=experiment.compute.threads)
+            except (RuntimeError, ValueError) as error:
+                raise InputError(str(error)) from None
+            stack.enter_context(threadpool_limits(running.threads))
+            request = device or experiment.compute.device
+            yield Job(experiment, folder, numbers, progress, request, running, collector.texts, start)
     finally:
         for logger in loggers:
             logger.removeHandler(collector)
@@ -82,7 +91,10 @@ def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> ran
 
 
 class _WarningCollector(logging.Handler):
-    """Keeps the text of each warning once; what vectors say of themselves the summary words pair by pair."""
+    """Keeps the text of each warning once.
+
+    What vectors say of themselves the summary words pair by pair, and errors are those of pairs that failed.
+    """
 
     def __init__(self, level: int):
         super().__init__(level)
@@ -90,12 +102,12 @@ class _WarningCollector(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
-        if text not in self.texts and record.name != "lfpiv.vectors":
+        if record.levelno == logging.WARNING and text not in self.texts and record.name != "lfpiv.vectors":
             self.texts.append(text)
 
 
 class Job:
-    """The steps on one experiment and one folder, with the clock that times them."""
+    """One invocation: the steps done once, the pairs to do, and what came of them."""
 
     def __init__(
         self,
@@ -103,6 +115,7 @@ class Job:
         folder: Folder,
         numbers: range,
         progress: Progress | None,
+        device_request: str,
         device: runtime.Device,
         warnings: list[str],
         start: float,
@@ -110,16 +123,21 @@ class Job:
         self.experiment = experiment
         self.folder = folder
         self.numbers = numbers
+        """Pairs selected for this invocation."""
         self.progress: Progress = progress or (lambda step, fraction: None)
+        self.device_request = device_request
+        """What was asked for: a cluster's machines have devices of their own."""
         self.device = device
         self.warnings = warnings
         self.reused: list[str] = []
         self.start = start
         self.seconds: dict[str, float] = {}
+        self.failed: dict[int, str] = {}
+        """Pair -> why this invocation has no result of it."""
         self.weights_report: dict[str, Any] = {}
-        self.done, self.total = 0, 1
+        self.workers_report: dict[str, Any] = {"count": 1, "threads": device.threads, "peak_memory_mib": None}
         self.calibration: Calibration | None = None
-        self.calibration_hash = _calibration_hash(experiment)
+        self.calibration_stamp = stamp.of_calibration(experiment)
         self.previous = summary.read(folder.summary)
 
     @contextlib.contextmanager
@@ -133,108 +151,94 @@ class Job:
         """Progress of a step as a function of its fraction."""
         return lambda fraction: self.progress(name, fraction)
 
-    def begin_pair(self, done: int, total: int) -> None:
-        """Say which pair is worked on; `pair_step` then reports parts of it."""
-        self.done, self.total = done, total
-        self.progress("image pairs", done / total)
+    # --- what is there, what is to do
 
-    def pair_step(self, first: float, share: float) -> Callable[[float], None]:
-        """Progress of a part of the present pair that starts at `first` and makes up `share` of it."""
-        return lambda fraction: self.progress("image pairs", (self.done + first + share * fraction) / self.total)
+    def unfinished(self, *, vectors: bool = True, volumes: bool = False) -> list[int]:
+        """Pairs of this invocation whose vectors or volumes are not there or do not fit; logs what is kept and why."""
+        todo, changed = [], dict[str, list[int]]()
+        for pair in self.numbers:
+            wanted = [(self.folder.vectors(pair), stamp.of_vectors)] if vectors else []
+            wanted += [(self.folder.volume(pair, frame), stamp.of_volumes) for frame in (0, 1)] if volumes else []
+            for path, mark in wanted:
+                found = stamp.marks(path)
+                why = None if found is None else mark(self.experiment, self.calibration_stamp.hash, pair).changes(found)
+                if why != []:
+                    todo.append(pair)
+                    changed.setdefault(", ".join(why or ()), []).append(pair)
+                    break
+            else:
+                self.reused.append(f"{'vectors' if vectors else 'volumes'} of pair {pair}")
+        if len(todo) < len(self.numbers):
+            log.info(
+                "%d of %d pairs: finished before with the same settings, kept",
+                len(self.numbers) - len(todo),
+                len(self.numbers),
+            )
+        for reason, pairs in changed.items():
+            if reason:
+                log.info("%s changed: %s made anew", reason, _listed(pairs))
+        return todo
 
-    def note_reused(self, what: str) -> None:
-        """Log and remember that something finished earlier is kept."""
-        log.info("%s: finished before with the same settings, kept", what)
-        self.reused.append(what)
+    def check_images(self, todo: Sequence[int]) -> None:
+        """Warn of pairs whose images cannot be used; they are tried and left out when their turn comes.
 
-    # --- hashes: what a finished file depends on
+        Raises
+        ------
+        InputError
+            If the first one's images cannot be used: they show whether the experiment file is right.
+        """
+        bad = dict(check_pairs(self.experiment, todo))
+        if bad and todo[0] in bad:
+            others = f" To do the pairs after it, use --pairs {todo[0] + 1}:." if len(bad) < len(todo) else ""
+            raise InputError(bad[todo[0]] + others)
+        for reason in list(bad.values())[:NAMED]:
+            log.error("%s The other pairs will be done.", reason)
+        if len(bad) > NAMED:
+            log.error("%d pairs have images that cannot be used: %s", len(bad), _listed(list(bad)))
 
-    def volume_hash(self, pair: int) -> str:
-        """Hash of all that the volumes of a pair depend on."""
-        experiment = self.experiment
-        identity = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in experiment.pair_paths(pair)]
-        return dataset.settings_hash(
-            calibration=self.calibration_hash,
-            grid=dataclasses.asdict(experiment.grid),
-            smart=experiment.smart.model_dump(),
-            weights=(experiment.compute.weights, experiment.compute.weights_form),
-            images=identity,
-        )
+    def has_volumes(self, pair: int) -> bool:
+        """Whether both volumes of a pair are in the folder and fit."""
+        wanted = stamp.of_volumes(self.experiment, self.calibration_stamp.hash, pair)
+        found = [stamp.marks(self.folder.volume(pair, frame)) for frame in (0, 1)]
+        return all(marks is not None and not wanted.changes(marks) for marks in found)
 
-    def vector_hash(self, pair: int) -> str:
-        """Hash of all that the vectors of a pair depend on."""
-        settings = self.experiment.correlation.model_dump()
-        return dataset.settings_hash(volumes=self.volume_hash(pair), correlation=settings, dt_s=self.experiment.dt_s)
-
-    def is_finished(self, pair: int, keep_volumes: bool) -> bool:
-        """Whether the vectors of a pair, and its volumes where they are to be kept, are there and still fit."""
-        stored = dataset.stored_hash(self.folder.vectors(pair))
-        if stored is None:
-            return False
-        if stored != self.vector_hash(pair):
-            log.info("pair %d: settings or images changed, its vectors are made anew", pair)
-            return False
-        return not keep_volumes or self._volumes_fit(pair)
-
-    def finished_pairs(self) -> list[int]:
-        """Pairs whose vectors in the folder fit the experiment."""
-        return [pair for pair in range(self.experiment.pairs) if self._vectors_fit(pair)]
-
-    def _vectors_fit(self, pair: int) -> bool:
-        return dataset.stored_hash(self.folder.vectors(pair)) == self.vector_hash(pair)
-
-    def _volumes_fit(self, pair: int) -> bool:
-        wanted = self.volume_hash(pair)
-        return all(dataset.stored_hash(self.folder.volume(pair, frame)) == wanted for frame in (0, 1))
-
-    # --- steps
+    # --- steps done once
 
     def load_calibration(self) -> Calibration:
         """Load the calibration in the folder; InputError where there is none that fits the experiment."""
         from lfpiv.calibration import load_calibration
 
         path = self.folder.calibration
-        if dataset.stored_hash(path) != self.calibration_hash:
+        found = stamp.marks(path)
+        if found is None or self.calibration_stamp.changes(found):
             raise InputError(
                 f"{path}: expected the calibration of this experiment, found none that fits. "
                 "Run `lfpiv calibrate` or `lfpiv run` first."
             )
-        self.note_reused("calibration")
+        log.info("calibration: finished before with the same settings, kept")
+        self.reused.insert(0, "calibration")
         self.calibration = load_calibration(path)
         return self.calibration
 
     def calibrate(self) -> Calibration:
         """Keep the calibration in the folder where it fits the experiment, make it otherwise."""
         path = self.folder.calibration
-        stored = dataset.stored_hash(path)
-        if stored == self.calibration_hash:
+        found = stamp.marks(path)
+        changes = None if found is None else self.calibration_stamp.changes(found)
+        if changes == []:
             return self.load_calibration()
-        if stored is not None:
-            log.info("calibration: settings or images changed, made anew")
+        if changes:
+            log.info("%s changed: calibration made anew", ", ".join(changes))
         from lfpiv.calibration import calibrate as calibrate_cameras
 
         with self.timed("calibration"):
             self.calibration = calibrate_cameras(self.experiment, progress=self.step("calibration"))
-        with dataset.replacing(path) as scratch:
-            self.calibration.save(scratch)
-            _stamp(scratch, settings_hash=self.calibration_hash, seconds=self.seconds["calibration"])
+        content = io.BytesIO()  # not straight to disk: see `dataset.write_bytes`
+        self.calibration.save(content)  # type: ignore[arg-type]  # HDF5 takes files too
+        _mark(content, **self.calibration_stamp.attributes, seconds=self.seconds["calibration"])
+        with writing(path):
+            dataset.write_bytes(content.getbuffer(), path)
         return self.calibration
-
-    def plan_memory(self) -> None:
-        """Refuse a volume whose weights do not fit into memory, before any work: from the nominal rig."""
-        from lfpiv.weights import estimate_memory
-
-        cameras, grid, form = (
-            _nominal_cameras(self.experiment),
-            self.experiment.grid,
-            self.experiment.compute.weights_form,
-        )
-        weights = estimate_memory(cameras, grid, form)
-        needed = memory.least_bytes(self.experiment) + weights
-        log.info("memory: about %.1f GiB needed, %.1f GiB of it for weights", needed / memory.GIB, weights / memory.GIB)
-        if form == "auto" and (most := estimate_memory(cameras, grid, "pixels")) > weights:
-            log.info("memory: up to %.1f GiB for weights where rays bend", most / memory.GIB)
-        memory.require(needed, self.experiment, "volumes and weights of")
 
     def build_weights(self, calibration: Calibration) -> Weights:
         """Build the weights of the grid."""
@@ -271,143 +275,83 @@ class Job:
                 log.info("weights differ from counted rays by %.1f %% (mean of %d voxels)", share, len(errors))
         return weights
 
-    def reconstruct(self, calibration: Calibration, weights: Weights, pair: int, *, keep: bool) -> list[xr.DataArray]:
-        """Reconstruct both volumes of a pair; write them where they are to be kept."""
-        from lfpiv.volume import reconstruct as reconstruct_volume
+    # --- the pairs
 
-        experiment, volumes = self.experiment, []
-        for number, frame in enumerate(experiment.frames):
-            with self.timed(f"volume {pair} {number}"):
-                light, noise = self.read_light(calibration, pair, frame)
-                shown = {name: structure(image, calibration.cameras[name].decoder) for name, image in light.items()}
-                settings = experiment.smart.model_dump()
-                progress = self.pair_step(number * FRAME_SHARE, FRAME_SHARE)
-                try:
-                    volume = reconstruct_volume(weights, light, floor=noise, progress=progress, **settings)
-                except ValueError as error:
-                    raise InputError(f"pair {pair}, frame {frame!r}: {error}") from error
-            volume.attrs |= {"cameras": list(shown), "structure": list(shown.values())}
-            volumes.append(volume)
-            if keep:
-                path = self.folder.volume(pair, number)
-                seconds = self.seconds[f"volume {pair} {number}"]
-                stamp = {"settings_hash": self.volume_hash(pair), "seconds": seconds, "pair": pair, "frame": frame}
-                dataset.write_volume(volume, path, attributes=stamp)
-        return volumes
+    def work(self, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
+        """Put together what is to be done with each pair."""
+        return PairWork(
+            experiment=self.experiment,
+            folder=self.folder,
+            calibration_hash=self.calibration_stamp.hash,
+            weights=weights,
+            keep_volumes=keep_volumes,
+            vectors=vectors,
+        )
 
-    def read_light(
-        self, calibration: Calibration, pair: int, frame: str
-    ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-        """Images of one frame without dark and background [counts], and the noise of that background [counts]."""
-        light, noise = {}, {}
-        for camera in self.experiment.cameras:
-            image, dark = self.experiment.particle_image(camera.name, pair, frame), self.experiment.dark(camera.name)
-            image = image if dark is None else image - dark
-            level, noise[camera.name] = calibration.cameras[camera.name].decoder.background(image)
-            light[camera.name] = image - np.float32(level)
-        return light, noise
+    def note(self, outcome: Outcome) -> None:
+        """Keep what came of a pair."""
+        if outcome.reason:
+            self.failed[outcome.pair] = outcome.reason
+            log.error("pair %d failed and is left out: %s", outcome.pair, outcome.reason)
 
-    def stored_volumes(self, pair: int) -> list[xr.DataArray] | None:
-        """Both volumes of a pair from the folder; None where they are missing or do not fit."""
-        if not self._volumes_fit(pair):
-            return None
-        return [dataset.read_volume(self.folder.volume(pair, frame)) for frame in (0, 1)]
-
-    def volume_seconds(self, pair: int, frame: int) -> float:
-        """Time that a volume took, in this invocation or an earlier one [s]."""
-        if f"volume {pair} {frame}" in self.seconds:
-            return self.seconds[f"volume {pair} {frame}"]
-        return float(dataset.read_attributes(self.folder.volume(pair, frame))["seconds"])
-
-    def correlate(self, pair: int, volumes: list[xr.DataArray]) -> None:
-        """Correlate the volumes of a pair and write its vectors."""
-        experiment = self.experiment
-        with self.timed(f"correlation {pair}"):
-            vectors = lfpiv.correlate(*volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
-        reconstructed = sum(self.volume_seconds(pair, frame) for frame in (0, 1))
-        path = self.folder.vectors(pair)
-        attributes = {
-            "settings_hash": self.vector_hash(pair),
-            "experiment": experiment.name,
-            "pair": pair,
-            "reconstruction_s": reconstructed,
-            "correlation_s": self.seconds[f"correlation {pair}"],
-            "smart": experiment.smart.model_dump(),
-            "correlation": experiment.correlation.model_dump(),
-        }
-        condensed = dataset.build_reconstruction(dict(zip(experiment.frames, volumes, strict=True)))
-        dataset.write_vectors(vectors, path, attributes=attributes, reconstruction=condensed)
-        log.info("pair %d: %.0f %% of the vectors valid", pair, 100 * float(vectors["valid"].mean()))
-
-    def finish(self, pairs: range | list[int], *, report: bool) -> dict[str, Any]:
-        """Write summary.json, and report.html where asked; return the summary."""
-        vectors = {pair: self.folder.vectors(pair) for pair in pairs}
+    def finish(self, *, report: bool) -> dict[str, Any]:
+        """Write summary.json of all that the folder holds, and report.html where asked; return the summary."""
+        if self.calibration is None:
+            raise InputError(f"{self.folder.calibration}: expected a calibration, found none. Run `lfpiv calibrate`.")
+        vectors, pairs = {}, []
+        for pair in range(self.experiment.pairs):
+            path = self.folder.vectors(pair)
+            found = stamp.marks(path)
+            if found is not None and not stamp.of_vectors(self.experiment, self.calibration_stamp.hash, pair).changes(
+                found
+            ):
+                vectors[pair] = path
+                pairs.append(summary.pair_entry(pair, path, found))
+        earlier = {entry["pair"]: entry["reason"] for entry in self.previous.get("failed", ())}
         result = summary.build(
             experiment=self.experiment,
             calibration=self.calibration,
             calibration_path=self.folder.calibration,
-            vectors=vectors,
+            pairs=pairs,
+            failed={pair: reason for pair, reason in {**earlier, **self.failed}.items() if pair not in vectors},
             previous=self.previous,
             weights_s=self.seconds.get("weights"),
             weights=self.weights_report,
+            workers=self.workers_report,
             device=self.device,
             warnings=self.warnings,
             reused=self.reused,
         )
-        self.stop_clock(result)
+        self._stop_clock(result)
         if report:
             from lfpiv.report import write_report
 
-            with self.timed("report"):
+            with self.timed("report"), writing(self.folder.report):
                 write_report(self.experiment, self.calibration, result, vectors, self.folder.report)
             result["timings_s"]["report"] = self.seconds["report"]
-            self.stop_clock(result)
-        dataset.write_json(result, self.folder.summary)
+            self._stop_clock(result)
+        with writing(self.folder.summary):
+            dataset.write_json(result, self.folder.summary)
         return result
 
-    def stop_clock(self, result: dict[str, Any]) -> None:
+    def _stop_clock(self, result: dict[str, Any]) -> None:
         """Put the time and the peak memory so far into a summary."""
         result["timings_s"]["total"] = time.perf_counter() - self.start
         earlier = self.previous.get("peak_memory_mib") if self.reused else None
-        result["peak_memory_mib"] = max(memory.peak_mib(), earlier or 0.0)
+        peaks = (memory.peak_mib(), earlier, self.workers_report["peak_memory_mib"])
+        result["peak_memory_mib"] = max(peak or 0.0 for peak in peaks)
 
 
-def _nominal_cameras(experiment: Experiment) -> Calibration:
-    """Return the rig as the data sheets have it: no image is read, nothing found."""
-    from lfpiv.calibration import CalibratedCamera, Calibration
-    from lfpiv.rig import LensLattice
-    from lfpiv.thinlens import thin_lens_model
-
-    cameras = {}
-    for setup in experiment.cameras:
-        pitch, half = setup.optics.microlens_pitch_mm, setup.optics.microlens_pitch_mm / 2
-        second = (half, half * 3**0.5) if setup.optics.layout == "hexagonal" else (0.0, pitch)
-        cameras[setup.name] = CalibratedCamera(
-            name=setup.name,
-            optics=setup.optics,
-            lattice=LensLattice(origin_mm=(0.0, 0.0), basis_mm=((pitch, 0.0), second), layout=setup.optics.layout),
-            decoder=None,
-            baseline=thin_lens_model(setup.optics, setup.nominal_angle_deg),
-        )
-    return Calibration(cameras)
-
-
-def _calibration_hash(experiment: Experiment) -> str:
-    cameras = [
-        [camera.name, dataclasses.asdict(camera.optics), camera.nominal_angle_deg, camera.image_flip]
-        for camera in experiment.cameras
-    ]
-    return dataset.settings_hash(
-        version=lfpiv.__version__,
-        cameras=cameras,
-        board=experiment.board.model_dump(),
-        network=experiment.network.model_dump(),
-        images=dataset.content_hash(experiment.calibration_paths()),
+def _listed(pairs: Sequence[int]) -> str:
+    """Name some pairs, and say how many there are where they are many."""
+    names = ", ".join(map(str, pairs[:NAMED]))
+    return f"pair{'s' if len(pairs) > 1 else ''} {names}" + (
+        f" and {len(pairs) - NAMED} more" if len(pairs) > NAMED else ""
     )
 
 
-def _stamp(path: Path, **attributes: Any) -> None:
+def _mark(file: io.BytesIO, **attributes: Any) -> None:
     import h5py
 
-    with h5py.File(path, "a") as file:
-        file.attrs.update(attributes)
+    with h5py.File(file, "a") as opened:
+        opened.attrs.update(attributes)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import Experiment
+
+if TYPE_CHECKING:
+    from lfpiv.calibration import Calibration
+
+log = logging.getLogger(__name__)
 
 MIB = 1 << 20
 GIB = 1 << 30
@@ -32,6 +39,45 @@ def least_bytes(experiment: Experiment) -> int:
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
     voxel_bytes = BYTES_PER_VOXEL + BYTES_PER_VOXEL_AND_CAMERA * cameras
     return BASE_BYTES + voxel_bytes * experiment.grid.size + BYTES_PER_PIXEL * pixels
+
+
+def weights_bytes(experiment: Experiment) -> int:
+    """Estimate the memory of the weights [byte] from the nominal rig, before any image is read; logs the upper end."""
+    from lfpiv.weights import estimate_memory
+
+    cameras, grid, form = _nominal_cameras(experiment), experiment.grid, experiment.compute.weights_form
+    weights = estimate_memory(cameras, grid, form)
+    if form == "auto" and (most := estimate_memory(cameras, grid, "pixels")) > weights:
+        log.info("memory: %.1f GiB for weights, up to %.1f GiB where rays bend", weights / GIB, most / GIB)
+    return weights
+
+
+def worker_bytes(experiment: Experiment) -> int:
+    """Estimate what one worker process takes beside the weights, which all share [byte]."""
+    pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
+    return BASE_BYTES + BYTES_PER_VOXEL * experiment.grid.size + BYTES_PER_PIXEL * pixels
+
+
+def run_bytes(experiment: Experiment, weights: int, workers: int) -> int:
+    """Estimate what a run takes [byte]: alone, or the larger of building the weights and working with them together."""
+    build = least_bytes(experiment) + weights
+    if workers == 1:
+        return build
+    return max(build, BASE_BYTES + weights + workers * worker_bytes(experiment))
+
+
+def fitting_workers(experiment: Experiment, weights: int, workers: int) -> int:
+    """Return how many of so many workers fit into the memory, at least 1."""
+    limit = allowed_bytes(experiment)
+    while workers > 1 and run_bytes(experiment, weights, workers) > limit:
+        workers -= 1
+    return workers
+
+
+def allowed_bytes(experiment: Experiment) -> int:
+    """Return the memory a run may take [byte]: what is available, and what ``compute.memory_gib`` allows."""
+    allowed = experiment.compute.memory_gib
+    return available_bytes() if allowed is None else min(int(allowed * GIB), available_bytes())
 
 
 def available_bytes() -> int:
@@ -66,8 +112,7 @@ def require(needed: int, experiment: Experiment, what: str) -> None:
     InputError
         With both numbers and the volume's size.
     """
-    allowed = experiment.compute.memory_gib
-    limit = available_bytes() if allowed is None else min(int(allowed * GIB), available_bytes())
+    allowed, limit = experiment.compute.memory_gib, allowed_bytes(experiment)
     if needed <= limit:
         return
     origin = "compute.memory_gib allows" if allowed is not None and limit == int(allowed * GIB) else "are available"
@@ -93,3 +138,23 @@ def _meminfo(key: str) -> int | None:
     except OSError:
         return None
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(key + ":")), None)
+
+
+def _nominal_cameras(experiment: Experiment) -> Calibration:
+    """Return the rig as the data sheets have it: no image is read, nothing found."""
+    from lfpiv.calibration import CalibratedCamera, Calibration
+    from lfpiv.rig import LensLattice
+    from lfpiv.thinlens import thin_lens_model
+
+    cameras = {}
+    for setup in experiment.cameras:
+        pitch, half = setup.optics.microlens_pitch_mm, setup.optics.microlens_pitch_mm / 2
+        second = (half, half * 3**0.5) if setup.optics.layout == "hexagonal" else (0.0, pitch)
+        cameras[setup.name] = CalibratedCamera(
+            name=setup.name,
+            optics=setup.optics,
+            lattice=LensLattice(origin_mm=(0.0, 0.0), basis_mm=((pitch, 0.0), second), layout=setup.optics.layout),
+            decoder=None,  # type: ignore[arg-type]  # there is no image yet
+            baseline=thin_lens_model(setup.optics, setup.nominal_angle_deg),
+        )
+    return Calibration(cameras)

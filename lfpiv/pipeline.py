@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from lfpiv import batch
 from lfpiv.errors import InputError
 from lfpiv.experiment import Experiment
-from lfpiv.job import Progress, open_job
+from lfpiv.job import Job, Progress, open_job
+from lfpiv.pair import Outcome
+
+if TYPE_CHECKING:
+    from lfpiv.calibration import Calibration
 
 
 def run(
@@ -17,11 +24,14 @@ def run(
     pairs: tuple[int, int | None] | None = None,
     device: str | None = None,
     keep_volumes: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Do the whole job: raw images to vectors, summary and report.
 
-    What is finished in `out` and still fits the experiment is kept: the calibration, and the pairs.
+    What is finished in `out` and still fits the experiment is kept: the calibration, and the pairs. A pair that cannot
+    be done is left out and listed under ``failed``; the others are done.
 
     Parameters
     ----------
@@ -35,6 +45,12 @@ def run(
         Default: ``compute.device`` of the experiment.
     keep_volumes : bool
         Write the volumes too.
+    workers : int, optional
+        Processes of this machine that work on pairs side by side, each with its share of the cores; default: one per
+        GPU on CUDA, this process alone otherwise. More than one need the extra ``distributed``, and a script that asks
+        for them calls this below ``if __name__ == "__main__":``.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers do the pairs; they must see `out` and the images under the same paths.
     progress : callable, optional
         Called as ``progress(step, fraction)``.
 
@@ -46,28 +62,19 @@ def run(
     Raises
     ------
     InputError
-        If something the user can mend is wrong: files, keys, memory, the output folder, the device.
+        If something the user can mend is wrong: files, keys, memory, the output folder, the device, the workers.
+    StorageError
+        If results cannot be written, for want of space or rights.
     """
+    if scheduler is not None and workers is not None:
+        raise InputError("--workers, --scheduler: expected one of them: a cluster has workers of its own.")
     with open_job(experiment, out, device, progress, pairs) as job:
-        numbers = job.numbers
-        todo = [pair for pair in numbers if not job.is_finished(pair, keep_volumes)]
-        if todo:
-            job.plan_memory()
+        todo = job.unfinished(volumes=keep_volumes)
+        planned = _plan(job, todo, workers, scheduler)
         calibration = job.calibrate()
-        for pair in numbers:
-            if pair not in todo:
-                job.note_reused(f"vectors of pair {pair}")
         if todo:
-            weights = None
-            for done, pair in enumerate(todo):
-                job.begin_pair(done, len(todo))
-                volumes = job.stored_volumes(pair)
-                if volumes is None:
-                    weights = weights or job.build_weights(calibration)
-                    volumes = job.reconstruct(calibration, weights, pair, keep=keep_volumes)
-                job.correlate(pair, volumes)
-            job.progress("image pairs", 1.0)
-        return job.finish(numbers, report=True)
+            _do(job, _outcomes(job, calibration, todo, planned, scheduler, keep_volumes))
+        return job.finish(report=True)
 
 
 def calibrate(
@@ -80,7 +87,7 @@ def calibrate(
     """Calibrate the cameras into ``calibration.h5``; the first step of `run`. Returns the summary."""
     with open_job(experiment, out, device, progress) as job:
         job.calibrate()
-        return job.finish(job.finished_pairs(), report=False)
+        return job.finish(report=False)
 
 
 def reconstruct(
@@ -93,19 +100,13 @@ def reconstruct(
 ) -> dict[str, Any]:
     """Reconstruct the volumes of some pairs into ``volumes/``; calibrates first where need be. Returns the summary."""
     with open_job(experiment, out, device, progress, pairs) as job:
-        numbers = job.numbers
-        job.plan_memory()
+        todo = job.unfinished(vectors=False, volumes=True)
+        _plan(job, todo, 1, None)
         calibration = job.calibrate()
-        weights = None
-        for done, pair in enumerate(numbers):
-            job.begin_pair(done, len(numbers))
-            if job.stored_volumes(pair) is not None:
-                job.note_reused(f"volumes of pair {pair}")
-                continue
-            weights = weights or job.build_weights(calibration)
-            job.reconstruct(calibration, weights, pair, keep=True)
-        job.progress("image pairs", 1.0)
-        return job.finish(job.finished_pairs(), report=False)
+        if todo:
+            work = job.work(job.build_weights(calibration), keep_volumes=True, vectors=False)
+            _do(job, batch.alone(work, todo, job.step("image pairs")))
+        return job.finish(report=False)
 
 
 def correlate(
@@ -121,35 +122,82 @@ def correlate(
     Raises
     ------
     InputError
-        If the calibration, or the volumes of a pair, are missing or belong to other settings.
+        If the calibration, or the volumes of all pairs, are missing or belong to other settings.
     """
     with open_job(experiment, out, device, progress, pairs) as job:
         job.load_calibration()
-        numbers = job.numbers
-        for done, pair in enumerate(numbers):
-            job.begin_pair(done, len(numbers))
-            if job.is_finished(pair, keep_volumes=False):
-                job.note_reused(f"vectors of pair {pair}")
-                continue
-            volumes = job.stored_volumes(pair)
-            if volumes is None:
+        todo = job.unfinished()
+        if todo:
+            if not any(job.has_volumes(pair) for pair in todo):
                 raise InputError(
-                    f"{job.folder.volume(pair, 0)}: expected the two volumes of pair {pair} made with the present "
-                    "settings, found none. Run `lfpiv reconstruct` first."
+                    f"{job.folder.volume(todo[0], 0)}: expected the two volumes of pair {todo[0]} made with the "
+                    "present settings, found none. Run `lfpiv reconstruct` first."
                 )
-            job.correlate(pair, volumes)
-        job.progress("image pairs", 1.0)
-        return job.finish(job.finished_pairs(), report=False)
+            work = job.work(None, keep_volumes=False)
+            _do(job, batch.alone(work, todo, job.step("image pairs")))
+        return job.finish(report=False)
 
 
 def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, Any]:
-    """Write summary and report anew from what a folder holds. Returns the summary.
+    """Write summary and report anew from what a folder holds, also while a run goes on. Returns the summary.
 
     Raises
     ------
     InputError
         If the folder holds no calibration that fits the experiment.
     """
-    with open_job(experiment, out, None, None) as job:
+    with open_job(experiment, out, None, None, writes_results=False) as job:
         job.load_calibration()
-        return job.finish(job.finished_pairs(), report=True)
+        return job.finish(report=True)
+
+
+def _plan(job: Job, todo: Sequence[int], workers: int | None, scheduler: str | None) -> batch.Plan | None:
+    """Check images, memory and workers before any work; None where a cluster does it."""
+    from lfpiv import memory
+
+    gpus = batch.visible_gpus() if job.device.kind == "cuda" else ()
+    planned = batch.plan(len(todo), workers, job.device, gpus)
+    if todo:
+        job.check_images(todo)
+        weights = memory.weights_bytes(job.experiment) if not all(map(job.has_volumes, todo)) else 0
+        batch.require_memory(job.experiment, weights, 1 if scheduler else planned.workers)
+    return None if scheduler else planned
+
+
+def _outcomes(
+    job: Job,
+    calibration: Calibration,
+    todo: Sequence[int],
+    planned: batch.Plan | None,
+    scheduler: str | None,
+    keep_volumes: bool,
+) -> Generator[Outcome, None, None]:
+    """Do the pairs here or in several processes; the weights are built once, for all of them."""
+    weights = None if all(map(job.has_volumes, todo)) else job.build_weights(calibration)
+    work = job.work(weights, keep_volumes=keep_volumes)
+    if planned is not None and weights is not None:
+        planned = batch.lowered(planned, job.experiment, weights.memory_bytes, job.device)
+    if planned is not None and planned.workers == 1:
+        yield from batch.alone(work, todo, job.step("image pairs"))
+        return
+    from lfpiv import crew, worker
+
+    if planned is None:
+        shared = worker.share(work, job.device_request, job.experiment.compute.threads)
+        job.workers_report |= {"count": None, "threads": job.experiment.compute.threads}
+    else:
+        shared = worker.share(work, job.device.kind, planned.threads)
+        job.workers_report |= {"count": planned.workers, "threads": planned.threads}
+    del work, weights  # the workers have them in their files; there must be room for both
+
+    def peak(mib: float) -> None:
+        job.workers_report["peak_memory_mib"] = mib
+
+    yield from crew.together(shared, todo, planned, scheduler, job.step("image pairs"), peak)
+
+
+def _do(job: Job, outcomes: Generator[Outcome, None, None]) -> None:
+    with contextlib.closing(outcomes):  # no worker outlives an interruption
+        for outcome in outcomes:
+            job.note(outcome)
+    job.progress("image pairs", 1.0)

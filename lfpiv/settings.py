@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -47,6 +47,13 @@ class Smart(Table):
     """Voxels below this share of the first guess's brightest are left out; 0 keeps all."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
     """Stop when an iteration lowers the misfit, a divergence, by less than this fraction; 0 runs all iterations."""
+    motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
+    """How often the motion is measured and both frames reconstructed anew from what they share along it: smaller errors
+    of displacement, whose stated uncertainty is then about half of what it should be. 0: each frame by itself."""
+
+    def of_one_frame(self) -> dict[str, Any]:
+        """Return the settings of `lfpiv.reconstruct`, which knows one frame only."""
+        return self.model_dump(exclude={"motion_passes"})
 
 
 class Correlation(Table):
@@ -100,14 +107,23 @@ class NominalCamera(Table):
     """Keys of ``[[camera]]`` that a data sheet and the plan of the rig give; scenes of the simulator have them too."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    """Name in file names and messages: letters, digits, '_', '-' and '.'."""
     focal_length_mm: Positive
+    """Focal length of the main lens [mm]."""
     magnification: Number
+    """Magnification of the main lens, not 0; the sign does not matter."""
     f_number: Positive
+    """f-number of the main lens as it was set."""
     microlens_pitch_mm: Positive
+    """Distance of neighbouring microlenses [mm]."""
     microlens_focal_length_mm: Positive
+    """Focal length of the microlenses [mm]; the sensor lies that far behind them."""
     pixel_um: Positive
+    """Pixel pitch of the sensor [um]."""
     microlens_layout: Literal["square", "hexagonal"] = "square"
+    """Arrangement of the microlenses."""
     nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
+    """Angle of the camera about y, to some ten degrees [degree]: names the board's dots, never enters the mapping."""
     image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
     """How the camera's images are mirrored."""
 
@@ -123,7 +139,9 @@ class CameraTable(NominalCamera):
     """Table ``[[camera]]``: nominal optics and images of one camera."""
 
     white_image: Annotated[str, Field(min_length=1)]
+    """Path of an image of an evenly lit white surface, which shows every microlens."""
     dark_image: Annotated[str, Field(min_length=1)] | None = None
+    """Path of an image with the lens capped; absent: the gaps between the microimages give the dark level."""
 
 
 class Board(Table):
@@ -158,8 +176,11 @@ class Volume(Table):
     """Table ``[volume]``: the grid to reconstruct on; (x, y, z) order."""
 
     centre_mm: tuple[Number, Number, Number]
+    """Centre (x, y, z) of the volume [mm]."""
     size_mm: tuple[Positive, Positive, Positive]
+    """Size (x, y, z) of the volume [mm]; at least 4 voxels along each axis."""
     voxel_mm: Positive
+    """Edge of a voxel [mm]."""
 
 
 class Particles(Table):
@@ -168,7 +189,9 @@ class Particles(Table):
     images: Annotated[str, Field(min_length=1)]
     """Path with ``{camera}``, ``{pair}`` and ``{frame}``, pairs counted from 0."""
     pairs: Count
+    """Number of image pairs."""
     frames: tuple[Annotated[str, Field(min_length=1)], Annotated[str, Field(min_length=1)]] = ("a", "b")
+    """What ``{frame}`` stands for in the first and in the second image of a pair."""
 
     @field_validator("frames")
     @classmethod
@@ -182,7 +205,9 @@ class ExperimentTable(Table):
     """The whole file."""
 
     name: Annotated[str, Field(min_length=1)]
+    """Title of the report."""
     dt_s: Positive
+    """Time between the two frames of a pair [s]."""
     camera: Annotated[tuple[CameraTable, ...], Field(min_length=1)]
     board: Board
     volume: Volume

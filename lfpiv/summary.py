@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,10 +33,12 @@ def build(
     experiment: Experiment,
     calibration: Calibration,
     calibration_path: Path,
-    vectors: Mapping[int, Path],
+    pairs: Sequence[Mapping[str, Any]],
+    failed: Mapping[int, str],
     previous: Mapping[str, Any],
     weights_s: float | None,
     weights: Mapping[str, Any],
+    workers: Mapping[str, Any],
     device: Device,
     warnings: Sequence[str],
     reused: Sequence[str],
@@ -52,12 +54,16 @@ def build(
         What was run.
     calibration, calibration_path
         The calibration and its file.
-    vectors : dict
-        Pair -> file of finished vectors.
+    pairs : sequence of dict
+        Figures of the finished pairs, from `pair_entry`.
+    failed : dict
+        Pair -> why it has no result.
     previous : dict
         Earlier summary of the folder, or nothing.
     weights_s, weights
         Seconds and figures of the weights; None and nothing where this invocation built none.
+    workers : dict
+        Processes that worked on pairs: how many, their threads and their peak memory.
     device : Device
         Where the kernels ran.
     warnings, reused : sequence of str
@@ -69,7 +75,6 @@ def build(
         JSON-able content of ``summary.json``; ``total`` and the peak memory are filled in at the very end of a run.
     """
     reports = {name: _report(camera, experiment.grid) for name, camera in calibration.cameras.items()}
-    pairs = [_pair(number, path) for number, path in vectors.items()]
     earlier = previous.get("timings_s", {})
     timings = {
         "calibration": float(dataset.read_attributes(calibration_path)["seconds"]),
@@ -97,6 +102,7 @@ def build(
             "voxel_mm": grid.voxel_mm,
         },
         "device": {"kind": device.kind, "threads": device.threads, "reason": device.reason},
+        "workers": dict(workers),
         "versions": dataset.versions(),
         "settings": {
             "smart": experiment.smart.model_dump(),
@@ -108,7 +114,8 @@ def build(
         "peak_memory_mib": None,
         "calibration": {name: _scalars(report) for name, report in reports.items()},
         "weights": dict(weights) or previous.get("weights", {}),
-        "pairs": pairs,
+        "pairs": list(pairs),
+        "failed": [{"pair": pair, "reason": reason} for pair, reason in sorted(failed.items())],
         "valid_fraction": _mean(pair["valid_fraction"] for pair in pairs),
         "finite_fraction": _mean(pair["finite_fraction"] for pair in pairs),
         "warnings": list(dict.fromkeys([*said, *warnings, *empty, *poor])),
@@ -146,13 +153,20 @@ def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
     return float(np.sqrt((correction**2).sum(1).mean()) / camera.lattice.pitch_mm)
 
 
-def _pair(number: int, path: Path) -> dict[str, Any]:
-    vectors, reconstruction = dataset.read_vectors(path), dataset.read_reconstruction(path)
+def pair_entry(number: int, path: Path, marks: Mapping[str, Any]) -> dict[str, Any]:
+    """Figures of a finished pair, from the marks of its file: thousands of files are not read as a whole."""
+    if "figures" in marks:
+        figures = json.loads(marks["figures"])
+    else:
+        figures = dataset.plain(pair_figures(dataset.read_vectors(path), dataset.read_reconstruction(path)))
+    return {"pair": number, "file": path.name, **figures}
+
+
+def pair_figures(vectors: xr.Dataset, reconstruction: xr.Dataset | None) -> dict[str, Any]:
+    """Figures of a pair's vectors and of what is left of its volumes; stored with the vectors."""
     valid = vectors["valid"].values
     finite = np.isfinite(vectors["u"].values) & np.isfinite(vectors["v"].values) & np.isfinite(vectors["w"].values)
-    result = {
-        "pair": number,
-        "file": path.name,
+    result: dict[str, Any] = {
         "vectors": list(vectors["u"].shape),
         "valid_fraction": float(valid.mean()),
         "finite_fraction": float(finite.mean()),
@@ -204,7 +218,7 @@ def _median(values: np.ndarray) -> float | None:
     return float(np.median(values)) if values.size else None
 
 
-def _mean(values) -> float | None:
+def _mean(values: Iterable[float]) -> float | None:
     values = list(values)
     return float(np.mean(values)) if values else None
 

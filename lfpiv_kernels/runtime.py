@@ -75,7 +75,7 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
         raise RuntimeError("device: 'cuda' was requested but none is visible; use 'auto' to allow the CPU.")
     kind = "cuda" if request != "cpu" and wp.is_cuda_available() else "cpu"
     reason = "no CUDA device visible" if request == "auto" and kind == "cpu" else ""
-    count = threads or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    count = threads or cores()
 
     import taichi as ti
 
@@ -92,6 +92,11 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
     if reason:
         log.info("kernels run on the CPU (%d threads): %s", count, reason)
     return _device
+
+
+def cores() -> int:
+    """Return the number of cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextlib.contextmanager

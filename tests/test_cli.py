@@ -1,5 +1,6 @@
 """The command line: exit status, one message for what the user can mend, nothing left behind."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,9 +8,10 @@ import sys
 import numpy as np
 import pytest
 import tifffile
+import typer
 
 import lfpiv
-from lfpiv import cli, memory, pipeline
+from lfpiv import cli, memory, pipeline, terminal
 from lfpiv.errors import InputError
 
 
@@ -30,8 +32,16 @@ SPOILERS = {
     "white image missing": (lambda e: (e.parent / "white/left.tif").unlink(), "white/left.tif"),
     "plane missing": (lambda e: (e.parent / "board/right/plane_01.tif").unlink(), "board/right/plane_01.tif"),
     "TIFF truncated": (
-        lambda e: os.truncate(e.parent / "particles/left/0001a.tif", 900),
-        "particles/left/0001a.tif",
+        lambda e: os.truncate(e.parent / "board/left/plane_01.tif", 900),
+        "board/left/plane_01.tif",
+    ),
+    "first pair missing": (
+        lambda e: (e.parent / "particles/left/0000a.tif").unlink(),
+        "particles/left/0000a.tif",
+    ),
+    "first pair truncated": (
+        lambda e: os.truncate(e.parent / "particles/right/0000b.tif", 900),
+        "--pairs 1:",
     ),
     "shape": (
         lambda e: tifffile.imwrite(e.parent / "board/left/plane_00.tif", np.ones((48, 60), np.uint16)),
@@ -148,6 +158,52 @@ def test_real_processes_end_with_the_same_status(tiny_experiment, tmp_path):
     status, written, said = run("run", tiny_experiment, "--out", tmp_path / "out")
     assert status == 2 and written == "" and said.count("\n") == 1 and "white/left.tif" in said
     assert not (tmp_path / "out").exists()
+
+
+def test_json_is_the_whole_of_standard_output_and_quiet_says_nothing(monkeypatch, tmp_path, capfd):
+    summary = {"failed": [{"pair": 1, "reason": "dark"}], "experiment": {"pairs": 2}, "value": np.float32("nan")}
+    monkeypatch.setattr(pipeline, "run", lambda *args, **options: summary)
+    command = ["run", "x.toml", "--out", str(tmp_path)]
+    assert cli.call([*command, "--json"]) == 3
+    written, said = capfd.readouterr()
+    assert json.loads(written) == {**summary, "value": None} and "failed: pair 1: dark" in said
+    monkeypatch.setattr(pipeline, "run", lambda *args, **options: {**summary, "failed": []})
+    assert cli.call([*command, "--quiet"]) == 0 and capfd.readouterr() == ("", "")
+
+
+def test_options_of_one_call_do_not_reach_the_next(capfd):
+    assert cli.call(["doctor", "--json"]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert {"item", "finding", "good"} == set(found[0]) and all(item["good"] for item in found)
+    assert cli.call(["doctor"]) == 0
+    assert found[0]["finding"] in capfd.readouterr().out.splitlines()[0]
+
+
+@pytest.mark.parametrize("name", sorted(typer.main.get_command(cli.app).commands))
+def test_help_shows_examples_that_the_parser_takes(name, capfd, monkeypatch):
+    assert cli.call([name, "--help"]) == 0
+    shown = capfd.readouterr().out
+    examples = [line.split() for line in shown.split("Examples:")[1].splitlines() if line.strip()]
+    assert examples and all(words[:2] == ["lfpiv", name] for words in examples)
+    for _, *words in examples:
+        command = typer.main.get_command(cli.app).commands[name]
+        command.make_context(name, words[1:])  # raises on what it does not know
+
+
+def test_the_shell_completes_commands():
+    words = {"_LFPIV_COMPLETE": "complete_bash", "COMP_WORDS": "lfpiv re", "COMP_CWORD": "1"}
+    done = subprocess.run([sys.executable, "-m", "lfpiv"], capture_output=True, text=True, env={**os.environ, **words})
+    assert done.stdout.split() == ["reconstruct", "report", "reproduce"]
+
+
+def test_log_lines_tell_the_time_left(caplog, monkeypatch):
+    clock = iter([0.0, 5.0, 60.0, 120.0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
+    with terminal.Voice().speaking() as progress, caplog.at_level("INFO", "lfpiv"):
+        for fraction in (0.0, 0.05, 0.25, 1.0):
+            progress("step", fraction)
+    assert [record.getMessage() for record in caplog.records] == ["step: 0 %", "step: 25 %, about 3 min left"]
+    assert [terminal.duration(s) for s in (40, 299, 7800)] == ["40 s", "5 min", "2 h 10 min"]
 
 
 def test_memory_is_counted_before_the_work(tiny_experiment):

@@ -1,0 +1,191 @@
+"""The work on one image pair: images to volumes to vectors, each written whole, and what came of it."""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+from threadpoolctl import threadpool_limits
+
+import lfpiv
+from lfpiv import dataset, stamp, summary
+from lfpiv.errors import InputError, StorageError
+from lfpiv.experiment import Experiment
+from lfpiv.folder import Folder, writing
+from lfpiv.settings import Correlation
+from lfpiv.structure import structure
+
+if TYPE_CHECKING:
+    from lfpiv.weights import Weights
+
+log = logging.getLogger(__name__)
+
+FRAME_SHARE = 0.45
+"""Part of a pair's work that one of its volumes takes, for progress bars."""
+
+Fraction = Callable[[float], None]
+"""Called with the finished fraction of a pair, from 0 to 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came of a pair."""
+
+    pair: int
+    reason: str = ""
+    """Why there is no result; empty where there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairWork:
+    """What is to be done with each pair of an experiment, and everything that needs."""
+
+    experiment: Experiment
+    folder: Folder
+    calibration_hash: str
+    weights: Weights | None
+    """None where all volumes are in the folder."""
+    keep_volumes: bool
+    """Write the volumes."""
+    vectors: bool = True
+    """Go on to the vectors."""
+
+    def do(self, pair: int, progress: Fraction) -> Outcome:
+        """Do all of it with one pair; what goes wrong with it is its outcome, and no other pair's.
+
+        Raises
+        ------
+        StorageError
+            If a result cannot be written: no other pair could be, either.
+        """
+        try:
+            # sums of BLAS depend on its threads, and the numbers must not depend on how many workers there are
+            with threadpool_limits(1):
+                self._do(pair, progress)
+        except StorageError:
+            raise
+        except MemoryError:
+            return Outcome(pair=pair, reason="out of memory: use fewer workers, larger voxels or a smaller volume")
+        except ValueError as error:
+            return Outcome(pair=pair, reason=" ".join(str(error).split()))
+        except Exception as error:  # whatever it is, the other pairs are not to blame
+            log.debug("pair %d: %s", pair, traceback.format_exc())
+            return Outcome(pair=pair, reason=f"unexpected {type(error).__name__}: {' '.join(str(error).split())}")
+        progress(1.0)
+        return Outcome(pair=pair)
+
+    def _do(self, pair: int, progress: Fraction) -> None:
+        volumes = self.stored_volumes(pair)
+        if volumes is None:
+            volumes = self.reconstruct(pair, lambda fraction: progress(2 * FRAME_SHARE * fraction))
+            if self.keep_volumes:
+                self._write_volumes(pair, volumes)
+        if self.vectors:
+            progress(2 * FRAME_SHARE)
+            self.correlate(pair, volumes)
+
+    def stored_volumes(self, pair: int) -> list[xr.DataArray] | None:
+        """Both volumes of a pair from the folder; None where they are missing or do not fit."""
+        wanted = stamp.of_volumes(self.experiment, self.calibration_hash, pair)
+        paths = [self.folder.volume(pair, frame) for frame in (0, 1)]
+        if not all(found is not None and not wanted.changes(found) for found in map(stamp.marks, paths)):
+            return None
+        volumes = [dataset.read_volume(path) for path in paths]
+        for volume, path in zip(volumes, paths, strict=True):
+            volume.attrs["seconds"] = float(dataset.read_attributes(path)["seconds"])
+        return volumes
+
+    def reconstruct(self, pair: int, progress: Fraction) -> list[xr.DataArray]:
+        """Reconstruct both volumes of a pair; the attribute `seconds` says what each took."""
+        if self.weights is None:
+            raise InputError(
+                f"{self.folder.volume(pair, 0)}: expected the two volumes of pair {pair} made with the present "
+                "settings, found none. Run `lfpiv reconstruct` first."
+            )
+        read = [self.read_light(pair, frame) for frame in self.experiment.frames]
+        volumes = _volumes(self.weights, read, self.experiment, pair, progress)
+        for volume, (light, _, seconds) in zip(volumes, read, strict=True):
+            shown = {name: structure(image, self.weights.cameras[name].decoder) for name, image in light.items()}
+            volume.attrs |= {"cameras": list(shown), "structure": list(shown.values())}
+            volume.attrs["seconds"] += seconds
+        return volumes
+
+    @cached_property
+    def darks(self) -> dict[str, np.ndarray | None]:
+        """Dark image of every camera [counts], None where there is none; read once."""
+        return {camera.name: self.experiment.dark(camera.name) for camera in self.experiment.cameras}
+
+    def read_light(self, pair: int, frame: str) -> tuple[dict[str, np.ndarray], dict[str, float], float]:
+        """Images of one frame without dark and background [counts], the noise of that background [counts], seconds."""
+        assert self.weights is not None
+        start = time.perf_counter()
+        light, noise = {}, {}
+        for camera in self.experiment.cameras:
+            image, dark = self.experiment.particle_image(camera.name, pair, frame), self.darks[camera.name]
+            image = image if dark is None else image - dark
+            level, noise[camera.name] = self.weights.cameras[camera.name].decoder.background(image)
+            light[camera.name] = image - np.float32(level)
+        return light, noise, time.perf_counter() - start
+
+    def _write_volumes(self, pair: int, volumes: Sequence[xr.DataArray]) -> None:
+        mark = stamp.of_volumes(self.experiment, self.calibration_hash, pair).attributes
+        for number, (volume, frame) in enumerate(zip(volumes, self.experiment.frames, strict=True)):
+            path = self.folder.volume(pair, number)
+            attributes = {**mark, "seconds": volume.attrs["seconds"], "pair": pair, "frame": frame}
+            with writing(path):
+                dataset.write_volume(volume, path, attributes=attributes)
+
+    def correlate(self, pair: int, volumes: Sequence[xr.DataArray]) -> None:
+        """Correlate the volumes of a pair and write its vectors, the figures of the summary with them."""
+        experiment, start = self.experiment, time.perf_counter()
+        vectors = lfpiv.correlate(*volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
+        vectors.attrs["reconstruction_s"] = sum(float(volume.attrs["seconds"]) for volume in volumes)
+        vectors.attrs["correlation_s"] = time.perf_counter() - start
+        condensed = dataset.build_reconstruction(dict(zip(experiment.frames, volumes, strict=True)))
+        attributes = {
+            **stamp.of_vectors(experiment, self.calibration_hash, pair).attributes,
+            "experiment": experiment.name,
+            "pair": pair,
+            "smart": experiment.smart.model_dump(),
+            "correlation": experiment.correlation.model_dump(),
+            "figures": summary.pair_figures(vectors, condensed),
+        }
+        path = self.folder.vectors(pair)
+        with writing(path):
+            dataset.write_vectors(vectors, path, attributes=attributes, reconstruction=condensed)
+        log.info("pair %d: %.0f %% of the vectors valid", pair, 100 * float(vectors["valid"].mean()))
+
+
+def _volumes(
+    weights: Weights,
+    read: Sequence[tuple[Mapping[str, np.ndarray], Mapping[str, float], float]],
+    experiment: Experiment,
+    pair: int,
+    progress: Fraction,
+) -> list[xr.DataArray]:
+    """Volumes of both frames from their light and noise, with the seconds each took."""
+    from lfpiv.motion import reconstruct_pair
+
+    # by windows of its own: other windows in `[correlation]` do not ask for other volumes
+    farthest, start = experiment.correlation.max_displacement_voxel, time.perf_counter()
+    try:
+        volumes = reconstruct_pair(
+            weights,
+            [light for light, _, _ in read],
+            floor=[noise for _, noise, _ in read],
+            correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
+            progress=progress,
+            **experiment.smart.model_dump(),
+        )
+    except ValueError as error:
+        raise InputError(f"pair {pair}: {error}") from error
+    for volume in volumes:
+        volume.attrs["seconds"] = (time.perf_counter() - start) / len(volumes)
+    return volumes

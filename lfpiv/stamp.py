@@ -1,0 +1,121 @@
+"""What a finished file depends on, kept inside it: a rerun compares, does anew what changed, and says what that was."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import lfpiv
+from lfpiv import dataset
+from lfpiv.davis import split_frame
+from lfpiv.experiment import Experiment
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """The parts that a result depends on, and the hash of all of them."""
+
+    parts: Mapping[str, Any]
+    """Name -> settings, a hash, or what tells the images apart; None where the images are gone."""
+
+    @cached_property
+    def hash(self) -> str:
+        """Short hash of all parts."""
+        return dataset.settings_hash(**self.parts)
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What is written into the result."""
+        return {"settings_hash": self.hash, "depends_on": json.dumps(dataset.plain(self.parts))}
+
+    def changes(self, marks: Mapping[str, Any]) -> list[str]:
+        """Names of what changed since a file was made, from its `marks`; empty where the file still fits.
+
+        Images that are gone did not change: a result outlives its raw data.
+        """
+        if marks.get("settings_hash") == self.hash:
+            return []
+        try:
+            before = dict(json.loads(marks["depends_on"]))
+        except (KeyError, ValueError, TypeError):
+            return ["settings or images"]
+        now = dataset.plain(self.parts)
+        found = []
+        for name in {**before, **now}:
+            old, new = before.get(name), now.get(name)
+            if old == new or (name == "images" and new is None):
+                continue
+            if isinstance(old, dict) and isinstance(new, dict):
+                found += [f"{name}.{key}" for key in {**old, **new} if old.get(key) != new.get(key)]
+            else:
+                found.append(name)
+        return found
+
+
+def marks(path: Path) -> dict[str, Any] | None:
+    """Stamp and figures in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
+    import h5py
+
+    found = {}
+    try:
+        with h5py.File(path, "r") as file:
+            for name in ("settings_hash", "depends_on", "figures"):
+                with contextlib.suppress(KeyError):
+                    found[name] = file.attrs[name]
+    except OSError:
+        return None
+    return found
+
+
+def of_calibration(experiment: Experiment) -> Stamp:
+    """Stamp of the calibration."""
+    cameras = {
+        camera.name: [dataclasses.asdict(camera.optics), camera.nominal_angle_deg, camera.image_flip]
+        for camera in experiment.cameras
+    }
+    return Stamp(
+        {
+            "version": lfpiv.__version__,
+            "camera": cameras,
+            "board": experiment.board.model_dump(),
+            "network": experiment.network.model_dump(),
+            "images": dataset.content_hash(experiment.calibration_paths()),
+        }
+    )
+
+
+def of_volumes(experiment: Experiment, calibration: str, pair: int) -> Stamp:
+    """Stamp of both volumes of a pair; `calibration` is the calibration's hash."""
+    compute = experiment.compute
+    reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
+    return Stamp(
+        {
+            "calibration": calibration,
+            "volume": dataclasses.asdict(experiment.grid),
+            "smart": experiment.smart.model_dump(),
+            "motion": reach if experiment.smart.motion_passes else None,
+            "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
+            "images": _identity(experiment.pair_paths(pair)),
+        }
+    )
+
+
+def of_vectors(experiment: Experiment, calibration: str, pair: int) -> Stamp:
+    """Stamp of the vectors of a pair."""
+    volumes = of_volumes(experiment, calibration, pair).parts
+    return Stamp({**volumes, "correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s})
+
+
+def _identity(paths: list[Path]) -> list[list[Any]] | None:
+    """Tell images from others at the price of a glance: by name, size and time of the last change."""
+    try:
+        found = [(path, split_frame(path)[0].stat()) for path in paths]
+    except OSError:
+        return None
+    return [[path.name, status.st_size, status.st_mtime_ns] for path, status in found]

@@ -1,0 +1,252 @@
+"""Pairs side by side: plans, weights that processes share, the same numbers from one worker, several, or a cluster."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import KilledWorker
+from ideal_rig import two_cameras
+from small_run import PAIRS, damage, same_vectors
+
+import lfpiv
+from lfpiv import batch, cli, crew, dataset, memory, pipeline, stamp, weightstore
+from lfpiv.errors import InputError, StorageError
+from lfpiv.experiment import read_experiment
+from lfpiv.pair import Outcome
+from lfpiv.rig import Grid
+from lfpiv.worker import Result
+from lfpiv_kernels.runtime import Device
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TOLERANCE_ADJOINT = 1e-6
+"""Both sides of <W v, i> = <v, W^T i> are float32 sums over some 1e6 products of positive numbers, in parts."""
+
+
+CPU, GPU = Device("cpu", 8), Device("cuda", 8)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "workers", "device", "gpus", "expected"),
+    [
+        (100, None, CPU, (), (1, 8, (None,))),
+        (100, 3, CPU, (), (3, 2, (None,) * 3)),
+        (100, 20, CPU, (), (20, 1, (None,) * 20)),
+        (2, 8, CPU, (), (2, 4, (None,) * 2)),
+        (0, 8, CPU, (), (1, 8, (None,))),
+        (100, None, GPU, ("0",), (1, 8, (None,))),
+        (100, None, GPU, ("0", "GPU-5c"), (2, 4, ("0", "GPU-5c"))),
+        (1, None, GPU, ("0", "1"), (1, 8, (None,))),
+        (100, 3, GPU, ("2", "7"), (3, 2, ("2", "7", "2"))),
+        (100, 1, GPU, ("0", "1"), (1, 8, (None,))),
+        (100, 2, GPU, ("0",), (2, 4, (None, None))),
+    ],
+)
+def test_pairs_are_shared_out_to_cores_and_gpus(pairs, workers, device, gpus, expected):
+    assert batch.plan(pairs, workers, device, gpus) == batch.Plan(*expected)
+
+
+@pytest.mark.parametrize("workers", [0, -1, 10**6, 2.0, True])
+def test_a_number_of_workers_that_makes_no_sense_is_refused(workers):
+    with pytest.raises(InputError, match="--workers"):
+        batch.plan(10, workers, CPU)
+
+
+def test_workers_must_fit_into_the_memory_together(small_run, monkeypatch):
+    experiment, weights = read_experiment(small_run.experiment), 3 * memory.GIB
+    each = memory.worker_bytes(experiment)
+    need = memory.run_bytes(experiment, weights, 4)
+    assert need >= weights + 4 * each and memory.run_bytes(experiment, weights, 5) == need + each
+    monkeypatch.setattr(memory, "available_bytes", lambda: need - 1)
+    with pytest.raises(InputError, match=r"--workers 4: .*3\.0 GiB .*that 4 workers share.* --workers 3"):
+        batch.require_memory(experiment, weights, 4)
+    batch.require_memory(experiment, weights, 3)
+    plan = batch.plan(100, 4, CPU)
+    assert batch.lowered(plan, experiment, weights, CPU) == batch.Plan(3, 2, (None,) * 3)
+    assert batch.lowered(plan, experiment, weights // 2, CPU) == plan
+    monkeypatch.setattr(memory, "available_bytes", lambda: weights)
+    with pytest.raises(InputError, match=r"volume: .*need at least"):
+        batch.require_memory(experiment, weights, 4)
+
+
+@pytest.fixture(scope="module")
+def weights():
+    """Weights of a small ideal rig; the smallest grid whose voxels light whole microimages."""
+    return lfpiv.build_weights(
+        two_cameras(), Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.8, 0.7, 0.6), voxel_mm=0.1)
+    )
+
+
+def test_stored_weights_are_the_same_operator(weights, tmp_path):
+    content = weightstore.save_weights(weights, tmp_path / "store")
+    opened = weightstore.open_weights(tmp_path / "store", weights.cameras, content)
+    rng = np.random.default_rng(0)
+    volume = rng.random(weights.grid.shape, np.float32)
+    images = {name: rng.random(camera.optics.sensor_shape, np.float32) for name, camera in weights.cameras.items()}
+    projected, seen = weights(volume), opened(volume)
+    for name in weights.cameras:
+        assert np.array_equal(projected[name], seen[name])
+        blocks = opened.projector(name).blocks
+        assert isinstance(blocks.value.base, np.memmap) and not blocks.value.flags.writeable  # shared, not copied
+    back = opened.T(images)
+    assert np.array_equal(weights.T(images), back) and np.array_equal(weights.column_sum, opened.column_sum)
+    left = sum(float(np.vdot(seen[name].astype(float), images[name])) for name in images)
+    assert left == pytest.approx(float(np.vdot(volume.astype(float), back)), rel=TOLERANCE_ADJOINT)
+    assert (opened.largest, opened.forms, opened.method) == (weights.largest, weights.forms, weights.method)
+    assert weightstore.save_weights(opened, tmp_path / "again") == content
+
+
+def test_other_or_incomplete_weights_are_refused(weights, tmp_path):
+    store = tmp_path / "store"
+    content = weightstore.save_weights(weights, store)
+    for cameras, wanted in (({"cam1": None}, content), (weights.cameras, "of another run")):
+        with pytest.raises(InputError, match=r"weights\.json"):
+            weightstore.open_weights(store, cameras, wanted)
+    largest = max(store.glob("*.npy"), key=lambda path: path.stat().st_size)
+    os.truncate(largest, largest.stat().st_size // 2)
+    with pytest.raises(InputError, match="none that fit"):
+        weightstore.open_weights(store, weights.cameras, content)
+    (store / "weights.json").unlink()
+    with pytest.raises(InputError, match="No such file"):
+        weightstore.open_weights(store, weights.cameras)
+
+
+class DeadlyClient:
+    """A Dask client whose workers die of some pairs: as often as `deaths` says."""
+
+    def __init__(self, deaths, result=None):
+        self.deaths, self.result, self.submitted = dict(deaths), result, []
+
+    def submit(self, function, shared, pair, topic, *, key, pure):
+        self.submitted.append(pair)
+        self.deaths[pair] = self.deaths.get(pair, 0) - 1
+        return DeadlyFuture(key, self.deaths[pair] >= 0, self.result or Result(outcome=Outcome(pair=pair)))
+
+    def subscribe_topic(self, topic, handler):
+        handler((0.0, (0, 0.5)))
+
+    def unsubscribe_topic(self, topic):
+        pass
+
+
+class DeadlyFuture:
+    def __init__(self, key, dead, result):
+        self.key, self.dead, self.result = key, dead, lambda: result
+        self.status = "error" if dead else "finished"
+
+    def exception(self):
+        return KilledWorker(self.key, None, 0)
+
+    def add_done_callback(self, call):
+        call(self)
+
+
+def outcomes(client, todo, width=2):
+    fractions = []
+    found = list(crew._outcomes(client, lambda: width, Path("shared"), todo, fractions.append, lambda mib: None))
+    assert fractions == sorted(fractions) and fractions[-1] <= 1
+    return {outcome.pair: outcome.reason for outcome in found}
+
+
+def test_a_pair_that_kills_its_worker_twice_has_failed():
+    """Each is tried once more, after all others; who dies once is done, who dies again is named."""
+    client = DeadlyClient({1: 1, 2: 9})
+    reasons = outcomes(client, range(6))
+    assert sorted(reasons) == list(range(6)) and [pair for pair in reasons if reasons[pair]] == [2]
+    assert "its worker died, in each of two trials" in reasons[2]
+    assert sorted(client.submitted[:6]) == list(range(6)) and sorted(client.submitted[6:]) == [1, 2]
+
+
+def test_what_stops_all_pairs_ends_the_run():
+    for storage, kind in ((True, StorageError), (False, InputError)):
+        with pytest.raises(kind, match="no room"):
+            outcomes(DeadlyClient({}, Result(outcome=None, fatal="no room", storage=storage)), range(3))
+
+
+STAND_IN = """
+from distributed import LocalCluster
+
+class SLURMCluster(LocalCluster):
+    '''Takes what dask-jobqueue takes; its jobs are processes of this machine.'''
+
+    def __init__(self, *, cores, processes, memory, queue, walltime, worker_extra_args):
+        assert (cores, processes, memory, walltime) == (2, 1, "2GB", "00:10:00")
+        option, threads = worker_extra_args
+        assert option == "--nthreads"
+        super().__init__(n_workers=0, threads_per_worker=int(threads), memory_limit=0, dashboard_address=None)
+
+    def scale(self, jobs):
+        super().scale(jobs)
+"""
+
+
+def test_a_cluster_under_slurm_gives_the_same_numbers(small_run, tmp_path):
+    """The documented script in a process of its own, with processes for jobs; one pair cannot be done."""
+    (tmp_path / "dask_jobqueue.py").write_text(STAND_IN)
+    out = small_run.calibrated(tmp_path / "out")
+    experiment = small_run.images(tmp_path / "data")
+    damage(next((tmp_path / "data").rglob("*0003*")))
+    done = subprocess.run(
+        [sys.executable, ROOT / "docs" / "slurm.py", experiment.relative_to(tmp_path), "out"]
+        + ["--jobs", "2", "--cores", "2", "--memory", "2GB", "--walltime", "00:10:00"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 3, done.stderr
+    assert "pair 3:" in done.stdout and "damaged" in done.stdout
+    assert "pair 0: " in done.stderr, "what workers log is lost"
+    for folder in (reference := small_run.results(tmp_path / "reference"), out):
+        (folder / "vectors" / "pair_0003.nc").unlink(missing_ok=True)
+    assert same_vectors(reference, out) == PAIRS - 1
+    assert not (out / ".shared").exists() and not (out / ".lock").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--scheduler", "nonsense://x"], ["--scheduler", "tcp://host:8786", "nonsense"]),
+        (["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"], ["--workers, --scheduler", "one of them"]),
+        (["--workers", "0"], ["--workers", "whole number"]),
+    ],
+)
+def test_workers_that_cannot_be_had_are_refused(small_run, tmp_path, capfd, options, words):
+    out = small_run.calibrated(tmp_path / "out")
+    assert cli.call(["run", str(small_run.experiment), "--out", str(out), *options]) == 2
+    said = capfd.readouterr().err.splitlines()[-1]
+    assert said.startswith("lfpiv: ") and all(word in said for word in words), said
+    assert [path.name for path in out.iterdir()] == ["calibration.h5"]
+
+
+def test_without_dask_its_extra_is_named(small_run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'lfpiv\[distributed\]'"):
+        pipeline.run(small_run.experiment, small_run.calibrated(tmp_path / "out"), workers=2)
+
+
+def test_finishing_thousands_of_pairs_opens_each_file_at_most_twice(small_run, tmp_path, monkeypatch):
+    """A count, no clock: what is there is noticed from the heads of the files, once, and summed up from them, once."""
+    pairs, file = 300, small_run.images(tmp_path / "data")
+    file.write_text(file.read_text().replace(f"pairs = {PAIRS}", f"pairs = {pairs}"))
+    out, experiment = small_run.calibrated(tmp_path / "out"), read_experiment(file)
+    (out / "vectors").mkdir()
+    calibration = stamp.of_calibration(experiment).hash
+    content = (small_run.out / "vectors" / "pair_0000.nc").read_bytes()
+    import h5py
+
+    for pair in range(pairs):
+        path = out / "vectors" / f"pair_{pair:04d}.nc"
+        path.write_bytes(content)
+        with h5py.File(path, "a") as vectors:
+            vectors.attrs.update(stamp.of_vectors(experiment, calibration, pair).attributes)
+    opened, marks = [], stamp.marks
+    monkeypatch.setattr(stamp, "marks", lambda path: opened.append(path) or marks(path))
+    monkeypatch.setattr(dataset, "read_vectors", lambda path: pytest.fail(f"{path} is read as a whole"))
+    monkeypatch.setattr(lfpiv.report, "write_report", lambda *arguments: None)
+    summary = pipeline.run(experiment, out)
+    assert len(summary["pairs"]) == pairs and summary["failed"] == []
+    assert sum("pair_" in path.name for path in opened) <= 2 * pairs

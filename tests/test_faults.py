@@ -1,0 +1,211 @@
+"""What goes wrong at night: killed processes, full disks, damaged images, a second run; real processes and signals."""
+
+import functools
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from small_run import PAIRS, damage, same_vectors, start
+
+from lfpiv import cli, pipeline
+from lfpiv.errors import InputError
+from lfpiv.folder import Folder
+from lfpiv.pair import PairWork
+
+PATIENCE_S = 300.0
+"""Longest wait for something that must happen [s]: many times what it takes, for a machine that does much else."""
+
+
+def wait_for(condition, process, what):
+    """Wait until something is true while a process runs; fails where the process ends before."""
+    end = time.monotonic() + PATIENCE_S
+    while not (found := condition()):
+        if process.poll() is not None:
+            pytest.fail(f"the run ended with {process.returncode} before {what}: {process.stderr.read()}")
+        assert time.monotonic() < end, f"no {what} in {PATIENCE_S:g} s"
+        time.sleep(0.02)
+    return found
+
+
+def workers_of(process):
+    """Worker processes of a run: those that have mapped the shared weights."""
+    found = []
+    for child in psutil.Process(process.pid).children(recursive=True):
+        try:
+            if any(".shared" in mapped.path for mapped in child.memory_maps()):
+                found.append(child)
+        except psutil.Error:
+            continue
+    return found
+
+
+def gone(processes):
+    _, alive = psutil.wait_procs(processes, timeout=PATIENCE_S)
+    return not alive
+
+
+def finished(out):
+    return [path.name for path in (out / "vectors").glob("pair_*.nc")] if (out / "vectors").exists() else []
+
+
+def whole(out):
+    """Whether nothing is in a folder but finished results."""
+    left = {path.name for path in out.rglob("*") if path.is_file() and path.suffix != ".nc"}
+    return left <= {"calibration.h5", "summary.json", "report.html"} and not (out / ".shared").exists()
+
+
+@pytest.fixture
+def no_report(monkeypatch):
+    """Leave the report out where it is not what is tested: it takes longer than the rest."""
+    monkeypatch.setattr("lfpiv.report.write_report", lambda *arguments: None)
+
+
+def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path, no_report):
+    """Kill -9 with two workers at work: they die too, nothing is half-written, and one process does the rest."""
+    out = small_run.calibrated(tmp_path / "out")
+    run = start("run", small_run.experiment, "--out", out, "--workers", 2)
+    wait_for(lambda: finished(out), run, "finished pair")
+    children = psutil.Process(run.pid).children(recursive=True)
+    run.kill()
+    run.communicate()
+    assert gone(children), "workers outlived their run"
+    before = {path: path.stat().st_mtime_ns for path in (out / "vectors").glob("pair_*.nc")}
+    assert 0 < len(before) < PAIRS and (out / ".shared").exists() and (out / ".lock").exists()
+    assert not (out / "summary.json").exists()
+    summary = pipeline.run(small_run.experiment, out)
+    assert same_vectors(small_run.out, out) == PAIRS and whole(out)
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items()), "a finished pair was done again"
+    assert len(summary["pairs"]) == PAIRS and summary["failed"] == []
+
+
+def test_a_killed_worker_costs_nothing_and_a_bad_pair_only_itself(small_run, tmp_path):
+    """One of two workers dies by kill -9, one image is damaged: the other pairs are done, status 3, as documented."""
+    experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+    spoilt = next((tmp_path / "data").rglob("*0002*"))
+    damage(spoilt)
+    run = start("run", experiment, "--out", out, "--workers", 2)
+    wait_for(lambda: workers_of(run), run, "worker")[0].kill()
+    written, said = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 3, said
+    summary = json.loads((out / "summary.json").read_text())
+    assert [pair["pair"] for pair in summary["pairs"]] == [0, 1, 3] and summary["workers"]["count"] == 2
+    ((failed),) = summary["failed"]
+    assert failed["pair"] == 2 and spoilt.name in failed["reason"] and "damaged" in failed["reason"]
+    assert "failed: pair 2:" in written and "its worker died; it is tried once more" in said and whole(out)
+    (reference := small_run.results(tmp_path / "reference")).joinpath("vectors", "pair_0002.nc").unlink()
+    assert same_vectors(reference, out) == PAIRS - 1
+
+
+@pytest.mark.parametrize(("number", "options"), [(signal.SIGINT, ["--workers", "2"]), (signal.SIGTERM, [])])
+def test_an_interrupted_run_ends_cleanly_and_says_how_to_go_on(small_run, tmp_path, number, options):
+    out = small_run.calibrated(tmp_path / "out")
+    run = start("run", small_run.experiment, "--out", out, *options)
+    wait_for(lambda: workers_of(run) if options else (out / ".lock").exists(), run, "work")
+    children = psutil.Process(run.pid).children(recursive=True)
+    run.send_signal(number)
+    _, said = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 1 and "the same command goes on from there" in said.splitlines()[-1]
+    assert "Traceback" not in said
+    assert gone(children) and whole(out) and len(finished(out)) < PAIRS
+
+
+def mounts():
+    """Whether this user may mount a file system of its own."""
+    command = ["unshare", "-m", "mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", "/mnt"]
+    return shutil.which("unshare") and subprocess.run(command, capture_output=True).returncode == 0
+
+
+def test_a_full_disk_leaves_nothing_half_written(small_run, tmp_path):
+    """The second pair's vectors do not fit: one clear message, status 1, every file whole."""
+    out = small_run.calibrated(tmp_path / "out")
+    room = (small_run.out / "vectors" / "pair_0000.nc").stat().st_size
+    command = [sys.executable, "-m", "lfpiv", "run", str(small_run.experiment), "--out", str(out)]
+    (out / "vectors").mkdir()
+    if mounts():  # the listing shows what is on the small disk, which ends with the namespace
+        mount = f"mount -t tmpfs -o size={3 * room // 2} tmpfs {out}/vectors"
+        script = f'{mount} && "$@"; status=$?; ls -A {out}/vectors; exit $status'
+        done = subprocess.run(["unshare", "-m", "sh", "-c", script, "sh", *command], capture_output=True, text=True)
+        assert done.stdout.split() == ["pair_0000.nc"] and "no space left" in done.stderr, done.stderr
+    else:  # no disk, but files that may not grow: the first pair's do not fit
+        smaller = functools.partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room // 2, room // 2))
+        done = subprocess.run(command, capture_output=True, text=True, preexec_fn=smaller)
+        assert "file too large" in done.stderr, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert done.returncode == 1 and "cannot be written: " in last and "the same command goes on" in last
+    assert "Traceback" not in done.stderr and whole(out) and not finished(out)
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from lfpiv.folder import Folder
+with Folder(Path(sys.argv[1])).held():
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_second_run_on_one_folder_is_refused(small_run, tmp_path, capfd, no_report):
+    """It names who holds the folder; a report may be made meanwhile; kill -9 leaves no stale lock."""
+    out = small_run.results(tmp_path / "out")
+    holder = subprocess.Popen([sys.executable, "-c", HOLDER, out], stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout.readline() == "held\n"
+        for command in ("run", "calibrate", "reconstruct", "correlate"):
+            assert cli.call([command, str(small_run.experiment), "--out", str(out)]) == 2
+            said = capfd.readouterr().err.splitlines()[-1]
+            assert f"process {holder.pid}" in said and "no other run writes to" in said
+        assert cli.call(["report", str(small_run.experiment), "--out", str(out)]) == 0
+    finally:
+        holder.kill()
+        holder.wait()
+    assert (out / ".lock").exists()
+    with Folder(out).held(), pytest.raises(InputError, match=f"process {os.getpid()}"), Folder(out).held():
+        pass
+    assert not (out / ".lock").exists()
+
+
+def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatch, no_report):
+    """Missing, of another shape, not finite, gone when its turn comes; the first pair must be whole."""
+    import numpy as np
+    import tifffile
+
+    experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+    images = [next((tmp_path / "data").rglob(f"*000{pair}*")) for pair in range(PAIRS)]
+    images[1].unlink()
+    tifffile.imwrite(images[2], np.ones((40, 30), np.uint16))
+    tifffile.imwrite(images[3], np.full((400, 400), np.nan, np.float32))
+    read = PairWork.read_light
+
+    def late(work, pair, frame):
+        images[0].unlink(missing_ok=True)
+        return read(work, pair, frame)
+
+    monkeypatch.setattr(PairWork, "read_light", late)
+    assert cli.call(["run", str(experiment), "--out", str(out)]) == 3
+    written, said = capfd.readouterr()
+    failed = {item["pair"]: item["reason"] for item in json.loads((out / "summary.json").read_text())["failed"]}
+    words = ["no such file", "no such file", "(40, 30)", "NaN"]
+    assert list(failed) == list(range(PAIRS)) and f"{PAIRS} of {PAIRS} pairs failed" in written
+    for pair, word in enumerate(words):
+        assert word in failed[pair] and images[pair].name in failed[pair]
+        assert pair == 0 or word in said.split("image pairs")[0], "the user is not told before the work"
+    assert cli.call(["run", str(experiment), "--out", str(out), "--pairs", "1:"]) == 2
+    assert images[1].name in capfd.readouterr().err.splitlines()[-1]
+    assert not finished(out) and whole(out)
+
+
+def test_a_bad_image_of_the_calibration_is_bad_input(small_run, tmp_path, capfd):
+    experiment = small_run.images(tmp_path / "data")
+    plane = sorted((tmp_path / "data").rglob("*plane*"))[3]
+    damage(plane)
+    assert cli.call(["run", str(experiment), "--out", str(tmp_path / "out")]) == 2
+    assert Path(plane).name in capfd.readouterr().err and not (tmp_path / "out").exists()
