@@ -117,7 +117,7 @@ def content_hash(paths: Iterable[Path]) -> str:
     for path in paths:
         image, frame = split_frame(path)
         with image.open("rb") as file:
-            for block in iter(lambda file=file: file.read(1 << 20), b""):
+            while block := file.read(1 << 20):
                 digest.update(block)
         digest.update(b"end of file" + frame.encode())
     return digest.hexdigest()
@@ -150,7 +150,7 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
     """
     frames = list(volumes)
     first = volumes[frames[0]]
-    variables = {}
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray | list[str]]] = {}
     for axis in _AXES:
         kept = tuple(name for name in _AXES if name != axis)
         stack = np.stack([volume.max(axis).transpose(*kept).values for volume in volumes.values()])
@@ -301,14 +301,14 @@ def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, A
 def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
     """Give a dataset the attributes and the compression it has in a file."""
     dataset = dataset.copy()
-    dataset.attrs = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
+    own = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
+    dataset.attrs = {key: _attribute(value) for key, value in own.items()}
     for name, item in dataset.variables.items():
-        item.attrs = {**item.attrs, **_DESCRIPTIONS.get(str(name), {})}
-    for item in (dataset, *dataset.variables.values()):
-        item.attrs = {key: _attribute(value) for key, value in item.attrs.items()}
+        described = {**item.attrs, **_DESCRIPTIONS.get(str(name), {})}
+        item.attrs = {key: _attribute(value) for key, value in described.items()}
     packed = {"zlib": True, "complevel": 1, "shuffle": True}
-    for item in dataset.data_vars.values():
-        item.encoding = packed if item.ndim >= 2 and item.dtype.kind in "fiub" else {}
+    for array in dataset.data_vars.values():
+        array.encoding = packed if array.ndim >= 2 and array.dtype.kind in "fiub" else {}
     return dataset
 
 

@@ -150,20 +150,21 @@ def _tiff_header(path: Path) -> Header:
     with tifffile.TiffFile(path) as tiff:
         if len(tiff.pages) != 1:
             raise NotOneImage(f"{len(tiff.pages)} pages; save one image per file")
-        page = tiff.pages[0]
+        page = tiff.pages.first
         end = max(
             (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0
         )
         if len(page.shape) != 2 or page.samplesperpixel != 1:
             raise NotOneImage(f"pixels of shape {page.shape}, such as a colour image; save raw grey values")
-        if page.photometric.name not in ("MINISBLACK",):
-            raise NotOneImage(f"{page.photometric.name} pixels; save raw grey values, 0 = black")
+        meaning = tifffile.PHOTOMETRIC(page.photometric)
+        if meaning is not tifffile.PHOTOMETRIC.MINISBLACK:
+            raise NotOneImage(f"{meaning.name} pixels; save raw grey values, 0 = black")
         if page.dtype is None:
             raise ValueError("unknown pixel type")
-        shape, dtype = page.shape, str(page.dtype)
+        (rows, columns), dtype = page.shape, str(page.dtype)
     if end == 0 or end > size:
         raise ValueError(f"pixel data end at byte {end}, the file at byte {size}")
-    return Header(tuple(int(n) for n in shape), dtype)
+    return Header((int(rows), int(columns)), dtype)
 
 
 def _png_header(path: Path) -> Header:

@@ -243,7 +243,8 @@ def _smooth(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int
         return np.repeat(values, len(points), axis)
     spline, inside = CubicSpline(nodes, values, axis, bc_type="natural"), np.clip(points, nodes[0], nodes[-1])
     beyond = (points - inside).reshape([-1 if k == axis else 1 for k in range(values.ndim)])
-    return spline(inside) + spline(inside, 1) * beyond
+    smooth: np.ndarray = spline(inside) + spline(inside, 1) * beyond
+    return smooth
 
 
 def _linear(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:

@@ -78,8 +78,9 @@ def gaussian(sigma_voxel: float, shape: tuple[int, int, int]) -> Blur:
         return lambda volume: volume
 
     def blur(volume: np.ndarray) -> np.ndarray:
-        volume = volume.reshape(shape)
-        return ndimage.gaussian_filter(volume, sigma_voxel, mode="constant", truncate=TRUNCATE).ravel()
+        shaped = volume.reshape(shape)
+        blurred: np.ndarray = ndimage.gaussian_filter(shaped, sigma_voxel, mode="constant", truncate=TRUNCATE)
+        return blurred.ravel()
 
     return blur
 
@@ -125,7 +126,7 @@ def iterate(
     .. [1] D. L. Snyder, M. I. Miller, "The use of sieves to stabilize images produced with the EM algorithm for
        emission tomography", IEEE Trans. Nucl. Sci. 32 (1985) 3864-3872, doi:10.1109/TNS.1985.4334521.
     """
-    coefficients, last, time = first, first.copy() if accelerate else None, 1.0
+    coefficients, last, time = first, first.copy() if accelerate else first, 1.0
     exponent = np.empty_like(first)
     volume = sieve(coefficients)
     misfit = compare(views, volume)

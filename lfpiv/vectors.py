@@ -11,7 +11,9 @@ import json
 import logging
 import math
 import numbers
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Any, TypeGuard
 
 import numpy as np
 import scipy.interpolate
@@ -154,23 +156,34 @@ def correlate(
 class _MultiPass:
     """The field after each pass, order (z, y, x) [voxel], and what the next pass needs of it."""
 
+    field: np.ndarray
+    """Displacements of the last pass, shape (z, y, x, 3)."""
+    valid: np.ndarray
+    """Where they are measured, shape (z, y, x)."""
+    guess: np.ndarray
+    """What the next pass starts from."""
+    peaks: kernel.WindowPeaks
+    """Correlation peaks of the last pass."""
+
     def __init__(self, first: np.ndarray, second: np.ndarray, *, symmetric: bool):
         self.volumes, self.symmetric = (first, second), symmetric
-        self.coefficients = None
-        self.field = self.guess = self.valid = self.peaks = None
         self.centres: list[np.ndarray] = []
-        self.passes: list[dict] = []
+        self.passes: list[dict[str, Any]] = []
+
+    @cached_property
+    def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
+        """Both volumes as splines, which deformed volumes are sampled from."""
+        first, second = self.volumes
+        return deform.spline_coefficients(first), deform.spline_coefficients(second)
 
     def run(self, window: tuple[int, int, int], overlap: float, search: tuple[int, int, int]) -> None:
         """Deform by the field so far, correlate, validate."""
         shape = self.volumes[0].shape
-        step = tuple(max(1, round(edge * (1 - overlap))) for edge in window)
+        step = _triple(max(1, round(edge * (1 - overlap))) for edge in window)
         origin, count = kernel.window_grid(shape, window, step)
         centres = [o + (w - 1) / 2 + s * np.arange(n) for o, w, s, n in zip(origin, window, step, count, strict=True)]
         first, second, predicted = *self.volumes, np.zeros(3)
         if self.passes:
-            if self.coefficients is None:
-                self.coefficients = [deform.spline_coefficients(volume) for volume in self.volumes]
             predictor = _Predictor(self.guess, self.centres, shape)
             first, second = deform.deform_pair(*self.coefficients, predictor.field, predictor.spacing)
             predicted = predictor.window_means(origin, step, count, window)
@@ -208,7 +221,7 @@ def _dataset(
     axes_mm: list[np.ndarray],
     spacing_mm: tuple[float, float, float],
     dt_s: float,
-    settings: dict,
+    settings: dict[str, Any],
 ) -> xr.Dataset:
     """Put the last pass into the form of the product, with units and a verdict."""
     deviation = np.full(result.field.shape, np.nan)
@@ -219,7 +232,7 @@ def _dataset(
     rival = np.maximum(result.peaks.rival, LOWEST_RIVAL)
     ratio = np.where(result.peaks.correlation > 0, result.peaks.correlation / rival, np.nan)
     dims = _AXES
-    variables = {}
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]] = {}
     for k, (name, axis) in enumerate(zip("wvu", _AXES, strict=True)):
         metres = spacing_mm[k] * 1e-3
         velocity = result.field[..., k] * metres / dt_s
@@ -247,7 +260,7 @@ def _dataset(
         places[axis] = (axis, positions[0] + distance * centres, attributes)
     share = float(result.valid.mean())
     verdict = Verdict.GOOD if share >= 0.8 else Verdict.POOR if share >= 0.3 else Verdict.FAILED
-    attributes = {
+    summary = {
         "title": "displacement and velocity of particles between two volumes",
         "dt_s": float(dt_s),
         "voxel_mm": [float(s) for s in spacing_mm],
@@ -258,10 +271,10 @@ def _dataset(
     }
     if verdict is not Verdict.GOOD:
         log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
-    return xr.Dataset(variables, places, attributes)
+    return xr.Dataset(variables, places, summary)
 
 
-def _is_finite(value: object) -> bool:
+def _is_finite(value: object) -> TypeGuard[float]:
     """Whether a value is a finite real number."""
     return isinstance(value, numbers.Real) and math.isfinite(value)
 
@@ -294,11 +307,10 @@ def _check_axes(
     """Voxel centres [mm] along z, y, x and their spacing [mm]."""
     if np.shape(volume_a) != np.shape(volume_b):
         raise ValueError(f"volume_b: expected the shape of volume_a, {np.shape(volume_a)}, got {np.shape(volume_b)}.")
-    labelled = [isinstance(volume, xr.DataArray) for volume in (volume_a, volume_b)]
-    if not all(labelled):
+    if not (isinstance(volume_a, xr.DataArray) and isinstance(volume_b, xr.DataArray)):
         if not (_is_finite(voxel_mm) and voxel_mm > 0):
             raise ValueError(f"voxel_mm: expected the voxel edge [mm] > 0, which arrays need, got {voxel_mm!r}.")
-        return [voxel_mm * np.arange(n) for n in np.shape(volume_a)], (voxel_mm,) * 3
+        return [voxel_mm * np.arange(n) for n in np.shape(volume_a)], (voxel_mm, voxel_mm, voxel_mm)
     if voxel_mm is not None:
         raise ValueError("voxel_mm: expected no value with DataArrays, whose coordinates tell it. Leave it out.")
     axes, spacing = [], []
@@ -317,21 +329,22 @@ def _check_axes(
             raise ValueError(f"volume_b: expected the coordinates {axis} of volume_a, got others.")
         axes.append(centres)
         spacing.append(float(distance))
-    return axes, tuple(spacing)
+    z, y, x = spacing
+    return axes, (z, y, x)
 
 
-def _check_windows(windows, shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:
+def _check_windows(windows: Sequence[Any] | None, shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:
     """Window of each pass as (z, y, x)."""
     if windows is None:
-        return [tuple(min(edge, n) for n in shape) for edge in DEFAULT_WINDOWS]
+        return [_triple(min(edge, n) for n in shape) for edge in DEFAULT_WINDOWS]
     if isinstance(windows, (int, float, str)):
         raise ValueError(f"windows: expected a sequence, one window per pass, got {windows!r}.")
     schedule = []
     for window in windows:
-        edges = tuple(window) if np.ndim(window) else (window,) * 3
-        if len(edges) != 3 or not all(_is_finite(edge) and int(edge) == edge and edge >= 4 for edge in edges):
+        given = tuple(window) if np.ndim(window) else (window,) * 3
+        if len(given) != 3 or not all(_is_finite(edge) and int(edge) == edge and edge >= 4 for edge in given):
             raise ValueError(f"windows: expected edges of whole voxels >= 4, one or (z, y, x) per pass, got {window}.")
-        edges = tuple(int(edge) for edge in edges)
+        edges = _triple(int(edge) for edge in given)
         too_large = [(axis, edge, n) for axis, edge, n in zip(_AXES, edges, shape, strict=True) if edge > n]
         if too_large and np.ndim(window):
             axis, edge, n = too_large[0]
@@ -341,7 +354,7 @@ def _check_windows(windows, shape: tuple[int, int, int]) -> list[tuple[int, int,
             )
         if too_large:
             log.info("window %d is cut to the volume %s", edges[0], shape)
-            edges = tuple(min(edge, n) for edge, n in zip(edges, shape, strict=True))
+            edges = _triple(min(edge, n) for edge, n in zip(edges, shape, strict=True))
         schedule.append(edges)
     if not schedule:
         raise ValueError("windows: expected at least one pass, got none.")
@@ -353,12 +366,18 @@ def _first_search(
 ) -> tuple[int, int, int]:
     """Largest lag of the first pass: a peak needs one lag beyond it."""
     if max_displacement_voxel is None:
-        return tuple(max(REFINE_SEARCH, math.ceil(FIRST_SEARCH * edge) + 1) for edge in window)
+        return _triple(max(REFINE_SEARCH, math.ceil(FIRST_SEARCH * edge) + 1) for edge in window)
     if not (_is_finite(max_displacement_voxel) and 0 < max_displacement_voxel < max(shape)):
         raise ValueError(
             f"max_displacement_voxel: expected a value > 0 and within the volume {shape}, got {max_displacement_voxel}."
         )
-    return tuple(min(max(REFINE_SEARCH, math.ceil(max_displacement_voxel) + 1), max(2, n - 1)) for n in shape)
+    return _triple(min(max(REFINE_SEARCH, math.ceil(max_displacement_voxel) + 1), max(2, n - 1)) for n in shape)
+
+
+def _triple(values: Iterable[int]) -> tuple[int, int, int]:
+    """Values along z, y, x as a tuple."""
+    z, y, x = values
+    return z, y, x
 
 
 class _Predictor:
@@ -371,13 +390,20 @@ class _Predictor:
     def __init__(self, field: np.ndarray, nodes: list[np.ndarray], shape: tuple[int, int, int]):
         counts = [max(2, math.ceil((n - 1) / CONTROL_SPACING) + 1) for n in shape]
         points = [np.linspace(0, max(n - 1, 1), count) for n, count in zip(shape, counts, strict=True)]
-        self.spacing = tuple(float(p[1] - p[0]) for p in points)
+        z, y, x = (float(p[1] - p[0]) for p in points)
+        self.spacing = (z, y, x)
         for axis in range(3):
             field = _along(_spline_matrix(nodes[axis], points[axis]), field, axis)
         self.field = field.astype(np.float32)
         self._points, self._shape = points, shape
 
-    def window_means(self, origin, step, count, window) -> np.ndarray:
+    def window_means(
+        self,
+        origin: tuple[int, int, int],
+        step: tuple[int, int, int],
+        count: tuple[int, int, int],
+        window: tuple[int, int, int],
+    ) -> np.ndarray:
         """Mean displacement over the windows, shape (z, y, x, 3) [voxel]."""
         means = self.field.astype(float)
         for axis in range(3):
@@ -399,7 +425,8 @@ def _spline_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
         return np.ones((len(points), 1))
     spline = scipy.interpolate.CubicSpline(nodes, np.eye(len(nodes)), bc_type="natural")
     inside = np.clip(points, nodes[0], nodes[-1])
-    return spline(inside) + spline(inside, 1) * (points - inside)[:, None]
+    matrix: np.ndarray = spline(inside) + spline(inside, 1) * (points - inside)[:, None]
+    return matrix
 
 
 def _linear_matrix(points: np.ndarray, positions: np.ndarray) -> np.ndarray:

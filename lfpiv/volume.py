@@ -137,11 +137,13 @@ def reconstruct(
     if active_share > 0:
         volume[volume < active_share * volume.max()] = 0.0
 
-    def smooth(volume):
+    def smooth(volume: np.ndarray) -> np.ndarray:
         if smoothing_voxel == 0:
             return volume
         shaped = volume.reshape(weights.stored.shape)
-        return ndimage.gaussian_filter(shaped, smoothing_voxel, mode="nearest", truncate=3.0).ravel() * lit
+        blurred = ndimage.gaussian_filter(shaped, smoothing_voxel, mode="nearest", truncate=3.0)
+        smoothed: np.ndarray = blurred.ravel() * lit
+        return smoothed
 
     norm = float(np.sqrt(sum(np.square(view.image, dtype=np.float64).sum() for view in views)))
     residual: list[float] = []
@@ -188,7 +190,9 @@ def reconstruct(
     )
 
 
-def _floors(floor, weights: Weights, images: Mapping[str, np.ndarray]) -> dict[str, float]:
+def _floors(
+    floor: float | Mapping[str, float] | None, weights: Weights, images: Mapping[str, np.ndarray]
+) -> dict[str, float]:
     """Noise floor of every camera [counts]."""
     if floor is None:
         floors = {}
@@ -198,10 +202,11 @@ def _floors(floor, weights: Weights, images: Mapping[str, np.ndarray]) -> dict[s
             noise = float(np.sqrt(np.mean(below**2))) if below.size else 0.0
             floors[name] = max(noise, 1e-4 * float(image.max()))
         return floors
-    missing = [name for name in weights.cameras if isinstance(floor, Mapping) and name not in floor]
+    given = floor if isinstance(floor, Mapping) else dict.fromkeys(weights.cameras, floor)
+    missing = [name for name in weights.cameras if name not in given]
     if missing:
-        raise ValueError(f"floor: camera {missing[0]!r} is missing; found {', '.join(floor) or 'none'}.")
-    floors = {name: floor[name] if isinstance(floor, Mapping) else floor for name in weights.cameras}
+        raise ValueError(f"floor: camera {missing[0]!r} is missing; found {', '.join(given) or 'none'}.")
+    floors = {name: given[name] for name in weights.cameras}
     if any(not (np.isfinite(value) and value >= 0) for value in floors.values()):
         raise ValueError(f"floor: expected a number >= 0, got {floor}.")
     return floors
@@ -268,7 +273,7 @@ def _given(first: np.ndarray, weights: Weights) -> np.ndarray:
     return weights.stored.store(values)
 
 
-def _check(iterations, relaxation, normalisation, active_share, **not_negative) -> None:
+def _check(iterations: int, relaxation: float, normalisation: str, active_share: float, **not_negative: float) -> None:
     whole = isinstance(iterations, (int, np.integer)) and not isinstance(iterations, bool)
     if not (whole and iterations >= 0):
         raise ValueError(f"iterations: expected a whole number >= 0, got {iterations!r}.")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -16,11 +17,14 @@ from lfpiv.raylayout import lay_out, microimage_edge, plain
 from lfpiv.raymodel import fit_rays, grid_models, ray_models
 from lfpiv.rig import Grid
 from lfpiv_kernels import footprint, runtime
-from lfpiv_kernels.lattice import cell_frame, cell_rectangles, pack_lattice
+from lfpiv_kernels.lattice import Lattice, cell_frame, cell_rectangles, pack_lattice
 from lfpiv_kernels.microimages import Microimages
 from lfpiv_kernels.project import Blocks
 from lfpiv_kernels.raymodel import LANES, LEVELS
 from lfpiv_kernels.trace import count_rays
+
+if TYPE_CHECKING:
+    from lfpiv.camera import CalibratedCamera
 
 log = logging.getLogger(__name__)
 
@@ -51,24 +55,25 @@ class StoredGrid:
     """Axes of the grid (0: z, 1: y, 2: x), outermost first."""
 
     @classmethod
-    def for_cameras(cls, grid: Grid, cameras: Iterable) -> StoredGrid:
+    def for_cameras(cls, grid: Grid, cameras: Iterable[CalibratedCamera]) -> StoredGrid:
         """Put the axis outermost that runs along the sensors' rows the most, then the one along their columns."""
-        middle = [
+        centre = [
             first + (n - 1) / 2 * grid.voxel_mm for first, n in zip(grid.first_centre_mm, grid.shape, strict=True)
         ]
-        steps = np.concatenate([[middle[::-1]], middle[::-1] + np.eye(3)[::-1]])  # 1 mm along z, y, x
+        steps = np.concatenate([[centre[::-1]], centre[::-1] + np.eye(3)[::-1]])  # 1 mm along z, y, x
         shift = np.zeros((3, 2))
         for camera in cameras:
             st = camera.map(steps, np.zeros((4, 2)))
             shift += np.abs(st[1:] - st[0])
         outer = int(np.argmax(shift[:, 1]))
-        rest = sorted((axis for axis in range(3) if axis != outer), key=lambda axis: -shift[axis, 0])
-        return cls(grid, (outer, *rest))
+        middle, inner = sorted((axis for axis in range(3) if axis != outer), key=lambda axis: -float(shift[axis, 0]))
+        return cls(grid, (outer, middle, inner))
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Voxel counts, outermost axis first."""
-        return tuple(self.grid.shape[axis] for axis in self.order)
+        outer, middle, inner = (self.grid.shape[axis] for axis in self.order)
+        return outer, middle, inner
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
         """Centres (x, y, z) [mm] of voxels by their stored index, shape (voxel, 3)."""
@@ -107,9 +112,9 @@ class StoredGrid:
 class CameraKernels:
     """One camera's constants as the kernels take them."""
 
-    setup: object
-    camera: object
-    lattice: object
+    setup: CalibratedCamera
+    camera: footprint.Camera
+    lattice: Lattice
     cell_mm: float
     frame: np.ndarray
     rectangles: np.ndarray
@@ -132,7 +137,7 @@ class CameraKernels:
         )
 
 
-def pack_camera(camera) -> CameraKernels:
+def pack_camera(camera: CalibratedCamera) -> CameraKernels:
     """Pack a camera for the kernels."""
     optics, lattice = camera.optics, camera.lattice
     basis = np.asarray(lattice.basis_mm)
@@ -149,7 +154,7 @@ def pack_camera(camera) -> CameraKernels:
             pupil_radius_mm=optics.pupil_radius_mm,
             edge=microimage_edge(optics),
         ),
-        lattice=pack_lattice(lattice.origin_mm, lattice.basis_mm),
+        lattice=pack_lattice(np.asarray(lattice.origin_mm), basis),
         cell_mm=float(cell),
         frame=cell_frame(basis, lattice.layout),
         rectangles=cell_rectangles(lattice.layout),
@@ -160,7 +165,7 @@ class _Growing:
     """An array of unknown length, filled piece by piece; memory that nobody wrote to yet costs nothing."""
 
     def __init__(self, dtype: type, expected: int):
-        self._array = np.empty(max(expected, 1), dtype)
+        self._array: np.ndarray = np.empty(max(expected, 1), dtype)
         self._used = 0
 
     def take(self, count: int) -> np.ndarray:
@@ -177,7 +182,11 @@ class _Growing:
 
 
 def footprint_blocks(
-    stored: StoredGrid, camera, form: str, progress: Progress, allow: Callable[[int], None] = lambda _: None
+    stored: StoredGrid,
+    camera: CalibratedCamera,
+    form: str,
+    progress: Progress,
+    allow: Callable[[int], None] = lambda _: None,
 ) -> Blocks:
     """Compute the blocks of one camera.
 
@@ -188,10 +197,10 @@ def footprint_blocks(
     pack = pack_camera(camera)
     blocks, values = sample_blocks(pack, stored, form)
     allow(int(size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)))
-    axes = tuple(2 - axis for axis in stored.order)
-    planes = grid_models(camera, stored.shape, stored.positions_mm, axes)
+    outer, middle, inner = (2 - axis for axis in stored.order)
+    planes = grid_models(camera, stored.shape, stored.positions_mm, (outer, middle, inner))
 
-    def batches():
+    def batches() -> Iterator[np.ndarray]:
         step = max(1, CHUNK_VOXELS // plane)
         with threadpool_limits(1, "blas"):  # products of a plane each: BLAS's own threads cost more than they bring
             for first in range(0, stored.shape[0], step):
@@ -252,7 +261,9 @@ def blocks_of(pack: CameraKernels, models: Iterable[np.ndarray], form: str, expe
     )
 
 
-def count_voxels(camera, centres_mm: np.ndarray, voxel_mm: float, *, samples: int, seed: int = 0):
+def count_voxels(
+    camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float, *, samples: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Trace rays from stratified points in voxels and count them per pixel (Eq. 10).
 
     Parameters
@@ -309,7 +320,7 @@ def count_voxels(camera, centres_mm: np.ndarray, voxel_mm: float, *, samples: in
     return count, total, first_pixel
 
 
-def count_blocks(stored: StoredGrid, camera, progress: Progress) -> Blocks:
+def count_blocks(stored: StoredGrid, camera: CalibratedCamera, progress: Progress) -> Blocks:
     """Count the rays of every voxel and pack the counts into blocks."""
     rays, size = plain(camera.optics.sensor_shape), stored.grid.size
     log.warning("%s: counting rays for %d voxels; 'footprint' is about a thousand times faster", camera.name, size)
@@ -335,7 +346,9 @@ def count_blocks(stored: StoredGrid, camera, progress: Progress) -> Blocks:
     )
 
 
-def _pack_windows(windows: np.ndarray, corner: np.ndarray, sensor_shape, stride: int):
+def _pack_windows(
+    windows: np.ndarray, corner: np.ndarray, sensor_shape: tuple[int, int], stride: int
+) -> tuple[np.ndarray, ...]:
     """Pack windows of weights, shape (voxel, rows, columns), into blocks of one column of tiles each.
 
     Returns blocks and rows per voxel, and the arrays ray, height, value, scale of `Blocks`.

@@ -114,6 +114,14 @@ def test_import_is_light_and_silent():
     assert done.stdout.strip() == "[]" and done.stderr == ""
 
 
+def test_type_checkers_see_every_public_name_where_it_is():
+    block = next(node for node in ast.parse(Path(lfpiv.__file__).read_text()).body if isinstance(node, ast.If))
+    assert ast.unparse(block.test) == "TYPE_CHECKING"
+    seen = {alias.name: node.module for node in block.body for alias in node.names}
+    assert seen == lfpiv._MODULES | dict.fromkeys(lfpiv._SUBMODULES, "lfpiv")
+    assert set(lfpiv._MODULES) == set(lfpiv.__all__) and (ROOT / "lfpiv" / "py.typed").exists()
+
+
 @pytest.mark.parametrize("name", lfpiv.__all__)
 def test_public_names_resolve_and_are_documented(name):
     value = getattr(lfpiv, name)

@@ -107,9 +107,11 @@ def test_command_prints_ours_beside_the_papers(cases, tmp_path, capsys):
     assert "fig99" in capsys.readouterr().err
 
 
-def test_a_result_may_not_hide_figures_behind_what_the_page_shows():
+def test_a_result_may_not_hide_figures_nor_hold_crooked_tables():
     with pytest.raises(ValueError, match="notes"):
         page.result({"notes": 3}, comparison=[])
+    with pytest.raises(ValueError, match="rows of 2 values as 'numbers' has columns, got 1"):
+        page.result({}, comparison=[], tables=[{"caption": "numbers", "columns": ["a", "b"], "rows": [[1, 2], [3]]}])
 
 
 def test_arrays_are_kept_for_the_same_settings_only(tmp_path):

@@ -59,7 +59,7 @@ def section(experiment: Experiment, calibration: Calibration, summary: Mapping[s
         camera = calibration.cameras[setup.name]
         parts.append(f"<h3>{markup.escape(setup.name)}</h3>")
         parts.append(_lens_figure(experiment, setup, camera))
-        found = None if camera.dots is None else dot_map(camera)
+        found = dot_map(camera)
         parts.append(_board_figure(experiment, setup, camera, found))
         if found is not None:
             parts.append(_mapping_figure(experiment, camera, found))
@@ -108,7 +108,7 @@ def _worst_corner(found: LensMap, shape: tuple[int, int], edge: int) -> tuple[tu
         "bottom right": (-1, -1, shape[0] - edge, shape[1] - edge),
     }
     rms = {name: np.nan_to_num(found.rms_px[place[:2]], nan=np.inf) for name, place in places.items()}
-    name = max(rms, key=rms.get)
+    name = max(rms, key=rms.__getitem__)
     return places[name][2:], name
 
 
@@ -133,7 +133,7 @@ def _board_figure(experiment: Experiment, setup: CameraSetup, camera: Calibrated
 
 
 def _plane_table(experiment: Experiment, camera: CalibratedCamera, found: DotMap, order: np.ndarray) -> str:
-    board, dots = experiment.board, camera.dots
+    board, dots = experiment.board, found.dots
     plane_of = found.number // (board.dots[0] * board.dots[1])
     rows = []
     for plane in order:
@@ -164,7 +164,7 @@ def _plane_table(experiment: Experiment, camera: CalibratedCamera, found: DotMap
 
 def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: DotMap) -> str:
     board, grid = experiment.board, experiment.grid
-    shown = [panels.mapping_field(found, tuple(board.dots), grid, depth=depth) for depth in (False, True)]
+    shown = [panels.mapping_field(found, board.dots, grid, depth=depth) for depth in (False, True)]
     numbers = markup.table(
         ["x, y, z [mm]", "labels", "mapping [pitch]", "labels, rms [pitch]"],
         _worst_dots(found),

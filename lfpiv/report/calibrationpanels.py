@@ -10,7 +10,7 @@ from matplotlib.patches import PathPatch, Polygon, Rectangle
 from lfpiv.report.dotmap import DotMap, rms_by
 from lfpiv.report.lensmap import LensMap, lattice_px
 from lfpiv.report.svg import INK, SERIES, arrows, colour_bar, new_panel, spread_ticks, style, to_svg
-from lfpiv.rig import Grid, LensLattice, Optics
+from lfpiv.rig import Grid, LensLattice, Optics, pair
 
 CROP_LENSES = 7
 """Microimages along the edge of a crop of the white image."""
@@ -113,7 +113,7 @@ def mapping_field(dots: DotMap, board_dots: tuple[int, int], grid: Grid, *, dept
     )
     low, high = ([grid.axis_mm(axis)[end] for axis in (2, 2 - up)] for end in (0, -1))
     corner, size = np.array(low) - grid.voxel_mm / 2, np.array(high) - np.array(low) + grid.voxel_mm
-    axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=INK, linestyle="--", linewidth=1))
+    axes.add_patch(Rectangle(pair(corner), *size, fill=False, edgecolor=INK, linestyle="--", linewidth=1))
     axes.margins(0.08)
     axes.autoscale_view()
     name = "yz"[depth]
@@ -154,6 +154,6 @@ def _centres_inside(optics: Optics, lattice: LensLattice, extent: tuple[float, f
     corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom]])
     index = (corners - origin) @ np.linalg.inv(basis)
     low, high = np.floor(index.min(0)).astype(int), np.ceil(index.max(0)).astype(int)
-    lenses = np.stack(np.mgrid[low[0] : high[0] + 1, low[1] : high[1] + 1], axis=-1).reshape(-1, 2)
-    centres = origin + lenses @ basis
+    lenses = np.moveaxis(np.mgrid[low[0] : high[0] + 1, low[1] : high[1] + 1], 0, -1).reshape(-1, 2)
+    centres: np.ndarray = origin + lenses @ basis
     return centres[((centres >= (left, top)) & (centres <= (right, bottom))).all(1)]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lfpiv.board import BoardDots
 from lfpiv.camera import CalibratedCamera
 from lfpiv.rig import Optics
 
@@ -24,6 +25,8 @@ class DotMap:
     not of what they share, the error of the dot's place: its length bounds the error of the mapping there.
     """
 
+    dots: BoardDots
+    """The labels."""
     number: np.ndarray
     """Numbers of the dots, plane * (nx ny) + row * nx + column, shape (dot,)."""
     position_mm: np.ndarray
@@ -36,14 +39,17 @@ class DotMap:
     """Root mean square of its labels' errors [pitch], shape (dot,)."""
 
 
-def dot_map(camera: CalibratedCamera) -> DotMap:
-    """Hold a camera's mapping against all labels of its dots, those of the training included."""
+def dot_map(camera: CalibratedCamera) -> DotMap | None:
+    """Hold a camera's mapping against all labels of its dots, those of the training included; None without dots."""
     dots = camera.dots
+    if dots is None:
+        return None
     difference = (dots.array_mm - camera.map(dots.points_mm, dots.pupil_mm)) / camera.lattice.pitch_mm
     number, first, inverse = np.unique(dots.dot, return_index=True, return_inverse=True)
     labels = np.bincount(inverse)
     mean = np.stack([np.bincount(inverse, part) / labels for part in difference.T], axis=1)
     return DotMap(
+        dots=dots,
         number=number,
         position_mm=dots.points_mm[first],
         labels=labels,
@@ -60,7 +66,11 @@ def rms_by(key: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def dot_outlines_px(
-    mapping: Callable, optics: Optics, dots: tuple[int, int], spacing_mm: float, depth_mm: float
+    mapping: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    optics: Optics,
+    dots: tuple[int, int],
+    spacing_mm: float,
+    depth_mm: float,
 ) -> np.ndarray:
     """Outline of each dot's light on the sensor: the rays through the pupil's edge, Eq. 9.
 

@@ -13,6 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import matplotlib
@@ -141,7 +142,7 @@ def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
         Every how many vectors along x and y are in the page.
     """
     fields = [(names[pair], vectors, "velocity") for pair, vectors in found.shown.items()]
-    if found.mean is not None:
+    if found.mean is not None and found.fluctuation is not None:
         fields += [(f"mean of {found.read:,} pairs", found.mean, "velocity")]
         fields += [(f"fluctuation (standard deviation), {found.read:,} pairs", found.fluctuation, "fluctuation")]
     block, described, thinning = bytearray(), [], 1
@@ -150,7 +151,7 @@ def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
         step = max(math.ceil(math.sqrt(vectors["u"].size / MOST_IN_FIELD)), 1)
         thinning = max(thinning, step)
         cut = {"x": slice(None, None, step), "y": slice(None, None, step)}
-        entry = {"label": label, "kind": kind, "values": {}}
+        entry: dict[str, Any] = {"label": label, "kind": kind, "values": {}}
         thin = vectors.isel(cut)
         for name, values in {**{name: thin[name] for name in "uvw"}, **derivatives}.items():
             values = values.isel(cut) if name in derivatives else values

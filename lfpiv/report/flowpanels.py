@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -116,7 +118,7 @@ def in_space(vectors: xr.Dataset) -> str:
     figure = Figure(figsize=(WIDTH_INCH, 3.4))
     FigureCanvasSVG(figure)
     figure.patch.set_alpha(0)
-    axes = figure.add_axes((0.0, 0.15, 0.82, 0.85), projection="3d")
+    axes: Any = figure.add_axes((0.0, 0.15, 0.82, 0.85), projection="3d")  # matplotlib does not type axes in space
     axes.patch.set_alpha(0)
     longest = float(speed[good].max(initial=0.0))
     apart = step * min((_spacing(vectors[axis].values) for axis in "zyx" if vectors.sizes[axis] > 1), default=1.0)

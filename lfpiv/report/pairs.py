@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 
@@ -66,7 +66,7 @@ def _values(item: Mapping[str, Any]) -> list[float | None]:
     return [item["valid_fraction"], item["uncertainty_voxel"], item["peak_ratio"], *spread]
 
 
-def _known(reduce, values: np.ndarray) -> float:
+def _known(reduce: Callable[[np.ndarray], SupportsFloat], values: np.ndarray) -> float:
     values = values[np.isfinite(values)]
     return float(reduce(values)) if values.size else float("nan")
 
@@ -111,7 +111,13 @@ def _said(items: Sequence[Mapping[str, Any]], failed: Sequence[int]) -> str:
 
 
 def _line(
-    groups: Groups, keys: Sequence[str], label: str, failed: Sequence[int], *, factor: float = 1.0, bottom=None
+    groups: Groups,
+    keys: Sequence[str],
+    label: str,
+    failed: Sequence[int],
+    *,
+    factor: float = 1.0,
+    bottom: float | None = None,
 ) -> str:
     figure, (axes,) = new_panel()
     middle = (groups.first + groups.last) / 2

@@ -17,7 +17,9 @@ from collections.abc import Sequence
 import cv2
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.path import Path
 
@@ -59,7 +61,7 @@ def new_panel(height_inch: float = 2.6, *, rows: int = 1, columns: int = 1) -> t
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 
-def style(axes, *, title: str = "", xlabel: str = "", ylabel: str = "", legend: bool = False) -> None:
+def style(axes: Axes, *, title: str = "", xlabel: str = "", ylabel: str = "", legend: bool = False) -> None:
     """Give axes the page's ink and type, and their names."""
     axes.patch.set_alpha(0)
     axes.set_title(title, color=INK, fontsize=TEXT_POINT)
@@ -74,10 +76,12 @@ def style(axes, *, title: str = "", xlabel: str = "", ylabel: str = "", legend: 
         axes.legend(fontsize=SMALL_POINT, labelcolor=INK, frameon=False, handlelength=1.4, borderaxespad=0.2)
 
 
-def colour_bar(figure: Figure, shown, axes, label: str, *, location: str = "right") -> None:
+def colour_bar(figure: Figure, shown: ScalarMappable, axes: Axes, label: str, *, location: str = "right") -> None:
     """Put a colour bar beside axes, as high as they are, or below them."""
-    place = {"cax": axes.inset_axes((1.04, 0, 0.05, 1))} if location == "right" else {"ax": axes, "location": location}
-    bar = figure.colorbar(shown, **place, **({} if location == "right" else {"fraction": 0.06, "pad": 0.03}))
+    if location == "right":
+        bar = figure.colorbar(shown, cax=axes.inset_axes((1.04, 0, 0.05, 1)))
+    else:
+        bar = figure.colorbar(shown, ax=axes, location=location, fraction=0.06, pad=0.03)
     bar.ax.locator_params(nbins=5 if location == "right" else 3)
     bar.set_label(label, color=INK, fontsize=TEXT_POINT)
     bar.ax.tick_params(colors=INK, labelsize=SMALL_POINT)
@@ -123,7 +127,7 @@ def to_svg(figure: Figure, alt: str) -> str:
     text = text.replace(INK, "currentColor")
     for number, colour in enumerate(SERIES):
         text = text.replace(colour, f"var(--series-{number})")
-    width, height = (float(value) for value in re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', text).groups())
+    width, height = 72 * figure.get_size_inches()  # [point], as in the file
     head = (
         f'<svg class="panel" role="img" aria-label="{html.escape(alt)}" viewBox="0 0 {width:g} {height:g}" '
         f'width="{width / 0.75:.0f}" height="{height / 0.75:.0f}">'
@@ -136,17 +140,19 @@ def _own_identifiers(text: str) -> str:
     used = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
     mark = f"svg{next(_numbers)}-"
 
-    def keep(match: re.Match) -> str:
+    def keep(match: re.Match[str]) -> str:
         return f' id="{mark}{match[1]}"' if match[1] in used else ""
 
     text = re.sub(r' id="([^"]+)"', keep, text)
     return re.sub(r'(url\(#|href="#)', rf"\g<1>{mark}", text).replace("xlink:href", "href")
 
 
-def _smaller_picture(match: re.Match) -> str:
+def _smaller_picture(match: re.Match[str]) -> str:
     """Store an opaque grey picture as grey, large ones as JPEG."""
     data = base64.b64decode(re.sub(r"\s", "", match[1]))
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        return match[0]
     kind = "png"
     opaque = picture.ndim == 3 and (picture.shape[2] == 3 or (picture[..., 3] == 255).all())
     if opaque and (picture[..., 0] == picture[..., 1]).all() and (picture[..., 1] == picture[..., 2]).all():
@@ -160,7 +166,7 @@ def _smaller_picture(match: re.Match) -> str:
     return f'href="data:image/{kind};base64,{base64.b64encode(data).decode()}"'
 
 
-def spread_ticks(axes, count: Sequence[int] = (5, 5)) -> None:
+def spread_ticks(axes: Axes, count: Sequence[int] = (5, 5)) -> None:
     """At most so many ticks along x and y."""
     axes.locator_params(axis="x", nbins=count[0])
     axes.locator_params(axis="y", nbins=count[1])

@@ -150,7 +150,7 @@ def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
     )
     lengths = np.array([len(history) for history in histories.values()])
     rows = []
-    for k in iteration:
+    for k in range(length):
         cells = [number(values[k], 4) for values in columns.values()]
         if len(histories) <= FEW_VOLUMES:
             cells = [cell if k < lengths[j] else markup.NONE for j, cell in enumerate(cells)]

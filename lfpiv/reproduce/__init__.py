@@ -23,6 +23,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import lfpiv
@@ -98,7 +99,7 @@ def reproduce(
         work.mkdir(parents=True, exist_ok=True)
         kept = (work / "result.json").exists()
 
-        def compute(case=case, key=key, work=work) -> dict[str, Any]:
+        def compute(case: ModuleType = case, key: str = key, work: Path = work) -> dict[str, Any]:
             start, start_cpu = time.perf_counter(), time.process_time()
 
             def step(what: str, fraction: float) -> None:

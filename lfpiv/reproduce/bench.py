@@ -9,14 +9,17 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 import lfpiv
 from lfpiv import metrics
 from lfpiv.calibration import Calibration
-from lfpiv.reproduce import rigs, store
+from lfpiv.camera import CalibratedCamera
+from lfpiv.reproduce import Progress, rigs, store
 from lfpiv.scene import Scene
 from lfpiv.settings import Correlation, Smart
 from lfpiv.simulate import FULL_SCALE, render_camera
@@ -35,7 +38,7 @@ MISALIGNED = {
     "right": {"nominal_angle_deg": -45.0, "true_yaw_deg": -45.7, "true_pitch_deg": 0.2, "true_roll_deg": 0.4},
 }
 """The cameras, and how they truly stand, which nobody measures."""
-SHARED: dict[str, dict] = {}
+SHARED: dict[str, dict[str, Any]] = {}
 """Tables that all scenes share; the others are the simulator's own."""
 ONE, TWO, THREE = ("middle",), ("left", "right"), ("left", "middle", "right")
 """Cameras of a measurement. The one that works alone looks along z, so that its depth is the volume's."""
@@ -89,7 +92,7 @@ class Judged:
         """Standard error of the mean error over the vectors of this pair [voxel]."""
         return _standard_error(self.length)
 
-    def row(self) -> dict:
+    def row(self) -> dict[str, Any]:
         """Figures for ``reproduce.json``."""
         return {
             "error_voxel": self.error.mean,
@@ -116,7 +119,7 @@ class Bench:
         self.grid = rigs.volume_grid(size_mm)
         self.flow = rigs.ring(size_mm)
         self._images: tuple[Pair | None, list[dict[str, np.ndarray]]] = (None, [{}, {}])
-        self._weights: tuple[tuple, Weights | None] = ((), None)
+        self._weights: tuple[tuple[CalibratedCamera, ...], Weights | None] = ((), None)
 
     def positions(self, pair: Pair) -> list[np.ndarray]:
         """Particles of both frames (n, 3) [mm]."""
@@ -143,10 +146,12 @@ class Bench:
         """Weights of some of a calibration's cameras; the last ones are kept at hand."""
         chosen = Calibration({name: calibration.cameras[name] for name in cameras})
         key = tuple(chosen.cameras.values())
-        if len(key) != len(self._weights[0]) or any(a is not b for a, b in zip(key, self._weights[0], strict=True)):
-            self._weights = ((), None)  # one set at a time: memory
-            self._weights = (key, lfpiv.build_weights(chosen, self.grid))
-        return self._weights[1]
+        last, weights = self._weights
+        if weights is None or len(key) != len(last) or any(a is not b for a, b in zip(key, last, strict=True)):
+            self._weights, weights = ((), None), None  # one set at a time: memory
+            weights = lfpiv.build_weights(chosen, self.grid)
+            self._weights = (key, weights)
+        return weights
 
     def volumes(
         self,
@@ -196,7 +201,7 @@ class Bench:
             "scene": self.rig.scene.model_dump(mode="json"),
         }
 
-        def compute() -> dict[str, np.ndarray]:
+        def compute() -> dict[str, ArrayLike]:
             weights = self.weights(calibration or self.rig.calibration, cameras)
             found, told = [], []
             for images in self.images(pair, cameras):
@@ -229,9 +234,9 @@ class Bench:
         quality = []
         for volume, at in zip(volumes, self.positions(pair), strict=True):
             true, particles = rigs.truth(at, self.grid), metrics.particle_quality(volume, at)
-            q = [metrics.reconstruction_quality(volume, true, zero_mean=zero_mean) for zero_mean in (False, True)]
+            both = [metrics.reconstruction_quality(volume, true, zero_mean=zero_mean) for zero_mean in (False, True)]
             ghosts = (particles.found_count - particles.matched_count) / particles.true_count
-            quality.append((*q, particles.accuracy, particles.ghost_ratio, ghosts, particles.elongation))
+            quality.append((*both, particles.accuracy, particles.ghost_ratio, ghosts, particles.elongation))
         q, q_zero_mean, accuracy, ghost_ratio, ghosts, elongation = (float(value) for value in np.mean(quality, axis=0))
         return Judged(
             error=metrics.displacement_error(field, exact),
@@ -275,7 +280,7 @@ class Bench:
         }
 
 
-def open_bench(root: Path, scale: str, seed: int, progress) -> Bench:
+def open_bench(root: Path, scale: str, seed: int, progress: Progress) -> Bench:
     """Return the three cameras' bench, simulated and calibrated in `root` or taken from there."""
     rig = rigs.calibrated_rig(bench_scene(scale, seed), root / "rig", progress)
     return Bench(rig, SIZE_MM[scale], root / "runs", seed)
@@ -286,7 +291,7 @@ def bench_scene(scale: str, seed: int) -> Scene:
     return scene(scale, seed, MISALIGNED, name="bench of three cameras")
 
 
-def scene(scale: str, seed: int, cameras: Mapping[str, Mapping], *, name: str, **shared) -> Scene:
+def scene(scale: str, seed: int, cameras: Mapping[str, Mapping[str, Any]], *, name: str, **shared: Any) -> Scene:
     """Scene of cameras around this bench's volume and board.
 
     Parameters
@@ -355,7 +360,7 @@ def _standard_error(values: np.ndarray) -> float:
     return float(values.std() * np.sqrt(8 / values.size))
 
 
-def recalibrated(bench: Bench, name: str, **network) -> Calibration:
+def recalibrated(bench: Bench, name: str, **network: Any) -> Calibration:
     """Calibrate two cameras of a bench again from the same images, with other settings of ``[network]``; kept."""
     stored = bench.folder / f"{name}.h5"
     experiment = bench.rig.experiment

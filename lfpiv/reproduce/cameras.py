@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import xarray as xr
 
-from lfpiv.reproduce import bench, page, plots, rigs
-from lfpiv.reproduce.bench import Bench, Pair
+from lfpiv.reproduce import Progress, bench, page, plots, rigs
+from lfpiv.reproduce.bench import Bench, Judged, Pair
 
 TITLE = "One, two and three cameras"
 
@@ -19,21 +22,22 @@ COLOURS = {"one": "#e0762a", "two": "#2f81d6", "three": "#2ca36b", "truth": plot
 NAMES = {"one": "one camera", "two": "two cameras", "three": "three cameras", "truth": "true particles"}
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Measure the same pairs with every set of cameras; see the package for the arguments."""
     own = bench.open_bench(work.parent / "bench", scale, seed, progress)
     return compute(own, PPM[scale], work, seed=seed, progress=progress)
 
 
-def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progress) -> dict:
+def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
     """Measure with every set of cameras on a calibrated bench."""
     judged, shown = {}, {}
     todo = [(ppm, name) for ppm in ppms for name in ("truth", *SETS)]
     for done, (ppm, name) in enumerate(todo):
         progress(f"{NAMES[name]}, {ppm:g} ppm", done / len(todo))
         pair = Pair(ppm=ppm)
+        told: dict[str, float] = {}
         if name == "truth":
-            volumes, told = own.true_volumes(pair), {}
+            volumes = own.true_volumes(pair)
         else:
             volumes, told = own.volumes(bench.run_name(pair, name), pair=pair, cameras=SETS[name])
         judged[name, ppm] = own.judge(volumes, told, pair=pair)
@@ -128,7 +132,7 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
     )
 
 
-def _about_depth(judged, ppm: float) -> str:
+def _about_depth(judged: Mapping[tuple[str, float], Judged], ppm: float) -> str:
     """Say what each set of cameras makes of depth."""
     parts = []
     for name in SETS:
@@ -140,12 +144,17 @@ def _about_depth(judged, ppm: float) -> str:
     )
 
 
-def _draw(judged, ppms, shown, path: Path) -> None:
+def _draw(
+    judged: Mapping[tuple[str, float], Judged],
+    ppms: tuple[float, ...],
+    shown: Mapping[str, xr.DataArray],
+    path: Path,
+) -> None:
     drawn = plots.figure(10.5, 6.0)
-    rows = drawn.subfigures(2, 1, height_ratios=(1.15, 1))
-    for axes, (name, volume) in zip(rows[0].subplots(1, len(shown)), shown.items(), strict=True):
+    top, bottom = drawn.subfigures(2, 1, squeeze=False, height_ratios=(1.15, 1))[:, 0]
+    for axes, (name, volume) in zip(top.subplots(1, len(shown)), shown.items(), strict=True):
         plots.draw_slice(axes, volume, SLICE_VOXEL, NAMES[name])
-    left, middle, right = rows[1].subplots(1, 3)
+    left, middle, right = bottom.subplots(1, 3)
     width = 0.8 / len(SETS) / len(ppms)
     for number, name in enumerate(SETS):
         for second, ppm in enumerate(ppms):

@@ -11,9 +11,10 @@ import numpy as np
 
 import lfpiv
 from lfpiv.calibration import Calibration
-from lfpiv.reproduce import bench, page, plots, rigs
+from lfpiv.reproduce import Progress, bench, page, plots, rigs
 from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
 from lfpiv.settings import Correlation, Smart
+from lfpiv.thinlens import thin_lens_model
 
 TITLE = "What each choice is worth"
 
@@ -97,13 +98,13 @@ CHOICES = OPEN | OWN
 OFFSET = {"textcoords": "offset points"}
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Measure one pair with every choice; see the package for the arguments."""
     own = bench.open_bench(work.parent / "bench", scale, seed, progress)
     return compute(own, CHOICES, work, seed=seed, progress=progress)
 
 
-def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int, progress) -> dict:
+def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
     """Measure with some choices on a calibrated bench with two cameras."""
     usual = own.volumes(bench.run_name(DEFAULT, "two"), pair=DEFAULT)
     default = own.judge(*usual, pair=DEFAULT)
@@ -185,11 +186,13 @@ def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int,
 
 def _traced(own: Bench, choice: Choice) -> Calibration:
     """Thin lenses at the nominal angles, as wrong about their height as the choice says."""
-    nominal, cameras = lfpiv.thin_lens(own.rig.experiment).cameras, {}
+    experiment, cameras = own.rig.experiment, {}
+    nominal = lfpiv.thin_lens(experiment).cameras
     for sign, name in zip((0.5, -0.5), bench.TWO, strict=True):
         camera = nominal[name]
-        offset = camera.baseline.offset_mm + [0.0, sign * choice.apart_mm, 0.0]
-        cameras[name] = replace(camera, baseline=replace(camera.baseline, offset_mm=offset))
+        lens = thin_lens_model(camera.optics, experiment.camera(name).nominal_angle_deg)
+        offset = lens.offset_mm + [0.0, sign * choice.apart_mm, 0.0]
+        cameras[name] = replace(camera, baseline=replace(lens, offset_mm=offset))
     return Calibration(cameras)
 
 
@@ -199,18 +202,31 @@ def _mapping(own: Bench, calibration: Calibration, seed: int) -> float:
     return max(float(errors[name].mean()) for name in bench.TWO)
 
 
-def _table(caption: str, choices, judged, gaps, default: Judged) -> dict:
+def _table(
+    caption: str,
+    choices: Mapping[str, Choice],
+    judged: Mapping[str, Judged],
+    gaps: Mapping[str, tuple[float, float]],
+    default: Judged,
+) -> dict[str, Any]:
+    rows: list[list[str | float | None]]
     rows = [["all defaults", default.error.mean, None, None, *default.error.mean_absolute, default.q, None]]
     rows += [
-        [choice.label, judged[key].error.mean, *gaps[key], *judged[key].error.mean_absolute, judged[key].q]
-        + [judged[key].q - default.q]
+        [
+            choice.label,
+            judged[key].error.mean,
+            *gaps[key],
+            *judged[key].error.mean_absolute,
+            judged[key].q,
+            judged[key].q - default.q,
+        ]
         for key, choice in choices.items()
     ]
     columns = ["", "error", "change", "standard error", "x", "y", "z", "Q", "change of Q"]
     return {"caption": caption, "columns": columns, "rows": rows}
 
 
-def _verdict(choices, gaps, default: Judged) -> str:
+def _verdict(choices: Mapping[str, Choice], gaps: Mapping[str, tuple[float, float]], default: Judged) -> str:
     """Say which choices differ from the defaults by more than chance."""
     told = {key: gap for key, (gap, error) in gaps.items() if abs(gap) > max(SURE * error, WORTH * default.error.mean)}
     better = [choices[key].label for key, gap in told.items() if gap < 0]
@@ -235,7 +251,7 @@ def _about_smoothing(judged: Mapping[str, Judged], default: Judged) -> list[str]
     ]
 
 
-def _about_mapping(choices, mapping: Mapping[str, float]) -> list[str]:
+def _about_mapping(choices: Mapping[str, Choice], mapping: Mapping[str, float]) -> list[str]:
     if len(mapping) == 1:
         return []
     parts = ", ".join(f"{choices[key].label} {value:.4f}" for key, value in mapping.items() if key != "default")
@@ -247,7 +263,13 @@ def _about_mapping(choices, mapping: Mapping[str, float]) -> list[str]:
     ]
 
 
-def _draw(choices, judged, gaps, default: Judged, path: Path) -> None:
+def _draw(
+    choices: Mapping[str, Choice],
+    judged: Mapping[str, Judged],
+    gaps: Mapping[str, tuple[float, float]],
+    default: Judged,
+    path: Path,
+) -> None:
     drawn = plots.figure(9, 1.2 + 0.27 * len(choices))
     left, right = drawn.subplots(1, 2, sharey=True, width_ratios=(1.5, 1))
     place = np.arange(len(choices))[::-1]

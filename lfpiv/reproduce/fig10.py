@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lfpiv import metrics
-from lfpiv.reproduce import page, plots
+from lfpiv.camera import CalibratedCamera
+from lfpiv.reproduce import Progress, page, plots
 from lfpiv.reproduce.rigs import VOXEL_MM, numerical_rig
 from lfpiv.rig import Grid
 from lfpiv.weightblocks import count_voxels
@@ -24,12 +27,13 @@ BATCH = 4
 PAPER_SSIM = 0.94
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Compare the weights; see the package for the arguments."""
     rig = numerical_rig(work.parent / "rig", scale, seed, progress)
     grid = Grid(shape=(1, 1, 1), voxel_mm=VOXEL_MM, first_centre_mm=VOXEL_AT_MM[::-1])
     network, drt = (rig.weights(grid, mapping) for mapping in ("network", "drt"))
-    cameras, images = {}, {}
+    cameras: dict[str, dict[str, float]] = {}
+    images = {}
     for number, name in enumerate(rig.calibration.cameras):
         ours, traced = network.image(name, (0, 0, 0)), drt.image(name, (0, 0, 0))
         counted = {}
@@ -53,7 +57,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
         images[name] = (ours, traced, drt_count)
     _draw(images, work / "fig10.png")
 
-    def worst(key, choose=max):
+    def worst(key: str, choose: Callable[[Iterable[float]], float] = max) -> float:
         return choose(figures[key] for figures in cameras.values())
 
     ssim = worst("ssim", min)
@@ -114,9 +118,24 @@ def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
     )
 
 
-def _count(camera, counts: int, seed: list[int], shape: tuple[int, int]) -> tuple[np.ndarray, float, np.ndarray]:
+def _count(
+    camera: CalibratedCamera, counts: int, seed: list[int], shape: tuple[int, int]
+) -> tuple[np.ndarray, float, np.ndarray]:
     """Mean of independent counts of the voxel on the sensor, that mean's noise (relative L2), and the first count."""
-    first, total, squares = None, np.zeros(shape), np.zeros(shape)
+    images = _counted_images(camera, counts, seed, shape)
+    first = next(images)
+    total, squares = first.copy(), first**2
+    for image in images:
+        total += image
+        squares += image**2
+    mean = total / counts
+    variance = np.maximum(squares / counts - mean**2, 0.0) / (counts - 1)
+    return mean, float(np.sqrt(variance.sum()) / np.linalg.norm(mean)), first
+
+
+def _counted_images(
+    camera: CalibratedCamera, counts: int, seed: list[int], shape: tuple[int, int]
+) -> Iterator[np.ndarray]:
     for start in range(0, counts, BATCH):
         draw = int(np.random.default_rng([*seed, start]).integers(2**31))
         centres = np.tile(VOXEL_AT_MM, (min(BATCH, counts - start), 1))
@@ -125,15 +144,10 @@ def _count(camera, counts: int, seed: list[int], shape: tuple[int, int]) -> tupl
             image = np.zeros(shape)
             image[row : row + window.shape[0], column : column + window.shape[1]] = window / number
             image *= camera.gain
-            first = image if first is None else first
-            total += image
-            squares += image**2
-    mean = total / counts
-    variance = np.maximum(squares / counts - mean**2, 0.0) / (counts - 1)
-    return mean, float(np.sqrt(variance.sum()) / np.linalg.norm(mean)), first
+            yield image
 
 
-def _draw(images, path: Path) -> None:
+def _draw(images: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]], path: Path) -> None:
     drawn = plots.figure(11, 2.45 * len(images))
     axes = drawn.subplots(len(images), 4, squeeze=False)
     for row, (name, (ours, traced, counted)) in zip(axes, images.items(), strict=True):
@@ -156,7 +170,7 @@ def _draw(images, path: Path) -> None:
             if place in (1, 3):
                 bar = drawn.colorbar(drawing, ax=row[place - 1 : place + 1].tolist(), shrink=0.85, pad=0.01)
                 bar.ax.tick_params(labelsize=7)
-                bar.formatter.set_powerlimits((0, 0))
+                bar.ax.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
                 bar.ax.yaxis.get_offset_text().set_fontsize(7)
         for axis, title in zip(row, ("network", "DRT", "network − DRT (×20)", "DRT − count (×20)"), strict=True):
             axis.set_title(f"{name}: {title}", fontsize=9)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -11,8 +12,9 @@ from scipy import ndimage
 import lfpiv
 from lfpiv import metrics
 from lfpiv.ghosts import PEAK_SHARE
-from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.reproduce import Progress, page, plots, rigs, store
 from lfpiv.settings import Correlation, Smart
+from lfpiv.weights import Weights
 
 TITLE = "Fig. 12: reconstructed particles; Fig. 11: at 0.1 particles per microlens"
 
@@ -29,7 +31,7 @@ TRUTH_PPM = 0.5
 """Seeding at which SMART is also started from the true particles: whether the images could tell ghosts at all."""
 DARK_SHARE = 1e-3
 """Brightness it starts with where there is no particle, as a part of the brightest voxel."""
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "blobs": {},
     "points": {},
     "from_truth": {},
@@ -43,7 +45,7 @@ CORRELATED_VOXEL = Correlation().smoothing_voxel
 """Smoothing of a volume before it is correlated, with which Q is reported as well [voxel]."""
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Reconstruct and judge; see the package for the arguments."""
     rig = rigs.numerical_rig(work.parent / "rig", scale, seed, progress)
     size, ppms = SIZE_MM[scale], PPM[scale]
@@ -54,14 +56,21 @@ def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
     todo += [("network", ppm, kind) for ppm in ppms for kind in ("paper", "sieve")]
     todo += [("network", TRUTH_PPM, "from_truth")]
     todo += [("network", ppm, "points") for ppm in POINTS_PPM[scale]]
-    built: dict[str, lfpiv.weights.Weights] = {}
+    built: dict[str, Weights] = {}
     rows = []
     for done, (mapping, ppm, kind) in enumerate(sorted(todo)):
         step = _part(progress, "reconstruction", done, len(todo))
         draw = [seed, 12, round(1000 * ppm)]
         positions = rigs.random_particles(size, ppm, draw)
 
-        def compute(mapping=mapping, ppm=ppm, kind=kind, step=step, draw=draw, positions=positions) -> dict:
+        def compute(
+            mapping: str = mapping,
+            ppm: float = ppm,
+            kind: str = kind,
+            step: Callable[[float], None] = step,
+            draw: list[int] = draw,
+            positions: np.ndarray = positions,
+        ) -> dict[str, Any]:
             if mapping not in built:
                 built.clear()  # one set of weights at a time: memory
                 built[mapping] = rig.weights(grid, mapping)
@@ -159,14 +168,19 @@ def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
 
 
 def _judge(
-    weights, images, positions_mm: np.ndarray, smart: Smart, from_truth: bool, step: Callable[[float], None]
-) -> dict:
+    weights: Weights,
+    images: Mapping[str, np.ndarray],
+    positions_mm: np.ndarray,
+    smart: Smart,
+    from_truth: bool,
+    step: Callable[[float], None],
+) -> dict[str, Any]:
     """Reconstruct a volume and compare it with its particles."""
     truth, first = rigs.truth(positions_mm, weights.grid), None
     if from_truth:  # dark voxels are not quite dark: ghosts may grow
         light = sum(float(image.sum(dtype=np.float64)) for image in images.values()) / len(images)
         first = (truth.values + DARK_SHARE * float(truth.max())) * np.float32(light / float(truth.sum()))
-    result = lfpiv.reconstruct(weights, images, first=first, progress=step, **smart.model_dump())
+    result = lfpiv.reconstruct(weights, images, first=first, progress=step, **smart.of_one_frame())
     quality = metrics.particle_quality(result, positions_mm)
     found = metrics.find_particles(result, quality.threshold)
     return {
@@ -188,18 +202,17 @@ def _judge(
     }
 
 
-def _mean(rows: list[dict], key: str = "q") -> float:
+def _mean(rows: Sequence[Mapping[str, Any]], key: str = "q") -> float:
     return float(np.mean([row[key] for row in rows]))
 
 
-def _part(progress, what: str, done: int, total: int) -> Callable[[float], None]:
+def _part(progress: Progress, what: str, done: int, total: int) -> Callable[[float], None]:
     return lambda fraction: progress(what, (done + fraction) / total)
 
 
-def _table(caption: str, rows: list[dict]) -> dict:
+def _table(caption: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     columns = ["weights", "ppm", "Q", "Q, smoothed", "R_acc", "R_g", "precision", "recall", "elongation"]
-    keys = ("ppm", "q", "q_as_correlated", "accuracy", "ghost_ratio", "precision", "recall")
-    keys = (*keys, "elongation")
+    keys = ("ppm", "q", "q_as_correlated", "accuracy", "ghost_ratio", "precision", "recall", "elongation")
     return {
         "caption": caption,
         "columns": columns,
@@ -207,7 +220,7 @@ def _table(caption: str, rows: list[dict]) -> dict:
     }
 
 
-def _verdict(q_mean: float, rows: list[dict], from_truth: dict) -> str:
+def _verdict(q_mean: float, rows: Sequence[Mapping[str, Any]], from_truth: Mapping[str, Any]) -> str:
     """Say whether the goal for Q is reached, and what the run from the true particles tells of the reason."""
     ours = next(row for row in rows if row["ppm"] == from_truth["ppm"])
     return (
@@ -219,7 +232,7 @@ def _verdict(q_mean: float, rows: list[dict], from_truth: dict) -> str:
     )
 
 
-def _draw_curves(blobs: dict[str, list[dict]], path: Path) -> None:
+def _draw_curves(blobs: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> None:
     drawn = plots.figure(9.5, 3.0)
     panels = (("accuracy", "R_acc"), ("ghost_ratio", "R_g"), ("q", "Q"))
     for axes, (key, label) in zip(drawn.subplots(1, 3), panels, strict=True):
@@ -238,28 +251,31 @@ def _draw_curves(blobs: dict[str, list[dict]], path: Path) -> None:
     plots.save(drawn, path)
 
 
-def _draw_scatter(found: dict[str, np.ndarray], true_mm: np.ndarray, size_mm, path: Path) -> None:
+def _draw_scatter(
+    found: Mapping[str, np.ndarray], true_mm: np.ndarray, size_mm: tuple[float, float, float], path: Path
+) -> None:
     """Draw the volumes' particles in space, and a slice of them."""
     drawn = plots.figure(11, 7.2)
-    drawn.get_layout_engine().set(w_pad=0.15, h_pad=0.05)
+    drawn.set_layout_engine("constrained", w_pad=0.15, h_pad=0.05)
     half = np.array(size_mm) / 2
     for place, (name, positions) in enumerate(found.items()):
         matched = np.zeros(len(positions), bool)
         matched[metrics.match_particles(positions, true_mm, rigs.VOXEL_MM)[:, 0]] = True
-        space = drawn.add_subplot(2, 3, place + 1, projection="3d")
+        space: Any = drawn.add_subplot(2, 3, place + 1, projection="3d")  # matplotlib does not type axes in space
         flat = drawn.add_subplot(2, 3, place + 4)
         near = np.abs(positions[:, 1]) < 0.5
         for which, colour, label in ((matched, plots.COLOURS.get(name), "particle"), (~matched, "#c23b3b", "ghost")):
             if not which.any():
                 continue
             space.scatter(*positions[which][:, [2, 0, 1]].T, s=2 if label == "particle" else 1, c=colour, alpha=0.7)
-            mark = {"s": 9, "c": colour} if label == "particle" else {"s": 14, "c": colour, "marker": "x", "lw": 0.7}
+            mark: dict[str, Any] = (
+                {"s": 9, "c": colour} if label == "particle" else {"s": 14, "c": colour, "marker": "x", "lw": 0.7}
+            )
             flat.scatter(*positions[which & near][:, [2, 0]].T, label=label, **mark)
         if name != "truth":
             inside = np.abs(true_mm[:, 1]) < 0.5
-            flat.scatter(
-                *true_mm[inside][:, [2, 0]].T, s=34, facecolors="none", edgecolors="#30363c", lw=0.5, label="true"
-            )
+            x, _, z = true_mm[inside].T
+            flat.scatter(z, x, s=34, facecolors="none", edgecolors="#30363c", lw=0.5, label="true")
         space.set_box_aspect(np.array(size_mm)[[2, 0, 1]], zoom=0.85)
         space.set(xlabel="z [mm]", ylabel="x [mm]", zlabel="y [mm]", title=f"{plots.NAMES[name]}: {len(positions)}")
         space.set(xlim=(-half[2], half[2]), ylim=(-half[0], half[0]), zlim=(-half[1], half[1]))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,10 +14,11 @@ from skimage.measure import marching_cubes
 import lfpiv
 from lfpiv import derived, metrics
 from lfpiv.flows import Ring
-from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.reproduce import Progress, page, plots, rigs, store
 from lfpiv.settings import Correlation, Smart
 from lfpiv.vectorfields import BELOW_VOXEL
 from lfpiv.vectors import DEFAULT_WINDOWS
+from lfpiv.weights import Weights
 
 TITLE = "Fig. 14: displacement of a ring vortex; Fig. 13: its vorticity at 0.5 particles per microlens"
 
@@ -37,8 +39,11 @@ WIDTHS = {"truth": 1.2, "network": 4.0, "drt": 1.2, "drt_plus_1deg": 1.2}
 """Widths of lines [point]: the network's shows beneath DRT's where they coincide."""
 GOAL_MEAN, GOAL_BELOW, GOAL_CONTRAST = 0.30, 0.80, 1.5
 
+Fields = dict[str, np.ndarray]
+"""Both schedules' vectors of a volume pair, and its Q: what `_pack` makes."""
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Reconstruct, correlate and judge; see the package for the arguments."""
     rig = rigs.numerical_rig(work.parent / "rig", scale, seed, progress)
     size, ppms = SIZE_MM[scale], PPM[scale]
@@ -59,21 +64,21 @@ def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
         return [middle - displacement / 2, middle + displacement / 2]
 
     def correlated(volumes: Sequence[xr.DataArray]) -> dict[str, np.ndarray]:
-        fields = {}
+        fields: dict[str, np.ndarray] = {}
         for name, windows in SCHEDULES.items():
             vectors = lfpiv.correlate(*volumes, dt_s=rigs.DT_S, windows=windows, **correlation)
             fields |= _pack(vectors, name)
         return fields
 
-    fields: dict[tuple[str, float], dict[str, np.ndarray]] = {}
+    fields: dict[tuple[str, float], Fields] = {}
     todo = [(mapping, ppms) for mapping in ("truth", *MAPPINGS)] + [(mapping, (SHOWN_PPM,)) for mapping in TURNED]
     total, done = sum(len(several) for _, several in todo), 0
     for mapping, several in todo:
-        built = None
+        built: Weights | None = None
         for ppm in several:
             progress("volumes and vectors", done / total)
 
-            def compute(mapping=mapping, ppm=ppm, done=done) -> dict[str, np.ndarray]:
+            def compute(mapping: str = mapping, ppm: float = ppm, done: int = done) -> dict[str, np.ndarray]:
                 nonlocal built
                 if mapping == "truth":
                     return correlated([rigs.truth(positions, grid) for positions in frames(ppm)])
@@ -82,7 +87,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
                 volumes, quality = [], []
                 for number, positions in enumerate(frames(ppm)):
                     images = _images(rig, work, settings, ppm, number, positions)
-                    volumes.append(lfpiv.reconstruct(built, images, **smart.model_dump()))
+                    volumes.append(lfpiv.reconstruct(built, images, **smart.of_one_frame()))
                     quality.append(metrics.reconstruction_quality(volumes[-1], rigs.truth(positions, grid)))
                     progress("volumes and vectors", (done + 0.4 * (number + 1)) / total)
                 return {**correlated(volumes), "q": np.array(quality)}
@@ -95,7 +100,9 @@ def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
     return _result(fields, ppms, size, flow, rigs.mapping_errors_pitch(rig, grid, seed), correlation, smart, work)
 
 
-def _images(rig, work: Path, settings: dict, ppm: float, frame: int, positions: np.ndarray) -> dict[str, np.ndarray]:
+def _images(
+    rig: rigs.Rig, work: Path, settings: Mapping[str, Any], ppm: float, frame: int, positions: np.ndarray
+) -> dict[str, np.ndarray]:
     """Images of a frame, rendered once for all mappings."""
 
     def compute() -> dict[str, np.ndarray]:
@@ -114,26 +121,35 @@ def _pack(vectors: xr.Dataset, name: str) -> dict[str, np.ndarray]:
     }
 
 
-def _analytic(packed: dict[str, np.ndarray], name: str, flow: Ring) -> np.ndarray:
+def _analytic(packed: Fields, name: str, flow: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Mean of the flow over the windows of a vector field [voxel], shape (z, y, x, 3)."""
     edge = SCHEDULES[name][-1] * rigs.VOXEL_MM
     return rigs.true_field(flow, [packed[f"{name}_{axis}"] for axis in "zyx"], edge) / rigs.VOXEL_MM
 
 
-def _result(fields, ppms, size, flow, mapping_error, correlation, smart, work: Path) -> dict:
+def _result(
+    fields: Mapping[tuple[str, float], Fields],
+    ppms: tuple[float, ...],
+    size: tuple[float, float, float],
+    flow: Ring,
+    mapping_error: Mapping[str, float],
+    correlation: Mapping[str, Any],
+    smart: Smart,
+    work: Path,
+) -> dict[str, Any]:
     runs = []
     for (mapping, ppm), packed in fields.items():
         for name in SCHEDULES:
             field = packed[f"{name}_field"]
-            exact = metrics.displacement_error(field, _analytic(packed, name, flow))
-            row = {
+            analytic = metrics.displacement_error(field, _analytic(packed, name, flow))
+            row: dict[str, Any] = {
                 "mapping": mapping,
                 "ppm": ppm,
                 "windows": name,
                 "valid": float(packed[f"{name}_valid"].mean()),
-                "vectors": exact.count,
-                "error_analytic_voxel": exact.mean,
-                "error_analytic_axes_voxel": exact.mean_absolute,
+                "vectors": analytic.count,
+                "error_analytic_voxel": analytic.mean,
+                "error_analytic_axes_voxel": analytic.mean_absolute,
             }
             if mapping != "truth":
                 error = metrics.displacement_error(field, fields["truth", ppm][f"{name}_field"])
@@ -208,7 +224,7 @@ def _result(fields, ppms, size, flow, mapping_error, correlation, smart, work: P
             "size_mm": size,
             "flow": flow.model_dump(),
             "smart": smart.model_dump(),
-            "correlation": correlation | {"windows": SCHEDULES},
+            "correlation": {**correlation, "windows": SCHEDULES},
             "mapping_error_pitch": mapping_error,
             "runs": runs,
         },
@@ -241,7 +257,7 @@ def _result(fields, ppms, size, flow, mapping_error, correlation, smart, work: P
     )
 
 
-def _stretch_error(packed: dict[str, np.ndarray], flow: Ring) -> float:
+def _stretch_error(packed: Fields, flow: Ring) -> float:
     """Mean error of the flow where both separation angles are overestimated and nothing else goes wrong [voxel].
 
     Two cameras see x cos(a) -+ z sin(a). With a + 1 degree in place of a the same rays meet at x cos(a) / cos(a + 1)
@@ -272,7 +288,7 @@ def _about_angles(contrast: float, turned: dict[str, float], stretch: float) -> 
     return text
 
 
-def _table(name: str, runs: list[dict]) -> dict:
+def _table(name: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     keys = ("ppm", "error_voxel", "below_043", "error_analytic_voxel", "valid", "q")
     rows = [
         [plots.NAMES[run["mapping"]], *(run.get(key) for key in keys), *run.get("error_axes_voxel", (None,) * 3)]
@@ -289,7 +305,12 @@ def _table(name: str, runs: list[dict]) -> dict:
     }
 
 
-def _draw_errors(runs: list[dict], fields, ppms, path: Path) -> None:
+def _draw_errors(
+    runs: Sequence[Mapping[str, Any]],
+    fields: Mapping[tuple[str, float], Fields],
+    ppms: tuple[float, ...],
+    path: Path,
+) -> None:
     drawn = plots.figure(10.5, 3.2)
     left, middle, right = drawn.subplots(1, 3)
     for mapping in ("truth", *MAPPINGS):
@@ -322,10 +343,10 @@ def _draw_errors(runs: list[dict], fields, ppms, path: Path) -> None:
     plots.save(drawn, path)
 
 
-def _draw_vorticity(panels: dict[str, dict[str, np.ndarray]], path: Path) -> None:
+def _draw_vorticity(panels: Mapping[str, Fields], path: Path) -> None:
     """Draw the iso-surfaces of Fig. 13."""
     drawn = plots.figure(11, 8.4)
-    drawn.get_layout_engine().set(w_pad=0.2, h_pad=0.2)
+    drawn.set_layout_engine("constrained", w_pad=0.2, h_pad=0.2)
     drawings = []
     largest = float(np.abs(panels["truth"]["8_field"][..., 2]).max())
     for place, (mapping, packed) in enumerate(panels.items()):
@@ -341,7 +362,7 @@ def _draw_vorticity(panels: dict[str, dict[str, np.ndarray]], path: Path) -> Non
     plots.save(drawn, path)
 
 
-def _draw_surface(axes, packed: dict[str, np.ndarray], largest: float) -> None:
+def _draw_surface(axes: Any, packed: Fields, largest: float) -> None:
     from matplotlib import colormaps
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
     from scipy.ndimage import map_coordinates

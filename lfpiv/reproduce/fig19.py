@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy import ndimage
 
 from lfpiv import metrics
-from lfpiv.reproduce import page, plots, store
+from lfpiv.reproduce import Progress, page, plots, store
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.rigs import Rig, reconstruct_images
 from lfpiv.rig import Grid
@@ -45,27 +46,31 @@ LEAST_SHARE = 0.2
 """A dot has at least this part of the light of the plane's median dot."""
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Reconstruct every plane of the board; see the package for the arguments. Both scales have all 13 planes."""
     rig = experimental_rig(work.parent / "experimental_rig", scale, seed, progress)
     planes = range(len(rig.experiment.board.planes_mm))
     return compute(rig, planes, work, seed=seed, progress=progress)
 
 
-def compute(rig: Rig, planes: Sequence[int], work: Path, *, seed: int, progress) -> dict:
+def compute(rig: Rig, planes: Sequence[int], work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
     """Reconstruct some planes of a rig's board; each finished one is kept in `work`."""
     board = rig.experiment.board
-    positions = []
+    found = []
     for done, plane in enumerate(planes):
         progress(f"plane {plane}", done / len(planes))
+
+        def reconstruct(plane: int = plane) -> dict[str, np.ndarray]:
+            return {"positions_mm": reconstruct_plane(rig, plane, seed=seed)}
+
         kept = store.kept_arrays(
             work / "planes" / f"plane_{plane:02d}.npz",
             {"seed": seed, "iterations": ITERATIONS, "board": board.model_dump(mode="json")},
-            lambda plane=plane: {"positions_mm": reconstruct_plane(rig, plane, seed=seed)},
+            reconstruct,
         )
-        positions.append(kept["positions_mm"])
+        found.append(kept["positions_mm"])
     progress("planes", 1.0)
-    positions = np.array(positions)
+    positions = np.array(found)
     planes_mm = [board.planes_mm[plane] for plane in planes]
     error = metrics.dot_error(positions, board.spacing_mm, planes_mm)
     expected = positions.shape[0] * positions.shape[1] * positions.shape[2]
@@ -132,10 +137,10 @@ def reconstruct_plane(rig: Rig, plane: int, *, seed: int) -> np.ndarray:
     rng = np.random.default_rng([seed, 19, plane])
     shift = OFF_CENTRE_VOXEL * voxel * rng.uniform(-1, 1, 3)
     shift[2] = OFF_CENTRE_DEPTH_MM * rng.uniform(-1, 1)
-    span = [(n - 1) * board.spacing_mm + 2 * MARGIN_MM for n in board.dots]
+    across, up = ((n - 1) * board.spacing_mm + 2 * MARGIN_MM for n in board.dots)
     grid = Grid.from_extent(
         centre_mm=tuple(np.array([0.0, 0.0, board.planes_mm[plane]]) + shift),
-        size_mm=(*span, 2 * DEPTH_MM),
+        size_mm=(across, up, 2 * DEPTH_MM),
         voxel_mm=voxel,
     )
     images = {name: rig.experiment.board_image(name, plane) for name in rig.calibration.cameras}
@@ -191,9 +196,9 @@ def locate_dots(volume: xr.DataArray, dots: tuple[int, int], spacing_mm: float, 
     return found
 
 
-def _draw_dots(positions, planes_mm, path: Path) -> None:
+def _draw_dots(positions: np.ndarray, planes_mm: Sequence[float], path: Path) -> None:
     drawn = plots.figure(8, 3.8)
-    axes = drawn.add_subplot(projection="3d")
+    axes: Any = drawn.add_subplot(projection="3d")  # matplotlib does not type axes in space
     x, y, z = positions.reshape(-1, 3).T
     shown = axes.scatter(z, x, y, c=z, cmap="turbo", s=7, depthshade=False, vmin=min(planes_mm), vmax=max(planes_mm))
     axes.set(xlabel="z [mm]", ylabel="x [mm]", zlabel="y [mm]")
@@ -206,7 +211,7 @@ def _draw_dots(positions, planes_mm, path: Path) -> None:
     plots.save(drawn, path)
 
 
-def _draw_errors(error, planes_mm, path: Path) -> None:
+def _draw_errors(error: metrics.DotError, planes_mm: Sequence[float], path: Path) -> None:
     drawn = plots.figure(7, 3.2)
     axes = drawn.subplots()
     blue, orange = "#2f81d6", "#e0762a"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
-from lfpiv.reproduce import page, plots
+from lfpiv.reproduce import Progress, page, plots
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.lsitwin import (
     DEPTHS_D,
@@ -18,6 +20,8 @@ from lfpiv.reproduce.lsitwin import (
     PROFILE_D,
     TURBULENCE_SHARE,
     WINDOWS,
+    LightField,
+    Sheet,
     Sizes,
     Twin,
     light_field_mean,
@@ -52,14 +56,14 @@ SIZES = {
 }
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Record and measure the injector's flow both ways; see the package for the arguments."""
     require_openpiv()
     rig = experimental_rig(work.parent / "experimental_rig", scale, seed, progress)
     return compute(rig, SIZES[scale], work, seed=seed, progress=progress)
 
 
-def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress) -> dict:
+def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
     """Record and measure on a calibrated rig; every finished pair is kept in `work`."""
     require_openpiv()
     twin = Twin(sizes, seed)
@@ -69,7 +73,7 @@ def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress) -> dict:
     return _result(twin, volume, planar, profiles, work)
 
 
-def sample_profiles(twin: Twin, volume: dict, planar: list[dict]) -> dict[str, np.ndarray]:
+def sample_profiles(twin: Twin, volume: LightField, planar: Sequence[Sheet]) -> dict[str, np.ndarray]:
     """Mean in-plane velocity along y at x/D = 0.2 in every plane [m/s], shape (plane, y, 2).
 
     Returns
@@ -89,21 +93,22 @@ def sample_profiles(twin: Twin, volume: dict, planar: list[dict]) -> dict[str, n
             :, :, 0, :2
         ],
     }
-    sampled |= {name: [] for name in ("planar", "planar_windows", "recorded", "mean")}
+    planes: dict[str, list[np.ndarray]] = {name: [] for name in ("planar", "planar_windows", "recorded", "mean")}
     for depth, plane in zip(twin.depths_mm, planar, strict=True):
         points = np.stack([np.full_like(y_mm, twin.profile_x_mm), y_mm, np.full_like(y_mm, depth)], axis=1)
         instants = [twin.instant(pair)(points) for pair in range(twin.sizes.pairs)]
-        sampled["recorded"].append(np.mean(instants, axis=0)[:, :2])
-        sampled["mean"].append(twin.mean(points)[:, :2])
+        planes["recorded"].append(np.mean(instants, axis=0)[:, :2])
+        planes["mean"].append(twin.mean(points)[:, :2])
         sheet = RegularGridInterpolator((plane["y_mm"], plane["x_mm"]), plane["displacement_mm"])
-        sampled["planar"].append(sheet(points[:, 1::-1]))
+        planes["planar"].append(sheet(points[:, 1::-1]))
         near_x = np.abs(plane["x_mm"] - twin.profile_x_mm) <= half[0]
         near_y = [np.abs(plane["y_mm"] - y) <= half[1] for y in y_mm]
-        sampled["planar_windows"].append(
-            [np.nanmean(plane["displacement_mm"][rows][:, near_x], axis=(0, 1)) for rows in near_y]
+        planes["planar_windows"].append(
+            np.array([np.nanmean(plane["displacement_mm"][rows][:, near_x], axis=(0, 1)) for rows in near_y])
         )
+    sampled |= {name: np.array(values) for name, values in planes.items()}
     to_m_s = 1 / 1000 / twin.dt_s
-    return {"y_mm": y_mm} | {name: to_m_s * np.array(values) for name, values in sampled.items()}
+    return {"y_mm": y_mm} | {name: to_m_s * values for name, values in sampled.items()}
 
 
 def _along(twin: Twin, axes_mm: list[np.ndarray], field: np.ndarray) -> np.ndarray:
@@ -125,21 +130,29 @@ def relative_error(values: np.ndarray, reference: np.ndarray) -> float:
     return float(np.abs(values - reference)[good].mean() / np.abs(reference)[good].mean())
 
 
-def error_by_pairs(twin: Twin, volume: dict, reference: np.ndarray) -> dict[str, list]:
+class ByPairs(TypedDict):
+    """What `error_by_pairs` returns."""
+
+    pairs: list[int]
+    error: list[list[float]]
+    chance: list[list[float]]
+
+
+def error_by_pairs(twin: Twin, volume: LightField, reference: np.ndarray) -> ByPairs:
     """Error of the profiles' average over more and more pairs, against the truth in the same windows.
 
     Parameters
     ----------
     twin : Twin
         Where the profiles are.
-    volume : dict
+    volume : LightField
         From `light_field_mean`.
     reference : ndarray, shape (plane, y, 2)
         What the errors are relative to: its mean magnitude [m/s].
 
     Returns
     -------
-    dict of list
+    ByPairs
         ``pairs``; for each ``error``, mean distance of the average of the first pairs, for (u, v); ``chance``: what
         their scatter from pair to pair lets expect, sqrt(2 / pi) of the standard error, were there no bias.
     """
@@ -156,7 +169,9 @@ def error_by_pairs(twin: Twin, volume: dict, reference: np.ndarray) -> dict[str,
     }
 
 
-def _result(twin: Twin, volume, planar, profiles, work: Path) -> dict:
+def _result(
+    twin: Twin, volume: LightField, planar: Sequence[Sheet], profiles: Mapping[str, np.ndarray], work: Path
+) -> dict[str, Any]:
     sizes = twin.sizes
     pairs = {
         "planar": ("light_field", "planar"),
@@ -180,7 +195,7 @@ def _result(twin: Twin, volume, planar, profiles, work: Path) -> dict:
     voxel = [float(np.nanmean(np.abs(off[..., axis]))) / 0.1 for axis in range(3)]
     _draw_profiles(twin, profiles, work / "fig22.png")
     _draw_planes(twin, volume, planar, work / "fig20_21.png")
-    measured = {f"error_{name}": errors[name]["planar"] for name in "uv"}
+    measured: dict[str, float] = {f"error_{name}": errors[name]["planar"] for name in "uv"}
     by_pairs = error_by_pairs(twin, volume, profiles["recorded"])
     measured |= {f"error_{name}_{key}": errors[name][key] for name in "uv" for key in pairs if key != "planar"}
     instants = "the same instants" if sizes.same_instants else "other instants"
@@ -259,7 +274,9 @@ def _result(twin: Twin, volume, planar, profiles, work: Path) -> dict:
                 "columns": ["pairs", "u", "u by chance", "v", "v by chance"],
                 "rows": [
                     [count, error[0], chance[0], error[1], chance[1]]
-                    for count, error, chance in zip(*by_pairs.values(), strict=True)
+                    for count, error, chance in zip(
+                        by_pairs["pairs"], by_pairs["error"], by_pairs["chance"], strict=True
+                    )
                 ],
             },
         ],
@@ -290,7 +307,7 @@ def _result(twin: Twin, volume, planar, profiles, work: Path) -> dict:
     )
 
 
-def _about_errors(twin: Twin, errors, by_pairs) -> str:
+def _about_errors(twin: Twin, errors: Mapping[str, Mapping[str, float]], by_pairs: ByPairs) -> str:
     """Say how much of the error is smoothing, chance and bias."""
     edge = " x ".join(f"{edge:g}" for edge in window_mm(twin))
     parts = []
@@ -318,7 +335,7 @@ def _about_errors(twin: Twin, errors, by_pairs) -> str:
     )
 
 
-def _draw_profiles(twin: Twin, profiles, path: Path) -> None:
+def _draw_profiles(twin: Twin, profiles: Mapping[str, np.ndarray], path: Path) -> None:
     drawn = plots.figure(9, 3.6)
     axes = drawn.subplots(1, 2, sharey=True)
     height = (profiles["y_mm"] - twin.outlet_mm[1]) / DIAMETER_MM
@@ -338,7 +355,7 @@ def _draw_profiles(twin: Twin, profiles, path: Path) -> None:
     plots.save(drawn, path)
 
 
-def _draw_planes(twin: Twin, volume, planar, path: Path) -> None:
+def _draw_planes(twin: Twin, volume: LightField, planar: Sequence[Sheet], path: Path) -> None:
     drawn = plots.figure(9, 6.4)
     axes = drawn.subplots(2, 3, sharex=True, sharey=True)
     to_m_s = 1 / 1000 / twin.dt_s

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
+import xarray as xr
 
 import lfpiv
 from lfpiv.calibration import warn_outside
 from lfpiv.flows import SwirlingJet
-from lfpiv.reproduce import store
+from lfpiv.reproduce import Progress, store
 from lfpiv.reproduce.planarpiv import SheetCamera, correlate_frames, sheet_images
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, reconstruct_images, recorded_images, true_field, volume_grid
 from lfpiv.rig import Grid
@@ -19,6 +21,7 @@ from lfpiv.scene import Noise
 from lfpiv.settings import Correlation, Smart
 from lfpiv.simulate import LEAST_INTENSITY
 from lfpiv.turbulence import Turbulence, TurbulentFlow
+from lfpiv.weights import Weights
 from lfpiv_kernels import render
 
 DIAMETER_MM = 34.0
@@ -79,7 +82,7 @@ class Twin:
     seed: int
 
     @property
-    def settings(self) -> dict:
+    def settings(self) -> dict[str, Any]:
         """What a pair's measurement depends on, beside the rig."""
         return {
             "seed": self.seed,
@@ -124,6 +127,32 @@ class Twin:
         return TurbulentFlow(self.mean, turbulence.realisation(seed=(self.seed, stream, number)))
 
 
+class LightField(TypedDict):
+    """Mean of the light field's vectors; arrays (z, y, x), components (x, y, z) last [mm]."""
+
+    axes_mm: list[np.ndarray]
+    """Middles of the windows along z, y, x."""
+    displacement_mm: np.ndarray
+    """Mean displacement, shape (z, y, x, 3)."""
+    truth_mm: np.ndarray
+    """The true one over the windows, shape (z, y, x, 3)."""
+    departures_mm: np.ndarray
+    """What each pair measured less its truth, shape (pair, z, y, x, 3); NaN where not valid."""
+    valid: float
+    """Part of the vectors."""
+
+
+class Sheet(TypedDict):
+    """Mean of planar PIV's vectors at one depth."""
+
+    y_mm: np.ndarray
+    x_mm: np.ndarray
+    displacement_mm: np.ndarray
+    """Over the light field's time between frames, shape (y, x, 2)."""
+    valid: float
+    """Part of the vectors."""
+
+
 def particle_frames(rig: Rig, twin: Twin, pair: int) -> list[dict[str, np.ndarray]]:
     """Both frames of a pair as the cameras record them: camera -> image (rows, columns), 12 bits with noise."""
     size = LIT * np.array(twin.sizes.volume_mm)
@@ -148,14 +177,16 @@ def particle_frames(rig: Rig, twin: Twin, pair: int) -> list[dict[str, np.ndarra
     ]
 
 
-def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Callable[[str, float], None]) -> dict:
+def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Progress) -> LightField:
     """Mean vectors of all pairs, the true ones over their windows, each pair's departure from these, and the axes."""
     grid = volume_grid(twin.sizes.volume_mm)
-    weights, total, departures = None, None, []
+    weights: Weights | None = None
+    total: tuple[np.ndarray, ...] = ()
+    departures = []
     for pair in range(twin.sizes.pairs):
         progress("light-field PIV", pair / twin.sizes.pairs)
 
-        def measure(pair=pair) -> dict[str, np.ndarray]:
+        def measure(pair: int = pair) -> dict[str, np.ndarray]:
             nonlocal weights
             if weights is None:  # once for all pairs, and not at all where these are done
                 warn_outside(rig.calibration, grid)
@@ -169,7 +200,7 @@ def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Callable[[str, 
         found = store.kept_arrays(work / "light_field" / f"pair_{pair:04d}.npz", twin.settings, measure)
         usable = np.where(found["valid"][..., None], found["displacement_mm"], np.nan)
         terms = np.nan_to_num(usable), np.isfinite(usable[..., 0]).astype(int), found["truth_mm"]
-        total = terms if total is None else tuple(a + b for a, b in zip(total, terms, strict=True))
+        total = tuple(a + b for a, b in zip(total, terms, strict=True)) if total else terms
         departures.append((usable - found["truth_mm"]).astype(np.float32))
     displacement, count, truth = total
     return {
@@ -183,10 +214,11 @@ def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Callable[[str, 
 
 def window_mm(twin: Twin) -> tuple[float, float, float]:
     """Edges (x, y, z) of the light field's last windows [mm]."""
-    return tuple(min(WINDOWS[-1] * VOXEL_MM, edge) for edge in twin.sizes.volume_mm)
+    x, y, z = (min(WINDOWS[-1] * VOXEL_MM, edge) for edge in twin.sizes.volume_mm)
+    return x, y, z
 
 
-def _measure(volumes, twin: Twin, grid: Grid, pair: int) -> dict[str, np.ndarray]:
+def _measure(volumes: Sequence[xr.DataArray], twin: Twin, grid: Grid, pair: int) -> dict[str, np.ndarray]:
     settings = Correlation(windows=WINDOWS).model_dump()
     vectors = lfpiv.correlate(*volumes, dt_s=twin.dt_s, **settings)
     displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "xyz"], axis=-1)
@@ -198,22 +230,23 @@ def _measure(volumes, twin: Twin, grid: Grid, pair: int) -> dict[str, np.ndarray
     }
 
 
-def planar_mean(twin: Twin, work: Path, progress: Callable[[str, float], None]) -> list[dict]:
+def planar_mean(twin: Twin, work: Path, progress: Progress) -> list[Sheet]:
     """Mean vectors of planar PIV at each depth, displacement over the light field's time between frames."""
     sizes, (x, y, _) = twin.sizes, twin.outlet_mm
     if sizes.field_mm is None:
-        half = np.array(sizes.volume_mm[:2]) / 2 + PLANAR_MARGIN_MM
-        field = (tuple(-half), tuple(half))
+        half_x, half_y = (edge / 2 + PLANAR_MARGIN_MM for edge in sizes.volume_mm[:2])
+        field = (-half_x, -half_y), (half_x, half_y)
     else:
-        field = tuple((corner[0] + x, corner[1] + y) for corner in sizes.field_mm)
+        (left, bottom), (right, top) = sizes.field_mm
+        field = (left + x, bottom + y), (right + x, top + y)
     camera = SheetCamera(axis_mm=(x, y + 15.0))  # the middle of a field 30 mm high
-    planes = []
+    planes: list[Sheet] = []
     for depth in twin.depths_mm:
-        total = None
+        total: tuple[np.ndarray, ...] = ()
         for pair in range(sizes.planar_pairs):
             progress(f"planar PIV at z = {depth:.1f} mm", pair / sizes.planar_pairs)
 
-            def measure(pair=pair, depth=depth) -> dict[str, np.ndarray]:
+            def measure(pair: int = pair, depth: float = depth) -> dict[str, np.ndarray]:
                 flow = twin.instant(pair, planar=True)
                 frames = sheet_images(
                     camera,
@@ -229,7 +262,7 @@ def planar_mean(twin: Twin, work: Path, progress: Callable[[str, float], None]) 
             found = store.kept_arrays(work / "planar" / name, twin.settings, measure)
             good = np.isfinite(found["displacement_mm"][..., 0])
             terms = np.nan_to_num(found["displacement_mm"]), good.astype(int)
-            total = terms if total is None else tuple(a + b for a, b in zip(total, terms, strict=True))
+            total = tuple(a + b for a, b in zip(total, terms, strict=True)) if total else terms
         displacement, count = total
         planes.append(
             {

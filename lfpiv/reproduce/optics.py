@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 import lfpiv
 from lfpiv.calibration import Calibration
-from lfpiv.reproduce import bench, page, plots, rigs
-from lfpiv.reproduce.bench import DEFAULT, Bench
-from lfpiv.scene import true_mapping
+from lfpiv.reproduce import Progress, bench, page, plots, rigs
+from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
+from lfpiv.scene import Scene, true_mapping
 
 TITLE = "Real optics: where ray tracing fails and the network does not"
 
@@ -77,6 +78,8 @@ CORRELATED = ("network", "drt")
 NAMES = {"network": "network", "fitted": "fitted thin lens", "drt": "DRT", "truth": "true particles"}
 NAMES |= {"labels": "the dots' own rays"}
 COLOURS = {"network": plots.COLOURS["network"], "fitted": plots.COLOURS["sieve"], "drt": plots.COLOURS["drt"]}
+RayErrors = dict[str, dict[str, float]]
+"""Mapping, or "labels" -> "mean" and "largest" distance from the true rays [pitch]."""
 SMALLEST_PITCH = 2e-4
 """Lowest ray error shown [pitch]: DRT's through ideal optics is none."""
 FURTHER = 1.5
@@ -85,18 +88,18 @@ SLICE_VOXEL = 2
 """Thickness of the slices that are shown [voxel]."""
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Calibrate through every optics and measure through some; see the package for the arguments."""
     return compute(scale, work, OPTICS, seed=seed, progress=progress)
 
 
-def compute(scale: str, work: Path, optics: Mapping[str, Optics], *, seed: int, progress) -> dict:
+def compute(scale: str, work: Path, optics: Mapping[str, Optics], *, seed: int, progress: Progress) -> dict[str, Any]:
     """Do it for some optics."""
     size = bench.SIZE_MM[scale]
     errors, judged, shown = {}, {}, {}
     for done, (key, one) in enumerate(optics.items()):
 
-        def step(what: str, fraction: float, done=done, one=one) -> None:
+        def step(what: str, fraction: float, done: int = done, one: Optics = one) -> None:
             progress(f"{one.short.replace(chr(10), ' ')}: {what}", (done + fraction) / len(optics))
 
         rig = rigs.calibrated_rig(optics_scene(scale, seed, one), work / key / "rig", step)
@@ -119,10 +122,10 @@ def compute(scale: str, work: Path, optics: Mapping[str, Optics], *, seed: int, 
     return _result(optics, errors, judged, size)
 
 
-def optics_scene(scale: str, seed: int, optics: Optics):
+def optics_scene(scale: str, seed: int, optics: Optics) -> Scene:
     """Scene of cameras exactly at their angles behind some optics: two, or one where only its rays are compared."""
     cameras = {"left": ANGLE_DEG, "right": -ANGLE_DEG} if optics.measured else {"left": ANGLE_DEG}
-    tables: dict[str, dict] = {name: {"nominal_angle_deg": angle} for name, angle in cameras.items()}
+    tables: dict[str, dict[str, Any]] = {name: {"nominal_angle_deg": angle} for name, angle in cameras.items()}
     if optics.water:
         for name, angle in cameras.items():
             towards = np.array([np.sin(np.radians(angle)), 0.0, np.cos(np.radians(angle))])
@@ -152,13 +155,18 @@ def _label_errors(rig: rigs.Rig) -> dict[str, float]:
     """Mean and largest distance of the dots' rays from the true ones, worst camera [pitch]."""
     errors = []
     for camera in rig.scene.camera:
-        dots = rig.calibration.cameras[camera.name].dots
+        dots = rig.labels(camera.name)
         miss = dots.array_mm - true_mapping(camera)(dots.points_mm, dots.pupil_mm)
         errors.append(np.linalg.norm(miss, axis=1) / camera.microlens_pitch_mm)
     return {"mean": max(float(e.mean()) for e in errors), "largest": max(float(e.max()) for e in errors)}
 
 
-def _result(optics, errors, judged, size) -> dict:
+def _result(
+    optics: Mapping[str, Optics],
+    errors: Mapping[str, RayErrors],
+    judged: Mapping[tuple[str, str], Judged],
+    size: tuple[float, float, float],
+) -> dict[str, Any]:
     measured = [key for key, one in optics.items() if one.measured]
     rows = []
     for key in optics:
@@ -231,7 +239,7 @@ def _result(optics, errors, judged, size) -> dict:
     )
 
 
-def _about_fits(optics, errors) -> list[str]:
+def _about_fits(optics: Mapping[str, Optics], errors: Mapping[str, RayErrors]) -> list[str]:
     """Say where the fitted thin lens is worse than the nominal one."""
     lost = [
         one.label
@@ -246,7 +254,7 @@ def _about_fits(optics, errors) -> list[str]:
     ]
 
 
-def _about_pair(optics: Optics, judged) -> str:
+def _about_pair(optics: Optics, judged: Mapping[str, Judged]) -> str:
     network, drt = judged["network"], judged["drt"]
     parts = ", ".join(
         f"{axis} {drt.error.mean_absolute[k]:.3f} against {network.error.mean_absolute[k]:.3f}"
@@ -259,7 +267,12 @@ def _about_pair(optics: Optics, judged) -> str:
     )
 
 
-def _draw(optics, errors, judged, path: Path) -> None:
+def _draw(
+    optics: Mapping[str, Optics],
+    errors: Mapping[str, RayErrors],
+    judged: Mapping[tuple[str, str], Judged],
+    path: Path,
+) -> None:
     measured = [key for key, one in optics.items() if one.measured]
     drawn = plots.figure(11, 3.4)
     axes = drawn.subplots(1, 1 + len(measured), width_ratios=(1.9, *(1.0,) * len(measured)), squeeze=False)[0]
@@ -288,7 +301,7 @@ def _draw(optics, errors, judged, path: Path) -> None:
     plots.save(drawn, path)
 
 
-def _draw_slices(optics, shown, path: Path) -> None:
+def _draw_slices(optics: Mapping[str, Optics], shown: Mapping[tuple[str, str], xr.DataArray], path: Path) -> None:
     measured = [key for key, one in optics.items() if one.measured]
     drawn = plots.figure(8, 3.4 * max(1, len(measured)))
     columns = ("truth", *CORRELATED)

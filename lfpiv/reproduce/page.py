@@ -32,14 +32,14 @@ def compare(
 
     Without `at_most` and `at_least` there is no goal, and ``reached`` is null.
     """
-    goal, reached = None, None
-    if at_most is not None or at_least is not None:
-        measured = ours is not None and ours == ours
-        bounds = [(at_most, "<=", measured and at_most is not None and ours <= at_most)]
-        bounds += [(at_least, ">=", measured and at_least is not None and ours >= at_least)]
-        bounds = [bound for bound in bounds if bound[0] is not None]
-        goal = ", ".join(f"{sign} {bound:g}" for bound, sign, _ in bounds)
-        reached = all(bool(good) for _, _, good in bounds)
+    goals, met = [], True
+    if at_most is not None:
+        goals.append(f"<= {at_most:g}")
+        met = met and ours is not None and bool(ours <= at_most)
+    if at_least is not None:
+        goals.append(f">= {at_least:g}")
+        met = met and ours is not None and bool(ours >= at_least)
+    goal, reached = (", ".join(goals), met) if goals else (None, None)
     return {"what": what, "ours": ours, "paper": paper, "goal": goal, "reached": reached, "unit": unit}
 
 

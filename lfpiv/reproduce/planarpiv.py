@@ -136,7 +136,7 @@ def _draw(column: np.ndarray, row: np.ndarray, light: np.ndarray, sigma: float, 
     column, row, light = column[inside], row[inside], light[inside]
     offset = np.arange(-reach, reach + 1)
 
-    def shares(at):
+    def shares(at: np.ndarray) -> np.ndarray:
         edge = np.floor(at)[:, None] + np.append(offset, reach + 1) - at[:, None]
         return np.diff(ndtr(edge / sigma), axis=1)
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from pathlib import Path
 
 import matplotlib
 import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -41,14 +45,14 @@ def figure(width: float, height: float) -> Figure:
     return drawn
 
 
-def plain(axes) -> None:
+def plain(axes: Axes) -> None:
     """Leave two spines and a faint grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#e6e9ec", linewidth=0.6)
     axes.set_axisbelow(True)
 
 
-def plain_log(axis, values) -> None:
+def plain_log(axis: Axis, values: Iterable[float]) -> None:
     """Mark the values that a logarithmic axis (`Axes.xaxis`, `Axes.yaxis`) reaches, as plain numbers."""
     low, high = sorted(axis.get_view_interval())
     shown = [value for value in values if low <= value <= high]
@@ -56,7 +60,7 @@ def plain_log(axis, values) -> None:
     axis.set_ticks([], minor=True)
 
 
-def draw_slice(axes, volume, voxels: int, title: str) -> None:
+def draw_slice(axes: Axes, volume: xr.DataArray, voxels: int, title: str) -> None:
     """Draw a volume's brightest voxels in a slice about its middle y, x down and z to the right [mm]."""
     middle = volume.sizes["y"] // 2
     slab = volume.values[:, max(0, middle - voxels // 2) : middle + (voxels + 1) // 2].max(1)

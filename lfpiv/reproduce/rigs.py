@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 import lfpiv
 from lfpiv import metrics
+from lfpiv.board import BoardDots
 from lfpiv.calibration import Calibration
 from lfpiv.experiment import Experiment
 from lfpiv.flows import Ring, window_mean
@@ -75,7 +77,14 @@ class Rig:
     experiment: Experiment
     calibration: Calibration
 
-    def weights(self, grid: Grid, mapping: str, progress: Callable[[float], None] | None = None):
+    def labels(self, name: str) -> BoardDots:
+        """Labels that a camera was calibrated with."""
+        dots = self.calibration.cameras[name].dots
+        if dots is None:
+            raise ValueError(f"{name}: expected a camera calibrated from a board, got one without dots.")
+        return dots
+
+    def weights(self, grid: Grid, mapping: str, progress: Callable[[float], None] | None = None) -> Weights:
         """Weights of a grid by "network", or by direct ray tracing with a key of `TURNED_DEG`."""
         calibration = self.calibration if mapping == "network" else self.ray_tracing(mapping)
         return lfpiv.build_weights(calibration, grid, progress=progress)
@@ -270,16 +279,18 @@ def reconstruct_images(
     for name, camera in weights.cameras.items():
         level, noise[name] = camera.decoder.background(images[name])
         light[name] = images[name] - np.float32(level)
-    return lfpiv.reconstruct(weights, light, floor=noise if floor is None else floor, first=first, **smart.model_dump())
+    return lfpiv.reconstruct(
+        weights, light, floor=noise if floor is None else floor, first=first, **smart.of_one_frame()
+    )
 
 
-def truth(positions_mm: np.ndarray, grid: Grid):
+def truth(positions_mm: np.ndarray, grid: Grid) -> xr.DataArray:
     """Draw the blobs on the voxels."""
     return metrics.truth_volume(positions_mm, None, grid, BLOB_VOXEL)
 
 
 def true_field(
-    flow: Callable[[np.ndarray], np.ndarray], axes_mm: list[np.ndarray], edge_mm: float | tuple[float, float, float]
+    flow: Callable[[np.ndarray], np.ndarray], axes_mm: Sequence[ArrayLike], edge_mm: float | tuple[float, float, float]
 ) -> np.ndarray:
     """Mean displacement of a flow over windows centred on axes (z, y, x) [mm], shape (z, y, x, 3) [mm].
 

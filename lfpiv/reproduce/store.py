@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lfpiv.errors import InputError
 
@@ -62,7 +63,7 @@ def kept(path: Path, settings: Mapping[str, Any], compute: Callable[[], Any]) ->
 
 
 def kept_arrays(
-    path: Path, settings: Mapping[str, Any], compute: Callable[[], Mapping[str, np.ndarray]]
+    path: Path, settings: Mapping[str, Any], compute: Callable[[], Mapping[str, ArrayLike]]
 ) -> dict[str, np.ndarray]:
     """Return the named arrays of `compute`, from the .npz file where they were computed with the same settings."""
     text = json.dumps(jsonable(settings), sort_keys=True)
@@ -73,8 +74,9 @@ def kept_arrays(
     arrays = {name: np.asarray(value) for name, value in compute().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    named: dict[str, Any] = {"settings": text, **arrays}
     with scratch.open("wb") as file:
-        np.savez_compressed(file, settings=text, **arrays)
+        np.savez_compressed(file, **named)
     os.replace(scratch, path)
     return arrays
 

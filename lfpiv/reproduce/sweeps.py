@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from lfpiv.reproduce import bench, page, plots
+from lfpiv.reproduce import Progress, bench, page, plots
 from lfpiv.reproduce.bench import DEFAULT, Bench, Judged, Pair
 
 TITLE = "Noise and seeding"
@@ -14,19 +16,23 @@ PPM = {"small": (0.05, 0.2, 0.5, 1.0, 2.0), "paper": (0.02, 0.05, 0.1, 0.2, 0.5,
 """Seeding, at the bench's exposure."""
 COUNTS = {"small": (300.0, 30.0, 8.0, 2.5), "paper": (300.0, 100.0, 30.0, 15.0, 8.0, 4.0, 2.5)}
 """Level of a pixel lit by one particle [count], at the bench's seeding; the noise stays as it is."""
+Told = dict[str, float]
+"""What the images of a run were like; see `Bench.volumes`."""
 AXES = {"x": "#2f81d6", "y": "#2ca36b", "z": "#e0762a"}
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Measure pairs of every seeding and every exposure; see the package for the arguments."""
     own = bench.open_bench(work.parent / "bench", scale, seed, progress)
     return compute(own, PPM[scale], COUNTS[scale], work, progress=progress)
 
 
-def compute(own: Bench, ppms: tuple[float, ...], counts: tuple[float, ...], work: Path, *, progress) -> dict:
+def compute(
+    own: Bench, ppms: tuple[float, ...], counts: tuple[float, ...], work: Path, *, progress: Progress
+) -> dict[str, Any]:
     """Measure on a calibrated bench with two cameras."""
     pairs = [replace(DEFAULT, ppm=ppm) for ppm in ppms] + [replace(DEFAULT, counts=level) for level in counts]
-    judged: dict[Pair, tuple[Judged, dict[str, float]]] = {}
+    judged: dict[Pair, tuple[Judged, Told]] = {}
     truth: dict[Pair, Judged] = {}
     for done, pair in enumerate(pairs):
         progress(f"{pair.ppm:g} ppm, {pair.counts:g} counts", done / len(pairs))
@@ -135,12 +141,12 @@ def compute(own: Bench, ppms: tuple[float, ...], counts: tuple[float, ...], work
     )
 
 
-def _electrons(told: dict[str, float]) -> int:
+def _electrons(told: Told) -> int:
     """Electrons of a particle, to what is worth reading."""
     return int(float(f"{told['electrons']:.2g}"))
 
 
-def _about_saturation(seeding) -> list[str]:
+def _about_saturation(seeding: Sequence[tuple[float, Judged, Told, Judged]]) -> list[str]:
     clipped = [(ppm, told["saturated"]) for ppm, _, told, _ in seeding if told["saturated"] > 1e-4]
     if not clipped:
         return []
@@ -148,7 +154,9 @@ def _about_saturation(seeding) -> list[str]:
     return [f"The exposure is the same for every seeding, so some pixels saturate: {text}."]
 
 
-def _draw(seeding, noise, path: Path) -> None:
+def _draw(
+    seeding: Sequence[tuple[float, Judged, Told, Judged]], noise: Sequence[tuple[float, Judged, Told]], path: Path
+) -> None:
     drawn = plots.figure(8.5, 5.2)
     (error_by_ppm, error_by_snr), (q_by_ppm, q_by_snr) = drawn.subplots(2, 2, sharex="col", sharey="row")
     for number, (axis, colour) in enumerate(AXES.items()):

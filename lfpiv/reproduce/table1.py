@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lfpiv.board import BoardDots, DotBoard, measure_board
 from lfpiv.calibration import MODEL_ERROR_PITCH
 from lfpiv.network import sigma_nor, train
-from lfpiv.reproduce import page, plots, store
+from lfpiv.reproduce import Progress, page, plots, store
 from lfpiv.reproduce.rigs import Rig, numerical_rig
 from lfpiv.reproduce.trainers import bayesian_regularisation, gradient_descent
 from lfpiv.scene import true_mapping
@@ -46,6 +49,11 @@ TRUE_RAYS = 20_000
 PROBE_SEED = 11
 """Number of the random stream of those rays; other cases draw from others."""
 
+Fit = dict[str, Any]
+"""What `fit` tells of a network, or an entry of the shallow ones: JSON-able."""
+Deep = dict[str, dict[int, list[Fit]]]
+"""Trainer -> hidden layers -> the cameras' fits."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
@@ -69,22 +77,20 @@ SIZES = {
 }
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Train all networks; see the package for the arguments."""
     rig = numerical_rig(work.parent / "rig", scale, seed, progress)
     return compute(rig, SIZES[scale], work, seed=seed, progress=progress)
 
 
-def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress) -> dict:
+def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
     """Train all networks on a rig's labels; each finished one is kept in `work`."""
     cameras = list(rig.calibration.cameras)
-    labels = {name: {"lens_integral": rig.calibration.cameras[name].dots} for name in cameras}
-    for name in cameras:
-        labels[name]["gaussian"] = _gaussian_labels(rig, name)
+    labels = {name: {"lens_integral": rig.labels(name), "gaussian": _gaussian_labels(rig, name)} for name in cameras}
 
     jobs = [(trainer, layers, name) for layers in sizes.layers for trainer in TRAINERS for name in cameras]
     cost = np.cumsum([layers**2 * (0.1 if trainer == "GDM" else 1) for trainer, layers, _ in jobs])
-    deep: dict[str, dict[int, list[dict]]] = {trainer: {layers: [] for layers in sizes.layers} for trainer in TRAINERS}
+    deep: Deep = {trainer: {layers: [] for layers in sizes.layers} for trainer in TRAINERS}
     for done, (trainer, layers, name) in enumerate(jobs):
         progress(f"{trainer}, {layers} hidden layers", float(cost[done - 1] / cost[-1]) if done else 0.0)
         epochs = sizes.descent_epochs if trainer == "GDM" else sizes.epochs
@@ -93,7 +99,8 @@ def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress) -> dict:
             store.kept(
                 work / "networks" / f"{trainer}_{layers:02d}_{name}.json",
                 settings,
-                lambda name=name, trainer=trainer, layers=layers, epochs=epochs: fit(
+                partial(
+                    fit,
                     rig,
                     name,
                     labels[name]["lens_integral"],
@@ -138,7 +145,7 @@ def fit(
     epochs: int,
     samples: int | None = None,
     seed: int,
-) -> dict:
+) -> dict[str, Any]:
     """Train one network on the labels of one camera: errors on held-out dots and against the true rays [pitch].
 
     Whole dots are held out, so the test part holds none that training saw. Labels of more than one kind count by their
@@ -199,10 +206,12 @@ def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
     )
 
 
-def _result(deep, shallow, labels, sizes: Sizes) -> dict:
+def _result(
+    deep: Deep, shallow: Sequence[Fit], labels: Mapping[str, Mapping[str, BoardDots]], sizes: Sizes
+) -> dict[str, Any]:
     cameras = list(labels)
 
-    def both(fits, key="sigma_nor"):
+    def both(fits: Sequence[Fit], key: str = "sigma_nor") -> list[float]:
         return [fit[key] for fit in fits]
 
     best = min(
@@ -340,18 +349,18 @@ def _result(deep, shallow, labels, sizes: Sizes) -> dict:
     )
 
 
-def _describe(entry) -> str:
+def _describe(entry: Fit) -> str:
     nodes = " + ".join(map(str, entry["hidden"]))
     base = "on a fitted thin lens" if entry["baseline"] == "thin_lens" else "alone"
     return f"{nodes} nodes {base}, {'Gaussian dots' if entry['estimator'] == 'gaussian' else 'integrated dots'}"
 
 
-def _parameters(hidden):
+def _parameters(hidden: Sequence[int]) -> list[int]:
     sizes = (5, *hidden, 2)
     return [(a + 1) * b for a, b in pairwise(sizes)]
 
 
-def _draw(deep, shallow, path: Path) -> None:
+def _draw(deep: Deep, shallow: Sequence[Fit], path: Path) -> None:
     drawn = plots.figure(9, 3.8)
     axes = drawn.subplots()
     for colour, (trainer, rows) in zip(("#2f81d6", "#2ca36b", "#e0762a"), deep.items(), strict=True):
@@ -361,7 +370,7 @@ def _draw(deep, shallow, path: Path) -> None:
                 layers, [np.mean([f[key] for f in rows[n]]) for n in layers], style, color=colour, label=label, ms=4
             )
         axes.plot(
-            PAPER[trainer].keys(),
+            list(PAPER[trainer]),
             [np.mean(pair) for pair in PAPER[trainer].values()],
             {"LM": "s:", "BR": "^:", "GDM": "v:"}[trainer],
             color=plots.COLOURS["paper"],

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import lfpiv
 from lfpiv.board import BoardDots
 from lfpiv.network import train
-from lfpiv.reproduce import page
+from lfpiv.reproduce import Progress, page
 from lfpiv.reproduce.rigs import Rig, numerical_rig, volume_grid
 from lfpiv.weights import compare_with_count
 from lfpiv_kernels import runtime
@@ -33,19 +35,19 @@ MATCH_TRAINING_S, MATCH_WEIGHTS_S = 60.0, 30.0
 """The goals at paper scale [s]."""
 
 
-def run(scale: str, work: Path, *, seed: int = 0, progress) -> dict:
+def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
     """Time training and weights; see the package for the arguments."""
     rig = numerical_rig(work.parent / "rig", scale, seed, progress)
     return compute(rig, scale, seed=seed, progress=progress)
 
 
-def compute(rig: Rig, scale: str, *, seed: int, progress) -> dict:
+def compute(rig: Rig, scale: str, *, seed: int, progress: Progress) -> dict[str, Any]:
     """Time training and weights on a calibrated rig. The kernels are compiled before the clock starts."""
     device = runtime.device()
-    trained = {}
+    trained: dict[str, dict[str, Any]] = {}
     for number, (name, camera) in enumerate(rig.calibration.cameras.items()):
         progress(f"training of {name}", number / 4)
-        points, pupil, array, dot = dense_labels(camera.dots, VIEWS[scale], camera.optics.pupil_radius_mm)
+        points, pupil, array, dot = dense_labels(rig.labels(name), VIEWS[scale], camera.optics.pupil_radius_mm)
         cpu = time.process_time()
         training = train(
             np.hstack([points, pupil]),
@@ -155,7 +157,7 @@ def compute(rig: Rig, scale: str, *, seed: int, progress) -> dict:
     )
 
 
-def _cpu(trained, built) -> str:
+def _cpu(trained: Mapping[str, Mapping[str, Any]], built: Mapping[str, Mapping[str, float]]) -> str:
     return f"{sum(camera['cpu_s'] for camera in trained.values()):.1f}, {built['network']['cpu_s']:.1f}"
 
 
@@ -171,7 +173,7 @@ def dense_labels(dots: BoardDots, views: int, pupil_radius_mm: float) -> tuple[n
     radius, angle = np.sqrt(number / views), np.pi * (1 + np.sqrt(5)) * number  # sunflower: evenly over the disc
     asked = PUPIL_PART * np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
-    def terms(pupil):
+    def terms(pupil: np.ndarray) -> np.ndarray:
         u, v = pupil.T
         return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
 

@@ -12,6 +12,9 @@ References
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
 
@@ -147,47 +150,51 @@ def gradient_descent(
     return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 
 
-def _packing(layers):
+def _packing(
+    layers: Sequence[np.ndarray],
+) -> tuple[Callable[[Sequence[np.ndarray]], np.ndarray], Callable[[np.ndarray], list[np.ndarray]]]:
     """Functions from layers to one vector and back."""
     shapes = [layer.shape for layer in layers]
     edges = np.cumsum([layer.size for layer in layers])[:-1]
 
-    def pack(parts):
+    def pack(parts: Sequence[np.ndarray]) -> np.ndarray:
         return np.concatenate([part.ravel() for part in parts])
 
-    def unpack(vector):
+    def unpack(vector: np.ndarray) -> list[np.ndarray]:
         return [part.reshape(shape) for part, shape in zip(np.split(vector, edges), shapes, strict=True)]
 
     return pack, unpack
 
 
-def _hyperparameters(gamma, values, squares, theta):
+def _hyperparameters(gamma: float, values: int, squares: float, theta: np.ndarray) -> tuple[float, float]:
     """Return alpha and beta of [2]_ for gamma determined parameters."""
-    return gamma / (2 * theta @ theta), (values - gamma) / (2 * squares)
+    return gamma / float(2 * theta @ theta), (values - gamma) / (2 * squares)
 
 
-def _factor(matrix, shift):
+def _factor(matrix: np.ndarray, shift: float) -> tuple[np.ndarray, bool] | None:
     """Cholesky factor of matrix + shift I, or None where rounding leaves it indefinite."""
     try:
-        return cho_factor(matrix + shift * np.eye(len(matrix)), overwrite_a=True, check_finite=False)
+        factor, lower = cho_factor(matrix + shift * np.eye(len(matrix)), overwrite_a=True, check_finite=False)
     except LinAlgError:
         return None
+    return factor, lower
 
 
-def _residual(outputs, samples):
-    return samples.weights * (samples.outputs - outputs)
+def _residual(outputs: np.ndarray, samples: Samples) -> np.ndarray:
+    residual: np.ndarray = samples.weights * (samples.outputs - outputs)
+    return residual
 
 
-def _sum_of_squares(layers, samples):
+def _sum_of_squares(layers: Sequence[np.ndarray], samples: Samples) -> float:
     residual = _residual(forward(layers, samples.inputs)[-1], samples)
     return float(np.vdot(residual, residual))
 
 
-def _rms(layers, samples):
-    return np.sqrt(_sum_of_squares(layers, samples) / samples.outputs.size)
+def _rms(layers: Sequence[np.ndarray], samples: Samples) -> float:
+    return math.sqrt(_sum_of_squares(layers, samples) / samples.outputs.size)
 
 
-def _gradient(layers, samples):
+def _gradient(layers: Sequence[np.ndarray], samples: Samples) -> list[np.ndarray]:
     """Gradient of the mean squared error by the layers, by backpropagation."""
     outputs = forward(layers, samples.inputs)
     residual = _residual(outputs[-1], samples)
