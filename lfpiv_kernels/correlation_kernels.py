@@ -31,6 +31,7 @@ VECTORS = """
     const int width = 1, group = 1;
     auto load = [](const float* p) { return *p; };
     auto store = [](float* p, V v) { *p = v; };
+    auto stream = [](float* p, V v) { *p = v; };
     auto any = [](M m) { return m != 0; };
     auto value = [](V v, int k) { return v; };
     auto at = [](M m, int k) { return m; };
@@ -47,6 +48,7 @@ VECTORS = """
     const int group = 16;
     auto load = [](const float* p) { return (V)*(const U*)p; };
     auto store = [](float* p, V v) { *(U*)p = v; };
+    auto stream = [](float* p, V v) { __builtin_nontemporal_store(v, (V*)p); };  // aligned, past the caches
     auto any = [](M m) { return __builtin_reduce_or(m) != 0; };
     auto value = [](V v, int k) { return v[k]; };
     auto at = [](M m, int k) { return m[k]; };
@@ -57,8 +59,8 @@ VECTORS = """
 _BLOCK = (
     VECTORS
     + """
-    const int bz = products > 0 ? 1 : block[0], by = block[1], bx = block[2], ny = lags[1], nx = lags[2];
-    const int ey = by + ny - 1, ex = bx + nx - 1, shared_pitch = (ny * nx + 2) / 3 * 3;
+    const int bz = block[0], by = block[1], bx = block[2], ny = lags[1], nx = lags[2];
+    const int ey = by + ny - 1, ex = bx + nx - 1;
 #if defined(__CUDA_ARCH__)
     const float* a0 = first.data + lane;
     const float* b0 = second.data + lane;
@@ -94,7 +96,7 @@ _BLOCK = (
     auto tap_at = [&](const float* row, int x) { return load(row + x * group); };
     auto lag_at = [&](const float* row, int x) { return load(row + x * group); };
 #endif
-    const int64_t out_pitch = products > 0 ? group : sum_pitch;
+    const int64_t out_pitch = sum_pitch;
     auto multiply = [&](auto& total, auto& tap, const float* row, const float* beside, int x, int lag) {
         constexpr int T = sizeof(total) / sizeof(V), C = sizeof(tap) / sizeof(V);
         #pragma unroll
@@ -139,39 +141,6 @@ CASES
         }
     };
 #if !defined(__CUDA_ARCH__)
-    if (products > 0) {
-        float* part = near + (int64_t)ey * ex * group;
-        for (int r = 0; r < products; ++r) {
-            gather_taps(r);
-            gather(r, 0);
-            plane(0, part + (int64_t)r * shared_pitch * group);
-        }
-        for (int k = 0; k < group; k += width) for (int lag = 0; lag < ny * nx; lag += 3) {
-            const int some = ny * nx - lag < 3 ? ny * nx - lag : 3;
-            for (int z = 0; z < lags[0]; z += 6) {
-                V total[6][3];
-                #pragma unroll
-                for (int j = 0; j < 18; ++j) total[j / 3][j % 3] = V{};
-                const float* from = part + (int64_t)lag * group + k;
-                for (int r = 0; r < products; ++r, from += (int64_t)shared_pitch * group) {
-                    V v[3];
-                    #pragma unroll
-                    for (int j = 0; j < 3; ++j) v[j] = load(from + j * group);
-                    #pragma unroll
-                    for (int i = 0; i < 6; ++i) {
-                        const float weight = inverse.data[r * inverse_pitch + z + i];
-                        #pragma unroll
-                        for (int j = 0; j < 3; ++j) total[i][j] += weight * v[j];
-                    }
-                }
-                for (int i = 0; i < 6 && z + i < lags[0]; ++i) for (int j = 0; j < some; ++j) {
-                    const int64_t row = sum_row + (int64_t)(z + i) * ny * nx + lag + j;
-                    store(sum_out.data + row * sum_pitch + lane + k, total[i][j]);
-                }
-            }
-        }
-        return;
-    }
     gather_taps(0);
     for (int z = lag_begin; z < lag_begin + bz - 1; ++z) gather(z, z % bz);
 #endif
@@ -191,90 +160,6 @@ CASES
 )
 
 
-_TRANSFORM = (
-    VECTORS
-    + """
-    auto combine = [&](auto& v, int64_t e, int r) {
-        constexpr int C = sizeof(v) / sizeof(V);
-        V total[6][C];
-        #pragma unroll
-        for (int i = 0; i < 6 * C; ++i) total[i / C][i % C] = V{};
-        const float* from = volume.data + plane * pitch + e;
-        for (int k = 0; k < terms; ++k, from += pitch) {
-            #pragma unroll
-            for (int c = 0; c < C; ++c) v[c] = load(from + c * width);
-            #pragma unroll
-            for (int i = 0; i < 6; ++i) {
-                const float weight = matrix.data[k * matrix_pitch + r + i];
-                #pragma unroll
-                for (int c = 0; c < C; ++c) total[i][c] += weight * v[c];
-            }
-        }
-        #pragma unroll
-        for (int i = 0; i < 6; ++i) if (r + i < rows)
-            #pragma unroll
-            for (int c = 0; c < C; ++c) store(plane_out.data + (out + r + i) * pitch + e + c * width, total[i][c]);
-    };
-    for (int r = 0; r < rows; r += 6) {
-        int64_t e = begin;
-        for (; e + 4 * width <= end; e += 4 * width) { V v[4]; combine(v, e, r); }
-        for (; e < end; e += width) { V v[1]; combine(v, e, r); }
-    }
-"""
-)
-
-
-@wp.func_native(_TRANSFORM)
-def _combine(
-    volume: wp.array(dtype=float),
-    matrix: wp.array(dtype=float),
-    matrix_pitch: int,
-    terms: int,
-    rows: int,
-    plane: wp.int64,
-    pitch: wp.int64,
-    begin: wp.int64,
-    end: wp.int64,
-    out: wp.int64,
-    plane_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
-def _transform_planes(
-    # in
-    volume: wp.array(dtype=float),  # split by phase
-    matrix: wp.array(dtype=float),  # (term, row rounded up to sixes)
-    matrix_pitch: int,
-    terms: int,  # planes that are combined
-    rows: int,  # combinations of them
-    first_plane: int,  # of layer 0
-    stride: int,  # distance of layers
-    pitch: int,  # elements per plane
-    part: int,  # elements per thread, a multiple of `LANES`
-    begin: int,
-    # out
-    plane_out: wp.array(dtype=float),  # (layer, row, element)
-):
-    index = begin + wp.tid()
-    parts = (pitch + part - 1) // part
-    layer = index // parts
-    start = index % parts * part
-    _combine(
-        volume,
-        matrix,
-        matrix_pitch,
-        terms,
-        rows,
-        wp.int64(first_plane + layer * stride),
-        wp.int64(pitch),
-        wp.int64(start),
-        wp.int64(wp.min(start + part, pitch)),
-        wp.int64(layer * rows),
-        plane_out,
-    )
-
-
 @wp.func_native(_BLOCK)
 def _sum_products(
     first: wp.array(dtype=float),
@@ -292,9 +177,6 @@ def _sum_products(
     lag_begin: int,
     lag_end: int,
     lane: int,
-    products: int,
-    inverse: wp.array(dtype=float),
-    inverse_pitch: int,
     sum_row: int,
     sum_pitch: int,
     slot: int,
@@ -322,9 +204,6 @@ def _correlate_blocks(
     groups: int,  # groups of lanes
     group: int,  # lanes of a group: `LANES` on the CPU, 1 on CUDA
     parts: int,  # parts the lags along z are cut into
-    products: int,  # planes of `_transform_planes` per layer of blocks, in both volumes; 0: voxels
-    inverse: wp.array(dtype=float),  # from products to lags along z, (product, lag)
-    inverse_pitch: int,  # lags in `inverse`: as many as there are, rounded up to sixes
     scratch_pitch: int,  # elements of scratch memory per slot
     slot: int,
     begin: int,
@@ -337,8 +216,6 @@ def _correlate_blocks(
     part = (index // groups) % parts
     layer = begin_layer + index // groups // parts
     plane = layer * stride
-    if products > 0:
-        plane = (layer - begin_layer) * products
     _sum_products(
         first,
         second,
@@ -355,9 +232,6 @@ def _correlate_blocks(
         part * lags[0] // parts,
         (part + 1) * lags[0] // parts,
         lane,
-        products,
-        inverse,
-        inverse_pitch,
         (layer % ring) * lags[0] * lags[1] * lags[2],
         groups * group,
         slot,

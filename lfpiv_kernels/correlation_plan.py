@@ -11,15 +11,18 @@ import scipy.fft
 
 from . import runtime
 from .correlation_kernels import LANES
+from .spectral_kernels import ROWS
 
 METHODS = ("auto", "direct", "fft")
+GROUP = 32
+"""Lanes a CPU task of the spectral kernel works on."""
 
 _DIRECT_SECONDS = 2.2e-11
 """Cost of one multiply-add of the direct kernel, all lanes counted (measured, one core, AVX-512)."""
 _FETCH = 3
 """Multiply-adds that take as long as fetching a voxel for a group of lanes."""
-_PLANE_SECONDS = 8e-10
-"""Cost of a voxel of the planes that are combined for fewer products (measured, as above)."""
+_SPECTRAL_SECONDS = 5.5e-11
+"""Cost of one multiply-add of the spectral kernel (measured, as above)."""
 _SUM_SECONDS = 1e-10
 """Cost of adding one row of blocks to its windows, per lag (measured, as above)."""
 _FFT_SECONDS = 1.1e-9
@@ -40,8 +43,8 @@ class Plan:
     """Windows per axis."""
     block: tuple[int, int, int]
     """Edges of the blocks that windows are made of; the window itself where nothing is shared."""
-    products: int = 0
-    """Products per block along z, see `products_along_z`; 0: one per voxel and lag."""
+    spectral: bool = False
+    """Whether blocks are correlated by transforms along z and y, see `Spectrum`."""
 
     @property
     def lags(self) -> tuple[int, int, int]:
@@ -85,15 +88,21 @@ class Plan:
 
     def direct_seconds(self) -> float:
         """Predict the time of the direct way on one CPU core."""
-        reach = [b + n - 1 for b, n in zip(self.block, self.lags, strict=True)]
-        plane, lags = math.prod(self.lags[1:]), math.prod(self.lags)
-        depths = (self.products, self.products) if self.products else (self.block[0], reach[0])
-        gathered = sum(n * math.prod(edges) for n, edges in zip(depths, (self.block[1:], reach[1:]), strict=True))
-        products = self.products or self.block[0] * self.lags[0]
-        block = products * math.prod(self.block[1:]) * plane + self.products * lags + _FETCH * gathered
-        planes = 2 * self.products * self.block_grid[0] * self.lanes * math.prod(self.stride[1:])
+        lags, blocks = math.prod(self.lags), self.block_grid[0] * self.lanes
+        if self.spectral:
+            nz, ny = (transform_size(b, r) for b, r in zip(self.block[:2], self.search[:2], strict=True))
+            tap, near, lag = self.block[2], self.stride[2] * (1 + LANES / GROUP), self.lags[2]
+            points = (nz / 2 - 1) * (ny + 2) + 2
+            planes = nz * (self.block[0] + nz) * math.prod(self.stride[1:])
+            forth = nz * (ny / 2 + 1) * 2 * (tap * self.block[1] + near * (ny / 2 + 1))
+            back = nz * lag * (ny / 2 + 1) * self.lags[1] + (nz / 2 + 1) * lags
+            block = planes + forth + 3 * points * tap * lag + back
+        else:
+            reach = [b + n - 1 for b, n in zip(self.block, self.lags, strict=True)]
+            block = math.prod(self.block) * lags + _FETCH * (math.prod(self.block) + math.prod(reach))
+        seconds = block * (_SPECTRAL_SECONDS if self.spectral else _DIRECT_SECONDS)
         sums = self.count[0] * (self.block_count[0] * self.block_count[1] + self.block_count[2]) * lags * self.lanes
-        return block * self.block_grid[0] * self.lanes * _DIRECT_SECONDS + planes * _PLANE_SECONDS + sums * _SUM_SECONDS
+        return blocks * seconds + sums * _SUM_SECONDS
 
     def fft_seconds(self) -> float:
         """Predict the time of the transforms on one CPU core."""
@@ -139,9 +148,8 @@ def make_plan(shape, second_shape, window, step, search, method) -> tuple[Plan, 
     whole = Plan(shape, tuple(window), tuple(step), tuple(search), origin, count, tuple(window))
     shared = replace(whole, block=tuple(math.gcd(w, s) for w, s in zip(window, step, strict=True)))
     plans = [whole, shared]
-    if runtime.device().kind == "cpu":  # on CUDA nothing is gained by fewer products: the planes would have to be kept
-        for plan in (whole, shared):
-            plans.append(replace(plan, products=len(products_along_z(plan.block[0], plan.lags[0])[0])))
+    if runtime.device().kind == "cpu":
+        plans += [replace(plan, spectral=True) for plan in plans]
     direct = min(plans, key=Plan.direct_seconds)
     if method == "auto":
         on_gpu = runtime.device().kind == "cuda"
@@ -149,36 +157,67 @@ def make_plan(shape, second_shape, window, step, search, method) -> tuple[Plan, 
     return (whole if method == "fft" else direct), method
 
 
-@functools.lru_cache
-def products_along_z(block: int, lags: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Factor the correlation of `block` voxels with ``block + lags - 1``: fewer products than one per voxel and lag.
+@dataclass(frozen=True)
+class Spectrum:
+    """Transforms along z and y that correlate blocks with their surroundings; see `spectral_kernels`.
 
-    It is ``inverse @ ((taps @ a) * (near @ b))``, a discrete Fourier transform in real numbers: of frequency f of a
-    and b, with real parts ar, br and imaginary parts ai, bi, the products are (ar - ai) br, ar (bi - br) and
-    ai (bi + br), whose sums are the real and imaginary part of conj(a) b. Numbers or whole planes may be multiplied,
-    planes by correlating them. The transform is as long as `near`: nothing wraps around.
-
-    Returns
-    -------
-    taps, near, inverse : ndarray, shapes (products, block), (products, block + lags - 1), (lags, products)
+    A block has offsets 0 to ``edge - 1``, its surroundings ``-search`` to ``edge - 1 + search``. In transforms that
+    long nothing wraps around; odd lengths get one more, whatever it holds meets no lag of the range.
     """
-    size = block + lags - 1
-    taps, near, inverse = [], [], []
-    k, lag = np.arange(size), np.arange(lags)
-    for f in range(size // 2 + 1):
-        angle, turn = 2 * np.pi * f * k / size, 2 * np.pi * f * lag / size
-        real, imaginary = np.cos(angle), -np.sin(angle)
-        if 2 * f in (0, size):  # real
-            taps.append(real)
-            near.append(real)
-            inverse.append(np.cos(turn) / size)
-        else:
-            taps += [real - imaginary, real, imaginary]
-            near += [real, imaginary - real, imaginary + real]
-            inverse += [2 * (np.cos(turn) - np.sin(turn)) / size, -2 * np.sin(turn) / size, 2 * np.cos(turn) / size]
-    return np.array(taps)[:, :block], np.array(near), np.array(inverse).T
+
+    size: tuple[int, int]
+    """Lengths along z and y."""
+    taps: np.ndarray
+    """Planes of a block to real parts at frequencies 0 to size / 2, then imaginary ones of those between, (row, z)."""
+    near: np.ndarray
+    """The same of its surroundings."""
+    matrices: np.ndarray
+    """Along y and back along y and z: cosines and sines by term, rows padded to threes, all in one."""
+
+    @classmethod
+    @functools.lru_cache
+    def of(cls, block: tuple[int, int, int], search: tuple[int, int, int]) -> Spectrum:
+        """Return the transforms for a block and a search range."""
+        size = transform_size(block[0], search[0]), transform_size(block[1], search[1])
+        half = [n // 2 for n in size]
+        planes = []
+        for offset in (np.arange(block[0]), np.arange(size[0]) - search[0]):
+            cosine, sine = _waves(size[0], np.arange(half[0] + 1), offset)
+            planes.append(np.concatenate([cosine, -sine[1:-1]]))
+        there = [_padded_pair(*_waves(size[1], np.arange(n), np.arange(half[1] + 1))) for n in (block[1], half[1] + 1)]
+        back = []
+        for n, h, r, share in zip(size[::-1], half[::-1], search[1::-1], (1.0, 1 / math.prod(size)), strict=True):
+            weight = np.full((h + 1, 1), share)
+            if n == size[0] and share != 1.0:
+                weight[1:-1] *= 2  # frequencies that stand for their negatives
+            back.append(_padded_pair(*(weight * wave for wave in _waves(n, np.arange(h + 1), np.arange(r + 1)))))
+        flat = np.concatenate([matrix.ravel() for matrix in (*there, *back)]).astype(np.float32)
+        return cls(size, *(plane.astype(np.float32) for plane in planes), flat)
+
+
+def transform_size(block: int, search: int) -> int:
+    """Even length of a transform that holds a block and its surroundings."""
+    return -(-(block + 2 * search) // 2) * 2
+
+
+def _waves(size: int, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cosines and sines of 2 pi row column / size; sines of multiples of pi are 0."""
+    product = np.multiply.outer(rows, columns) % size
+    angle = 2 * np.pi * product / size
+    return np.cos(angle), np.where(2 * product % size == 0, 0.0, np.sin(angle))
+
+
+def _padded_pair(cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
+    """Cosines and sines side by side, (term, 2, row rounded up to `ROWS`)."""
+    pair = np.stack([cosine, sine], 1)
+    return np.pad(pair, [(0, 0), (0, 0), (0, -pair.shape[2] % ROWS)])
 
 
 def whole_groups(lanes: int) -> int:
     """Next multiple of `LANES`."""
     return -(-lanes // LANES) * LANES
+
+
+def largest_factor(edge: int) -> int:
+    """Largest factor that is no larger than its counterpart."""
+    return max(n for n in range(1, math.isqrt(edge) + 1) if edge % n == 0)

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from .correlate import box_sum
+from .boxsum import box_sum
 
 REACH = 4
 """Edge of the cubes whose sums of terms are squared: terms closer than this count as correlated [voxel]."""

@@ -6,12 +6,24 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import scipy.ndimage
+import warp as wp
 import xarray as xr
 
 import lfpiv
 from lfpiv import validation, vectors
+from lfpiv_kernels import (
+    boxsum,
+    correlation_kernels,
+    correlation_plan,
+    deform,
+    neighbours,
+    peak_kernels,
+    plane_kernels,
+    runtime,
+    spectral_kernels,
+    window_kernels,
+)
 from lfpiv_kernels import correlate as kernel
-from lfpiv_kernels import correlation_plan, deform, neighbours, runtime
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -148,7 +160,7 @@ def peaks_twin(score, search):
 
 
 @pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
-@pytest.mark.parametrize("method", ["direct", "fft"])
+@pytest.mark.parametrize("method", ["direct", "spectral", "fft"])
 @pytest.mark.parametrize(
     ("window", "step", "search"),
     [
@@ -156,10 +168,18 @@ def peaks_twin(score, search):
         ((7, 9, 10), (7, 3, 5), (2, 5, 3)),
         ((16, 16, 16), (16, 8, 8), (4, 4, 4)),
         ((12, 12, 8), (6, 4, 2), (3, 2, 6)),  # several blocks along y and x, two parts of the lags along x
+        (
+            (9, 10, 5),
+            (3, 5, 7),
+            (2, 4, 3),
+        ),  # odd blocks, whose transforms are longer than needed; windows that leave gaps
     ],
 )
 def test_peaks_equal_the_definition(monkeypatch, window, step, search, method, symmetric):
     monkeypatch.setattr(kernel, "_SLAB_BYTES", 1)  # every layer of windows on its own
+    if method != "fft":
+        monkeypatch.setattr(correlation_plan, "_SPECTRAL_SECONDS", 1e9 if method == "direct" else 0.0)
+        method = "direct"
     first, second = particle_pair((21, 26, 28), uniform(0.4, -1.2, 0.8), seed=1, ghosts=0.5, noise=0.05)
     score = coefficients_twin(first, second, window, step, search)
     if symmetric:
@@ -177,12 +197,29 @@ def test_peaks_equal_the_definition(monkeypatch, window, step, search, method, s
         assert peaks.measured[cell] == np.isfinite(displacement).all()
 
 
-@pytest.mark.parametrize(("block", "lags"), [(1, 5), (4, 9), (8, 17), (8, 19), (7, 12)])
-def test_fewer_products_make_the_same_correlation(block, lags):
+@pytest.mark.parametrize(("edge", "search"), [(1, 2), (4, 4), (8, 8), (7, 3)])
+def test_spectra_of_blocks_and_surroundings_give_their_correlation(edge, search):
     rng = np.random.default_rng(7)
-    a, b = rng.normal(size=block), rng.normal(size=block + lags - 1)
-    taps, near, inverse = correlation_plan.products_along_z(block, lags)
-    np.testing.assert_allclose(inverse @ ((taps @ a) * (near @ b)), np.correlate(b, a, "valid"), atol=1e-12)
+    block, around = rng.normal(size=edge), rng.normal(size=edge + 2 * search)
+    spectrum = correlation_plan.Spectrum.of((edge,) * 3, (search,) * 3)
+    whole = np.pad(around, (0, spectrum.size[0] - around.size), constant_values=9.0)  # what comes after does not matter
+    rows = [spectrum.taps @ block, spectrum.near @ whole]
+    half = spectrum.size[0] // 2
+    taps, near = (row[: half + 1] + 1j * np.pad(row[half + 1 :], 1) for row in rows)
+    found = np.fft.irfft(taps.conj() * near, spectrum.size[0])[np.arange(-search, search + 1)]
+    np.testing.assert_allclose(found, np.correlate(around, block, "valid"), atol=TOLERANCE_SUM)
+
+
+@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
+@pytest.mark.parametrize(
+    "module",
+    [boxsum, correlation_kernels, peak_kernels, plane_kernels, spectral_kernels, window_kernels],
+    ids=lambda module: module.__name__.rpartition(".")[2],
+)
+def test_correlation_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):
+    (compiled,) = wp.compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
+    entries = compiled.read_text().count(".visible .entry")
+    assert entries == len(wp.get_module(module.__name__).kernels)
 
 
 @pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
@@ -195,11 +232,11 @@ def test_peaks_do_not_depend_on_how_they_are_computed(monkeypatch, device, symme
         return {name: getattr(found, name) for name in ("displacement", "second_displacement", "correlation", "rival")}
 
     ways = []
-    for cost in (0.0, 1e9):  # of the planes that are combined for fewer products
-        monkeypatch.setattr(correlation_plan, "_PLANE_SECONDS", cost)
+    for cost in (0.0, 1e9):  # of transforms that replace products
+        monkeypatch.setattr(correlation_plan, "_SPECTRAL_SECONDS", cost)
         ways.append(peaks())
         plan = correlation_plan.make_plan(pair[0].shape, pair[1].shape, (12,) * 3, (6,) * 3, (4,) * 3, "direct")[0]
-        assert device.kind == "cuda" or (plan.products > 0) == (cost == 0)
+        assert device.kind == "cuda" or plan.spectral == (cost == 0)
     for name, values in ways[0].items():
         np.testing.assert_allclose(values, ways[1][name], atol=TOLERANCE_PEAK, err_msg=name)
     with ThreadPoolExecutor(1) as pool:
@@ -219,12 +256,12 @@ def test_windows_without_signal_are_not_measured():
 def test_box_sums(window):
     volume = np.random.default_rng(3).random((19, 21, 23), dtype=np.float32)
     expected = np.lib.stride_tricks.sliding_window_view(volume.astype(float), window).sum((-1, -2, -3))
-    result = kernel.box_sum(volume, window)
+    result = boxsum.box_sum(volume, window)
     inside = tuple(slice(n) for n in expected.shape)
     np.testing.assert_allclose(result[inside], expected, rtol=TOLERANCE_SUM)
     assert result.sum(dtype=float) == pytest.approx(result[inside].sum(dtype=float))
     keep = (slice(0, 12, 3), slice(2, 9, 2), slice(0, 6, 5))
-    np.testing.assert_array_equal(kernel.box_sum(volume, window, keep), result[keep])
+    np.testing.assert_array_equal(boxsum.box_sum(volume, window, keep), result[keep])
 
 
 def test_deformation_samples_the_spline():
