@@ -91,7 +91,7 @@ def write_json(value: Any, path: Path) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Turn arrays, NumPy numbers, tuples and non-finite numbers into what JSON knows."""
+    """Turn arrays, NumPy numbers, tuples, paths and non-finite numbers into what JSON knows."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
@@ -102,7 +102,7 @@ def plain(value: Any) -> Any:
         return plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    return str(value) if isinstance(value, Path) else value
 
 
 def settings_hash(**parts: Any) -> str:
@@ -261,17 +261,6 @@ def read_volume(path: Path) -> xr.DataArray:
     if "intensity" not in dataset or dataset["intensity"].dims != _AXES:
         raise InputError(f"{path}: expected a volume 'intensity' over (z, y, x), found {list(dataset.data_vars)}.")
     return dataset["intensity"]
-
-
-def stored_hash(path: Path) -> str | None:
-    """Return the settings hash in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
-    import h5py
-
-    try:
-        with h5py.File(path, "r") as file:
-            return str(file.attrs["settings_hash"])
-    except (OSError, KeyError):
-        return None
 
 
 def read_attributes(path: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import tifffile
 import xarray as xr
 
 import lfpiv
-from lfpiv import dataset, images
+from lfpiv import dataset, images, stamp
 from lfpiv.errors import InputError
 from lfpiv.experiment import ExperimentTable, open_experiment
 from lfpiv.settings import Compute, Correlation, Network, Smart
@@ -295,7 +295,7 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
     back = dataset.read_vectors(path)
     xr.testing.assert_equal(back, written)
     assert back["valid"].dtype == bool and back["w"].attrs["units"] == "m/s"
-    assert dataset.stored_hash(path) == "0123" and json.loads(back.attrs["smart"]) == {"iterations": 2}
+    assert stamp.marks(path) == {"settings_hash": "0123"} and json.loads(back.attrs["smart"]) == {"iterations": 2}
     condensed = dataset.read_reconstruction(path)
     np.testing.assert_array_equal(condensed["projection_y"].values[1], pair["b"].values.max(1))
     np.testing.assert_array_equal(condensed["residual"].values, [[0.9, 0.5, 0.4], [0.8, 0.6, np.nan]])
@@ -330,7 +330,7 @@ def test_a_vector_file_of_another_form_is_refused(tmp_path):
     (tmp_path / "pair.nc").write_bytes(b"no NetCDF")
     with pytest.raises(InputError, match=r"pair\.nc"):
         dataset.read_vectors(tmp_path / "pair.nc")
-    assert dataset.stored_hash(tmp_path / "pair.nc") is None
+    assert stamp.marks(tmp_path / "pair.nc") is None
 
 
 def test_a_failed_write_leaves_the_old_file_alone(tmp_path):

@@ -62,6 +62,10 @@ class Pair:
 DEFAULT = Pair()
 
 
+COLUMNS = ("error", "±", "x", "y", "z", "valid", "Q", "Q, zero mean", "R_acc", "R_g", "ghosts")
+"""Heads of the figures that tables show of a pair: `Judged.cells`."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Judged:
     """What one pair's measurement is worth."""
@@ -86,6 +90,11 @@ class Judged:
     """Of the particles along depth, likewise."""
     iterations: float
     """SMART iterations, likewise."""
+
+    def cells(self) -> list[float]:
+        """Figures for a table, below `COLUMNS`."""
+        errors = [self.error.mean, self.standard_error, *self.error.mean_absolute]
+        return [*errors, self.valid, self.q, self.q_zero_mean, self.accuracy, self.ghost_ratio, self.ghosts]
 
     @property
     def standard_error(self) -> float:
@@ -306,16 +315,7 @@ def scene(scale: str, seed: int, cameras: Mapping[str, Mapping[str, Any]], *, na
         Tables of the whole scene, such as ``window`` and ``aberrations``.
     """
     rows, columns = SENSOR_PX[scale]
-    optics = {
-        "focal_length_mm": 100.0,
-        "magnification": -1.0,
-        "f_number": 4.0,
-        "microlens_pitch_mm": 0.1,
-        "microlens_focal_length_mm": 0.8,
-        "pixel_um": 5.5,
-        "sensor_width_px": columns,
-        "sensor_height_px": rows,
-    }
+    optics = {**rigs.OPTICS, "sensor_width_px": columns, "sensor_height_px": rows}
     return Scene.model_validate(
         {
             "name": name,

@@ -46,20 +46,7 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
     progress("cameras", 1.0)
     _draw(judged, ppms, shown, work / "cameras.png")
     densest = ppms[-1]
-    rows = [
-        [
-            NAMES[name],
-            ppm,
-            one.error.mean,
-            one.standard_error,
-            *one.error.mean_absolute,
-            one.valid,
-            one.q,
-            one.q_zero_mean,
-        ]
-        + [one.accuracy, one.ghost_ratio, one.ghosts, one.elongation]
-        for (name, ppm), one in judged.items()
-    ]
+    rows = [[NAMES[name], ppm, *one.cells(), one.elongation] for (name, ppm), one in judged.items()]
     return page.result(
         {
             "angles_deg": {camera.name: camera.true_yaw_deg for camera in own.rig.scene.camera},
@@ -96,22 +83,7 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
                 "components; all in voxels, all vectors; ±: standard error of the mean. Ghosts: peaks that "
                 "are no particle, for each true one. Elongation: of the particles "
                 "found, along depth over across.",
-                "columns": [
-                    "",
-                    "ppm",
-                    "error",
-                    "±",
-                    "x",
-                    "y",
-                    "z",
-                    "valid",
-                    "Q",
-                    "Q, zero mean",
-                    "R_acc",
-                    "R_g",
-                    "ghosts",
-                    "elongation",
-                ],
+                "columns": ["", "ppm", *bench.COLUMNS, "elongation"],
                 "rows": rows,
             }
         ],

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lfpiv.reproduce.rigs import VOXEL_MM, Rig, calibrated_rig
+from lfpiv.reproduce.rigs import OPTICS, VOXEL_MM, Rig, calibrated_rig
 from lfpiv.scene import Scene
 
 SENSOR_PX = {"small": (1728, 2208), "paper": (2208, 2752)}
@@ -45,11 +45,7 @@ def experimental_scene(scale: str, seed: int) -> Scene:
     cameras = [
         {
             "name": f"camera{number + 1}",
-            "focal_length_mm": 100.0,
-            "magnification": -1.0,
-            "f_number": 4.0,
-            "microlens_pitch_mm": 0.1,
-            "microlens_focal_length_mm": 0.8,
+            **OPTICS,
             "pixel_um": 4.54,
             "sensor_width_px": columns,
             "sensor_height_px": rows,

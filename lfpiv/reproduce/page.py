@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lfpiv.reproduce import store
+from lfpiv import dataset
 
 log = logging.getLogger(__name__)
 
@@ -103,14 +103,14 @@ def write(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
         if not path.exists():
             continue
         stored = json.loads(path.read_text("utf-8"))
-        if stored["settings"] != store.jsonable(settings):
+        if stored["settings"] != dataset.plain(settings):
             continue
         content[key] = stored["value"]
         for figure in content[key]["figures"]:
             shutil.copyfile(path.parent / figure["file"], out / f".{figure['file']}")
             (out / f".{figure['file']}").replace(out / figure["file"])
-    store.write_json(out / "reproduce.json", content)
-    store.write_bytes(out / "index.html", _page(out, content).encode("utf-8"))
+    dataset.write_json(content, out / "reproduce.json")
+    dataset.write_text(_page(out, content), out / "index.html")
     return content
 
 

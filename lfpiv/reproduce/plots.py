@@ -14,7 +14,7 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lfpiv.reproduce import store
+from lfpiv import dataset
 
 DPI = 150
 COLOURS = {
@@ -83,4 +83,4 @@ def save(drawn: Figure, path: Path) -> None:
     """Write a figure as PNG by rename."""
     buffer = io.BytesIO()
     drawn.savefig(buffer, format="png", dpi=DPI)
-    store.write_bytes(path, buffer.getvalue())
+    dataset.write_bytes(buffer.getvalue(), path)

@@ -15,12 +15,11 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 import lfpiv
-from lfpiv import metrics
+from lfpiv import dataset, metrics
 from lfpiv.board import BoardDots
 from lfpiv.calibration import Calibration
 from lfpiv.experiment import Experiment
 from lfpiv.flows import Ring, window_mean
-from lfpiv.reproduce import store
 from lfpiv.rig import Grid
 from lfpiv.scene import Scene, true_mapping
 from lfpiv.settings import Smart
@@ -33,6 +32,15 @@ log = logging.getLogger(__name__)
 
 VOXEL_MM = 0.1
 """Edge of the paper's voxels [mm], one microlens."""
+OPTICS = {
+    "focal_length_mm": 100.0,
+    "magnification": -1.0,
+    "f_number": 4.0,
+    "microlens_pitch_mm": 0.1,
+    "microlens_focal_length_mm": 0.8,
+    "pixel_um": 5.5,
+}
+"""Table 2: main lens, microlenses, and the numerical column's pixels."""
 ANGLES_DEG = (45.0, -45.0)
 """Separation angles of the two cameras."""
 TURNED_DEG = {
@@ -115,12 +123,7 @@ def numerical_scene(scale: str, seed: int) -> Scene:
     cameras = [
         {
             "name": f"camera{number + 1}",
-            "focal_length_mm": 100.0,
-            "magnification": -1.0,
-            "f_number": 4.0,
-            "microlens_pitch_mm": 0.1,
-            "microlens_focal_length_mm": 0.8,
-            "pixel_um": 5.5,
+            **OPTICS,
             "sensor_width_px": SENSOR_PX[scale],
             "sensor_height_px": SENSOR_PX[scale],
             "nominal_angle_deg": angle,
@@ -158,10 +161,11 @@ def calibrated_rig(scene: Scene, folder: Path, progress: Callable[[str, float], 
     """Simulate the board of a scene and calibrate from it; both are kept in `folder` while the scene stays the same."""
     runtime.device()
     path, marker = folder / "experiment" / "experiment.toml", folder / "scene.json"
-    content = store.jsonable(scene.model_dump(mode="json"))
+    content = dataset.plain(scene.model_dump(mode="json"))
     if not marker.exists() or json.loads(marker.read_text("utf-8")) != content:
         shutil.rmtree(folder, ignore_errors=True)
-        store.write_json(marker, content)
+        folder.mkdir(parents=True, exist_ok=True)
+        dataset.write_json(content, marker)
     if not path.exists():
         simulate(scene, path.parent, progress=lambda what, done, total: progress(what, done / total))
     experiment = lfpiv.open_experiment(path)

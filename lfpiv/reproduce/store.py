@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfpiv import dataset
 from lfpiv.errors import InputError
 
 
@@ -28,7 +27,7 @@ def open_folder(out: Path, settings: Mapping[str, Any]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         before = json.loads(path.read_text("utf-8")) if path.exists() else None
         if before is None:
-            write_json(path, settings)
+            dataset.write_json(settings, path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{out}: the folder cannot be used ({reason}). Choose another one with --out.") from None
@@ -52,13 +51,14 @@ def kept(path: Path, settings: Mapping[str, Any], compute: Callable[[], Any]) ->
     compute : callable
         Called where there is no file, or one of other settings.
     """
-    settings = jsonable(settings)
+    settings = dataset.plain(settings)
     if path.exists():
         content = json.loads(path.read_text("utf-8"))
         if content["settings"] == settings:
             return content["value"]
-    value = jsonable(compute())
-    write_json(path, {"settings": settings, "value": value})
+    value = dataset.plain(compute())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    dataset.write_json({"settings": settings, "value": value}, path)
     return value
 
 
@@ -66,44 +66,14 @@ def kept_arrays(
     path: Path, settings: Mapping[str, Any], compute: Callable[[], Mapping[str, ArrayLike]]
 ) -> dict[str, np.ndarray]:
     """Return the named arrays of `compute`, from the .npz file where they were computed with the same settings."""
-    text = json.dumps(jsonable(settings), sort_keys=True)
+    text = json.dumps(dataset.plain(settings), sort_keys=True)
     if path.exists():
         with np.load(path, allow_pickle=False) as data:
             if str(data["settings"]) == text:
                 return {name: data[name] for name in data.files if name != "settings"}
     arrays = {name: np.asarray(value) for name, value in compute().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
     named: dict[str, Any] = {"settings": text, **arrays}
-    with scratch.open("wb") as file:
+    with dataset.replacing(path) as scratch, scratch.open("wb") as file:
         np.savez_compressed(file, **named)
-    os.replace(scratch, path)
     return arrays
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file by rename."""
-    write_bytes(path, (json.dumps(jsonable(value), indent=1) + "\n").encode("utf-8"))
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file by rename."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_bytes(content)
-    os.replace(scratch, path)
-
-
-def jsonable(value: Any) -> Any:
-    """Convert NumPy values, tuples and paths for JSON; NaN and infinity become null."""
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return jsonable(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [jsonable(item) for item in value]
-    if isinstance(value, np.generic):
-        return jsonable(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value

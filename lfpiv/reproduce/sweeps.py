@@ -79,50 +79,13 @@ def compute(
             {
                 "caption": f"Seeding, at {_electrons(seeding[0][2])} electrons per particle and camera. Errors "
                 "in voxels, against the flow's mean over each window; true: of the true particles' correlation.",
-                "columns": [
-                    "ppm",
-                    "error",
-                    "±",
-                    "x",
-                    "y",
-                    "z",
-                    "true",
-                    "valid",
-                    "Q",
-                    "Q, zero mean",
-                    "R_acc",
-                    "R_g",
-                    "ghosts",
-                    "SNR",
-                ],
-                "rows": [
-                    [ppm, one.error.mean, one.standard_error, *one.error.mean_absolute, exact.error.mean]
-                    + [one.valid, one.q, one.q_zero_mean, one.accuracy, one.ghost_ratio, one.ghosts, told["snr"]]
-                    for ppm, one, told, exact in seeding
-                ],
+                "columns": ["ppm", *bench.COLUMNS, "true", "SNR"],
+                "rows": [[ppm, *one.cells(), exact.error.mean, told["snr"]] for ppm, one, told, exact in seeding],
             },
             {
                 "caption": f"Noise, at {DEFAULT.ppm:g} ppm. Electrons: what one camera receives of one particle.",
-                "columns": [
-                    "electrons",
-                    "SNR",
-                    "error",
-                    "±",
-                    "x",
-                    "y",
-                    "z",
-                    "valid",
-                    "Q",
-                    "Q, zero mean",
-                    "R_acc",
-                    "R_g",
-                    "ghosts",
-                ],
-                "rows": [
-                    [_electrons(told), told["snr"], one.error.mean, one.standard_error, *one.error.mean_absolute]
-                    + [one.valid, one.q, one.q_zero_mean, one.accuracy, one.ghost_ratio, one.ghosts]
-                    for _, one, told in noise
-                ],
+                "columns": ["electrons", "SNR", *bench.COLUMNS],
+                "rows": [[_electrons(told), told["snr"], *one.cells()] for _, one, told in noise],
             },
         ],
         notes=[
