@@ -16,9 +16,11 @@ from lfpiv.board import BoardDots
 from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
 from lfpiv.network import Network
+from lfpiv.raylayout import lay_out
 from lfpiv.rig import LensLattice, Optics, pair
 from lfpiv.thinlens import ThinLensModel
 from lfpiv_kernels import mapping
+from lfpiv_kernels.microimages import Microimages
 
 SCHEMA_VERSION = 1
 
@@ -54,6 +56,11 @@ class CalibratedCamera:
         """
         share = 0.0 if self.dots is None else self.dots.response_share
         return self.decoder.shrunk_gain(0.0 if math.isnan(share) else share)
+
+    @cached_property
+    def microimages(self) -> Microimages:
+        """How the rays of the microlenses lie in memory; it is the same for every grid."""
+        return lay_out(self.optics, self.lattice)
 
     def map(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
         """Trace rays to the microlens array (Eqs. 6-7).

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from lfpiv_kernels.trace import POWERS
 
@@ -16,6 +18,12 @@ RINGS = ((0.0, 1), (0.5, 6), (0.97, 12))
 """Pupil points at which the mapping is evaluated: (radius / pupil radius, points on the ring)."""
 CHUNK_POINTS = 100_000
 """Object points per evaluation: bounds the scratch memory."""
+STEPS = (8, 4, 2, 1)
+"""Voxels from one fit to the next on a grid, the widest that serves first."""
+PROBES = 256
+"""Random voxels in which interpolated fits are compared with their own."""
+NEAR_PITCH = 3e-4
+"""Largest difference of rays there [microlens pitch]; the mapping in single precision is known to 2e-4."""
 
 
 def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
@@ -84,8 +92,8 @@ def grid_models(
 ) -> Iterator[np.ndarray]:
     """Ray models of a grid's voxels, plane by plane of its outermost axis.
 
-    The projected edges are half the differences of the mapping between a voxel's neighbours: one fit per voxel instead
-    of seven.
+    The mapping is far smoother than a voxel is small: fits at every `STEPS`-th voxel, the widest step that serves, are
+    interpolated by cubic splines. The projected edges are half the differences between a voxel's neighbours.
 
     Parameters
     ----------
@@ -94,7 +102,8 @@ def grid_models(
     shape : tuple of int
         Voxels along the three axes, outermost first.
     centres_mm : callable
-        Takes indices along the three axes, shape (point, 3), also one outside the grid; returns (x, y, z) [mm].
+        Takes indices along the three axes, shape (point, 3), whole or not, also one outside the grid; returns
+        (x, y, z) [mm].
     axes : tuple of int
         Which of x, y, z (0, 1, 2) each axis of the grid is.
 
@@ -104,15 +113,17 @@ def grid_models(
         See ``lfpiv_kernels.raymodel.MODEL_SIZE``.
     """
     outer, rows, columns = shape
-    inner = np.stack(np.meshgrid(np.arange(-1, rows + 1), np.arange(-1, columns + 1), indexing="ij"), -1).reshape(-1, 2)
+    fits, along = _interpolated(camera, shape, centres_mm)
 
-    def fits(plane: int) -> np.ndarray:
-        index = np.column_stack([np.full(len(inner), plane), inner])
-        return fit_rays(camera, centres_mm(index), degree=2).reshape(rows + 2, columns + 2, 2, 6)
+    def plane_fits(plane: int) -> np.ndarray:
+        plane_nodes = along[0][plane + 1] @ fits.reshape(len(fits), -1)
+        row_fits = along[1] @ plane_nodes.reshape(fits.shape[1], -1)
+        every: np.ndarray = along[2] @ row_fits.reshape(rows + 2, fits.shape[2], -1)
+        return every.reshape(rows + 2, columns + 2, 2, 6)
 
-    before, here = fits(-1), fits(0)
+    before, here = plane_fits(-1), plane_fits(0)
     for plane in range(outer):
-        after = fits(plane + 1)
+        after = plane_fits(plane + 1)
         model = np.empty((rows, columns, 30), np.float32)
         model[..., :12] = here[1:-1, 1:-1].reshape(rows, columns, 12)
         differences = (
@@ -123,8 +134,43 @@ def grid_models(
         for axis, difference in zip(axes, differences, strict=True):
             model[..., 12 + 2 * axis : 14 + 2 * axis] = 0.5 * difference[..., 0]
             model[..., 18 + 4 * axis : 22 + 4 * axis] = 0.5 * difference[..., 1:3].reshape(rows, columns, 4)
-        yield _finite(model.reshape(-1, 30))
+        yield model.reshape(-1, 30)
         before, here = here, after
+
+
+def _interpolated(
+    camera: CalibratedCamera, shape: tuple[int, int, int], centres_mm: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Fits at the nodes of a coarser grid, shape (nodes, nodes, nodes, 12), and what interpolates them.
+
+    That is one matrix per axis, shape (voxels + 2, nodes), float32: a voxel before the grid, its own, one behind.
+    """
+    rng = np.random.default_rng(0)
+    probes = np.column_stack([rng.integers(0, n, PROBES) for n in shape])
+    scale = camera.optics.pupil_radius_mm ** np.array([sum(power) for power in POWERS if sum(power) <= 2])
+    expected = _finite(fit_rays(camera, centres_mm(probes), degree=2)) * scale
+    for step in STEPS:
+        counts = [math.ceil((n + 1) / step) + 1 for n in shape]
+        nodes = [np.linspace(-1, n, count) for n, count in zip(shape, counts, strict=True)]
+        points = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+        fits = _finite(fit_rays(camera, centres_mm(points), degree=2)).reshape(*counts, 12)
+        along = [_spline_matrix(at, n) for at, n in zip(nodes, shape, strict=True)]
+        if step == 1:
+            break
+        weights = [matrix[probe + 1] for matrix, probe in zip(along, probes.T, strict=True)]
+        found = np.einsum("pa,pb,pc,abcf->pf", *weights, fits, optimize=True).reshape(PROBES, 2, 6) * scale
+        error = np.abs(found - expected).sum(-1).max() / camera.lattice.pitch_mm
+        if error < NEAR_PITCH:
+            break
+    return fits, along
+
+
+def _spline_matrix(nodes: np.ndarray, voxels: int) -> np.ndarray:
+    """Matrix that takes values at nodes to those at -1, 0, ..., `voxels`."""
+    wanted = np.arange(-1, voxels + 1)
+    if len(nodes) == len(wanted):
+        return np.eye(len(nodes), dtype=np.float32)
+    return CubicSpline(nodes, np.eye(len(nodes)))(wanted).astype(np.float32)
 
 
 def _finite(model: np.ndarray) -> np.ndarray:

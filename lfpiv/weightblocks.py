@@ -6,19 +6,17 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv.raylayout import lay_out, microimage_edge, plain
+from lfpiv.raylayout import microimage_edge, plain
 from lfpiv.raymodel import fit_rays, grid_models, ray_models
 from lfpiv.rig import Grid
 from lfpiv_kernels import footprint, runtime
 from lfpiv_kernels.lattice import Lattice, cell_frame, cell_rectangles, pack_lattice
-from lfpiv_kernels.microimages import Microimages
 from lfpiv_kernels.project import Blocks
 from lfpiv_kernels.raymodel import LANES, LEVELS
 from lfpiv_kernels.trace import count_rays
@@ -119,18 +117,13 @@ class CameraKernels:
     frame: np.ndarray
     rectangles: np.ndarray
 
-    @cached_property
-    def microimages(self) -> Microimages:
-        """How the rays lie in memory."""
-        return lay_out(self.setup.optics, self.setup.lattice)
-
     def footprints(self, form: str) -> footprint.Footprints:
         """Return what computes this camera's blocks of a form."""
         return footprint.Footprints(
             self.camera,
             self.lattice,
             self.cell_mm,
-            self.microimages,
+            self.setup.microimages,
             frame=self.frame,
             rectangles=self.rectangles,
             form=form,
@@ -257,7 +250,7 @@ def blocks_of(pack: CameraKernels, models: Iterable[np.ndarray], form: str, expe
         width=width.done(),
         value=value.done(),
         scale=np.concatenate(scales),
-        microimages=pack.microimages,
+        microimages=pack.setup.microimages,
     )
 
 

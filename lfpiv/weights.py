@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -215,18 +216,23 @@ class Weights:
         if len(self._projectors) == len(self.cameras):
             return
         runtime.device()
-        for number, (name, camera) in enumerate(self.cameras.items()):
+        with ThreadPoolExecutor(1) as ahead:  # the next camera's rays are laid out while this one's kernels run
+            laid_out = [ahead.submit(getattr, camera, "microimages") for camera in self.cameras.values()]
+            for number, name in enumerate(self.cameras):
+                laid_out[number].result()
 
-            def step(fraction: float, number: int = number) -> None:
-                if progress is not None:
-                    progress((number + fraction) / len(self.cameras))
+                def step(fraction: float, number: int = number) -> None:
+                    if progress is not None:
+                        progress((number + fraction) / len(self.cameras))
 
-            if self.method == "footprint":
-                self.forms[name] = self._choose(name, camera)
-                blocks = footprint_blocks(self.stored, camera, self.forms[name], step, self._allow(name))
-            else:
-                blocks = count_blocks(self.stored, camera, step)
-            self._projectors[name] = Projector(blocks)
+                self._projectors[name] = Projector(self._blocks(name, step))
+
+    def _blocks(self, name: str, progress: Progress) -> Blocks:
+        camera = self.cameras[name]
+        if self.method == "count":
+            return count_blocks(self.stored, camera, progress)
+        self.forms[name] = self._choose(name, camera)
+        return footprint_blocks(self.stored, camera, self.forms[name], progress, self._allow(name))
 
     def _allow(self, name: str) -> Callable[[int], None]:
         """Check of one camera's memory before it is taken."""
@@ -378,7 +384,7 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
         chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
         pack = pack_camera(camera)
         blocks, values = sample_blocks(pack, stored, chosen)
-        rays = 4 * (5 + 2) * pack.microimages.size + 24 * runtime.CHUNKS
+        rays = 4 * (5 + 2) * camera.microimages.size + 24 * runtime.CHUNKS
         total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * grid.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
     return int(total)
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from lfpiv.raylayout import lay_out
 from lfpiv.rig import LensLattice, Optics
 
 
@@ -48,6 +49,7 @@ class IdealCamera:
 
     def __post_init__(self):
         self.gain = np.ones(self.optics.sensor_shape, np.float32)
+        self.microimages = lay_out(self.optics, self.lattice)
 
     def map(self, points, pupil):
         camera = np.asarray(points, float) @ self.pose.T

@@ -10,8 +10,7 @@ from ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_came
 
 import lfpiv
 from lfpiv import weightblocks
-from lfpiv.raylayout import lay_out
-from lfpiv.raymodel import ray_models
+from lfpiv.raymodel import NEAR_PITCH, grid_models, ray_models
 from lfpiv.weightblocks import count_voxels
 from lfpiv.weights import compare_with_count, estimate_memory
 from lfpiv_kernels import footprint, footprint_source, project, raymodel, reference, runtime, trace
@@ -22,6 +21,7 @@ LEVEL = 0.5 / raymodel.LEVELS * 1.1  # rounding to 8 bits, in units of the large
 TOLERANCE_TWIN = 2e-3  # float32 polynomials against float64, of the largest weight
 TOLERANCE_ADJOINT = 1e-5  # the issue's figure; float32 sums of about 1e5 terms with random signs
 TOLERANCE_EDGE = 0.012  # relative L2: at the pupil's edge the kernels know how weights fall in steps of LAYER_FALL
+TOLERANCE_EDGES = 0.002  # of a projected edge: what interpolated rays, half a voxel more apart, make of NEAR_PITCH
 FOOTPRINT_MEAN, FOOTPRINT_WORST = 0.02, 0.035  # relative L2 against a converged count: the project's goal
 SAMPLES = 100  # pupil points per axis: counting noise of about 1 %, subtracted by the two halves' difference
 
@@ -85,12 +85,37 @@ def test_footprint_kernel_equals_its_twin(name, form):
         rectangles=cell_rectangles(camera.lattice.layout),
         local=form == "pixels",
     )
-    rays = lay_out(camera.optics, camera.lattice)
+    rays = camera.microimages
     whole = np.ones(camera.optics.sensor_shape, bool)  # pixels that lie inside the pupil altogether
     whole.ravel()[rays.pixel[(rays.share > 0) & (rays.share < 1)]] = False
     levels = (1 if form == "pixels" else 2) * LEVEL  # a product of two rounded profiles
     assert np.abs(image - twin)[whole].max() <= (levels + TOLERANCE_TWIN) * twin.max()
     assert np.linalg.norm(image - twin) <= TOLERANCE_EDGE * np.linalg.norm(twin)
+
+
+@pytest.mark.parametrize(("waves", "step"), [(0, 8), (1, 2), (7, 1)], ids=["smooth", "curved", "rough"])
+def test_ray_models_of_a_grid_are_those_of_its_voxels(waves, step, monkeypatch):
+    """Interpolated as coarsely as the mapping allows; `waves` of a tenth of a pitch over the grid's length."""
+    camera, shape = RIGS["mild coma"], (20, 6, 9)
+    ideal, asked = camera.map_fan, []
+
+    def rippled(points, pupil):
+        asked.append(len(points))
+        wave = np.sin(2 * np.pi * waves * points[:, None, 2:] / (shape[0] * VOXEL_MM))
+        return ideal(points, pupil) + np.float32(0.1 * camera.lattice.pitch_mm) * wave.astype(np.float32)
+
+    monkeypatch.setattr(camera, "map_fan", rippled)
+    grid = lfpiv.Grid(shape=shape, voxel_mm=VOXEL_MM, first_centre_mm=(-1.0, 0.2, -0.3))
+    stored = weightblocks.StoredGrid(grid, (1, 0, 2))
+    found = np.concatenate(list(grid_models(camera, stored.shape, stored.positions_mm, (1, 2, 0))))
+    assert asked[-1] == np.prod([np.ceil((n + 1) / step) + 1 for n in shape])
+    exact = ray_models(camera, stored.centres_mm(np.arange(grid.size)), VOXEL_MM)
+    radius = camera.optics.pupil_radius_mm
+    powers = np.array([1, radius, radius, radius**2, radius**2, radius**2])
+    rays = np.abs((found - exact)[:, :12].reshape(-1, 2, 6) * powers).sum(-1)
+    assert rays.max() <= 2 * NEAR_PITCH * camera.lattice.pitch_mm  # a few voxels may be further off than those probed
+    if step > 1:  # half the difference of neighbours is not that of opposite faces on waves of three voxels
+        assert np.abs((found - exact)[:, 12:18]).max() <= TOLERANCE_EDGES * VOXEL_MM
 
 
 @pytest.mark.parametrize("form", footprint.FORMS)
