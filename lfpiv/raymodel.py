@@ -170,7 +170,8 @@ def _spline_matrix(nodes: np.ndarray, voxels: int) -> np.ndarray:
     wanted = np.arange(-1, voxels + 1)
     if len(nodes) == len(wanted):
         return np.eye(len(nodes), dtype=np.float32)
-    return CubicSpline(nodes, np.eye(len(nodes)))(wanted).astype(np.float32)
+    matrix: np.ndarray = CubicSpline(nodes, np.eye(len(nodes)))(wanted).astype(np.float32)
+    return matrix
 
 
 def _finite(model: np.ndarray) -> np.ndarray:

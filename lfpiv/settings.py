@@ -41,15 +41,17 @@ class Smart(Table):
     """Standard deviation of the Gaussian smoothing after each iteration [voxel]; 0 switches it off."""
     floor_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1
     """Least noise floor, as a share of the images' brightness; 0 takes the measured noise as it is."""
-    sieve_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
-    """Standard deviation of the Gaussians that the volume is a sum of [voxel]; 0 for voxels of any brightness."""
+    sieve_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] | Literal["auto"] = "auto"
+    """Standard deviation of the Gaussians that the volume is a sum of [voxel]; 0 for voxels of any brightness, "auto"
+    for what suits the particles, whose size the images tell: 0 where they are smaller than voxels."""
     active_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
     """Voxels below this share of the first guess's brightest are left out; 0 keeps all."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
     """Stop when an iteration lowers the misfit, a divergence, by less than this fraction; 0 runs all iterations."""
     motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
-    """How often the motion is measured and both frames reconstructed anew from what they share along it: smaller errors
-    of displacement, whose stated uncertainty is then about half of what it should be. 0: each frame by itself."""
+    """How often the motion is measured and both frames reconstructed anew from what they share along it: errors of
+    displacement are smaller by about a sixth, and a wrong motion draws vectors along, which the uncertainty then tells.
+    0: each frame by itself."""
 
     def of_one_frame(self) -> dict[str, Any]:
         """Return the settings of `lfpiv.reconstruct`, which knows one frame only."""
@@ -66,7 +68,8 @@ class Correlation(Table):
     max_displacement_voxel: Positive | None = None
     """Largest displacement the first pass looks for [voxel]; absent: a quarter of its window."""
     smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.5
-    """Standard deviation of a Gaussian applied to the volumes before correlation [voxel]; 0 switches it off."""
+    """Standard deviation of a Gaussian applied to the volumes before correlation [voxel], less what SMART's sieve has
+    smoothed; 0 switches it off."""
     intensity_power: Annotated[float, Field(strict=True, gt=0, le=2)] = 0.5
     """Power of the volumes' intensities that is correlated, after smoothing; 1 takes them as they are."""
 

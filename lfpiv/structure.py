@@ -52,7 +52,8 @@ def structure(light: np.ndarray, decoder: LightFieldDecoder) -> float:
     even = _clipped(even - mean / np.maximum(share, 1e-6), core)
     core[:reach], core[-reach:], core[:, :reach], core[:, -reach:] = False, False, False, False  # one-sided means
     lag = max(1, round(_LAG * pitch))
-    return min(_correlation(even, core, decoder.lens_index, lag, side) for side in (lag, -lag))
+    lens = np.ascontiguousarray(decoder.lens_index, np.int16).view(np.int32)[..., 0]  # both indices as one number
+    return min(_correlation(even, core, lens, lag, side) for side in (lag, -lag))
 
 
 def _clipped(values: np.ndarray, core: np.ndarray) -> np.ndarray:
@@ -63,15 +64,15 @@ def _clipped(values: np.ndarray, core: np.ndarray) -> np.ndarray:
     return clipped
 
 
-def _correlation(values: np.ndarray, core: np.ndarray, lens_index: np.ndarray, down: int, aside: int) -> float:
+def _correlation(values: np.ndarray, core: np.ndarray, lens: np.ndarray, down: int, aside: int) -> float:
     """Correlation of pixels of one lens with those `down` rows and `aside` columns away."""
     rows, columns = values.shape
     first = slice(0, rows - down), slice(max(-aside, 0), columns - max(aside, 0))
     second = slice(down, rows), slice(max(aside, 0), columns + min(aside, 0))
-    pair = core[first] & core[second] & (lens_index[first] == lens_index[second]).all(-1)
+    pair = core[first] & core[second] & (lens[first] == lens[second])
     if np.count_nonzero(pair) < _FEWEST_PAIRS:
         return 1.0
-    a, b = values[first][pair], values[second][pair]
-    if not min(a.std(), b.std()) > 0:
-        return 0.0
-    return float(np.corrcoef(a, b)[0, 1])
+    a, b = (part[pair].astype(float) for part in (values[first], values[second]))
+    a, b = a - a.mean(), b - b.mean()
+    power = float((a * a).sum() * (b * b).sum())
+    return float((a * b).sum()) / power**0.5 if power > 0 else 0.0

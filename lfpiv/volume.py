@@ -10,12 +10,15 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from lfpiv.smart import View, gaussian, iterate
+from lfpiv.particlesize import matching_sieve
+from lfpiv.smart import View, gaussian, iterate, sharpen
 from lfpiv.weights import Weights
 
 log = logging.getLogger(__name__)
 
 NORMALISATIONS = ("column", "paper")
+AUTO = "auto"
+"""Sieve that suits the particles."""
 FLOOR_SHARE = 0.1
 """Least floor, as a share of an image's brightness: voxels cannot show what is smaller than they are any better."""
 DIVERGENCE = 1.5
@@ -42,7 +45,7 @@ def reconstruct(
     normalisation: str = "column",
     accelerate: bool = True,
     smoothing_voxel: float = 0.0,
-    sieve_voxel: float = 0.0,
+    sieve_voxel: float | str = 0.0,
     active_share: float = 0.0,
     tolerance: float = 0.0,
     first: np.ndarray | None = None,
@@ -84,9 +87,11 @@ def reconstruct(
     smoothing_voxel : float
         Standard deviation [voxel] of a Gaussian that smooths the volume after each iteration but the last; 0 for none.
         The misfit may rise by it.
-    sieve_voxel : float
+    sieve_voxel : float or "auto"
         Standard deviation [voxel] of a sieve: the volume is a sum of Gaussians of this size, and SMART iterates their
-        brightnesses c, E = G c, with w G for w. Unlike smoothing it keeps SMART's guarantee. 0 for none.
+        brightnesses c, E = G c, with w G for w; with momentum by the sharper steps of `lfpiv.smart`. Unlike smoothing
+        it keeps the misfit falling. 0 for none. "auto": what suits the size of the particles, which the images tell
+        (`lfpiv.particlesize`), none for particles smaller than voxels.
     active_share : float
         Voxels below this share of the first guess's brightest are zero from the start and cost nothing. 0 keeps all.
     tolerance : float
@@ -121,6 +126,8 @@ def reconstruct(
     )
     recorded = {name: _light(weights, images, name) for name in weights.cameras}
     floors = _floors(floor, weights, images)
+    if isinstance(sieve_voxel, str):
+        sieve_voxel = matching_sieve(weights, images)
     for name, image in recorded.items():
         floors[name] = max(floors[name], floor_share * _brightness(image))
     views = [_view(weights, name, recorded[name], floors[name]) for name in weights.cameras]
@@ -129,10 +136,14 @@ def reconstruct(
     column_sum = weights.stored.store(weights.column_sum)
     lit = column_sum > 1e-6 * column_sum.max()
     if normalisation == "column":
-        step = np.divide(relaxation, sieve(column_sum), out=np.zeros_like(column_sum), where=lit)
+        step, unblurred = (
+            np.divide(relaxation, total, out=np.zeros_like(column_sum), where=lit)
+            for total in (sieve(column_sum), column_sum)
+        )
     else:
         pixels = weights.stored.store(weights.affected_pixels)
         step = np.divide(relaxation / weights.largest, pixels, out=np.zeros_like(column_sum), where=lit & (pixels > 0))
+        unblurred = step
     volume = _first_guess(views, column_sum, lit) if first is None else _given(first, weights) * lit
     if active_share > 0:
         volume[volume < active_share * volume.max()] = 0.0
@@ -145,11 +156,23 @@ def reconstruct(
         smoothed: np.ndarray = blurred.ravel() * lit
         return smoothed
 
+    def sharp(exponent: np.ndarray) -> np.ndarray:
+        return sharpen(exponent * unblurred, weights.stored.shape)
+
     norm = float(np.sqrt(sum(np.square(view.image, dtype=np.float64).sum() for view in views)))
     residual: list[float] = []
     misfit: list[float] = []
     stop = Stop.DONE if tolerance == 0 else Stop.ITERATION_LIMIT
-    steps = iterate(views, volume, step, iterations=iterations, accelerate=accelerate, sieve=sieve, smooth=smooth)
+    steps = iterate(
+        views,
+        volume,
+        step,
+        iterations=iterations,
+        accelerate=accelerate,
+        sieve=sieve,
+        smooth=smooth,
+        sharp=sharp if accelerate and sieve_voxel > 0 else None,
+    )
     for count, (volume, current) in enumerate(steps):  # noqa: B007 - the last one is returned
         residual.append(float(np.sqrt(current.squares)) / norm)
         misfit.append(current.divergence)
@@ -239,8 +262,6 @@ def _view(weights: Weights, name: str, image: np.ndarray, floor: float) -> View:
         gain=np.ascontiguousarray(weights.cameras[name].gain, np.float32).reshape(-1),
         floor=floor,
         projector=weights.projector(name),
-        projected=np.empty_like(image),
-        ratio=np.empty_like(image),
     )
 
 
@@ -254,8 +275,7 @@ def _first_guess(views: list[View], column_sum: np.ndarray, lit: np.ndarray) -> 
     guess = np.where(lit, np.maximum(guess, 1e-6 * guess.max()), 0.0).astype(np.float32)
     seen = light = 0.0
     for view in views:
-        view.projector.project(guess, view.projected)
-        modelled = view.gain * view.projected
+        modelled = view.gain * view.projector.project(guess, np.empty_like(view.image))
         seen += float(view.image[modelled > 0].sum(dtype=np.float64))
         light += float(modelled.sum(dtype=np.float64))
     if not seen > 0:
@@ -273,7 +293,9 @@ def _given(first: np.ndarray, weights: Weights) -> np.ndarray:
     return weights.stored.store(values)
 
 
-def _check(iterations: int, relaxation: float, normalisation: str, active_share: float, **not_negative: float) -> None:
+def _check(
+    iterations: int, relaxation: float, normalisation: str, active_share: float, **not_negative: float | str
+) -> None:
     whole = isinstance(iterations, (int, np.integer)) and not isinstance(iterations, bool)
     if not (whole and iterations >= 0):
         raise ValueError(f"iterations: expected a whole number >= 0, got {iterations!r}.")
@@ -284,5 +306,8 @@ def _check(iterations: int, relaxation: float, normalisation: str, active_share:
     if not 0 <= active_share < 1:
         raise ValueError(f"active_share: expected a number from 0 to below 1, got {active_share!r}.")
     for name, value in not_negative.items():
-        if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"{name}: expected a number >= 0, got {value!r}.")
+        if name == "sieve_voxel" and value == AUTO:
+            continue
+        if isinstance(value, str) or not (np.isfinite(value) and value >= 0):
+            wanted = f'a number >= 0 or "{AUTO}"' if name == "sieve_voxel" else "a number >= 0"
+            raise ValueError(f"{name}: expected {wanted}, got {value!r}.")

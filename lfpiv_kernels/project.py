@@ -2,11 +2,12 @@
 
 A block is at most LANES rays wide, so that its row is one vector, and some rows high. It holds one value per ray, or a
 profile along the columns and one along the rows, whose products are the values. The backward pass gathers per voxel.
-The forward pass scatters: on the CPU every chunk of voxels adds into rays of its own, which are summed in a fixed
-order, so results do not depend on the number of threads; on CUDA it adds atomically. The innermost loops are C++: as
-Warp's vectors they take two to three times as long on the CPU. Twin: ``reference.dense``.
+The forward pass scatters: on the CPU every part of the voxels adds into rays of its own, which each pixel sums in a
+fixed order; on CUDA it adds atomically. The innermost loops are C++: as Warp's vectors they take two to three times as
+long on the CPU. Twin: ``reference.dense``.
 """
 
+import itertools
 import sys
 from dataclasses import dataclass
 
@@ -14,7 +15,9 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.microimages import Microimages, RayMap
+from lfpiv_kernels.microimages import Microimages
+from lfpiv_kernels.project_source import GATHER, SCATTER
+from lfpiv_kernels.raymap import RayMap
 from lfpiv_kernels.raymodel import LANES
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -89,106 +92,7 @@ class Matrix:
     profiles: bool
 
 
-# A row of 8 floats or bytes in C++: a vector of the compiler on the CPU, a plain loop on a GPU. What lies in a row
-# beyond its block is another block's: `within` puts 0 there.
-_ROWS = """
-#if defined(__CUDA_ARCH__)
-    struct row { float x[8]; };
-    auto zero = []() { row r; for (int i = 0; i < 8; ++i) r.x[i] = 0.0f; return r; };
-    auto load = [](const float* p) { row r; for (int i = 0; i < 8; ++i) r.x[i] = p[i]; return r; };
-    auto levels = [](const unsigned char* p) { row r; for (int i = 0; i < 8; ++i) r.x[i] = p[i]; return r; };
-    auto within = [](row a, int width) { for (int i = width; i < 8; ++i) a.x[i] = 0.0f; return a; };
-    auto add = [](row a, row b, float c) { for (int i = 0; i < 8; ++i) a.x[i] += b.x[i] * c; return a; };
-    auto add_product = [](row a, row b, row c) { for (int i = 0; i < 8; ++i) a.x[i] += b.x[i] * c.x[i]; return a; };
-    auto sum = [](row a) {
-        return ((a.x[0] + a.x[4]) + (a.x[1] + a.x[5])) + ((a.x[2] + a.x[6]) + (a.x[3] + a.x[7]));
-    };
-#else
-    typedef float row __attribute__((vector_size(32), aligned(4)));
-    typedef unsigned char bytes __attribute__((vector_size(8), aligned(1)));
-    typedef int lanes __attribute__((vector_size(32)));
-    auto zero = []() { return row{0, 0, 0, 0, 0, 0, 0, 0}; };
-    auto load = [](const float* p) { return *(const row*)p; };
-    auto levels = [](const unsigned char* p) { return __builtin_convertvector(*(const bytes*)p, row); };
-    auto within = [](row a, int width) { return (lanes{0, 1, 2, 3, 4, 5, 6, 7} < width) ? a : row{}; };
-    auto add = [](row a, row b, float c) { return a + b * c; };
-    auto add_product = [](row a, row b, row c) { return a + b * c; };
-    auto sum = [](row a) { return ((a[0] + a[4]) + (a[1] + a[5])) + ((a[2] + a[6]) + (a[3] + a[7])); };
-#endif
-"""
-
-_GATHER = (
-    _ROWS
-    + """
-    const unsigned char* level = levels_in.data + first_value;
-    row total = zero();
-    for (int block = first; block < last; ++block) {
-        const float* at = rays.data + ray.data[block];
-        const int rows = height.data[block], columns = width.data[block];
-        row even = zero(), odd = zero();
-        int k = 0;
-        if (profiles) {
-            const row across = within(levels(level), columns);
-            level += columns;
-            for (; k < rows; ++k, at += stride) even = add(even, load(at), (float)level[k]);
-            level += rows;
-            total = add_product(total, even, across);
-        } else {
-            for (; k + 1 < rows; k += 2, at += 2 * stride, level += 2 * columns) {
-                even = add_product(even, load(at), levels(level));
-                odd = add_product(odd, load(at + stride), levels(level + columns));
-            }
-            if (k < rows) {
-                even = add_product(even, load(at), levels(level));
-                level += columns;
-            }
-            total = add(total, within(add(even, odd, 1.0f), columns), 1.0f);
-        }
-    }
-    return sum(total);
-"""
-)
-
-_SCATTER = (
-    _ROWS
-    + """
-#if !defined(__CUDA_ARCH__)  // rays of its own: not for two threads at once
-    const unsigned char* level = levels_in.data + first_value;
-    for (int block = first; block < last; ++block) {
-        float* at = rays_out.data + ray.data[block];
-        const int rows = height.data[block], columns = width.data[block];
-        const row light = within(zero() + intensity, columns);
-        int k = 0;
-        if (profiles) {
-            const row across = levels(level) * light;
-            level += columns;
-            for (; k + 1 < rows; k += 2, at += 2 * stride) {  // load two rows, then store two
-                const row even = add(load(at), across, (float)level[k]);
-                const row odd = add(load(at + stride), across, (float)level[k + 1]);
-                *(row*)at = even;
-                *(row*)(at + stride) = odd;
-            }
-            if (k < rows) *(row*)at = add(load(at), across, (float)level[k]);
-            level += rows;
-        } else {
-            for (; k + 1 < rows; k += 2, at += 2 * stride, level += 2 * columns) {
-                const row even = add_product(load(at), levels(level), light);
-                const row odd = add_product(load(at + stride), levels(level + columns), light);
-                *(row*)at = even;
-                *(row*)(at + stride) = odd;
-            }
-            if (k < rows) {
-                *(row*)at = add_product(load(at), levels(level), light);
-                level += columns;
-            }
-        }
-    }
-#endif
-"""
-)
-
-
-@wp.func_native(_GATHER)
+@wp.func_native(GATHER)
 def _gather(
     first: int,
     last: int,
@@ -203,7 +107,7 @@ def _gather(
 ) -> float: ...
 
 
-@wp.func_native(_SCATTER)
+@wp.func_native(SCATTER)
 def _scatter(
     first: int,
     last: int,
@@ -320,13 +224,16 @@ def _count_lit(
 class Projector:
     """The linear map of one camera's weights on the running device: voxels to sensor pixels, and back.
 
+    Light goes from voxels to rays (`scatter`) and from rays to pixels, and the same way back (`gather`). On the way the
+    rays keep it, in memory of their own for every part of the voxels that a CPU launch takes: so no two threads write
+    one ray, and results do not depend on their number. A ray that voxels of two parts light lies in both.
+
     Arrays in and out are float32, C-contiguous and flat; on the CPU they are used in place.
     """
 
     def __init__(self, blocks: Blocks):
         self.blocks = blocks
         self._device = runtime.device()
-        self._map = RayMap(blocks.microimages)
         self._matrix = Matrix()
         self._matrix.first_block = self._put(blocks.first_block, int)
         self._matrix.first_value = self._put(blocks.first_value, wp.int64)
@@ -337,37 +244,83 @@ class Projector:
         self._matrix.scale = self._put(blocks.scale, float)
         self._matrix.stride = blocks.microimages.edge
         self._matrix.profiles = blocks.form == "profiles"
-        self._rays = wp.zeros(blocks.microimages.size, dtype=float, device=self._device.warp)
         wp.load_module(sys.modules[__name__], device=self._device.warp)  # before threads use it
-        self._spans = [self._span(part) for part in range(runtime.CHUNKS)] if self._device.kind == "cpu" else []
-        self._parts: list[np.ndarray] = []
+        self._spans = self._find_spans()
+        self._places = np.cumsum([0] + [stop - start for start, stop in self._spans])
+        self.rays = wp.zeros(max(int(self._places[-1]), 1), dtype=float, device=self._device.warp)
+        """The light on the rays, part after part."""
+        self._parts = [  # each as if it began with the camera's first ray, where the blocks count from
+            wp.array(ptr=self.rays.ptr + 4 * (int(place) - start), dtype=float, shape=(stop,), device=self.rays.device)
+            for place, (start, stop) in zip(self._places, self._spans, strict=False)
+        ]
+        self.map = self._map_rays()
 
     def _put(self, array, dtype):
         return wp.array(array, dtype=dtype, device=self._device.warp, copy=False)
 
-    def _span(self, part):
-        """First and last ray that a chunk of voxels can touch."""
+    def _find_spans(self):
+        """First and last ray that each part of the voxels can touch."""
         voxels, rays = len(self.blocks.scale), self.blocks.microimages
-        a, b = (self.blocks.first_block[voxels * k // runtime.CHUNKS] for k in (part, part + 1))
-        if a == b:
-            return 0, 0
-        first, last, tall = self.blocks.ray[a:b].min(), self.blocks.ray[a:b].max(), self.blocks.height[a:b].max()
-        return int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + LANES, rays.size)
+        if self._device.kind == "cuda":
+            return [(0, rays.size)]
+        edges = [self.blocks.first_block[voxels * part // runtime.CHUNKS] for part in range(runtime.CHUNKS + 1)]
+        spans = []
+        for a, b in itertools.pairwise(edges):
+            if a == b:
+                spans.append((0, 0))
+                continue
+            first, last, tall = self.blocks.ray[a:b].min(), self.blocks.ray[a:b].max(), self.blocks.height[a:b].max()
+            spans.append((int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + LANES, rays.size)))
+        return spans
 
-    def back_project(self, image: np.ndarray, out: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-        """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
+    def _map_rays(self):
+        """Map of the rays that voxels light to pixels."""
+        self.scatter(np.ones(len(self.blocks.scale), np.float32))
+        place = np.flatnonzero(self.rays.numpy()).astype(np.int32)
+        shift = [start - int(first) for first, (start, _) in zip(self._places, self._spans, strict=False)]
+        counts = np.diff(np.searchsorted(place, self._places))
+        return RayMap(self.blocks.microimages, place, place + np.repeat(np.array(shift, np.int32), counts))
+
+    def scatter(self, volume: np.ndarray) -> None:
+        """Send the light of `volume`, shape (voxel,), to the rays."""
+        voxels = self._put(volume, float)
+        if self._device.kind == "cuda":
+            self.rays.zero_()
+            wp.launch(
+                _project_atomic,
+                dim=len(volume),
+                inputs=[self._matrix, voxels],
+                outputs=[self.rays],
+                device=self._device.warp,
+            )
+            return
+        rays = self.rays.numpy()
+
+        def launch(part, first, last):
+            rays[self._places[part] : self._places[part + 1]] = 0.0
+            wp.launch(
+                _project,
+                dim=last - first,
+                inputs=[first, self._matrix, voxels],
+                outputs=[self._parts[part]],
+                device="cpu",
+            )
+
+        runtime.run_chunks(len(volume), launch)
+
+    def gather(self, out: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
+        """Add the weighted sum of the light on each voxel's rays to `out`, shape (voxel,).
 
         Voxels whose `active` is zero are left out. Returns `out`.
         """
         volume = self._put(out, float)
         mask = self._put(np.ones_like(out) if active is None else active, float)
-        self._map.spread(self._put(image, float), self._rays)
 
-        def launch(_, first, last):
+        def launch(part, first, last):
             wp.launch(
                 _back_project,
                 dim=last - first,
-                inputs=[first, self._matrix, self._rays, mask],
+                inputs=[first, self._matrix, self._parts[part], mask],
                 outputs=[volume],
                 device=self._device.warp,
             )
@@ -379,37 +332,21 @@ class Projector:
 
     def project(self, volume: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Write the image of `volume`, shape (voxel,), into `out`, shape (pixel,); returns `out`."""
-        voxels, image = self._put(volume, float), self._put(out, float)
-        self._rays.zero_()
+        self.scatter(volume)
+        out.fill(0.0)  # pixels that no voxel lights
+        image = self._put(out, float)
+        self.map.collect(self.rays, image)
         if self._device.kind == "cuda":
-            wp.launch(
-                _project_atomic,
-                dim=len(volume),
-                inputs=[self._matrix, voxels],
-                outputs=[self._rays],
-                device=self._device.warp,
-            )
-            self._map.collect(self._rays, image)
             out[:] = image.numpy()
-            return out
-        if not self._parts:
-            self._parts = [np.empty(last - first, np.float32) for first, last in self._spans]
-
-        def launch(part, first, last):
-            start, stop = self._spans[part]
-            if start == stop:
-                return
-            scratch = self._parts[part]
-            scratch[:] = 0.0
-            rays = wp.array(ptr=scratch.ctypes.data - 4 * start, dtype=float, shape=(stop,), device="cpu", copy=False)
-            wp.launch(_project, dim=last - first, inputs=[first, self._matrix, voxels], outputs=[rays], device="cpu")
-
-        runtime.run_chunks(len(volume), launch)
-        rays = self._rays.numpy()
-        for (start, stop), scratch in zip(self._spans, self._parts, strict=True):
-            rays[start:stop] += scratch
-        self._map.collect(self._rays, image)
         return out
+
+    def back_project(self, image: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
+
+        Returns `out`.
+        """
+        self.map.spread(self._put(image, float), self.rays)
+        return self.gather(out)
 
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32."""

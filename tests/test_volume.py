@@ -1,23 +1,28 @@
 """SMART: convergence to the minimum of its divergence, its invariants, and a particle that comes back in its place."""
 
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from ideal_rig import two_cameras
+from ideal_rig import optics, two_cameras
 from scipy import ndimage
 from scipy.optimize import minimize
 
 import lfpiv
-from lfpiv import smart
+from lfpiv import particlesize, smart
 from lfpiv.raylayout import plain
 from lfpiv.weightblocks import StoredGrid
 from lfpiv.weights import Weights
 from lfpiv_kernels import raymodel, reference, runtime
+from lfpiv_kernels import smart as kernels
 from lfpiv_kernels.project import Blocks, Projector
 
 TOLERANCE_F32 = 2e-4  # 50 iterations of float32 steps whose sums have <= 60 terms: 50 * 60 * 6e-8
+TOLERANCE_NEAR = 5e-3  # projections rounded by 6e-8 in differences of 1e-4 from the image, over 300 pixels
+TOLERANCE_RATIO = 1e-6  # logarithms up to 6 in float32, relative to a voxel's weights
 TOLERANCE_MISFIT = 1e-6  # a misfit is a float32 image's sum: rounding of 24 pixels relative to their light
+TOLERANCE_SIZE = 0.08  # [voxel] some hundred particles: a tenth of their covariance, a twentieth of its root
 TOLERANCE_LIMIT = 2e-3  # SMART converges linearly: what is left after 2,000 iterations in float32, 400 with momentum
 
 
@@ -79,7 +84,7 @@ def accelerated_twin(matrix, image, first, *, iterations, floor):
     for _ in range(iterations):
         following = reference.smart(matrix, image, point, iterations=1, floor=floor)
         later = (1 + np.sqrt(1 + 4 * time**2)) / 2
-        ratio = np.clip(following / last, 1 / smart.LARGEST_LEAP, smart.LARGEST_LEAP)
+        ratio = np.clip(following / last, 1 / kernels.LARGEST_LEAP, kernels.LARGEST_LEAP)
         ahead = following * ratio ** min((time - 1) / later, smart.MOMENTUM)
         if divergence(matrix, image, ahead, floor) > misfit:
             point, time, restarts = following, 1.0, restarts + 1
@@ -190,9 +195,47 @@ def test_momentum_that_only_harms_leaves_plain_smart(monkeypatch):
 def noisy_images(weights, seed):
     """Images that no volume explains: 30 % off pixel by pixel, one in ten dark; as a mapping and as one vector."""
     rng = np.random.default_rng(seed)
-    image = matrix_of(weights) @ rng.random(weights.grid.size) ** 4 * rng.uniform(0.7, 1.3, 2 * 4 * 8)
+    matrix = matrix_of(weights)
+    image = matrix @ rng.random(weights.grid.size) ** 4 * rng.uniform(0.7, 1.3, len(matrix))
     image[rng.random(image.size) < 0.1] = 0.0
     return images_of(weights, image), image.astype(np.float32)
+
+
+@pytest.mark.parametrize("distance", [1.0, 1e-4])
+def test_comparison_equals_its_twin_far_from_the_minimum_and_at_it(distance):
+    """With gains, dead pixels and pixels no voxel lights; and so near the minimum that log(I / P) loses its digits."""
+    weights, rng = random_system(7, rows=40, lit=0.03), np.random.default_rng(7)
+    projector = weights._projectors["one"]
+    matrix, floor = reference.dense(projector.blocks), 0.2
+    volume = rng.uniform(0.5, 2.0, matrix.shape[1]).astype(np.float32)
+    gain = rng.uniform(0.5, 1.5, len(matrix)).astype(np.float32) * (rng.random(len(matrix)) > 0.1)
+    projected = gain * (matrix @ volume.astype(float))
+    image = (projected * np.exp(distance * rng.normal(size=len(matrix)))).astype(np.float32)
+    if distance == 1.0:
+        image[(matrix.sum(1) == 0) & (gain > 0)] = 0.7  # light from elsewhere
+        image[rng.random(len(image)) < 0.1] = 0.0
+    comparison = kernels.Comparison(projector, image, gain, floor)
+    image = image.astype(float)
+    ratio = np.log((image + floor) / (projected + floor))
+    terms = image - projected - (projected + floor) * ratio
+    squares, misfit = comparison.compare(volume)
+    assert squares == pytest.approx(np.square(image - projected).sum(), rel=TOLERANCE_NEAR)
+    assert misfit == pytest.approx(terms.sum(), rel=TOLERANCE_NEAR)
+    seen, added = rng.random(len(volume)) < 0.5, np.ones_like(volume)
+    projector.gather(added, active=seen.astype(np.float32))
+    expected = 1 + seen * (matrix.T @ (gain * ratio))
+    assert np.abs(added - expected).max() <= TOLERANCE_RATIO * matrix.sum(0).max()
+
+
+def test_threads_change_nothing(monkeypatch):
+    weights = random_system(8, rows=40)
+    images, _ = noisy_images(weights, 8)
+    many = lfpiv.reconstruct(weights, images, iterations=12)
+    with ThreadPoolExecutor(1) as one:
+        monkeypatch.setattr(runtime, "_pool", one)
+        alone = lfpiv.reconstruct(weights, images, iterations=12)
+    assert alone.values.tobytes() == many.values.tobytes()
+    assert alone.misfit == many.misfit
 
 
 @pytest.mark.parametrize(
@@ -297,6 +340,140 @@ def test_a_sieve_is_smart_on_blurred_voxels():
     assert np.abs(volume.values.ravel() / (blur @ twin) - 1).max() <= TOLERANCE_F32
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_sharp_steps_reach_the_images_in_half_the_iterations(seed):
+    """With a sieve, plain momentum and sharp steps solve W G c = I; sharp ones are faster and leave solutions alone."""
+    weights = random_system(seed, voxels=(6, 6, 6))
+    shape, (truth, start) = weights.grid.shape, np.random.default_rng(seed).uniform(0.5, 2.0, (2, 216))
+    blur = smart.gaussian(0.6, weights.stored.shape)
+    order = weights.stored.store(truth.reshape(shape).astype(np.float32))
+    volume = weights.stored.restore(blur(order))
+    keywords = {"floor": 1e-3, "floor_share": 0.0, "sieve_voxel": 0.6}
+    stays = lfpiv.reconstruct(weights, weights(volume), iterations=20, first=truth.reshape(shape), **keywords)
+    assert np.abs(stays.values / volume - 1).max() <= TOLERANCE_F32
+    sharp, plain = (_misfits(weights, weights(volume), start.reshape(shape), sharp) for sharp in (True, False))
+    assert sharp[30] < plain[60] < plain[0]
+
+
+def _misfits(weights, images, first, sharp):
+    """Misfits of 60 iterations with a sieve and momentum, with sharp steps or without."""
+    views = [
+        smart.View(image=images[name].reshape(-1), gain=camera.gain.reshape(-1), floor=1e-3, projector=projector)
+        for (name, camera), projector in zip(weights.cameras.items(), weights._projectors.values(), strict=True)
+    ]
+    shape = weights.stored.shape
+    blur, total = smart.gaussian(0.6, shape), weights.stored.store(weights.column_sum)
+    steps = smart.iterate(
+        views,
+        weights.stored.store(first.astype(np.float32)),
+        1 / blur(total),
+        iterations=60,
+        accelerate=True,
+        sieve=blur,
+        smooth=lambda volume: volume,
+        sharp=(lambda exponent: smart.sharpen(exponent / total, shape)) if sharp else None,
+    )
+    return [misfit.divergence for _, misfit in steps]
+
+
+@pytest.mark.parametrize("gain", [-1.0, 30.0])
+def test_a_sharp_step_that_raises_the_misfit_is_taken_back(gain):
+    weights = random_system(12)
+    images, image = noisy_images(weights, 12)
+    view = smart.View(image=images["one"].reshape(-1), gain=np.ones(32, np.float32), floor=0.2, projector=None)
+    views = [
+        smart.View(**{**vars(view), "image": images[name].reshape(-1), "projector": weights._projectors[name]})
+        for name in images
+    ]
+    blur, total = smart.gaussian(0.6, weights.stored.shape), weights.stored.store(weights.column_sum)
+    misfits = [
+        misfit.divergence
+        for _, misfit in smart.iterate(
+            views,
+            np.ones_like(total),
+            1 / blur(total),
+            iterations=40,
+            accelerate=True,
+            sieve=blur,
+            smooth=lambda volume: volume,
+            sharp=lambda exponent: np.clip(gain * exponent / total, -3, 3),
+        )
+    ]
+    assert (np.diff(misfits) <= TOLERANCE_MISFIT * image.sum()).all()
+    assert misfits[-1] < 0.7 * misfits[0]
+
+
+def traced_images(rig, positions, sigma_mm, seed, *, counts, noise=2.0, rays=2000):
+    """Images of particles by tracing rays from points of Gaussian clouds, and noise: no weights, no simulator."""
+    rng, images = np.random.default_rng(seed), {}
+    for name, camera in rig.cameras.items():
+        geometry = camera.optics
+        rows, columns = geometry.sensor_shape
+        points = np.repeat(positions, rays, axis=0)
+        points = points + sigma_mm * rng.standard_normal(points.shape)
+        radius, angle = geometry.pupil_radius_mm * np.sqrt(rng.random(len(points))), rng.random(len(points)) * 2 * np.pi
+        pupil = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        meets = camera.map(points, pupil)
+        lens = camera.lattice.centres_mm(camera.lattice.nearest(meets))
+        pixel = np.floor((lens + geometry.sensor_per_pupil * (meets - pupil)) / geometry.pixel_mm).astype(int)
+        pixel += (columns // 2, rows // 2)
+        inside = ((pixel >= 0) & (pixel < (columns, rows))).all(1)
+        light = np.bincount(pixel[inside, 1] * columns + pixel[inside, 0], minlength=rows * columns)
+        image = light * (250 * counts / rays) + noise * rng.standard_normal(rows * columns)  # 250 pixels a microimage
+        images[name] = image.reshape(rows, columns).astype(np.float32)
+    return images
+
+
+@pytest.fixture(scope="module")
+def small_volume():
+    rig = two_cameras(optics=optics(rows=460, columns=600))
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.0, 2.0, 1.8), voxel_mm=0.1)
+    return rig, lfpiv.build_weights(rig, grid)
+
+
+@pytest.mark.parametrize(
+    ("sigma_voxel", "ppm", "counts"),
+    [(0.7, 0.2, 200.0), (0.7, 1.0, 200.0), (0.7, 0.5, 8.0), (1.0, 0.5, 200.0), (0.0, 0.2, 200.0), (0.0, 1.0, 8.0)],
+)
+def test_images_tell_how_large_particles_are(small_volume, sigma_voxel, ppm, counts):
+    """Whatever their number and brightness; the voxel's own variance of 1/12 is the weights' and does not count."""
+    rig, weights = small_volume
+    rng = np.random.default_rng([round(10 * sigma_voxel), round(10 * ppm)])
+    positions = rng.uniform(-0.5, 0.5, (round(400 * ppm), 3)) * (2.0, 2.0, 1.8)
+    images = traced_images(rig, positions, sigma_voxel * 0.1, 1, counts=counts)
+    size = particlesize.particle_size(weights, images)
+    assert size == pytest.approx(np.sqrt(max(sigma_voxel**2 - 1 / 12, 0)), abs=TOLERANCE_SIZE)
+    volume = lfpiv.reconstruct(weights, images, iterations=1, sieve_voxel="auto")
+    if sigma_voxel:
+        assert volume.sieve_voxel == pytest.approx(np.sqrt(size**2 - 1 / 12), abs=particlesize.SIEVE_STEP_VOXEL / 2)
+    else:  # points: plain SMART, bit for bit
+        assert volume.sieve_voxel == 0.0
+        assert volume.values.tobytes() == lfpiv.reconstruct(weights, images, iterations=1).values.tobytes()
+
+
+def test_images_of_noise_ask_for_no_sieve(small_volume):
+    rig, weights = small_volume
+    images = traced_images(rig, np.zeros((1, 3)), 0.1, 2, counts=0.0)
+    assert particlesize.particle_size(weights, images) is None
+    assert particlesize.matching_sieve(weights, images) == 0.0
+
+
+def test_volumes_made_of_gaussians_are_smoothed_less_before_they_are_correlated():
+    positions, grid = (
+        np.random.default_rng(4).uniform(0, 1.6, (150, 3)),
+        lfpiv.Grid(shape=(16, 16, 16), voxel_mm=0.1, first_centre_mm=(0.0, 0.0, 0.0)),
+    )
+    pair = [lfpiv.metrics.truth_volume(positions + shift, None, grid) for shift in (0.0, 0.07)]
+    made = [volume.assign_attrs(sieve_voxel=sieve) for volume, sieve in zip(pair, (0.4, 0.3), strict=True)]
+    less, same = (
+        lfpiv.correlate(*volumes, dt_s=1.0, windows=(16, 8), smoothing_voxel=smoothing)
+        for volumes, smoothing in ((made, 0.5), (pair, 0.4))
+    )
+    assert less["valid"].any() and "0.5" in less.attrs["settings"]  # what was asked for, the same for all pairs
+    for name in ("displacement_x", "displacement_y", "displacement_z"):
+        assert np.allclose(less[name], same[name], atol=TOLERANCE_F32)
+
+
 def test_truth_is_a_fixed_point():
     weights = random_system(4)
     truth = np.random.default_rng(4).uniform(0.5, 2, weights.grid.shape).astype(np.float32)
@@ -381,6 +558,7 @@ def test_light_outside_the_volume_and_dead_pixels_do_not_break_it():
         ({"relaxation": float("nan")}, "relaxation: expected a number > 0"),
         ({"smoothing_voxel": -0.1}, "smoothing_voxel: expected"),
         ({"sieve_voxel": float("nan")}, "sieve_voxel: expected"),
+        ({"sieve_voxel": "0.6"}, 'sieve_voxel: expected a number >= 0 or "auto"'),
         ({"tolerance": -0.1}, "tolerance: expected"),
         ({"floor_share": float("nan")}, "floor_share: expected"),
         ({"active_share": 1.0}, "active_share: expected"),
