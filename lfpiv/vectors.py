@@ -94,7 +94,8 @@ def correlate(
     smoothing_voxel : float
         Standard deviation of a Gaussian applied to both volumes first [voxel]; 0: none. For particles that are single
         bright voxels, about 0.5; it widens larger ones, so that more ghosts meet (blobs of 0.7 voxel: a quarter more
-        error).
+        error). What `reconstruct` made of Gaussians is as smooth already: volumes that say so, by their attribute
+        ``sieve_voxel``, are only smoothed by what is missing, sqrt(smoothing_voxel^2 - sieve_voxel^2).
     intensity_power : float
         Power of the smoothed intensities that is correlated, negative ones taken as 0; 1: as they are. Below 1 a few
         bright particles, and the ghosts they cast, no longer outweigh the others: 0.5 lowered the error of
@@ -134,8 +135,8 @@ def correlate(
         raise ValueError(f"intensity_power: expected a value > 0, got {intensity_power!r}.")
     schedule = _check_windows(windows, first.shape)
     search = _first_search(max_displacement_voxel, schedule[0], first.shape)
-    if smoothing_voxel > 0:
-        first, second = (scipy.ndimage.gaussian_filter(v, smoothing_voxel, mode="constant") for v in (first, second))
+    if (missing := missing_smoothing(smoothing_voxel, volume_a, volume_b)) > 0:
+        first, second = (scipy.ndimage.gaussian_filter(v, missing, mode="constant") for v in (first, second))
     if intensity_power != 1:
         first, second = (np.maximum(v, 0) ** np.float32(intensity_power) for v in (first, second))
     multi_pass = _MultiPass(first, second, symmetric=len(schedule) > 1)
@@ -274,6 +275,14 @@ def _dataset(
     return xr.Dataset(variables, places, summary)
 
 
+def missing_smoothing(smoothing_voxel: float, *volumes: xr.DataArray | np.ndarray) -> float:
+    """Return what volumes lack of a smoothing [voxel]: those made of Gaussians, ``sieve_voxel``, are as smooth."""
+    sieve = min(
+        float(volume.attrs.get("sieve_voxel", 0.0)) if isinstance(volume, xr.DataArray) else 0.0 for volume in volumes
+    )
+    return math.sqrt(max(smoothing_voxel**2 - sieve**2, 0.0)) if sieve > 0 else smoothing_voxel
+
+
 def _is_finite(value: object) -> TypeGuard[float]:
     """Whether a value is a finite real number."""
     return isinstance(value, numbers.Real) and math.isfinite(value)
@@ -290,14 +299,16 @@ def _check_volume(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
     if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fiub":
         raise ValueError(f"{name}: expected a volume of numbers (z, y, x), got {values.dtype} of shape {values.shape}.")
     with np.errstate(over="ignore"):
-        values = values.astype(np.float32)
+        values = values.astype(np.float32, copy=isinstance(volume, np.ma.MaskedArray))
     if isinstance(volume, np.ma.MaskedArray):
         values[np.ma.getmaskarray(volume)] = np.nan
-    bad = values.size - int(np.isfinite(values).sum())
-    if bad:
+    lowest, highest = float(values.min()), float(values.max())
+    if not (math.isfinite(lowest) and math.isfinite(highest)):
+        bad = values.size - int(np.isfinite(values).sum())
         raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
-    values -= np.median(values.ravel()[:: 1 + values.size // _BACKGROUND_SAMPLES])
-    values /= max(float(values.max()), -float(values.min()), float(np.finfo(np.float32).tiny))
+    background = np.median(values.ravel()[:: 1 + values.size // _BACKGROUND_SAMPLES])
+    values = values - background  # a copy
+    values /= max(highest - float(background), float(background) - lowest, float(np.finfo(np.float32).tiny))
     return values
 
 

@@ -23,17 +23,20 @@ from numpy.lib.stride_tricks import sliding_window_view
 from . import correlation_kernels as kernels
 from . import peak_kernels, plane_kernels, runtime, spectral_kernels
 from .correlation_kernels import LANES
-from .correlation_memory import free_memory, launch, new_array, to_device
-from .correlation_plan import GROUP, Plan, Spectrum, make_plan, transform_size, whole_groups, window_grid
+from .correlation_memory import free_memory, launch, new_array
+from .correlation_plan import GROUP, Plan, make_plan, whole_groups, window_grid
 from .correlation_sides import Side
+from .correlation_transforms import Planes, Spectrum
 from .spectral_kernels import ROWS
 
 __all__ = ["WindowPeaks", "correlate_windows", "window_grid"]
 
-_SLAB_BYTES = 1 << 25
+_SLAB_BYTES = 1 << 26
 """Correlation sums held at a time; larger problems run in slabs of window layers."""
 _SCORE_BYTES = 1 << 23
 """Coefficients a CPU task holds: long rows of neighbouring windows are worth more than fast memory."""
+_PART = 1 << 10
+"""Elements of a plane that a task transforms along z: long rows, and what it holds stays in a core's own cache."""
 
 
 @dataclass(frozen=True)
@@ -94,13 +97,15 @@ def correlate_windows(
         If shapes differ, values are not finite, a window does not fit, `search` is below 2 or the method is unknown.
     """
     plan, method = make_plan(first.shape, second.shape, window, step, search, method)
-    for name, volume in (("first", first), ("second", second)):
-        flat = np.ravel(volume)
-        if not math.isfinite(float(np.dot(flat, flat))):
+    flat = first.ravel(), second.ravel()
+    squares = [float(np.dot(values, values)) for values in flat]
+    for name, total in zip(("first", "second"), squares, strict=True):
+        if not math.isfinite(total):
             raise ValueError(f"{name}: expected finite values whose squares add up to a float32, got others.")
     free_memory()
-    sides = Side(plan, first, search if symmetric else (0, 0, 0)), Side(plan, second, search)
-    peaks = _measure(plan, sides, symmetric, method)
+    searches = (search if symmetric else (0, 0, 0)), search
+    first_side, second_side = map(Side, (plan, plan), (first, second), squares, searches)
+    peaks = _measure(plan, (first_side, second_side), symmetric, method)
     return WindowPeaks(
         displacement=np.moveaxis(peaks[:3], 0, -1).copy(),
         second_displacement=np.moveaxis(peaks[3:6], 0, -1).copy(),
@@ -195,12 +200,14 @@ class _Work:
         """Room for some layers of blocks."""
         spectra = 0
         if plan.spectral:
-            size = transform_size(plan.block[0], plan.search[0]), transform_size(plan.block[1], plan.search[1])
-            spectra = layers * size[0] * max(side.voxels.plane for side in sides)
-            reach = plan.block[2] + plan.lags[2] - 1
-            half, wide = size[1] // 2 + 1, min(plan.stride[2], reach) * whole_groups(GROUP + _lanes_past(plan))
-            pitch = GROUP * plan.block[2] * (2 * plan.block[1] + 6 * ROWS) + wide * (4 * half + 6 * ROWS)
-            pitch += GROUP * plan.lags[2] * (4 * half + (size[0] + 2) * plan.lags[1]) + whole_groups(reach)
+            spectrum = Spectrum.of(plan.block, plan.search)
+            spectra = layers * spectrum.size[0] * max(side.voxels.plane for side in sides)
+            taps, near = (len(quads) for quads in spectrum.folds)
+            reach, half = plan.block[2] + plan.lags[2] - 1, spectrum.size[1] // 2 + 1
+            wide = min(plan.stride[2], reach) * whole_groups(GROUP + _lanes_past(plan))
+            pitch = GROUP * plan.block[2] * (8 * taps + 6 * ROWS) + wide * (8 * near + 6 * ROWS)
+            pitch += GROUP * plan.lags[2] * (4 * half + (spectrum.size[0] + 2) * plan.lags[1]) + whole_groups(reach)
+            pitch = max(pitch, *(len(planes.quads) * _PART for planes in spectrum.planes))
         else:
             edges = zip(plan.block[1:], plan.lags[1:], strict=True)
             pitch = LANES * plan.block[0] * (math.prod(plan.block[1:]) + math.prod(b + n - 1 for b, n in edges))
@@ -223,13 +230,13 @@ def _correlate_layers(
     pitches, lags = wp.vec2i(first.voxels.plane, second.voxels.plane), wp.vec3i(*plan.lags)
     if plan.spectral:
         spectrum = Spectrum.of(plan.block, plan.search)
-        start, stride = layers.start * plan.stride[0], plan.stride[0]
-        _combine(spectrum.taps, taps[0], start, stride, len(layers), first.voxels.plane, work.taps)
-        _combine(spectrum.near, near, start, stride, len(layers), second.voxels.plane, work.near)
+        _transform_planes(spectrum.planes[0], taps[0], layers, plan.stride[0], first.voxels.plane, work, work.taps)
+        _transform_planes(spectrum.planes[1], near, layers, plan.stride[0], second.voxels.plane, work, work.near)
+        quads, matrices = spectrum.arrays
+        inputs = [work.taps, work.near, *taps[1:], *second.voxels.offsets, pitches, quads, wp.vec3i(*spectrum.counts)]
+        inputs += [matrices, wp.vec2i(*spectrum.size), plan.stride[2], wp.vec3i(*plan.block)]
         groups = -(-plan.lanes // GROUP)
-        inputs = [work.taps, work.near, *taps[1:], *second.voxels.offsets, pitches, to_device(spectrum.matrices)]
-        inputs += [wp.vec2i(*spectrum.size), plan.stride[2], wp.vec3i(*plan.block), lags, layers.start, ring, groups]
-        inputs += [GROUP, _lanes_past(plan), plan.lanes, work.scratch_pitch]
+        inputs += [lags, layers.start, ring, groups, GROUP, _lanes_past(plan), plan.lanes, work.scratch_pitch]
         launch(
             spectral_kernels._correlate_spectra,
             len(layers) * groups,
@@ -247,22 +254,22 @@ def _correlate_layers(
     launch(kernels._correlate_blocks, size, (), [*inputs, work.scratch_pitch], [work.scratch, sums], slots=True)
 
 
-def _combine(
-    matrix: np.ndarray, volume: wp.array, start: int, stride: int, layers: int, plane: int, out: wp.array
+def _transform_planes(
+    planes: Planes, volume: wp.array, layers: range, stride: int, plane: int, work: _Work, out: wp.array
 ) -> None:
-    """Combine the planes of each layer, (layer, row of the matrix, element of a plane)."""
-    rows, terms = matrix.shape
-    part = 256  # so that the planes' parts stay in the fastest cache
-    inputs = [volume, *_padded(matrix.T), terms, rows, start, stride, plane, part]
-    launch(plane_kernels._transform_planes, layers * -(-plane // part), (), inputs, [out])
-
-
-def _padded(matrix: np.ndarray) -> tuple[wp.array, int]:
-    """Flat matrix with rows of whole sixes, and their length."""
-    columns = -(-matrix.shape[1] // 6) * 6
-    padded = np.zeros((len(matrix), columns), np.float32)
-    padded[:, : matrix.shape[1]] = matrix
-    return wp.array(padded.ravel(), dtype=float, device=runtime.device().warp), columns
+    """Transform the planes of each layer, (layer, row, element of a plane)."""
+    quads, rows, matrix = planes.arrays
+    layout = [layers.start * stride, stride, plane, _PART]
+    inputs = [volume, quads, len(planes.quads) // 4, rows, wp.vec4i(*planes.counts), matrix, *layout]
+    launch(
+        plane_kernels._transform_planes,
+        len(layers) * -(-plane // _PART),
+        (),
+        inputs,
+        [work.scratch, out],
+        slots=True,
+        after_slot=[work.scratch_pitch],
+    )
 
 
 def _shifted(side: Side, search: tuple[int, int, int]) -> tuple[wp.array, wp.array, wp.array]:

@@ -52,10 +52,10 @@ def new_array(shape: tuple[int, ...]) -> wp.array:
     return wp.empty(shape, dtype=float, device=where.warp)
 
 
-def to_device(values: np.ndarray) -> wp.array:
-    """Float array on the running device; on the CPU a view that keeps its owner."""
+def to_device(values: np.ndarray, dtype: type = float) -> wp.array:
+    """Array on the running device; on the CPU a view that keeps its owner."""
     where = runtime.device()
-    return wp.array(values, dtype=float, device=where.warp, copy=where.kind != "cpu")
+    return wp.array(values, dtype=dtype, device=where.warp, copy=where.kind != "cpu")
 
 
 def launch(kernel, size, inner, inputs, outputs, *, slots=False, after_slot=()) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
-import numpy as np
 import scipy.fft
 
 from . import runtime
 from .correlation_kernels import LANES
-from .spectral_kernels import ROWS
+from .correlation_transforms import transform_size
 
 METHODS = ("auto", "direct", "fft")
 GROUP = 32
@@ -21,7 +20,7 @@ _DIRECT_SECONDS = 2.2e-11
 """Cost of one multiply-add of the direct kernel, all lanes counted (measured, one core, AVX-512)."""
 _FETCH = 3
 """Multiply-adds that take as long as fetching a voxel for a group of lanes."""
-_SPECTRAL_SECONDS = 5.5e-11
+_SPECTRAL_SECONDS = 8e-11
 """Cost of one multiply-add of the spectral kernel (measured, as above)."""
 _SUM_SECONDS = 1e-10
 """Cost of adding one row of blocks to its windows, per lag (measured, as above)."""
@@ -44,44 +43,44 @@ class Plan:
     block: tuple[int, int, int]
     """Edges of the blocks that windows are made of; the window itself where nothing is shared."""
     spectral: bool = False
-    """Whether blocks are correlated by transforms along z and y, see `Spectrum`."""
+    """Whether blocks are correlated by transforms along z and y, see `correlation_transforms`."""
 
-    @property
+    @cached_property
     def lags(self) -> tuple[int, int, int]:
         """Lags per axis."""
         return tuple(2 * r + 1 for r in self.search)
 
-    @property
+    @cached_property
     def shared(self) -> bool:
         """Whether windows are sums of smaller blocks."""
         return self.block != self.window
 
-    @property
+    @cached_property
     def stride(self) -> tuple[int, int, int]:
         """Distance of blocks [voxel]."""
         return self.block if self.shared else self.step
 
-    @property
+    @cached_property
     def block_count(self) -> tuple[int, int, int]:
         """Blocks per window and axis."""
         return tuple(w // b for w, b in zip(self.window, self.block, strict=True))
 
-    @property
+    @cached_property
     def block_step(self) -> tuple[int, int, int]:
         """Distance of windows [block]."""
         return tuple(s // d for s, d in zip(self.step, self.stride, strict=True))
 
-    @property
+    @cached_property
     def block_grid(self) -> tuple[int, int, int]:
         """Blocks per axis that all windows need."""
         return tuple((c - 1) * m + k for c, m, k in zip(self.count, self.block_step, self.block_count, strict=True))
 
-    @property
+    @cached_property
     def pitch(self) -> int:
         """Lanes from one row of blocks to the next: the blocks, and room for the farthest lag of the last one."""
         return self.block_grid[2] + (self.block[2] + self.lags[2] - 2) // self.stride[2]
 
-    @property
+    @cached_property
     def lanes(self) -> int:
         """Lanes of a layer of blocks."""
         return whole_groups(self.block_grid[1] * self.pitch)
@@ -93,9 +92,9 @@ class Plan:
             nz, ny = (transform_size(b, r) for b, r in zip(self.block[:2], self.search[:2], strict=True))
             tap, near, lag = self.block[2], self.stride[2] * (1 + LANES / GROUP), self.lags[2]
             points = (nz / 2 - 1) * (ny + 2) + 2
-            planes = nz * (self.block[0] + nz) * math.prod(self.stride[1:])
-            forth = nz * (ny / 2 + 1) * 2 * (tap * self.block[1] + near * (ny / 2 + 1))
-            back = nz * lag * (ny / 2 + 1) * self.lags[1] + (nz / 2 + 1) * lags
+            planes = nz * (self.block[0] / 2 + nz / 4) * math.prod(self.stride[1:])
+            forth = nz * (ny / 2 + 1) * 2 * (tap * self.block[1] / 2 + near * ny / 4)
+            back = nz * lag * (ny / 4 + 1) * self.lags[1] + (nz / 4 + 1) * lags
             block = planes + forth + 3 * points * tap * lag + back
         else:
             reach = [b + n - 1 for b, n in zip(self.block, self.lags, strict=True)]
@@ -155,62 +154,6 @@ def make_plan(shape, second_shape, window, step, search, method) -> tuple[Plan, 
         on_gpu = runtime.device().kind == "cuda"
         method = "direct" if on_gpu or direct.direct_seconds() <= whole.fft_seconds() else "fft"
     return (whole if method == "fft" else direct), method
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Transforms along z and y that correlate blocks with their surroundings; see `spectral_kernels`.
-
-    A block has offsets 0 to ``edge - 1``, its surroundings ``-search`` to ``edge - 1 + search``. In transforms that
-    long nothing wraps around; odd lengths get one more, whatever it holds meets no lag of the range.
-    """
-
-    size: tuple[int, int]
-    """Lengths along z and y."""
-    taps: np.ndarray
-    """Planes of a block to real parts at frequencies 0 to size / 2, then imaginary ones of those between, (row, z)."""
-    near: np.ndarray
-    """The same of its surroundings."""
-    matrices: np.ndarray
-    """Along y and back along y and z: cosines and sines by term, rows padded to threes, all in one."""
-
-    @classmethod
-    @functools.lru_cache
-    def of(cls, block: tuple[int, int, int], search: tuple[int, int, int]) -> Spectrum:
-        """Return the transforms for a block and a search range."""
-        size = transform_size(block[0], search[0]), transform_size(block[1], search[1])
-        half = [n // 2 for n in size]
-        planes = []
-        for offset in (np.arange(block[0]), np.arange(size[0]) - search[0]):
-            cosine, sine = _waves(size[0], np.arange(half[0] + 1), offset)
-            planes.append(np.concatenate([cosine, -sine[1:-1]]))
-        there = [_padded_pair(*_waves(size[1], np.arange(n), np.arange(half[1] + 1))) for n in (block[1], half[1] + 1)]
-        back = []
-        for n, h, r, share in zip(size[::-1], half[::-1], search[1::-1], (1.0, 1 / math.prod(size)), strict=True):
-            weight = np.full((h + 1, 1), share)
-            if n == size[0] and share != 1.0:
-                weight[1:-1] *= 2  # frequencies that stand for their negatives
-            back.append(_padded_pair(*(weight * wave for wave in _waves(n, np.arange(h + 1), np.arange(r + 1)))))
-        flat = np.concatenate([matrix.ravel() for matrix in (*there, *back)]).astype(np.float32)
-        return cls(size, *(plane.astype(np.float32) for plane in planes), flat)
-
-
-def transform_size(block: int, search: int) -> int:
-    """Even length of a transform that holds a block and its surroundings."""
-    return -(-(block + 2 * search) // 2) * 2
-
-
-def _waves(size: int, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cosines and sines of 2 pi row column / size; sines of multiples of pi are 0."""
-    product = np.multiply.outer(rows, columns) % size
-    angle = 2 * np.pi * product / size
-    return np.cos(angle), np.where(2 * product % size == 0, 0.0, np.sin(angle))
-
-
-def _padded_pair(cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """Cosines and sines side by side, (term, 2, row rounded up to `ROWS`)."""
-    pair = np.stack([cosine, sine], 1)
-    return np.pad(pair, [(0, 0), (0, 0), (0, -pair.shape[2] % ROWS)])
 
 
 def whole_groups(lanes: int) -> int:

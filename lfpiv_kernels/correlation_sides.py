@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ from . import correlation_kernels as kernels
 from . import runtime, window_kernels
 from .correlation_kernels import LANES
 from .correlation_memory import launch, new_array, to_device
-from .correlation_plan import Plan, largest_factor, transform_size, whole_groups
+from .correlation_plan import Plan, largest_factor, whole_groups
 
 SIGNAL_FLOOR = 1e-4
 """A window whose variance is below this part of the whole volume's variance holds no signal."""
@@ -21,19 +22,17 @@ SIGNAL_FLOOR = 1e-4
 class Side:
     """One volume as the kernels take it: split by phase, with the statistics of its windows at every lag."""
 
-    def __init__(self, plan: Plan, volume: np.ndarray, search: tuple[int, int, int]):
+    def __init__(self, plan: Plan, volume: np.ndarray, squares: float, search: tuple[int, int, int]):
         self.volume, self.search = np.ascontiguousarray(volume, np.float32), search
         self.lags = tuple(2 * r + 1 for r in search)
         reach = [b + n - 1 for b, n in zip(plan.block, self.lags, strict=True)]
-        if plan.spectral:
-            reach[:2] = (transform_size(b, r) for b, r in zip(plan.block[:2], search[:2], strict=True))
         corner = tuple(o - r for o, r in zip(plan.origin, search, strict=True))
         self.voxels = Split.empty(plan, reach)
         phases, lanes = wp.vec2i(*self.voxels.shape[1:3]), self.voxels.shape[3]
         layout = [wp.vec3i(*plan.shape), wp.vec3i(*corner), wp.vec2i(*plan.stride[1:]), phases, plan.pitch, lanes]
         inputs = [to_device(self.volume.ravel()), *layout]
         launch(kernels._split, self.voxels.shape[0], (), inputs, [self.voxels.flat])
-        self.mean, self.scale = _statistics(plan, self.volume, search)
+        self.mean, self.scale = _statistics(plan, self.volume, squares, search)
 
 
 @dataclass(frozen=True)
@@ -52,12 +51,8 @@ class Split:
         past = [(r - 1) // s for r, s in zip(reach, plan.stride, strict=True)]
         lanes = whole_groups(plan.lanes + past[1] * plan.pitch + past[2] + LANES)
         shape = ((plan.block_grid[0] - 1) * plan.stride[0] + reach[0], phases[1], phases[2], lanes)
-        y, x = (np.arange(r) for r in reach[1:])
-        along_y = y % plan.stride[1] * phases[2] * lanes + y // plan.stride[1] * plan.pitch
-        along_x = x % plan.stride[2] * lanes + x // plan.stride[2]
-        where = runtime.device().warp
-        offsets = tuple(wp.array(o.astype(np.int32), dtype=int, device=where) for o in (along_y, along_x))
-        return cls(shape, new_array(shape), offsets)
+        along_y = _offsets(reach[1], plan.stride[1], phases[2] * lanes, plan.pitch)
+        return cls(shape, new_array(shape), (along_y, _offsets(reach[2], plan.stride[2], lanes, 1)))
 
     @property
     def flat(self) -> wp.array:
@@ -70,7 +65,14 @@ class Split:
         return math.prod(self.shape[1:])
 
 
-def _statistics(plan: Plan, volume: np.ndarray, search: tuple[int, int, int]) -> tuple[Split, Split]:
+@functools.lru_cache
+def _offsets(reach: int, stride: int, phase_pitch: int, lane_pitch: int) -> wp.array:
+    """Distance in memory for the offsets 0 to ``reach - 1`` along one axis; a call needs many, seldom new ones."""
+    offset = np.arange(reach, dtype=np.int32)
+    return to_device(offset % stride * phase_pitch + offset // stride * lane_pitch, int)
+
+
+def _statistics(plan: Plan, volume: np.ndarray, squares: float, search: tuple[int, int, int]) -> tuple[Split, Split]:
     """Mean of the windows at every lag, and 1 / sqrt(sum of squared deviations), 0 where there is no signal."""
     window, shape, where = wp.vec3i(*plan.window), wp.vec3i(*plan.shape), runtime.device()
     on_cpu = where.kind == "cpu"
@@ -92,8 +94,7 @@ def _statistics(plan: Plan, volume: np.ndarray, search: tuple[int, int, int]) ->
     inputs += [plan.origin[1], plan.stride[1], phases[1]]
     outputs = [array.flatten() for array in (scratch, total, square)]
     launch(window_kernels._sum_planes, plan.shape[0], (), inputs, outputs, slots=True, after_slot=[scratch_pitch])
-    flat = volume.ravel()
-    variance = float(np.dot(flat, flat)) / flat.size - float(flat.mean()) ** 2
+    variance = squares / volume.size - float(volume.mean()) ** 2
     floor = SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
     mean, scale = (Split.empty(plan, lags) for _ in range(2))
     lattice = [wp.vec3i(*plan.origin), wp.vec3i(*plan.stride), wp.vec3i(*phases)]

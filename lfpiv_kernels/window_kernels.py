@@ -165,10 +165,12 @@ _STATISTICS = """
                 int x = corner + r - begin;  // first of this phase in this part of the row
                 int kx = 0;
                 if (x < 0) { kx = (-x + stride - 1) / stride; x += kx * stride; }
-                for (; kx < pitch && x < some; ++kx, x += stride) {
-                    mean_out.data[plane_at + (int64_t)r * out_pitch + kx] = mean[x];
-                    scale_out.data[plane_at + (int64_t)r * out_pitch + kx] = scale[x];
-                }
+                const int end = x < some ? kx + (some - x + stride - 1) / stride : kx, last = end < pitch ? end : pitch;
+                float* means = mean_out.data + plane_at + (int64_t)r * out_pitch;
+                float* scales = scale_out.data + plane_at + (int64_t)r * out_pitch;
+                const float *m = mean + x, *s = scale + x;
+                for (int k = kx; k < last; ++k, m += stride) means[k] = *m;
+                for (int k = kx; k < last; ++k, s += stride) scales[k] = *s;
             }
         }
     }

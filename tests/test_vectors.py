@@ -15,6 +15,7 @@ from lfpiv_kernels import (
     boxsum,
     correlation_kernels,
     correlation_plan,
+    correlation_transforms,
     deform,
     neighbours,
     peak_kernels,
@@ -173,6 +174,7 @@ def peaks_twin(score, search):
             (3, 5, 7),
             (2, 4, 3),
         ),  # odd blocks, whose transforms are longer than needed; windows that leave gaps
+        ((12, 12, 8), (12, 12, 8), (11, 2, 3)),  # lags along z in two parts; blocks longer than half a transform
     ],
 )
 def test_peaks_equal_the_definition(monkeypatch, window, step, search, method, symmetric):
@@ -197,13 +199,24 @@ def test_peaks_equal_the_definition(monkeypatch, window, step, search, method, s
         assert peaks.measured[cell] == np.isfinite(displacement).all()
 
 
-@pytest.mark.parametrize(("edge", "search"), [(1, 2), (4, 4), (8, 8), (7, 3)])
+def planes_twin(planes, values):
+    """Rows that `_transform_planes` makes of one column of planes."""
+    folds = planes.quads.reshape(-1, 4)
+    up, down, far_up, far_down = np.append(values, 0)[folds].T  # the place -1 holds nothing
+    classes = [up + down + far_up + far_down, up - down - far_up + far_down]
+    classes += [up + down - far_up - far_down, up - down + far_up - far_down]
+    parts = np.split(planes.matrix, len(folds) * np.cumsum(planes.counts)[:-1])
+    rows = np.empty(len(planes.rows))
+    rows[planes.rows] = np.concatenate([c @ m.reshape(len(folds), -1) for c, m in zip(classes, parts, strict=True)])
+    return rows
+
+
+@pytest.mark.parametrize(("edge", "search"), [(1, 2), (4, 4), (8, 8), (7, 3), (12, 2), (9, 2)])
 def test_spectra_of_blocks_and_surroundings_give_their_correlation(edge, search):
     rng = np.random.default_rng(7)
     block, around = rng.normal(size=edge), rng.normal(size=edge + 2 * search)
-    spectrum = correlation_plan.Spectrum.of((edge,) * 3, (search,) * 3)
-    whole = np.pad(around, (0, spectrum.size[0] - around.size), constant_values=9.0)  # what comes after does not matter
-    rows = [spectrum.taps @ block, spectrum.near @ whole]
+    spectrum = correlation_transforms.Spectrum.of((edge,) * 3, (search,) * 3)
+    rows = [planes_twin(planes, values) for planes, values in zip(spectrum.planes, (block, around), strict=True)]
     half = spectrum.size[0] // 2
     taps, near = (row[: half + 1] + 1j * np.pad(row[half + 1 :], 1) for row in rows)
     found = np.fft.irfft(taps.conj() * near, spectrum.size[0])[np.arange(-search, search + 1)]
