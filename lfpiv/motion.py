@@ -9,6 +9,9 @@ There both volumes are averaged. Here a volume keeps its own particles in their 
 changed, by the ratio of the two volumes after both were smoothed: a displacement that is wrong by a fraction of a voxel
 matters less then, and draws the next measurement less towards itself (docs/accuracy.md).
 
+Volumes that share their light are alike beyond what was measured, and their correlation no longer shows how much of it
+is noise. So the volumes of each frame by itself stay with them, and `unshared_quality` asks those for the uncertainty.
+
 .. [1] M. Novara, K. J. Batenburg, F. Scarano, "Motion tracking-enhanced MART for tomographic PIV", Meas. Sci. Technol.
    21 (2010) 035401, doi:10.1088/0957-0233/21/3/035401.
 """
@@ -16,6 +19,7 @@ matters less then, and draws the next measurement less towards itself (docs/accu
 from __future__ import annotations
 
 import enum
+import json
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -26,10 +30,12 @@ import xarray as xr
 from scipy import ndimage
 from scipy.interpolate import CubicSpline
 
-from lfpiv.vectors import CONTROL_SPACING, correlate
+from lfpiv.vectors import CONTROL_SPACING, LOWEST_RIVAL, REFINE_SEARCH, correlate, missing_smoothing
 from lfpiv.volume import Stop, reconstruct
 from lfpiv.weights import Weights
 from lfpiv_kernels import deform
+from lfpiv_kernels.correlate import correlate_windows, window_grid
+from lfpiv_kernels.uncertainty import displacement_deviation
 
 log = logging.getLogger(__name__)
 
@@ -49,6 +55,9 @@ LEAST_VALID = 0.3
 """Least part of valid vectors: with fewer there is no motion to follow."""
 FOLLOWED = 4
 """Steps of the fixed point that turns displacements midway in time into those of the particles of one frame."""
+
+UNSHARED = "unshared"
+"""Coordinate of a volume that shares light with the other frame: the frame's volume by itself."""
 
 
 class Motion(enum.Enum):
@@ -101,7 +110,9 @@ def reconstruct_pair(
     list of two DataArrays, shape (z, y, x), float32
         Volumes as `reconstruct` returns them; `residual`, `misfit` and `iterations` go through all passes, `stop` is
         the first reconstruction's, unless a pass diverged. Attributes beyond those: `motion`, the verdict;
-        `motion_valid`, the part of valid vectors measured before each pass.
+        `motion_valid`, the part of valid vectors measured before each pass. Where a pass was made, the coordinate
+        `UNSHARED` holds what the first reconstruction gave: hand the vectors that `correlate` measures, and these
+        volumes, to `unshared_quality`.
 
     Raises
     ------
@@ -142,6 +153,7 @@ def reconstruct_pair(
         except ValueError as error:
             raise ValueError(f"frame {number + 1} of the pair: {error}") from error
         done += iterations
+    alone = list(volumes)
     verdict, valid = Motion.OFF, []
     for _ in range(motion_passes):
         vectors = correlate(*volumes, dt_s=1.0, **correlation)
@@ -159,9 +171,87 @@ def reconstruct_pair(
             done += restart
     if progress is not None:
         progress(1.0)
-    for volume in volumes:
+    for number, (volume, before) in enumerate(zip(volumes, alone, strict=True)):
         volume.attrs |= {"motion": verdict.value, "motion_valid": list(valid)}
+        if volume is not before:
+            about = {"units": "counts", "long_name": "particle intensity, this frame by itself"}
+            volumes[number] = volume.assign_coords({UNSHARED: (volume.dims, before.values, about)})
     return volumes
+
+
+def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dataset:
+    """State uncertainty, peak ratio and correlation of vectors by the volumes of each frame by itself.
+
+    The statistics of `lfpiv_kernels.uncertainty`, by which `correlate` states it, take what two volumes do not have in
+    common for noise. Volumes that share their light have noise in common, too: they state two thirds of the random
+    error (docs/accuracy.md). Here the volumes of `UNSHARED`, whose noise is independent, are deformed onto each other
+    by the displacement given, and the same statistics are taken of them in the same windows, s. What these volumes
+    then show, correlated once more, is off the vector by d, be it that sharing bettered it, or that a wrong motion drew
+    it along. The uncertainty of each component is the larger one, ``max(s, |d|)``. Peak ratio and correlation, which
+    rise by sharing too, are those of this correlation.
+
+    Without motion passes `correlate` states s: the random part, what would differ were the same flow recorded anew.
+    Ghosts move with the mean of the particles whose lines of sight cross in them [1]_, so they smooth the flow along
+    its gradients, alike in both frames and in every pair, and no statistics of noise know of it. In a uniform flow
+    there is no such error, and s is right; in the vortex ring of docs/accuracy.md it is larger than the random one.
+    Motion passes lower both, and d tells of what they took off.
+
+    Parameters
+    ----------
+    vectors : Dataset
+        From `correlate` of the two volumes.
+    volumes : sequence of two DataArrays, shape (z, y, x)
+        From `reconstruct_pair`, with the coordinate `UNSHARED`; volumes without it leave the vectors as they are.
+
+    Returns
+    -------
+    Dataset
+        The vectors with other ``uncertainty_z``, ``_y``, ``_x`` and ``uncertainty`` [voxel], NaN where they were
+        replaced, where the frames by themselves show no peak within `REFINE_SEARCH`, and after a single pass; with
+        other ``peak_ratio`` and ``correlation``, unless after a single pass.
+
+    References
+    ----------
+    .. [1] G. E. Elsinga, J. Westerweel, F. Scarano, M. Novara, "On the velocity of ghost particles and the bias errors
+       in Tomographic-PIV", Exp. Fluids 50 (2011) 825-838, doi:10.1007/s00348-010-0930-0.
+    """
+    if not all(UNSHARED in volume.coords for volume in volumes):
+        if any(volume.attrs.get("motion") == Motion.FOLLOWED.value for volume in volumes):
+            log.warning("motion: volumes without what each frame shows by itself; the uncertainty is too small")
+        return vectors
+    settings = json.loads(vectors.attrs["settings"])
+    settings["smoothing_voxel"] = missing_smoothing(settings["smoothing_voxel"], *volumes)
+    if len(settings["windows"]) == 1 or not vectors["valid"].any():
+        return vectors
+    control, window = _Control(volumes[0], vectors), tuple(settings["windows"][-1])
+    first, second = (deform.spline_coefficients(_correlated(volume[UNSHARED].values, settings)) for volume in volumes)
+    field = np.ascontiguousarray(np.moveaxis(control.middle, 0, -1), np.float32)
+    first, second = deform.deform_pair(first, second, field, tuple(control.spacing))
+    step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(control.nodes, first.shape, strict=True))
+    origin, count = window_grid(first.shape, window, step)
+    scatter = displacement_deviation(first, second, window=window, origin=origin, step=step, count=count)
+    search = (REFINE_SEARCH,) * 3
+    left = correlate_windows(first, second, window=window, step=step, search=search, symmetric=True)
+    measured = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
+    shown = np.moveaxis(control.window_means(window, origin, step, count), 0, -1) + left.displacement
+    deviation = np.maximum(scatter, np.abs(shown - measured))
+    deviation[~vectors["valid"].values] = np.nan
+    stated = {f"uncertainty_{axis}": deviation[..., k] for k, axis in enumerate("zyx")}
+    stated["uncertainty"] = np.sqrt((deviation**2).sum(-1))
+    stated["correlation"] = left.correlation
+    ratio = left.correlation / np.maximum(left.rival, LOWEST_RIVAL)
+    stated["peak_ratio"] = np.where(left.correlation > 0, ratio, np.nan)
+    return vectors.assign({name: vectors[name].copy(data=values.astype(np.float32)) for name, values in stated.items()})
+
+
+def _correlated(volume: np.ndarray, settings: Mapping[str, Any]) -> np.ndarray:
+    """Return a volume as `correlate` compares it: no background, smoothed, to a power; its scale does not matter."""
+    volume = (volume - np.median(volume)).astype(np.float32)
+    if settings["smoothing_voxel"] > 0:
+        volume = ndimage.gaussian_filter(volume, settings["smoothing_voxel"], mode="constant")
+    if settings["intensity_power"] != 1:
+        volume = np.maximum(volume, 0) ** np.float32(settings["intensity_power"])
+    return volume
 
 
 def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list[np.ndarray]:
@@ -209,27 +299,40 @@ class _Control:
     def __init__(self, volume: xr.DataArray, vectors: xr.Dataset):
         self.shape = volume.shape
         axes = [(volume[axis].values.astype(float), vectors[axis].values) for axis in "zyx"]
-        nodes = [(centres - own[0]) * (len(own) - 1) / (own[-1] - own[0]) for own, centres in axes]
+        self.nodes = [(centres - own[0]) * (len(own) - 1) / (own[-1] - own[0]) for own, centres in axes]
+        """Places of the vectors along each axis [voxel]."""
         counts = [max(2, math.ceil((n - 1) / CONTROL_SPACING) + 1) for n in self.shape]
-        points = [np.linspace(0, max(n - 1, 1), count) for n, count in zip(self.shape, counts, strict=True)]
-        self.spacing = np.array([p[1] - p[0] for p in points])
-        self._points = np.stack(np.meshgrid(*points, indexing="ij"))
+        self.points = [np.linspace(0, max(n - 1, 1), count) for n, count in zip(self.shape, counts, strict=True)]
+        self.spacing = np.array([p[1] - p[0] for p in self.points])
         middle = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"]).astype(float)
         trust = vectors["valid"].values.astype(float)
         for axis in range(3):
-            middle = _smooth(middle, nodes[axis], points[axis], axis + 1)
-            trust = _linear(trust, nodes[axis], np.arange(self.shape[axis]), axis)
-        self._middle = middle
+            middle = _smooth(middle, self.nodes[axis], self.points[axis], axis + 1)
+            trust = _linear(trust, self.nodes[axis], np.arange(self.shape[axis]), axis)
+        self.middle = middle
+        """Displacement of what is at a control point midway in time, shape (3, z, y, x)."""
         self.trust = trust.astype(np.float32)
         """1 among valid vectors, 0 among replaced ones, on the voxels."""
 
     def displacement(self, sign: int) -> np.ndarray:
         """From the control points of one frame to the other: 1 from the first to the second, -1 back; (3, z, y, x)."""
-        moved, start = self._middle, self._points - deform.OFFSET  # the kernel takes the field at x + OFFSET for x
+        start = np.stack(np.meshgrid(*self.points, indexing="ij")) - deform.OFFSET  # the kernel's field at x + OFFSET
+        moved = self.middle
         for _ in range(FOLLOWED):
             halfway = (start + sign * moved / 2) / self.spacing[:, None, None, None]
-            moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in self._middle])
+            moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in self.middle])
         return sign * moved
+
+    def window_means(
+        self, window: Sequence[int], origin: Sequence[int], step: Sequence[int], count: Sequence[int]
+    ) -> np.ndarray:
+        """Mean displacement midway in time over windows, shape (3, z, y, x)."""
+        means = self.middle
+        for axis, (w, o, s, c) in enumerate(zip(window, origin, step, count, strict=True), start=1):
+            sampled = deform.OFFSET + np.arange(self.shape[axis - 1])
+            dense = np.moveaxis(_linear(means, self.points[axis - 1], sampled, axis), axis, 0)
+            means = np.stack([dense[o + k * s :][:w].mean(0) for k in range(c)], axis)
+        return means
 
     def carried(self, coefficients: np.ndarray, field: np.ndarray) -> np.ndarray:
         """Sample a volume, given by its spline, at x + field(x) for all voxels x; 0 outside."""

@@ -30,6 +30,9 @@ log = logging.getLogger(__name__)
 FRAME_SHARE = 0.45
 """Part of a pair's work that one of its volumes takes, for progress bars."""
 
+WRITES = 0.99
+"""Finished part of a pair when all that is left is to write its vectors."""
+
 Fraction = Callable[[float], None]
 """Called with the finished fraction of a pair, from 0 to 1."""
 
@@ -89,7 +92,7 @@ class PairWork:
                 self._write_volumes(pair, volumes)
         if self.vectors:
             progress(2 * FRAME_SHARE)
-            self.correlate(pair, volumes)
+            self.correlate(pair, volumes, progress)
 
     def stored_volumes(self, pair: int) -> list[xr.DataArray] | None:
         """Both volumes of a pair from the folder; None where they are missing or do not fit."""
@@ -142,10 +145,11 @@ class PairWork:
             with writing(path):
                 dataset.write_volume(volume, path, attributes=attributes)
 
-    def correlate(self, pair: int, volumes: Sequence[xr.DataArray]) -> None:
+    def correlate(self, pair: int, volumes: Sequence[xr.DataArray], progress: Fraction) -> None:
         """Correlate the volumes of a pair and write its vectors, the figures of the summary with them."""
         experiment, start = self.experiment, time.perf_counter()
         vectors = lfpiv.correlate(*volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
+        vectors = _with_motion(vectors, volumes)
         vectors.attrs["reconstruction_s"] = sum(float(volume.attrs["seconds"]) for volume in volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         condensed = dataset.build_reconstruction(dict(zip(experiment.frames, volumes, strict=True)))
@@ -158,6 +162,7 @@ class PairWork:
             "figures": summary.pair_figures(vectors, condensed),
         }
         path = self.folder.vectors(pair)
+        progress(WRITES)
         with writing(path):
             dataset.write_vectors(vectors, path, attributes=attributes, reconstruction=condensed)
         log.info("pair %d: %.0f %% of the vectors valid", pair, 100 * float(vectors["valid"].mean()))
@@ -188,4 +193,18 @@ def _volumes(
         raise InputError(f"pair {pair}: {error}") from error
     for volume in volumes:
         volume.attrs["seconds"] = (time.perf_counter() - start) / len(volumes)
+    if experiment.smart.motion_passes:
+        log.info("pair %d: %s", pair, volumes[0].attrs["motion"])
     return volumes
+
+
+def _with_motion(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dataset:
+    """Vectors that know whether their volumes share light along the motion, and whose quality does not count that."""
+    from lfpiv.motion import Motion, unshared_quality
+
+    told = volumes[0].attrs
+    if told.get("motion", Motion.OFF.value) == Motion.OFF.value:
+        return vectors
+    vectors = unshared_quality(vectors, volumes)
+    vectors.attrs |= {"motion": told["motion"], "motion_valid": np.atleast_1d(told["motion_valid"]).tolist()}
+    return vectors

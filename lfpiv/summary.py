@@ -90,6 +90,7 @@ def build(
         for pair in pairs
         if pair["verdict"] != Verdict.GOOD.value
     ]
+    lost = [text for pair in pairs for text in _without_motion(pair)]
     grid = experiment.grid
     return {
         "schema_version": SCHEMA_VERSION,
@@ -118,7 +119,7 @@ def build(
         "failed": [{"pair": pair, "reason": reason} for pair, reason in sorted(failed.items())],
         "valid_fraction": _mean(pair["valid_fraction"] for pair in pairs),
         "finite_fraction": _mean(pair["finite_fraction"] for pair in pairs),
-        "warnings": list(dict.fromkeys([*said, *warnings, *empty, *poor])),
+        "warnings": list(dict.fromkeys([*said, *warnings, *empty, *lost, *poor])),
         "reused": list(reused),
     }
 
@@ -177,6 +178,14 @@ def pair_figures(vectors: xr.Dataset, reconstruction: xr.Dataset | None) -> dict
         "uncertainty_voxel": _median(vectors["uncertainty"].values[valid]),
         "peak_ratio": _median(vectors["peak_ratio"].values[valid]),
     }
+    if "motion" in vectors.attrs:
+        from lfpiv.motion import Motion
+
+        result["motion"] = {
+            "verdict": str(vectors.attrs["motion"]),
+            "followed": vectors.attrs["motion"] == Motion.FOLLOWED.value,
+            "valid_fraction": np.atleast_1d(vectors.attrs["motion_valid"]).tolist(),
+        }
     if reconstruction is not None:
         frames = [str(frame) for frame in reconstruction["frame"].values]
         history = reconstruction["residual"].values
@@ -204,6 +213,15 @@ def _without_particles(pair: Mapping[str, Any]) -> list[str]:
                 "trigger and file. Vectors of this pair mean nothing, valid or not."
             )
     return texts
+
+
+def _without_motion(pair: Mapping[str, Any]) -> list[str]:
+    """Warn of a pair whose motion could not be followed."""
+    motion = pair.get("motion")
+    if motion is None or motion["followed"]:
+        return []
+    shares = motion["valid_fraction"]
+    return [f"pair {pair['pair']}, motion pass {len(shares)}: {100 * shares[-1]:.0f} % valid; {motion['verdict']}"]
 
 
 def _spread(values: xr.DataArray, valid: np.ndarray) -> dict[str, float | None]:

@@ -196,7 +196,8 @@ class Bench:
             One volume of each frame.
         dict
             Means of all images: ``electrons`` that one camera receives of a particle; ``snr``: the image's brightness
-            sum I^2 / sum I over its shot and read-out noise; ``saturated``: part of the pixels. And ``iterations``.
+            sum I^2 / sum I over its shot and read-out noise; ``saturated``: part of the pixels. And ``iterations``, and
+            ``sieve_voxel``, the size of the Gaussians that the volumes are made of.
         """
         smart = smart or Smart()
         settings = {
@@ -218,13 +219,15 @@ class Bench:
                 found.append(rigs.reconstruct_images(weights, images, smart, floor=floor, first=first))
                 told += [self._signal(weights, name, images[name], pair) for name in cameras]
             means = {key: np.mean([one[key] for one in told]) for key in told[0]}
-            means["iterations"] = np.mean([volume.attrs["iterations"] for volume in found])
+            for key in ("iterations", "sieve_voxel"):
+                means[key] = np.mean([volume.attrs[key] for volume in found])
             return {"volumes": np.stack([volume.values for volume in found]), **means}
 
         kept = store.kept_arrays(self.folder / f"{name}.npz", settings, compute)
         coords = {axis: (axis, self.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
-        volumes = [xr.DataArray(values, coords, ("z", "y", "x")) for values in kept.pop("volumes")]
-        return volumes, {key: float(value) for key, value in kept.items()}
+        pair_values, told = kept.pop("volumes"), {key: float(value) for key, value in kept.items()}
+        attributes = {"sieve_voxel": told["sieve_voxel"]}  # the correlation smooths what is not smooth already
+        return [xr.DataArray(values, coords, ("z", "y", "x"), attrs=attributes) for values in pair_values], told
 
     def judge(
         self,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
 
 import lfpiv
 from lfpiv.calibration import Calibration
-from lfpiv.reproduce import Progress, bench, page, plots, rigs
+from lfpiv.reproduce import Progress, bench, page, plots, rigs, store
 from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
 from lfpiv.settings import Correlation, Smart
 from lfpiv.thinlens import thin_lens_model
@@ -48,6 +50,8 @@ class Choice:
     """Choice whose volumes are correlated; absent: its own."""
     floor: float | None = None
     flat_guess: bool = False
+    both_frames: bool = False
+    """Both frames are reconstructed from what they share along their motion."""
 
     @property
     def reconstructs(self) -> bool:
@@ -55,7 +59,7 @@ class Choice:
         return replace(self, label="", correlation={}) != Choice(label="")
 
 
-PAPER_SMART = {"iterations": 10, "accelerate": False, "floor_share": 0.0, "tolerance": 0.0}
+PAPER_SMART = {"iterations": 10, "accelerate": False, "floor_share": 0.0, "tolerance": 0.0, "sieve_voxel": 0.0}
 OPEN = {
     "exponent": Choice(label="exponent as printed in Eq. 5, not by the column sum", smart={"normalisation": "paper"}),
     "noise_floor": Choice(label="floor: the measured noise alone", smart={"floor_share": 0.0}),
@@ -73,9 +77,15 @@ OPEN = {
 OWN = {
     "no_momentum": Choice(label="SMART without momentum", smart={"accelerate": False}),
     "ten_iterations": Choice(label="10 SMART iterations", smart={"iterations": 10}),
-    "sieve": Choice(label="volumes made of Gaussians of 0.6 voxel", smart={"sieve_voxel": 0.6}),
+    "no_sieve": Choice(label="no sieve: voxels of any brightness", smart={"sieve_voxel": 0.0}),
+    "motion_pass": Choice(label="one motion pass: both frames at once", smart={"motion_passes": 1}, both_frames=True),
     "smoothed_smart": Choice(label="volume smoothed by 0.5 voxel in every iteration", smart={"smoothing_voxel": 0.5}),
-    "unsmoothed": Choice(label="volumes correlated unsmoothed", correlation={"smoothing_voxel": 0.0}),
+    "unsmoothed": Choice(
+        label="no sieve, and volumes correlated unsmoothed",
+        smart={"sieve_voxel": 0.0},
+        like="no_sieve",
+        correlation={"smoothing_voxel": 0.0},
+    ),
     "unsmoothed_points": Choice(
         label="points, their volumes correlated unsmoothed",
         points=True,
@@ -115,7 +125,9 @@ def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int,
         if choice.network or choice.drt:
             calibration = _traced(own, choice) if choice.drt else bench.recalibrated(own, key, **choice.network)
             mapping[key] = _mapping(own, calibration, seed)
-        if choice.reconstructs:
+        if choice.both_frames:
+            made = _both_frames(own, f"choice_{key}", Smart(**choice.smart))
+        elif choice.reconstructs:
             made = own.volumes(
                 f"choice_{choice.like or key}",
                 pair=pair,
@@ -135,7 +147,7 @@ def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int,
                 key: {
                     "what": choices[key].label,
                     "error_difference_voxel": gaps[key][0],
-                    "standard_error_voxel": gaps[key][1],
+                    "difference_standard_error_voxel": gaps[key][1],
                     "q_difference": one.q - default.q,
                     **one.row(),
                 }
@@ -178,10 +190,41 @@ def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int,
             _verdict(choices, gaps, default),
             "Q is held against blobs of "
             f"{rigs.BLOB_VOXEL:g} voxel, points too, which they are not. Choices of the correlation leave Q as it is.",
-            *_about_smoothing(judged, default),
+            *_about_smoothing(judged),
             *_about_mapping(choices, mapping),
         ],
     )
+
+
+def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray], dict[str, float]]:
+    """Reconstruct the usual pair by motion passes, or take it from the folder: `Bench.volumes` takes frames alone."""
+    settings = {
+        "seed": own.seed,
+        "size_mm": own.size_mm,
+        "pair": asdict(DEFAULT),
+        "smart": smart.model_dump(),
+        "scene": own.rig.scene.model_dump(mode="json"),
+    }
+
+    def compute() -> dict[str, ArrayLike]:
+        weights = own.weights(own.rig.calibration, bench.TWO)
+        light, noise = [], []
+        for images in own.images(DEFAULT, bench.TWO):
+            levels = {camera: weights.cameras[camera].decoder.background(images[camera]) for camera in bench.TWO}
+            light.append({camera: images[camera] - np.float32(level) for camera, (level, _) in levels.items()})
+            noise.append({camera: deviation for camera, (_, deviation) in levels.items()})
+        found = lfpiv.reconstruct_pair(weights, light, floor=noise, **smart.model_dump())
+        return {
+            "volumes": np.stack([volume.values for volume in found]),
+            "iterations": np.mean([volume.attrs["iterations"] for volume in found]),
+            "sieve_voxel": np.mean([volume.attrs["sieve_voxel"] for volume in found]),
+        }
+
+    kept = store.kept_arrays(own.folder / f"{name}.npz", settings, compute)
+    coords = {axis: (axis, own.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
+    smooth = {"sieve_voxel": float(kept["sieve_voxel"])}
+    volumes = [xr.DataArray(values, coords, ("z", "y", "x"), attrs=smooth) for values in kept["volumes"]]
+    return volumes, {"iterations": float(kept["iterations"])}
 
 
 def _traced(own: Bench, choice: Choice) -> Calibration:
@@ -241,12 +284,13 @@ def _verdict(choices: Mapping[str, Choice], gaps: Mapping[str, tuple[float, floa
     return f"{text} Those that cost most: {share}."
 
 
-def _about_smoothing(judged: Mapping[str, Judged], default: Judged) -> list[str]:
-    if not {"points", "unsmoothed", "unsmoothed_points"} <= judged.keys():
+def _about_smoothing(judged: Mapping[str, Judged]) -> list[str]:
+    if not {"points", "no_sieve", "unsmoothed", "unsmoothed_points"} <= judged.keys():
         return []
     return [
-        "Volumes are smoothed by 0.5 voxel before correlation for the sake of particles smaller than a voxel. Error "
-        f"with and without it here: blobs {default.error.mean:.3f} and {judged['unsmoothed'].error.mean:.3f}, points "
+        "Volumes are smoothed by 0.5 voxel before correlation for the sake of particles smaller than a voxel; those "
+        "made of Gaussians by a sieve are as smooth already. Error with and without it here: blobs without a sieve "
+        f"{judged['no_sieve'].error.mean:.3f} and {judged['unsmoothed'].error.mean:.3f}, points "
         f"{judged['points'].error.mean:.3f} and {judged['unsmoothed_points'].error.mean:.3f} voxel."
     ]
 
@@ -274,7 +318,7 @@ def _draw(
     left, right = drawn.subplots(1, 2, sharey=True, width_ratios=(1.5, 1))
     place = np.arange(len(choices))[::-1]
     change, error = np.array([gaps[key] for key in choices]).T
-    colours = [plots.COLOURS["network"] if key in OPEN else plots.COLOURS["sieve"] for key in choices]
+    colours = [plots.COLOURS["network"] if key in OPEN else plots.COLOURS["no_sieve"] for key in choices]
     left.barh(place, change, xerr=SURE * error, color=colours, height=0.62, error_kw={"lw": 0.8, "ecolor": "#30363c"})
     comparable = [0.0 if choices[key].points else judged[key].q - default.q for key in choices]
     right.barh(place, comparable, color=colours, height=0.62)
