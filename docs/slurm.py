@@ -7,6 +7,7 @@ The same command again goes on where an interrupted one stopped. The exit status
 
 import argparse
 import logging
+import subprocess
 import sys
 
 from dask_jobqueue import SLURMCluster
@@ -24,6 +25,8 @@ def main() -> int:
     parser.add_argument("--memory", default="16GB", help="memory of each job; `lfpiv run` logs what a worker needs")
     parser.add_argument("--queue", help="partition of SLURM")
     parser.add_argument("--walltime", default="04:00:00", help="time of each job; a pair cut off is done again")
+    parser.add_argument("--directive", action="append", default=[], help="more for sbatch: --directive=--gres=gpu:1")
+    parser.add_argument("--logs", default="slurm-logs", help="folder for what the jobs say")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
 
@@ -33,9 +36,17 @@ def main() -> int:
         memory=arguments.memory,
         queue=arguments.queue,
         walltime=arguments.walltime,
+        job_extra_directives=arguments.directive,
+        log_directory=arguments.logs,
         worker_extra_args=["--nthreads", "1"],  # a worker does one pair at a time, with all cores of its job
     ) as cluster:
-        cluster.scale(jobs=arguments.jobs)
+        # a refused job would only be a line in the log, and the run would wait for workers
+        test = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
+        if test.returncode:
+            print(f"SLURM refuses such a job: {test.stderr.strip()}", file=sys.stderr)
+            return 2
+        # for a job that ends, by its time or by scancel, another one is started; `scale` would not do so
+        cluster.adapt(minimum_jobs=arguments.jobs, maximum_jobs=arguments.jobs)
         summary = lfpiv.run(arguments.experiment, arguments.out, scheduler=cluster.scheduler_address)
     for failed in summary["failed"]:
         print(f"pair {failed['pair']}: {failed['reason']}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
 from collections.abc import Callable, Generator, Sequence
@@ -29,6 +30,8 @@ class Plan:
     """CPU threads of each."""
     devices: tuple[str | None, ...]
     """What each process sees as CUDA_VISIBLE_DEVICES; None: what this one sees."""
+    kind: str = "cpu"
+    """Where their kernels run: "cpu" or "cuda"."""
 
 
 def plan(pairs: int, workers: int | None, device: Device, gpus: Sequence[str] = ()) -> Plan:
@@ -57,16 +60,37 @@ def plan(pairs: int, workers: int | None, device: Device, gpus: Sequence[str] = 
         workers = len(gpus) if spread else 1
     workers = max(min(workers, pairs), 1)
     devices = tuple(gpus[number % len(gpus)] if spread and workers > 1 else None for number in range(workers))
-    return Plan(workers, max(device.threads // workers, 1), devices)
+    if spread and workers != len(gpus):
+        using = f"each has one of {len(gpus)} GPUs" if workers < len(gpus) else f"they share {len(gpus)} GPUs"
+        log.info("%d %s for %d pairs: %s", workers, "worker" if workers == 1 else "workers", pairs, using)
+    return Plan(workers, max(device.threads // workers, 1), devices, device.kind)
 
 
 def visible_gpus() -> tuple[str, ...]:
-    """Return the names of the GPUs this process sees, as CUDA_VISIBLE_DEVICES has them; Warp must run."""
+    """Return the names of the GPUs that processes of this one can have, as CUDA_VISIBLE_DEVICES has them.
+
+    Warp must run.
+    """
     import warp as wp
 
-    count = len(wp.get_cuda_devices())
-    names = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
-    return tuple((names or [str(number) for number in range(count)])[:count])
+    return gpu_names(os.environ.get("CUDA_VISIBLE_DEVICES"), len(wp.get_cuda_devices()))
+
+
+def gpu_names(listed: str | None, count: int) -> tuple[str, ...]:
+    """Name the GPUs that a process may hand on to others.
+
+    Parameters
+    ----------
+    listed : str, optional
+        CUDA_VISIBLE_DEVICES: numbers or UUIDs, as the user or the cluster set it; None where it is not set.
+    count : int
+        GPUs that this process sees. Of a list CUDA takes what stands before the first name it does not know. Of parts
+        of GPUs (names with "MIG-") it shows every process a single one, whatever the list says.
+    """
+    names = [name.strip() for name in (listed or "").split(",")]
+    if count and all(name.startswith("MIG-") for name in names):
+        return tuple(dict.fromkeys(names))
+    return tuple(names[:count] if listed else map(str, range(count)))
 
 
 def require_memory(experiment: Experiment, weights: int, workers: int) -> None:
@@ -93,17 +117,31 @@ def require_memory(experiment: Experiment, weights: int, workers: int) -> None:
 
 
 def lowered(planned: Plan, experiment: Experiment, weights: int, device: Device) -> Plan:
-    """Take fewer workers where the weights came out larger than foreseen; says so."""
+    """Take fewer workers where so many do not fit into the memory beside the weights; says so."""
     fits = memory.fitting_workers(experiment, weights, planned.workers)
     if fits == planned.workers:
         return planned
     log.warning(
-        "%d workers instead of %d: the weights take %.1f GiB, more than foreseen",
+        "%d %s instead of %d: beside %.1f GiB of weights each takes %.1f GiB of memory",
         fits,
+        "worker" if fits == 1 else "workers",
         planned.workers,
         weights / memory.GIB,
+        memory.worker_bytes(experiment) / memory.GIB,
     )
     return replace(planned, workers=fits, threads=max(device.threads // fits, 1), devices=planned.devices[:fits])
+
+
+def unasked(planned: Plan, device: Device) -> Plan:
+    """Several workers that nobody asked for need a package that nobody need have installed; without it, take one."""
+    if planned.workers == 1 or importlib.util.find_spec("distributed") is not None:
+        return planned
+    log.warning(
+        "one of %d GPUs is used: several processes need the package `distributed`. "
+        "Install it: pip install 'lfpiv[distributed]'",
+        len(set(planned.devices)),
+    )
+    return Plan(1, device.threads, (None,), device.kind)
 
 
 def alone(work: PairWork, todo: Sequence[int], progress: Callable[[float], None]) -> Generator[Outcome, None, None]:

@@ -14,7 +14,7 @@ import typer
 
 import lfpiv
 from lfpiv import terminal
-from lfpiv.errors import InputError, StorageError
+from lfpiv.errors import ClusterError, InputError, StorageError
 from lfpiv.reproduce import CASES
 from lfpiv.terminal import Interrupted, Voice
 
@@ -337,7 +337,7 @@ def call(arguments: Sequence[str] | None = None) -> int:
         return _fail(2, str(error), error)
     except (Interrupted, KeyboardInterrupt, typer.Abort) as error:
         return _fail(1, "interrupted. What is finished is kept; the same command goes on from there.", error)
-    except StorageError as error:
+    except (StorageError, ClusterError) as error:
         return _fail(1, str(error), error)
     except MemoryError as error:
         return _fail(1, "out of memory. Raise volume.voxel_mm, shrink volume.size_mm, or free memory.", error)

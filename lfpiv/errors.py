@@ -1,4 +1,4 @@
-"""The error for what a user can mend: a file, a key, an argument."""
+"""The errors that users meet: what they can mend in files, keys, arguments, on the disk or in a cluster."""
 
 
 class InputError(ValueError):
@@ -12,4 +12,11 @@ class StorageError(OSError):
     """Results cannot be written, for want of space or rights; the message names the file and says how to go on.
 
     What was written before is whole. The command line exits with status 1.
+    """
+
+
+class ClusterError(RuntimeError):
+    """The scheduler that hands pairs to workers was lost in the middle of a run; the message says how to go on.
+
+    What was finished before is whole. The command line exits with status 1.
     """

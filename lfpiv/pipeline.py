@@ -160,8 +160,16 @@ def _plan(job: Job, todo: Sequence[int], workers: int | None, scheduler: str | N
     if todo:
         job.check_images(todo)
         weights = memory.weights_bytes(job.experiment) if not all(map(job.has_volumes, todo)) else 0
+        if workers is None:
+            planned = batch.lowered(batch.unasked(planned, job.device), job.experiment, weights, job.device)
         batch.require_memory(job.experiment, weights, 1 if scheduler else planned.workers)
-    return None if scheduler else planned
+    if scheduler:
+        return None
+    if planned.workers > 1:
+        from lfpiv import machine
+
+        machine.warm_up(planned.kind)
+    return planned
 
 
 def _outcomes(

@@ -24,7 +24,7 @@ from lfpiv import memory
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment import Experiment
 from lfpiv.folder import Folder, writing
-from lfpiv.pair import Outcome, PairWork
+from lfpiv.pair import WRITES, Outcome, PairWork
 from lfpiv_kernels import runtime
 
 log = logging.getLogger(__name__)
@@ -200,8 +200,10 @@ def _now_and_then(shared: Path, pair: int, report: Callable[[int, float], None])
         nonlocal last
         if shared in _stopped:
             raise _Stopped
-        if time.monotonic() - last >= REPORT_EVERY_S:
+        if time.monotonic() - last >= REPORT_EVERY_S or fraction == WRITES:
             last = time.monotonic()
+            if not (shared / _TASK).exists():  # its run is dead, and the next one has swept it away
+                raise _Stopped
             report(pair, fraction)
 
     return progress

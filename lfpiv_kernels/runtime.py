@@ -90,7 +90,7 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
     _device = Device(kind, count, reason)
     _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
     if reason:
-        log.info("kernels run on the CPU (%d threads): %s", count, reason)
+        log.info("kernels run on the CPU (%d %s): %s", count, "thread" if count == 1 else "threads", reason)
     return _device
 
 
@@ -128,8 +128,11 @@ def run_chunks(size: int, job: Callable[[int, int, int], None], *, chunks: int =
         job(0, 0, size)
         return
     edges = [size * part // chunks for part in range(chunks + 1)]
-    futures = [
-        _pool.submit(job, part, edges[part], edges[part + 1]) for part in range(chunks) if edges[part + 1] > edges[part]
-    ]
+    parts = [(part, edges[part], edges[part + 1]) for part in range(chunks) if edges[part + 1] > edges[part]]
+    if where.threads == 1:  # handing chunks to another thread took a tenth of the time of small volumes
+        for part in parts:
+            job(*part)
+        return
+    futures = [_pool.submit(job, *part) for part in parts]
     for future in futures:
         future.result()

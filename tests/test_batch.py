@@ -3,17 +3,19 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from distributed import KilledWorker
 from ideal_rig import two_cameras
-from small_run import PAIRS, damage, same_vectors
+from small_run import PAIRS
 
 import lfpiv
-from lfpiv import batch, cli, crew, dataset, memory, pipeline, stamp, weightstore
-from lfpiv.errors import InputError, StorageError
+from lfpiv import batch, cli, cluster, crew, dataset, memory, pipeline, stamp, weightstore
+from lfpiv.errors import ClusterError, InputError, StorageError
 from lfpiv.experiment import read_experiment
 from lfpiv.pair import Outcome
 from lfpiv.rig import Grid
@@ -29,6 +31,9 @@ TOLERANCE_ADJOINT = 1e-6
 CPU, GPU = Device("cpu", 8), Device("cuda", 8)
 
 
+FOUR = ("0", "1", "2", "3")
+
+
 @pytest.mark.parametrize(
     ("pairs", "workers", "device", "gpus", "expected"),
     [
@@ -39,14 +44,52 @@ CPU, GPU = Device("cpu", 8), Device("cuda", 8)
         (0, 8, CPU, (), (1, 8, (None,))),
         (100, None, GPU, ("0",), (1, 8, (None,))),
         (100, None, GPU, ("0", "GPU-5c"), (2, 4, ("0", "GPU-5c"))),
-        (1, None, GPU, ("0", "1"), (1, 8, (None,))),
+        (100, None, GPU, FOUR, (4, 2, FOUR)),
+        (100, 2, GPU, FOUR, (2, 4, ("0", "1"))),
+        (3, None, GPU, FOUR, (3, 2, ("0", "1", "2"))),
+        (1, None, GPU, FOUR, (1, 8, (None,))),
         (100, 3, GPU, ("2", "7"), (3, 2, ("2", "7", "2"))),
-        (100, 1, GPU, ("0", "1"), (1, 8, (None,))),
+        (100, 1, GPU, FOUR, (1, 8, (None,))),
         (100, 2, GPU, ("0",), (2, 4, (None, None))),
     ],
 )
-def test_pairs_are_shared_out_to_cores_and_gpus(pairs, workers, device, gpus, expected):
-    assert batch.plan(pairs, workers, device, gpus) == batch.Plan(*expected)
+def test_pairs_are_shared_out_to_cores_and_gpus(pairs, workers, device, gpus, expected, caplog):
+    with caplog.at_level("INFO", "lfpiv.batch"):
+        assert batch.plan(pairs, workers, device, gpus) == batch.Plan(*expected, device.kind)
+    unusual = len(gpus) > 1 and expected[0] != len(gpus)
+    assert [f"{len(gpus)} GPUs" in text for text in caplog.messages] == [True] * unusual, "the user is not told"
+
+
+@pytest.mark.parametrize(
+    ("listed", "count", "names"),
+    [
+        (None, 4, FOUR),
+        (None, 0, ()),
+        ("", 0, ()),
+        ("2,3", 2, ("2", "3")),
+        (" GPU-5c01, GPU-77aa ", 2, ("GPU-5c01", "GPU-77aa")),
+        ("1,0,9,2", 2, ("1", "0")),  # there is no 9: CUDA stops before it
+        ("-1", 0, ()),
+        (
+            "MIG-aa,MIG-bb",
+            1,
+            ("MIG-aa", "MIG-bb"),
+        ),  # CUDA shows a process one part of a GPU
+        ("MIG-GPU-5c01/1/0", 1, ("MIG-GPU-5c01/1/0",)),
+    ],
+)
+def test_gpus_are_named_as_the_cluster_gave_them(listed, count, names):
+    assert batch.gpu_names(listed, count) == names
+
+
+def test_several_gpus_do_not_ask_for_a_package_nobody_asked_for(monkeypatch, caplog):
+    plan = batch.plan(100, None, GPU, FOUR)
+    assert batch.unasked(plan, GPU) == plan
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert batch.unasked(plan, GPU) == batch.Plan(1, 8, (None,), "cuda")
+    assert "one of 4 GPUs" in caplog.text and "pip install 'lfpiv[distributed]'" in caplog.text
+    one = batch.plan(100, None, GPU, ("0",))
+    assert batch.unasked(one, GPU) == one
 
 
 @pytest.mark.parametrize("workers", [0, -1, 10**6, 2.0, True])
@@ -115,15 +158,18 @@ def test_other_or_incomplete_weights_are_refused(weights, tmp_path):
 
 
 class DeadlyClient:
-    """A Dask client whose workers die of some pairs: as often as `deaths` says."""
+    """A Dask client whose workers die of some pairs, as often as `deaths` says; or whose connection breaks as often."""
 
-    def __init__(self, deaths, result=None):
-        self.deaths, self.result, self.submitted = dict(deaths), result, []
+    def __init__(self, deaths, result=None, how="error"):
+        self.deaths, self.result, self.how, self.submitted, self.keys = dict(deaths), result, how, [], set()
 
     def submit(self, function, shared, pair, topic, *, key, pure):
+        assert key not in self.keys, "the cluster would hand out what it knows under this key"
+        self.keys.add(key)
         self.submitted.append(pair)
         self.deaths[pair] = self.deaths.get(pair, 0) - 1
-        return DeadlyFuture(key, self.deaths[pair] >= 0, self.result or Result(outcome=Outcome(pair=pair)))
+        status = self.how if self.deaths[pair] >= 0 else "finished"
+        return DeadlyFuture(key, status, self.result or Result(outcome=Outcome(pair=pair)))
 
     def subscribe_topic(self, topic, handler):
         handler((0.0, (0, 0.5)))
@@ -133,9 +179,11 @@ class DeadlyClient:
 
 
 class DeadlyFuture:
-    def __init__(self, key, dead, result):
-        self.key, self.dead, self.result = key, dead, lambda: result
-        self.status = "error" if dead else "finished"
+    def __init__(self, key, status, result):
+        self.key, self.status, self.found = key, status, result
+
+    def result(self, timeout):
+        return self.found
 
     def exception(self):
         return KilledWorker(self.key, None, 0)
@@ -160,50 +208,57 @@ def test_a_pair_that_kills_its_worker_twice_has_failed():
     assert sorted(client.submitted[:6]) == list(range(6)) and sorted(client.submitted[6:]) == [1, 2]
 
 
+def test_a_broken_connection_is_no_trial_of_a_pair():
+    """What the scheduler forgot is handed out again, however often."""
+    client = DeadlyClient({1: 3, 2: 1}, how="cancelled")
+    assert outcomes(client, range(4)) == dict.fromkeys(range(4), "")
+    assert len(client.submitted) == 4 + 3 + 1
+
+
 def test_what_stops_all_pairs_ends_the_run():
     for storage, kind in ((True, StorageError), (False, InputError)):
         with pytest.raises(kind, match="no room"):
             outcomes(DeadlyClient({}, Result(outcome=None, fatal="no room", storage=storage)), range(3))
 
 
-STAND_IN = """
-from distributed import LocalCluster
+def test_a_scheduler_that_hangs_is_told_and_given_up(monkeypatch, caplog):
+    """The clock is the test's own: nothing until a minute has passed, then a word each minute, an error at last."""
+    now = [0.0]
+    monkeypatch.setattr(cluster, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    watch = cluster._Watch(SimpleNamespace(status="running"), "tcp://there:1")
+    watch.answer = Future()
+    with caplog.at_level("INFO", "lfpiv.cluster"):
+        for now[0] in np.arange(0.0, cluster.SILENT_S, 1.0):
+            assert watch.width() > 1e6
+    assert len(caplog.messages) == cluster.SILENT_S // cluster.REMIND_S - 1
+    assert all("tcp://there:1 has not answered for" in text for text in caplog.messages)
+    now[0] = cluster.SILENT_S + 1
+    with pytest.raises(ClusterError, match=r"tcp://there:1 has not answered for 601 s\. What is finished is kept"):
+        watch.width()
+    watch.answer.set_result(0)
+    assert watch.width() > 1e6 and watch.count == 0, "it answered after all"
+    watch.client.status = "connecting"
+    assert watch.width() == 0
+    watch.client.status = "closed"
+    with pytest.raises(ClusterError, match="tcp://there:1 is gone"):
+        watch.width()
 
-class SLURMCluster(LocalCluster):
-    '''Takes what dask-jobqueue takes; its jobs are processes of this machine.'''
 
-    def __init__(self, *, cores, processes, memory, queue, walltime, worker_extra_args):
-        assert (cores, processes, memory, walltime) == (2, 1, "2GB", "00:10:00")
-        option, threads = worker_extra_args
-        assert option == "--nthreads"
-        super().__init__(n_workers=0, threads_per_worker=int(threads), memory_limit=0, dashboard_address=None)
-
-    def scale(self, jobs):
-        super().scale(jobs)
-"""
+@pytest.mark.parametrize(("granted", "expected"), [(None, 16), ("4", 4), ("64", 16)])
+def test_a_worker_uses_the_cores_that_its_job_was_given(monkeypatch, granted, expected):
+    monkeypatch.setattr(crew, "cores", lambda: 16)
+    monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
+    if granted is not None:
+        monkeypatch.setenv("SLURM_CPUS_PER_TASK", granted)
+    assert crew._cores() == expected
 
 
-def test_a_cluster_under_slurm_gives_the_same_numbers(small_run, tmp_path):
-    """The documented script in a process of its own, with processes for jobs; one pair cannot be done."""
-    (tmp_path / "dask_jobqueue.py").write_text(STAND_IN)
-    out = small_run.calibrated(tmp_path / "out")
-    experiment = small_run.images(tmp_path / "data")
-    damage(next((tmp_path / "data").rglob("*0003*")))
-    done = subprocess.run(
-        [sys.executable, ROOT / "docs" / "slurm.py", experiment.relative_to(tmp_path), "out"]
-        + ["--jobs", "2", "--cores", "2", "--memory", "2GB", "--walltime", "00:10:00"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 3, done.stderr
-    assert "pair 3:" in done.stdout and "damaged" in done.stdout
-    assert "pair 0: " in done.stderr, "what workers log is lost"
-    for folder in (reference := small_run.results(tmp_path / "reference"), out):
-        (folder / "vectors" / "pair_0003.nc").unlink(missing_ok=True)
-    assert same_vectors(reference, out) == PAIRS - 1
-    assert not (out / ".shared").exists() and not (out / ".lock").exists()
+def test_what_workers_are_forked_from_is_whole_and_has_started_nothing():
+    """A device or a thread of Python would not survive the fork; a module that cannot be read would be passed over."""
+    script = "import threading, lfpiv.warm; from lfpiv_kernels import runtime"
+    script += "; print(runtime._device, runtime._pool, threading.active_count())"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.split() == ["None", "None", "1"]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """What goes wrong at night: killed processes, full disks, damaged images, a second run; real processes and signals."""
 
+import contextlib
 import functools
 import json
 import os
@@ -20,8 +21,13 @@ from lfpiv.errors import InputError
 from lfpiv.folder import Folder
 from lfpiv.pair import PairWork
 
+ROOT = Path(__file__).resolve().parents[1]
+
 PATIENCE_S = 300.0
 """Longest wait for something that must happen [s]: many times what it takes, for a machine that does much else."""
+
+HANG_S = 8.0
+"""Longer than a run waits before it asks the scheduler, shorter than it takes to give it up [s]."""
 
 
 def wait_for(condition, process, what):
@@ -35,12 +41,12 @@ def wait_for(condition, process, what):
     return found
 
 
-def workers_of(process):
+def workers_of(process, shared=".shared"):
     """Worker processes of a run: those that have mapped the shared weights."""
     found = []
     for child in psutil.Process(process.pid).children(recursive=True):
         try:
-            if any(".shared" in mapped.path for mapped in child.memory_maps()):
+            if any(shared in mapped.path for mapped in child.memory_maps()):
                 found.append(child)
         except psutil.Error:
             continue
@@ -102,6 +108,121 @@ def test_a_killed_worker_costs_nothing_and_a_bad_pair_only_itself(small_run, tmp
     assert "failed: pair 2:" in written and "its worker died; it is tried once more" in said and whole(out)
     (reference := small_run.results(tmp_path / "reference")).joinpath("vectors", "pair_0002.nc").unlink()
     assert same_vectors(reference, out) == PAIRS - 1
+
+
+def dask(*arguments):
+    """Start a part of a cluster as a user does, and in its own group, which ends it as a whole."""
+    command = [sys.executable, "-m", "dask", *map(str, arguments), "--no-dashboard", "--host", "127.0.0.1"]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A Dask cluster of processes: its address, its scheduler, and a function that starts a worker."""
+    file, started = tmp_path / "scheduler.json", []
+
+    def worker():
+        started.append(dask("worker", "--scheduler-file", file, "--nthreads", 1, "--death-timeout", 60))
+        return started[-1]
+
+    started.append(dask("scheduler", "--port", 0, "--scheduler-file", file))
+    try:
+        wait_for(lambda: file.exists() and file.stat().st_size, started[0], "scheduler")
+        yield json.loads(file.read_text())["address"], started[0], worker
+    finally:
+        for process in started:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_run, tmp_path, cluster):
+    """Kill -9 the run, then in the next run a worker; let the scheduler hang for a while: the same numbers."""
+    address, scheduler, start_worker = cluster
+    out, worker = small_run.calibrated(tmp_path / "out"), start_worker()
+    run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
+    wait_for(lambda: finished(out), run, "finished pair")
+    (dead,) = (out / ".shared").iterdir()
+    run.kill()
+    run.communicate()
+    assert 0 < len(finished(out)) < PAIRS and worker.poll() is None
+    run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
+    shared = wait_for(lambda: not dead.exists() and next((out / ".shared").glob("*"), None), run, "shared weights")
+    wait_for(lambda: workers_of(worker, str(shared)), run, "pair")[0].kill()
+    scheduler.send_signal(signal.SIGSTOP)
+    time.sleep(HANG_S)
+    assert run.poll() is None
+    scheduler.send_signal(signal.SIGCONT)
+    _, said = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 0, said
+    assert same_vectors(small_run.out, out) == PAIRS and whole(out)
+    assert worker.poll() is None and scheduler.poll() is None, "the cluster is not ours to end"
+
+
+def test_a_lost_scheduler_ends_the_run_with_one_message(small_run, tmp_path, cluster, no_report):
+    """Kill -9: status 1, all files whole, and the same command goes on, here without the cluster."""
+    address, scheduler, start_worker = cluster
+    out, worker = small_run.calibrated(tmp_path / "out"), start_worker()
+    run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
+    wait_for(lambda: finished(out), run, "finished pair")
+    scheduler.kill()
+    _, said = run.communicate(timeout=PATIENCE_S)
+    last = said.splitlines()[-1]
+    assert run.returncode == 1 and f"the scheduler at {address} is gone" in last and "the same command goes on" in last
+    assert "Traceback" not in said and whole(out)
+    before = finished(out)
+    assert 0 < len(before) < PAIRS
+    pipeline.run(small_run.experiment, out)
+    assert same_vectors(small_run.out, out) == PAIRS and whole(out)
+    worker.wait(PATIENCE_S)
+
+
+SBATCH = """#!/bin/sh
+# a queue that starts every job at once, on this machine
+[ "$1" = --test-only ] && exec cat > /dev/null
+cp "$1" "$JOBS/script"
+SLURM_CPUS_PER_TASK=$(sed -n "s/#SBATCH --cpus-per-task=//p" "$1") setsid sh "$JOBS/script" > /dev/null 2>&1 &
+touch "$JOBS/$!.job"
+echo "Submitted batch job $!"
+"""
+SCANCEL = """#!/bin/sh
+kill -- "-$1"
+"""
+
+
+def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
+    """The documented script and dask-jobqueue, processes for jobs: one job is cancelled, one pair cannot be done."""
+    (tmp_path / "bin").mkdir()
+    for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL)):
+        (tmp_path / "bin" / name).write_text(text)
+        (tmp_path / "bin" / name).chmod(0o755)
+    experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+    damage(next((tmp_path / "data").rglob("*0003*")))
+    command = [sys.executable, ROOT / "docs" / "slurm.py", experiment.relative_to(tmp_path), "out", "--jobs", "1"]
+    environment = {
+        "PATH": os.pathsep.join([str(tmp_path / "bin"), os.environ["PATH"]]),
+        "PYTHONPATH": str(ROOT),
+        "JOBS": str(tmp_path),
+    }
+    run = subprocess.Popen(
+        [*command, "--cores", "1", "--memory", "2GB", "--walltime", "00:10:00", "--queue", "normal"],
+        cwd=tmp_path,
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_for(lambda: finished(out), run, "finished pair")
+    (job,) = tmp_path.glob("*.job")
+    os.killpg(int(job.stem), signal.SIGTERM)
+    written, said = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 3, said
+    assert "pair 3:" in written and "damaged" in written
+    assert "pair 0: " in said and "CPU (1 thread" in said, "what workers log is lost"
+    assert len(list(tmp_path.glob("*.job"))) > 1 and (tmp_path / "slurm-logs").is_dir()
+    for folder in (reference := small_run.results(tmp_path / "reference"), out):
+        (folder / "vectors" / "pair_0003.nc").unlink(missing_ok=True)
+    assert same_vectors(reference, out) == PAIRS - 1 and whole(out)
 
 
 @pytest.mark.parametrize(("number", "options"), [(signal.SIGINT, ["--workers", "2"]), (signal.SIGTERM, [])])
