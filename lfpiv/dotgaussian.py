@@ -9,8 +9,10 @@ import numpy as np
 
 from lfpiv.boardfind import Detection, DotBoard
 from lfpiv.dotfit import spread_over_pupil
-from lfpiv.dotlabel import PUPIL_PART, Labels
+from lfpiv.dotlabel import Labels
 from lfpiv.lightfield import LightFieldDecoder
+
+_PUPIL_PART = 0.92  # views stay this far inside the pupil's edge, where pixels are wholly lit
 
 
 def label_by_gaussian(
@@ -28,7 +30,7 @@ def label_by_gaussian(
     columns = [np.ones(len(a)), a, b, a * a, b * b] + ([a * b] if len(steps) > 5 else [])
     solve = np.linalg.pinv(np.stack(columns, axis=1))
     slope = detection.pose.rays(board.of_dots_mm(detection.dot))[1]
-    views = spread_over_pupil(PUPIL_PART * optics.pupil_radius_mm)
+    views = spread_over_pupil(_PUPIL_PART * optics.pupil_radius_mm)
     expected = detection.chief_mm[:, None] + slope[:, None, None] * views
     label = np.full(expected.shape, np.nan)
     for plane in np.unique(detection.dot // board.size):

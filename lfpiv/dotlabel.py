@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from lfpiv.boardfind import FEWEST_DOTS, Detection, DotBoard
 from lfpiv.boardpose import CameraPose
@@ -20,15 +21,15 @@ from lfpiv.dotfit import (
     lens_offset_mm,
     ray_terms,
     slope_of,
-    spread_over_pupil,
 )
+from lfpiv.dotshared import Shared, settle, update_bend
 from lfpiv.errors import InputError
-from lfpiv.lightfield import LightFieldDecoder
+from lfpiv.lightfield import LightFieldDecoder, disc_fraction
 
 log = logging.getLogger(__name__)
 
-PUPIL_PART = 0.92  # labels stay this far inside the pupil's edge, where pixels are wholly lit
-_FIT_COVERAGE = 0.9  # pixels cut by the edge of a microimage are left out of a fit
+_FIT_COVERAGE = 0.9  # pixels cut by the edge of a microimage are left out of a fit,
+_BESIDE_COVERAGE = 0.01  # and those that the next microimage reaches
 _MARGIN_PITCHES = (0.5, 0.25)  # pixels this far beyond a dot's support are fitted too, first and second round
 _PRIOR_PITCHES = (0.5, 0.3, 0.1)  # first round: loose prior on position, slope and curvature over the pupil [pitch]
 _FLOOR_PITCHES = (0.02, 0.01, 0.005)  # second round: never tighter than this, so that light decides where it can
@@ -38,12 +39,7 @@ _OUTLIER_LIGHT = 3.0  # dots this many times fainter or brighter than the typica
 _OUTLIER_SIGMA = 6.0  # dots this far off the smooth mapping, in units of its scatter, are none
 _OUTLIER_PITCHES = 0.15  # but closer than this no dot is taken for an outlier
 _NOISE_SHARE = 0.3  # pixels that see at least this part of a dot tell noise and pixel response
-_SIZE_SAMPLE = 48  # dots that tell their diameter and the blur
-_SIZE_ROUNDS = 8
-_SIZE_CHANGE = 0.005  # it is settled when it changes by less than this part
-_SIZE_STEP = 0.25  # and changes at most by this in one round
-_SIZE_PRIOR = (0.3, 0.5)  # how far a diameter is off (logarithm), and how large the square of a blur is [pixel^2]
-_SIZE_NOTABLE = 0.1  # and worth a warning when it is this far off
+_VIEWS = 37  # pupil points at which a dot's rays are labelled
 _NORMAL_MAD = 1.4826
 _TUKEY = 4.685
 
@@ -88,12 +84,18 @@ def label_by_integral(
     mean[:, 0] = detection.chief_mm
     loose = np.tile(1 / (np.take(_PRIOR_PITCHES, _ORDER) * pitch) ** 2, 2)
     response = decoder.coverage * decoder.smooth_gain * np.float32(decoder.white_counts)
-    diameter, blur = rounds.dot_and_blur(noise, response, dot, mean, loose)
-    model = LensIntegral(decoder, diameter, blur, noise, decoder.counts_per_photon)
-    fits, taken = rounds.run(model, response, dot, mean, np.tile(loose, (len(dot), 1)), _MARGIN_PITCHES[0] * pitch)
+    margin = _MARGIN_PITCHES[0] * pitch
+
+    def fit(model: LensIntegral, chosen: np.ndarray) -> list[DotFit | None]:
+        return rounds.run(model, response, dot[chosen], mean[chosen], np.tile(loose, (len(chosen), 1)), margin)[0]
+
+    shared = settle(fit, len(dot), decoder, board.diameter_mm, noise)
+    model = shared.model(decoder, noise, decoder.counts_per_photon)
+    fits, taken = rounds.run(model, response, dot, mean, np.tile(loose, (len(dot), 1)), margin)
+    shared, fits = update_bend(shared, fits, pitch)
 
     photon, share = _noise_and_response(fits, taken, decoder)
-    model = LensIntegral(decoder, diameter, blur, noise, photon)
+    model = shared.model(decoder, noise, photon)
     response = decoder.coverage * decoder.shrunk_gain(share) * np.float32(decoder.white_counts)
 
     good = [k for k, fit in enumerate(fits) if fit is not None and fit.converged]
@@ -118,9 +120,7 @@ def label_by_integral(
     fits, _ = rounds.run(model, response, candidates, mean, information, _MARGIN_PITCHES[1] * pitch)
 
     trusted = _trusted(fits, candidates // board.size, mean, sigma, pitch, detection.sign)
-    return _integral_labels(
-        fits, candidates, trusted, np.isin(candidates, dot) & ~trusted, decoder, share, diameter, blur
-    )
+    return _integral_labels(fits, candidates, trusted, np.isin(candidates, dot) & ~trusted, decoder, share, shared)
 
 
 def _candidates(detection: Detection, board: DotBoard) -> np.ndarray:
@@ -142,7 +142,11 @@ class _Rounds:
     ):
         self.signals, self.decoder, self.board, self.sign = signals, decoder, board, detection.sign
         self.pose = detection.pose
-        self.usable = (decoder.coverage > _FIT_COVERAGE) & (decoder.gain > 0)
+        optics = decoder.optics
+        to_px = optics.sensor_per_pupil / optics.pixel_mm
+        alone, _ = disc_fraction(decoder.pupil_mm * np.float32(to_px), optics.pupil_radius_mm * to_px)
+        beside = ndimage.maximum_filter(decoder.coverage - alone, 3)  # blur takes light one pixel further
+        self.usable = (alone > _FIT_COVERAGE) & (beside < _BESIDE_COVERAGE) & (decoder.gain > 0)
 
     def run(
         self,
@@ -179,41 +183,6 @@ class _Rounds:
             taken.append(where)
         return fits, taken
 
-    def dot_and_blur(
-        self, noise: float, response: np.ndarray, dots: np.ndarray, mean: np.ndarray, information: np.ndarray
-    ) -> tuple[float, float]:
-        """Diameter the dots show [mm], and blur of the pixels [pixel]: what a sample of dots fits best.
-
-        A dot drawn too large or too small is fitted in the wrong place wherever its light is cut by a lens's edge. The
-        diameter matters everywhere, the blur grows with the slope of the rays; so focus tells the two apart.
-        """
-        chosen = np.unique(np.linspace(0, len(dots) - 1, _SIZE_SAMPLE).astype(int))
-        prior = np.tile(information, (len(chosen), 1))
-        margin = _MARGIN_PITCHES[0] * self.decoder.optics.microlens_pitch_mm
-        nominal = self.board.diameter_mm
-        size, blur2 = 0.0, 0.0  # log(diameter / nominal), blur^2
-        for _ in range(_SIZE_ROUNDS):
-            model = LensIntegral(
-                self.decoder, nominal * np.exp(size), np.sqrt(blur2), noise, self.decoder.counts_per_photon
-            )
-            tried = self.run(model, response, dots[chosen], mean[chosen], prior, margin)[0]
-            fits = [fit for fit in tried if fit is not None and fit.converged]
-            if not fits:
-                break
-            typical = np.median([fit.reduced_chi2 for fit in fits])
-            fits = [fit for fit in fits if fit.reduced_chi2 <= 2 * typical]
-            total = sum(fit.growth_information for fit in fits) / typical + np.diag(1 / np.square(_SIZE_PRIOR))
-            pull = sum(fit.growth for fit in fits) / typical - np.array([size, blur2]) / np.square(_SIZE_PRIOR)
-            change = np.clip(np.linalg.solve(total, pull), -_SIZE_STEP, _SIZE_STEP)
-            if blur2 + change[1] < 0:  # no blur: the diameter alone
-                change = np.array([np.clip(pull[0] / total[0, 0], -_SIZE_STEP, _SIZE_STEP), -blur2])
-            size, blur2 = size + change[0], blur2 + change[1]
-            if np.abs(change).max() < _SIZE_CHANGE:
-                break
-        if abs(size) > _SIZE_NOTABLE:
-            log.warning("the board's dots look %.3g mm wide, not %.3g mm", nominal * np.exp(size), nominal)
-        return float(nominal * np.exp(size)), float(np.sqrt(blur2))
-
     def _pixels(
         self,
         model: LensIntegral,
@@ -225,8 +194,9 @@ class _Rounds:
         """Rows and columns of the usable pixels that may see a dot and none of its neighbours, shape (n, 2)."""
         decoder, optics = self.decoder, self.decoder.optics
         slope = slope_of(theta, model.pupil_radius_mm)
-        support = model.support_mm(board_jacobian, slope)
-        reach = support + margin_mm + np.abs(theta[1:]).sum(0) + optics.microlens_pitch_mm
+        support = model.support_mm(board_jacobian, theta)
+        bent = np.vstack([theta, model.bend_mm])
+        reach = support + margin_mm + np.abs(bent[1:]).sum(0) + optics.microlens_pitch_mm
         corners = optics.sensor_px((theta[0] + [-reach, reach]) * (1 + optics.sensor_per_pupil))
         low = np.maximum(np.floor(corners[0]), 0).astype(int)
         high = np.maximum(np.ceil(corners[1]) + 1, low).astype(int)
@@ -235,7 +205,7 @@ class _Rounds:
         at = (row + low[1], column + low[0])
         lens = decoder.lattice.centres_mm(decoder.lens_index[at])
         terms = ray_terms(decoder.pupil_mm[at], model.pupil_radius_mm)
-        offset, _ = lens_offset_mm(terms, theta, lens, model.pupil_radius_mm)
+        offset, _ = lens_offset_mm(terms, bent, lens, model.pupil_radius_mm)
         away = np.abs(offset)
         take = (away[:, 0] < support[0] + margin_mm) & (away[:, 1] < support[1] + margin_mm)
         inverse = np.linalg.inv(np.eye(2) - slope)
@@ -355,6 +325,15 @@ def _trusted(
     return fitted
 
 
+def _views(dot: int, radius_mm: float) -> np.ndarray:
+    """Pupil points spread evenly to the edge, others for each dot, so that a network sees them all, (VIEWS, 2) [mm]."""
+    golden = (np.sqrt(5) - 1) / 2
+    number = np.arange(_VIEWS) + dot * golden % 1
+    angle = 2 * np.pi * (number * golden + dot * np.sqrt(2))
+    directions: np.ndarray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return radius_mm * np.sqrt(number / _VIEWS)[:, None] * directions
+
+
 def _integral_labels(
     fits: Sequence[DotFit | None],
     dots: np.ndarray,
@@ -362,22 +341,22 @@ def _integral_labels(
     rejected: np.ndarray,
     decoder: LightFieldDecoder,
     share: float,
-    diameter: float,
-    blur: float,
+    shared: Shared,
 ) -> Labels:
     """Sample the fitted ray models at pupil points near which each dot was seen."""
     optics = decoder.optics
-    views = spread_over_pupil(PUPIL_PART * optics.pupil_radius_mm)
-    terms = ray_terms(views, optics.pupil_radius_mm)
     near = (1.5 * optics.pupil_pixel_mm) ** 2
     pupil, array, std, owner = [], [], [], []
     kept = [(dot, fit) for dot, fit, sure in zip(dots, fits, trusted, strict=True) if sure and fit is not None]
     for dot, fit in kept:
+        views = _views(int(dot), optics.pupil_radius_mm)
+        terms = ray_terms(views, optics.pupil_radius_mm)
         seen = (((views[:, None] - fit.pupil_mm[None]) ** 2).sum(-1) < near).any(1)
         covariance = fit.covariance[:TERMS, :TERMS] + fit.covariance[TERMS:, TERMS:]
-        variance = np.einsum("va,ab,vb->v", terms[seen], covariance, terms[seen]) / 2
+        own = terms[seen, :TERMS]
+        variance = np.einsum("va,ab,vb->v", own, covariance, own) / 2
         pupil.append(views[seen])
-        array.append(terms[seen] @ fit.coefficients)
+        array.append(terms[seen] @ np.vstack([fit.coefficients, shared.bend_mm]))
         std.append(np.sqrt(variance * max(fit.reduced_chi2, 1)))
         owner.append(np.full(seen.sum(), dot))
     return Labels(
@@ -391,6 +370,6 @@ def _integral_labels(
         slope=np.array([slope_of(fit.coefficients, optics.pupil_radius_mm) for _, fit in kept]).reshape(-1, 2, 2),
         reduced_chi2=np.array([fit.reduced_chi2 for _, fit in kept]),
         response_share=share,
-        diameter_mm=diameter,
-        blur_px=blur,
+        diameter_mm=shared.diameter_mm,
+        blur_px=shared.blur_px,
     )

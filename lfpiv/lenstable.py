@@ -16,7 +16,7 @@ _DISC_CHANGE = -2 * special.jv(2, _PHASE) / _PHASE**2
 
 
 class LensTable:
-    """F on a grid of lens offsets, with its gradient and its change over the pupil, read by linear interpolation."""
+    """F on a grid of lens offsets, with its derivatives and its change over the pupil, read by linear interpolation."""
 
     def __init__(
         self,
@@ -38,15 +38,21 @@ class LensTable:
         blurring = 2 * np.pi**2 * (along(pixel[:, 0]) ** 2 + along(pixel[:, 1]) ** 2)  # of a Gaussian one pixel wide
         window = cell * np.sinc(along(pixel[:, 0])) * np.sinc(along(pixel[:, 1])) * np.exp(-blurring * blur_px**2)
         spectrum = window * np.interp(phase, _PHASE, _DISC)
+        s, t = frequency
+        variance = 1 / 12 + blur_px**2  # of a pixel, in sides
+        growth = window * np.interp(phase, _PHASE, _DISC_CHANGE)
         spectra = [spectrum, *(2j * np.pi * f * spectrum for f in frequency)]
-        window *= np.interp(phase, _PHASE, _DISC_CHANGE)
-        spectra += [window * phase**2, -blurring * spectrum]
-        spectra += [window * sum(a * 2 * np.pi * along(c[:, k]) for k, a in enumerate(axes)) for c in change]
-        table = fft.fftshift(fft.irfft2(np.stack(spectra), s=(TABLE, TABLE)), axes=(1, 2))
+        spectra += [growth * sum(a * 2 * np.pi * along(c[:, k]) for k, a in enumerate(axes)) for c in change]
+        spectra += [-2 * np.pi**2 * variance * f * spectrum for f in (s * s, 2 * s * t, t * t)]
+        spectra += [growth * phase**2, -blurring * spectrum]
+        table = fft.fftshift(fft.irfft2(np.stack(spectra).astype(np.complex64), s=(TABLE, TABLE)), axes=(1, 2))
         self._table = np.ascontiguousarray(np.moveaxis(table, 0, -1).reshape(TABLE * TABLE, -1))
         self._step = step_mm
+        self.pixel_mm2 = (pixel @ pixel.T)[[0, 0, 1], [0, 1, 1]]
 
-    def __call__(self, offset_mm: np.ndarray, pupil: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def __call__(
+        self, offset_mm: np.ndarray, pupil: np.ndarray, pixel_mm2: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Read F, dF/dg [1/mm] and F's change with the dot's diameter and the pixels' blur.
 
         Parameters
@@ -55,6 +61,9 @@ class LensTable:
             Offsets g from a lens centre [mm].
         pupil : ndarray, shape (n, 2)
             Pupil points [pupil radii].
+        pixel_mm2 : ndarray, shape (n, 3)
+            Sides of each pixel's image on the array, P P^T (ss, st, tt) [mm^2]. The table holds one pixel's; what the
+            others' second moments differ by enters by the second derivatives of F.
 
         Returns
         -------
@@ -69,14 +78,14 @@ class LensTable:
         inside = np.flatnonzero((s >= 0) & (t >= 0) & (s < TABLE - 1.001) & (t < TABLE - 1.001))  # F vanishes elsewhere
         s, t = s[inside], t[inside]
         row, column = s.astype(np.intp), t.astype(np.intp)
-        x, y = (s - row)[:, None], (t - column)[:, None]
+        x, y = (s - row).astype(np.float32)[:, None], (t - column).astype(np.float32)[:, None]
         first = row * TABLE + column
         low = (1 - y) * self._table.take(first, 0) + y * self._table.take(first + 1, 0)
         high = (1 - y) * self._table.take(first + TABLE, 0) + y * self._table.take(first + TABLE + 1, 0)
         low += x * (high - low)
-        low[:, 0] += low[:, 5] * pupil[inside, 0] + low[:, 6] * pupil[inside, 1]
+        low[:, 0] += (low[:, 3:5] * pupil[inside]).sum(1) + (low[:, 5:8] * (pixel_mm2[inside] - self.pixel_mm2)).sum(1)
         values = np.zeros((len(offset_mm), 5))
-        values[inside] = low[:, :5]
+        values[inside] = low[:, [0, 1, 2, 8, 9]]
         return values[:, 0], values[:, 1:3], values[:, 3:]
 
 

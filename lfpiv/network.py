@@ -266,6 +266,7 @@ def train(
     split: tuple[float, float, float] = (0.70, 0.15, 0.15),
     groups: np.ndarray | None = None,
     std: np.ndarray | None = None,
+    guide: tuple[np.ndarray, np.ndarray, float] | None = None,
     shrink: bool = False,
     seed: int = 0,
     unit: float = 1.0,
@@ -291,6 +292,8 @@ def train(
         dots that training never saw.
     std : ndarray, shape (n,), optional
         Standard deviation of each sample's outputs; a sample counts by its inverse square in training and validation.
+    guide : tuple of ndarray, ndarray, float, optional
+        Inputs and outputs of further samples for training alone, and their standard deviation.
     shrink : bool
         The outputs are corrections to a baseline, such as the residual of a fitted thin lens, so that 0 is the safe
         answer: multiply the network by the factor, from 0 to 1, that fits the validation part best. A network that
@@ -329,6 +332,13 @@ def train(
         )
 
     training, validation = samples(parts[0]), samples(parts[1])
+    if guide is not None:
+        weight = np.full((len(guide[0]), 1), 1 / guide[2] / np.sqrt(np.mean(weights[parts[0]] ** 2)))
+        training = Samples(
+            inputs=np.vstack([training.inputs, (guide[0] - centre) / scale]),
+            outputs=np.vstack([training.outputs, (guide[1] - output_centre) / output_scale]),
+            weights=np.vstack([training.weights, weight]),
+        )
     sizes = (inputs.shape[1], *hidden, outputs.shape[1])
     parameters = sum((a + 1) * b for a, b in pairwise(sizes))
     if training.outputs.size < parameters:

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from lfpiv.board import DotBoard, measure_board
 from lfpiv.boardoutline import MARGIN, outline, require_stated
-from lfpiv.dotfit import LensIntegral
+from lfpiv.dotfit import BENDS, TERMS, DotFit, LensIntegral, ray_terms
+from lfpiv.dotshared import Shared, update_bend
 from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
 from lfpiv.rig import LensLattice, Optics
@@ -31,6 +32,9 @@ HONEST = (0.5, 2.0)  # true over stated error; small model errors are shared by 
 DIAMETER_ERROR = 0.04  # 20 % cost 0.03 pitch in the labels, so 4 % cost what noise does
 SHARE_ERROR = 0.1  # scatter of the white image that is response; a tenth changes no weight noticeably
 GRADIENT_ERROR = 0.03  # the gradient has kinks; differences over 2 % of a lens round them off
+FALSE_BENDS = (
+    0.03  # one in a thousand where all dots tell as much as another; five unequal ones are told from noise less well
+)
 F_ERROR = 5 * 0.5 / np.sqrt(20_000)  # five standard deviations of a count of 20,000 rays
 
 
@@ -59,6 +63,8 @@ class Scene:
     full_well: float = 65535.0  # counts
     stated_diameter: float = 1.0  # what the user says over what is true
     response_sd: float = 0.0  # pixel response
+    spherical_pitch: float = 0.0  # where a ray through the pupil's edge misses
+    coma_pitch: float = 0.0  # the same for tangential coma along t, everywhere in the field
     focal_length_mm: float = 60.0
     pixel_mm: float = 0.0065
     seed: int = 1
@@ -100,7 +106,10 @@ class Scene:
         focus = 1 / (1 / f - 1 / image_distance) / self.magnification
         slope = (pupil - camera[:, :2]) / (focus - camera[:, 2])[:, None]
         power = 1 / image_distance + 1 / focus  # a camera whose magnification differs is focused there all the same
-        return pupil + image_distance * (slope - pupil * power)
+        p = pupil / self.optics.pupil_radius_mm
+        pp = (p**2).sum(1, keepdims=True)
+        aberration = self.spherical_pitch * pp * p + self.coma_pitch / 3 * (pp * [0, 1] + 2 * p[:, 1:] * p)
+        return pupil + image_distance * (slope - pupil * power) + self.optics.microlens_pitch_mm * aberration
 
 
 class Renderer:
@@ -202,6 +211,17 @@ SCENES = {
         visible=(25, 25, 20),
         seed=2,
     ),
+    "aberrated, few dots": Scene(
+        nominal_angle_deg=38,
+        yaw_deg=41,
+        roll_deg=0.7,
+        spherical_pitch=0.4,  # left out of the dots' rays it would leave 0.07
+        coma_pitch=0.3,
+        dots=(4, 4),
+        planes_mm=(-0.9, 0.8),
+        visible=(16, 16),
+        seed=4,
+    ),
     "dark dots on a bright board": Scene(
         nominal_angle_deg=38, yaw_deg=35, pitch_deg=-0.8, magnification=0.95, dark_dots=True, seed=3
     ),
@@ -282,20 +302,33 @@ def test_dots_outside_the_field_are_missing_and_overlapping_ones_are_not_biased(
     assert ((centre > -20) & (centre < [columns + 20, rows + 20])).all()  # half of the light is seen, so the middle
 
 
+def slope_at(theta, pupil):
+    """Derivative of the ray model over pupil points in radii, by differences; shape (n, 2, 2)."""
+    steps = 1e-5 * np.eye(2)
+    ahead, behind = ([ray_terms(pupil + sign * step, 1.0) @ theta for step in steps] for sign in (1, -1))
+    return np.stack([(a - b) / 2e-5 for a, b in zip(ahead, behind, strict=True)], axis=-1)
+
+
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
 def test_light_of_a_pixel_against_counted_rays(layout):
     """F of the dot model: rays of a tilted dot towards one pixel behind one lens, counted."""
     random, optics = np.random.default_rng(5), SCENES["hexagonal, steep"].optics
     scene = replace(SCENES["hexagonal, steep"], layout=layout, sensor_shape=(200, 200))
     decoder = LightFieldDecoder.from_white(scene.optics, scene.lattice, Renderer(scene).images()[0])
-    model = LensIntegral(decoder, 0.12, 0.4, 1.0, 1.0)
+    bend = 1e-3 * random.normal(size=(BENDS, 2))
+    model = LensIntegral(decoder, 0.12, 0.4, bend, 1.0, 1.0)
     jacobian = np.array([[-0.7, 0.02], [0.03, -1.05]])
     tilt = np.zeros((2, 2, 2))
     tilt[0, 0, 0], tilt[1, 0, 1] = 0.06, 0.06
     slope = np.array([[0.02, 0.001], [-0.001, 0.018]])
+    theta = 1e-2 * random.normal(size=(TERMS, 2))
+    theta[1:3] = slope.T * optics.pupil_radius_mm
     offset = random.uniform(-0.11, 0.11, (60, 2))
     pupil = random.uniform(-0.7, 0.7, (60, 2))
-    share, gradient, growth = model.table(jacobian, tilt, slope)(offset, pupil)
+    here = slope_at(np.vstack([theta, bend]), pupil) / optics.pupil_radius_mm
+    image = np.linalg.inv(np.eye(2) - here) @ here * optics.pupil_pixel_mm  # of each pixel on the array
+    pixel_mm2 = np.stack([(image[:, a] * image[:, b]).sum(1) for a, b in ((0, 0), (0, 1), (1, 1))], axis=1)
+    share, gradient, growth = model.table(jacobian, tilt, theta)(offset, pupil, pixel_mm2)
 
     count = 20_000
     radius, angle = 0.06 * np.sqrt(random.random(count)), 2 * np.pi * random.random(count)
@@ -304,23 +337,60 @@ def test_light_of_a_pixel_against_counted_rays(layout):
     inverse = np.linalg.inv(np.eye(2) - slope)
     lattice = replace(scene.lattice, origin_mm=(0.0, 0.0))
     for k in range(len(offset)):
-        landed = offset[k] + (dot @ (jacobian + tilt @ pupil[k]).T + pixel @ slope.T) @ inverse.T
+        landed = (
+            offset[k] + dot @ (jacobian + tilt @ pupil[k]).T @ inverse.T + pixel / optics.pupil_pixel_mm @ image[k].T
+        )
         counted = (lattice.nearest(landed) == 0).all(1).mean()
         assert abs(share[k] - counted) < F_ERROR
-    table, step = model.table(jacobian, tilt, slope), 2e-3
+    table, step = model.table(jacobian, tilt, theta), 2e-3
+    same = np.tile(table.pixel_mm2, (len(offset), 1))
+    _, gradient, growth = table(offset, 0 * pupil, same)
     for axis in (0, 1):
-        ahead, behind = (table(offset + sign * step * np.eye(2)[axis], 0 * pupil)[0] for sign in (1, -1))
+        ahead, behind = (table(offset + sign * step * np.eye(2)[axis], 0 * pupil, same)[0] for sign in (1, -1))
         miss = (ahead - behind) / (2 * step) - gradient[:, axis]
         assert np.sqrt((miss**2).mean()) < GRADIENT_ERROR * np.abs(gradient).max()
     for column, steps in enumerate([(0.05, 0), (0, 0.05)]):
         up, down = (
-            LensIntegral(decoder, 0.12 * np.exp(sign * steps[0]), np.sqrt(0.16 + sign * steps[1]), 1.0, 1.0).table(
-                jacobian, tilt, slope
-            )(offset, pupil)[0]
+            LensIntegral(
+                decoder, 0.12 * np.exp(sign * steps[0]), np.sqrt(0.16 + sign * steps[1]), bend, 1.0, 1.0
+            ).table(jacobian, tilt, theta)(offset, 0 * pupil, same)[0]
             for sign in (1, -1)
         )
         miss = (up - down) / 0.1 - growth[:, column]
         assert np.sqrt((miss**2).mean()) < GRADIENT_ERROR * np.abs(growth[:, column]).max()
+
+
+def dots_that_say(bend, count, scatter, start, random):
+    """Fits, by the bend `start`, of dots that all tell one bend but for errors `scatter` times the stated ones."""
+    size, fits = 2 * BENDS, []
+    following = random.normal(size=(2 * TERMS, size + 2))
+    for _ in range(count):
+        information = np.cov(random.normal(size=(size + 2, 3 * size)))
+        error = scatter * np.linalg.cholesky(information[2:, 2:]) @ random.normal(size=size)
+        pull = np.concatenate([random.normal(size=2), information[2:, 2:] @ (bend - start).T.ravel() + error])
+        given = {"coefficients": np.zeros((TERMS, 2)), "pull": pull, "pull_information": information}
+        given |= {"following": following, "reduced_chi2": 1.0, "converged": True}
+        fits.append(DotFit(**{name: given.get(name) for name in DotFit.__dataclass_fields__}))
+    return fits, following
+
+
+@pytest.mark.parametrize("count", [5, 60])
+def test_a_bend_is_found_by_all_dots_together_and_none_is_made_of_noise(count):
+    """Errors of each dot as large as the bend, and twice what the dots state."""
+    random, pitch = np.random.default_rng(7), 30.0  # so large that the prior has no say
+    none = np.zeros((BENDS, 2))
+    start = Shared(diameter_mm=0.1, blur_px=0.3, bend_mm=0.5 * random.normal(size=(BENDS, 2)))
+    found = [
+        update_bend(start, [None, *dots_that_say(none, count, 2.0, start.bend_mm, random)[0]], pitch)[0].bend_mm
+        for _ in range(200)
+    ]
+    assert np.mean([bend.any() for bend in found]) < FALSE_BENDS
+    true = 2.5 * random.normal(size=(BENDS, 2))
+    fits, following = dots_that_say(true, count, 2.0, start.bend_mm, random)
+    shared, moved = update_bend(start, fits, pitch)
+    assert np.abs(shared.bend_mm - true).max() < 5 * 2 / np.sqrt(count) * 1.5  # five standard errors, and thin dots
+    change = following[:, 2:] @ (shared.bend_mm - start.bend_mm).T.ravel()
+    assert np.allclose(moved[0].coefficients.T.ravel(), change)
 
 
 def seen_board(true, stated, view, offset=(0, 0), planes=3, hidden=()):

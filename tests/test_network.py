@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from lfpiv import trainers
+from lfpiv.guide import between_dots
 from lfpiv.network import Network, sigma_nor, split_samples, train
 from lfpiv.rig import Optics
 from lfpiv.scenecamera import SceneCamera, true_mapping
@@ -446,3 +447,18 @@ def test_network_refuses_layers_that_do_not_fit():
         dataclasses.replace(network, weights=network.weights[::-1])
     with pytest.raises(ValueError, match=r"shape \(n, 5\)"):
         network(np.zeros((3, 4)))
+
+
+def test_the_guide_is_exact_for_a_polynomial_and_stays_among_the_dots():
+    """Few dots along an axis lower its order; what is within that order come back to rounding, none beyond the dots."""
+    rng = np.random.default_rng(0)
+    dots = np.stack(np.meshgrid([0, 1, 2.0], [0, 1, 2.0], [0, 1.0], indexing="ij"), -1).reshape(-1, 3)
+    points, pupil = np.repeat(dots, 20, axis=0), rng.uniform(-1, 1, (360, 2))
+
+    def mapping(x, y, z, u, v):
+        return np.stack([x * u + z, v**3 - y], axis=1)
+
+    outputs = mapping(*points.T, *pupil.T)
+    inputs, guided, std = between_dots(points, pupil, outputs, np.full(360, 0.01), pitch_mm=0.1, seed=0)
+    assert np.abs(guided - mapping(*inputs.T)).max() < 1e-12  # sums of a hundred terms of order 1 in float64
+    assert (inputs[:, :3] >= 0).all() and (inputs[:, :3] <= [2, 2, 1]).all() and std > 0

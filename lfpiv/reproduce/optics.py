@@ -77,7 +77,7 @@ CORRELATED = ("network", "drt")
 """Mappings a pair is measured by."""
 NAMES = {"network": "network", "fitted": "fitted thin lens", "drt": "DRT", "truth": "true particles"}
 NAMES |= {"labels": "the dots' own rays"}
-COLOURS = {"network": plots.COLOURS["network"], "fitted": plots.COLOURS["sieve"], "drt": plots.COLOURS["drt"]}
+COLOURS = {"network": plots.COLOURS["network"], "fitted": plots.COLOURS["no_sieve"], "drt": plots.COLOURS["drt"]}
 RayErrors = dict[str, dict[str, float]]
 """Mapping, or "labels" -> "mean" and "largest" distance from the true rays [pitch]."""
 SMALLEST_PITCH = 2e-4
@@ -229,8 +229,8 @@ def _result(
             "Fitted thin lens: pose and scale free, fitted to the same dots as the network. It mends what a shift or "
             "a defocus can mend, such as water behind a wall that faces the camera.",
             "The network is as good as its labels, the dots' own rays. A dot's rays are fitted as quadratics of the "
-            "pupil point: coma and the window's astigmatism fit, spherical aberration, cubic in the pupil point, does "
-            "not.",
+            "pupil point, which hold coma and the window's astigmatism; cubic terms, which spherical aberration needs, "
+            "are fitted once for all dots of a camera.",
             *_about_fits(optics, errors),
             "A voxel's rays that miss by a part of a microlens light wrong pixels of the microimage; where they no "
             "longer meet in the particle, it is smeared, split or lost, and ghosts grow.",
