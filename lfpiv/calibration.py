@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from lfpiv.board import BoardDots, DotBoard, measure_board
 from lfpiv.camera import CalibratedCamera, Calibration, load_calibration
 from lfpiv.errors import InputError
 from lfpiv.experiment import CameraSetup, Experiment
+from lfpiv.exposure import GAP_LIGHT, MISPLACED, NO_PLACE, SATURATED, gap_light, saturated_share
+from lfpiv.guide import between_dots
 from lfpiv.lensarray import find_lens_array
 from lfpiv.lightfield import LightFieldDecoder
 from lfpiv.network import train
 from lfpiv.rig import Grid, LensLattice
-from lfpiv.thinlens import fit_thin_lens, thin_lens_model
+from lfpiv.thinlens import ThinLensModel, fit_thin_lens, thin_lens_model
 
 __all__ = ["CalibratedCamera", "Calibration", "calibrate", "load_calibration", "thin_lens", "warn_outside"]
 
@@ -31,6 +34,12 @@ PUPIL_SCALE, PUPIL_SCALE_INCOMPLETE = 0.3, 0.1
 """Largest departure of the fitted pupil from the stated one, and the same where over a tenth of the dots are missing.
 Good boards fit within 0.01 and are complete; planes in the wrong order, a wrong angle's sign, an unnoticed mirror gave
 0.17 to 1.2 and lost a quarter of the dots or more, because depth and defocus then disagree."""
+TURN_DEG = 20.0
+"""Turn of a camera from its nominal pose that is no misalignment: ten degrees are allowed, and windows bend rays."""
+MAGNIFICATION = 0.04
+"""Relative difference from the stated magnification that is worth a look; a wrong dot spacing gives half its own."""
+EXPLAINED = 0.2
+"""Median distance of the dots' rays from the thin lens's that it can be held to [microlens pitch]."""
 MODEL_ERROR_PITCH = 0.002
 """Error of a dot's labels that they share and their standard errors do not hold [microlens pitch]."""
 FEWEST_PLANES = 2
@@ -150,13 +159,19 @@ def _decode(experiment: Experiment, setup: CameraSetup) -> tuple[LensLattice, Li
         decoder = LightFieldDecoder.from_white(optics, lattice, white, dark)
     except ValueError as error:
         raise InputError(f"{setup.white_path}: white_image of camera {setup.name!r}: {error}") from None
-    report = {
+    report: dict[str, Any] = {
         "lens_array_rms_px": float(array.rms_px),
         "lens_array_pitch_px": float(array.pitch_px),
         "lens_array_rotation_deg": float(array.rotation_deg),
         "lenses": len(array.centres_px),
         "warnings": [],
     }
+    share = saturated_share(white)
+    if share > SATURATED:
+        report["warnings"].append(
+            f"{setup.name}: {100 * share:.0f} % of the white image's bright pixels are saturated, so their response is "
+            "not known; expose it to two thirds of the range."
+        )
     return lattice, decoder, report
 
 
@@ -167,6 +182,7 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
     images = [experiment.board_image(setup.name, plane) for plane in range(len(experiment.board.planes_mm))]
     if dark is not None:
         images = [image - dark for image in images]
+    _check_light(experiment, setup, decoder, images, report)
     step(0.2)
     board, settings = experiment.board, experiment.network
     try:
@@ -205,6 +221,8 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
                 f"{fitted.pupil_scale:.2f}. Check the sign of nominal_angle_deg, image_flip, and the order and sign of "
                 "board.planes_mm."
             )
+        missed = float(np.median(np.linalg.norm(array - fitted(points, pupil), axis=1))) / pitch
+        _compare_with_nominal(setup, fitted, missed, report)
         keep = _agreeing_dots(dots, array - fitted(points, pupil), pitch)
         baseline = fitted if settings.baseline == "thin_lens" else None
         target = array if baseline is None else array - baseline(points, pupil)
@@ -215,6 +233,7 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
             epochs=settings.epochs,
             groups=dots.dot[keep],
             std=std[keep],
+            guide=between_dots(points[keep], pupil[keep], target[keep], std[keep], pitch_mm=pitch, seed=settings.seed),
             shrink=baseline is not None,
             seed=settings.seed,
             unit=pitch,
@@ -259,6 +278,49 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
     )
     step(1.0)
     return camera
+
+
+def _compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, missed: float, report: dict[str, Any]) -> None:
+    """Warn of a camera that the dots see elsewhere, or magnifying otherwise, than the experiment file says.
+
+    Both are measured to a fraction of a degree and of a percent, and no result depends on what is stated. But they tell
+    what nothing else does: pictures turned on their side, a wrong spacing of the dots or of the planes. Where the thin
+    lens misses the dots' rays by more than `EXPLAINED`, as behind a tilted window, its magnification means nothing.
+    """
+    nominal = thin_lens_model(setup.optics, setup.nominal_angle_deg)
+    turn = Rotation.from_matrix(fitted.rotation @ nominal.rotation.T).magnitude() * 180 / math.pi
+    depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the board's middle, where the axes are said to meet
+    magnification = fitted.image_distance_mm / (fitted.object_distance_mm - depth)
+    ratio = magnification * nominal.object_distance_mm / nominal.image_distance_mm
+    report |= {"turn_from_nominal_deg": float(turn), "magnification": float(magnification)}
+    if turn > TURN_DEG:
+        report["warnings"].append(
+            f"{setup.name}: by the board's dots the camera stands {turn:.0f} degrees from where nominal_angle_deg = "
+            f"{setup.nominal_angle_deg:g} has it. Are its pictures turned by 90 degrees? Then x and y are."
+        )
+    if missed < EXPLAINED and not 1 / (1 + MAGNIFICATION) < ratio < 1 + MAGNIFICATION:
+        report["warnings"].append(
+            f"{setup.name}: the board's dots are magnified {magnification:.3f} times, not "
+            f"{abs(setup.optics.magnification):g} times as stated. Check magnification, and board.spacing_mm and "
+            "board.planes_mm: all lengths and velocities depend on those two."
+        )
+
+
+def _check_light(
+    experiment: Experiment,
+    setup: CameraSetup,
+    decoder: LightFieldDecoder,
+    images: Sequence[np.ndarray],
+    report: dict[str, Any],
+) -> None:
+    """Refuse, or warn of, a white image that does not belong to the board's images."""
+    plane = len(images) // 2
+    light = gap_light(images[plane], decoder)
+    if light > GAP_LIGHT:
+        path = experiment.board_path(setup.name, plane)
+        if light > NO_PLACE:
+            raise InputError(f"{path}: board.images of camera {setup.name!r}: {MISPLACED} Are these board images?")
+        report["warnings"].append(f"{setup.name}: {path}: {MISPLACED}")
 
 
 def _check_planes(experiment: Experiment, setup: CameraSetup, dots: BoardDots, report: dict[str, Any]) -> None:

@@ -46,6 +46,25 @@ def split_frame(path: Path) -> tuple[Path, str]:
     return path, ""
 
 
+def check(path: Path, place: str) -> None:
+    """Check what can be known of a DaVis image without decoding the buffer, all frames of which are decoded together.
+
+    Raises
+    ------
+    InputError
+        If the extra ``davis`` is missing.
+    NotOneImage
+        If what is named behind ``#`` can be no frame.
+    ValueError
+        If the file is empty.
+    """
+    file, fragment = split_frame(path)
+    _library(place)
+    _named_frame(fragment)
+    if file.stat().st_size == 0:
+        raise ValueError("the file is empty")
+
+
 def read(path: Path, place: str) -> np.ndarray:
     """Read one frame of a DaVis image buffer.
 
@@ -109,20 +128,27 @@ def _buffer(library: Any, file: str, changed_ns: int, size: int) -> Any:
     return library.read_buffer(file)
 
 
-def _frame_number(fragment: str, count: int) -> int:
-    """Turn what is named behind ``#`` into the number of a frame."""
+def _named_frame(fragment: str) -> int | None:
+    """Turn what is named behind ``#`` into the number of a frame; None where nothing is."""
     if not fragment:
-        if count == 1:
-            return 0
-        raise NotOneImage(f"{count} frames; name one behind the file: #0 to #{count - 1}, or #CAMERA.EXPOSURE")
+        return None
     match = _FRAME.fullmatch(fragment)
     if match is None:
         raise NotOneImage(f"a frame called {fragment!r}; name it by number (#0) or #CAMERA.EXPOSURE (#1.0)")
-    number, camera = int(match["frame"]), match["camera"]
-    if camera is not None:
-        if number > 1:
-            raise NotOneImage(f"exposure {number} in #{fragment}; a double frame has the exposures 0 and 1")
-        number += 2 * int(camera)
+    if match["camera"] is None:
+        return int(match["frame"])
+    if int(match["frame"]) > 1:
+        raise NotOneImage(f"exposure {match['frame']} in #{fragment}; a double frame has the exposures 0 and 1")
+    return 2 * int(match["camera"]) + int(match["frame"])
+
+
+def _frame_number(fragment: str, count: int) -> int:
+    """Return the number of the frame that is named behind ``#`` in a buffer of `count` frames."""
+    number = _named_frame(fragment)
+    if number is None:
+        if count == 1:
+            return 0
+        raise NotOneImage(f"{count} frames; name one behind the file: #0 to #{count - 1}, or #CAMERA.EXPOSURE")
     if number >= count:
         raise NotOneImage(f"{count} frame{'' if count == 1 else 's'}, none of them #{fragment}; they count from 0")
     return number

@@ -30,6 +30,9 @@ from lfpiv.toml import read_toml
 DECODED_PIXELS = 100_000_000
 """Particle images decoded before the work starts [pixel], in order; the others are checked by header and length."""
 
+MICROLENS_SHARE = 0.2
+"""Largest focal length of the microlenses over the main lens's image distance; more is a slip in a unit."""
+
 FEWEST_LENSES = 3
 """Microlenses a sensor must hold along each axis; fewer are a slip in the pitch or the pixel."""
 
@@ -79,29 +82,23 @@ class Experiment:
     def white(self, name: str) -> np.ndarray:
         """White image of a camera, float32 (rows, columns), dark not subtracted."""
         camera = self.camera(name)
-        return images.read_image(camera.white_path, f"white_image of camera {name!r}", flip=camera.image_flip)
+        return _read(camera.white_path, f"white_image of camera {name!r}", camera)
 
     def dark(self, name: str) -> np.ndarray | None:
         """Dark image of a camera, float32 (rows, columns), or None where the file names none."""
         camera = self.camera(name)
         if camera.dark_path is None:
             return None
-        return images.read_image(camera.dark_path, f"dark_image of camera {name!r}", flip=camera.image_flip)
+        return _read(camera.dark_path, f"dark_image of camera {name!r}", camera)
 
     def board_image(self, name: str, plane: int) -> np.ndarray:
         """Board image of a camera at plane number `plane`, float32 (rows, columns)."""
-        label = f"board.images, camera {name!r}, plane {plane}"
-        return images.read_image(self.board_path(name, plane), label, flip=self.camera(name).image_flip)
+        return _read(self.board_path(name, plane), _board_label(name, plane), self.camera(name))
 
     def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
         """Particle image of a camera, float32 (rows, columns); InputError where it is no such image, or even."""
-        label, path, camera = (
-            _particle_label(name, pair, frame),
-            self.particle_path(name, pair, frame),
-            self.camera(name),
-        )
-        image = images.read_image(path, label, flip=camera.image_flip)
-        _require_shape(image.shape, path, label, camera)
+        label, path = _particle_label(name, pair, frame), self.particle_path(name, pair, frame)
+        image = _read(path, label, self.camera(name))
         images.require_contrast(image, path, label)
         return image
 
@@ -127,7 +124,8 @@ def open_experiment(path: str | Path) -> Experiment:
     """Read an experiment file and check everything it says and names, before any work.
 
     White, dark and board images are decoded, and particle images up to `DECODED_PIXELS`; of the others the header and
-    the length are checked. `lfpiv.run` asks less: there only the first pair must be whole, see `check_pairs`.
+    the length are checked, of DaVis images only that they are there. `lfpiv.run` asks less: there only the first pair
+    must be whole, see `check_pairs`.
 
     Parameters
     ----------
@@ -199,7 +197,8 @@ def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[
     experiment : Experiment
         From `read_experiment`.
     pairs : sequence of int
-        Pairs to check: decoded up to `DECODED_PIXELS`, the first one at any rate, the others by header and length.
+        Pairs to check: decoded up to `DECODED_PIXELS`, the first one at any rate; the others by header and length (a
+        DaVis image must be there).
 
     Yields
     ------
@@ -266,7 +265,7 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
 
 def _camera(path: Path, table: CameraTable) -> CameraSetup:
     white_path = path.parent / table.white_image
-    header = images.read_header(white_path, f"white_image of camera {table.name!r}")
+    shape = _white_shape(white_path, f"white_image of camera {table.name!r}")
     optics = Optics(
         focal_length_mm=table.focal_length_mm,
         magnification=table.magnification,
@@ -274,14 +273,20 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
         microlens_pitch_mm=table.microlens_pitch_mm,
         microlens_focal_length_mm=table.microlens_focal_length_mm,
         pixel_mm=table.pixel_um / 1000,
-        sensor_shape=header.shape,
+        sensor_shape=shape,
         layout=table.microlens_layout,
     )
+    if table.microlens_focal_length_mm > MICROLENS_SHARE * optics.image_distance_mm:
+        raise InputError(
+            f"{path}: camera {table.name!r}, microlens_focal_length_mm: expected far less than the image distance "
+            f"f (1 + |M|) = {optics.image_distance_mm:g} mm, found {table.microlens_focal_length_mm:g}. Are it and "
+            "focal_length_mm in mm?"
+        )
     pitch_px = optics.microimage_pitch_px
-    if not (math.isfinite(pitch_px) and 2 <= pitch_px <= min(header.shape) / FEWEST_LENSES):
+    if not (math.isfinite(pitch_px) and 2 <= pitch_px <= min(shape) / FEWEST_LENSES):
         raise InputError(
             f"{path}: camera {table.name!r}, microlens_pitch_mm: expected microimages of at least 2 pixels, and "
-            f"at least {FEWEST_LENSES} of them across the sensor of {header.shape} pixels, found {pitch_px:.4g}. "
+            f"at least {FEWEST_LENSES} of them across the sensor of {shape} pixels, found {pitch_px:.4g}. "
             "Check microlens_pitch_mm and pixel_um."
         )
     return CameraSetup(
@@ -294,14 +299,21 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
     )
 
 
+def _white_shape(path: Path, label: str) -> tuple[int, int]:
+    header = images.read_header(path, label)
+    if header is not None:
+        return header.shape
+    rows, columns = images.read_image(path, label).shape
+    return rows, columns
+
+
 def _check_calibration_images(experiment: Experiment) -> None:
     """Check that every image of the calibration is there, fits its camera's white image and can be decoded."""
     for camera in experiment.cameras:
         if camera.dark_path is not None:
             _check_shape(camera.dark_path, f"dark_image of camera {camera.name!r}", camera)
         for plane in range(len(experiment.board.planes_mm)):
-            label = f"board.images, camera {camera.name!r}, plane {plane}"
-            _check_shape(experiment.board_path(camera.name, plane), label, camera)
+            _check_shape(experiment.board_path(camera.name, plane), _board_label(camera.name, plane), camera)
     for camera in experiment.cameras:
         white, dark = experiment.white(camera.name), experiment.dark(camera.name)
         label = f"white_image of camera {camera.name!r}"
@@ -313,13 +325,25 @@ def _check_calibration_images(experiment: Experiment) -> None:
             )
         for plane in range(len(experiment.board.planes_mm)):
             board = experiment.board_image(camera.name, plane)
-            label = f"board.images, camera {camera.name!r}, plane {plane}"
-            images.require_contrast(board, experiment.board_path(camera.name, plane), label)
+            path, label = experiment.board_path(camera.name, plane), _board_label(camera.name, plane)
+            images.require_contrast(board, path, label)
+
+
+def _read(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
+    """Read an image of a camera, its mirroring undone; refused where it is of another shape than the white image."""
+    image = images.read_image(path, label, flip=camera.image_flip)
+    _require_shape(image.shape, path, label, camera)
+    return image
 
 
 def _check_shape(path: Path, label: str, camera: CameraSetup) -> None:
-    """Refuse an image that is missing, damaged, or of another shape than its camera's white image."""
-    _require_shape(images.read_header(path, label).shape, path, label, camera)
+    """Refuse an image that is missing, damaged, or of another shape than its camera's white image.
+
+    A DaVis image must be there; what is in it is checked where it is decoded.
+    """
+    header = images.read_header(path, label)
+    if header is not None:
+        _require_shape(header.shape, path, label, camera)
 
 
 def _require_shape(shape: tuple[int, ...], path: Path, label: str, camera: CameraSetup) -> None:
@@ -328,6 +352,10 @@ def _require_shape(shape: tuple[int, ...], path: Path, label: str, camera: Camer
             f"{path} ({label}): expected {camera.optics.sensor_shape} pixels (rows, columns) as in the white image "
             f"{camera.white_path}, found {shape}. All images of a camera have one size."
         )
+
+
+def _board_label(camera: str, plane: int) -> str:
+    return f"board.images, camera {camera!r}, plane {plane}"
 
 
 def _particle_label(camera: str, pair: int, frame: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,19 +36,21 @@ class Header:
     """Name of the pixel type."""
 
 
-def read_header(path: Path, label: str) -> Header:
+def read_header(path: Path, label: str) -> Header | None:
     """Check an image file as far as that goes without decoding its pixels.
 
     Parameters
     ----------
     path : Path
-        A TIFF or PNG file, or a DaVis image, which is decoded to be checked (see `lfpiv.davis`).
+        A TIFF, PNG or DaVis image (see `lfpiv.davis`).
     label : str
         What the file is, for messages: the key and the camera it belongs to.
 
     Returns
     -------
-    Header
+    Header or None
+        None for a DaVis image, which says nothing of itself before it is decoded: all that is known then is that it
+        is there, holds something, and can be decoded on this machine.
 
     Raises
     ------
@@ -65,24 +69,12 @@ def read_header(path: Path, label: str) -> Header:
             f"{place}: expected a TIFF, PNG or DaVis image ({', '.join(SUFFIXES)}), found {found}. "
             "Convert the image without loss."
         )
-    try:
+    with _naming(place):
         if kind in davis.SUFFIXES:
-            pixels = davis.read(path, place)
-            header = Header(pixels.shape, str(pixels.dtype))
-        else:
-            header = _png_header(path) if kind == ".png" else _tiff_header(path)
-    except InputError:
-        raise
-    except NotOneImage as error:
-        raise InputError(f"{place}: expected one single-channel image, found {error}.") from None
-    except PermissionError:
-        raise InputError(f"{place}: the file may not be read. Change its permissions.") from None
-    except Exception as error:  # decoders raise anything on damaged files
-        raise InputError(_damaged(place, error)) from None
-    if header.dtype not in DTYPES:
-        raise InputError(
-            f"{place}: expected pixels of type {', '.join(DTYPES)}, found {header.dtype}. Save raw grey values."
-        )
+            davis.check(path, place)
+            return None
+        header = _png_header(path) if kind == ".png" else _tiff_header(path)
+    _require_dtype(header.dtype, place)
     return header
 
 
@@ -108,13 +100,11 @@ def read_image(path: Path, label: str, *, flip: str = "none") -> np.ndarray:
     """
     header = read_header(path, label)
     place = f"{path} ({label})"
-    try:
+    with _naming(place):
         pixels = _decode(path, place)
-    except InputError:
-        raise
-    except Exception as error:  # as above
-        raise InputError(_damaged(place, error)) from None
-    if pixels.shape != header.shape:
+    if header is None:
+        _require_dtype(str(pixels.dtype), place)
+    elif pixels.shape != header.shape:
         raise InputError(f"{place}: expected {header.shape} pixels as its header says, found {pixels.shape}.")
     image = np.ascontiguousarray(pixels[FLIPS[flip]], np.float32)
     if not np.isfinite(image).all():
@@ -136,9 +126,27 @@ def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
         raise InputError(f"{path} ({label}): expected an exposed image, found one that {what}. Take the image again.")
 
 
-def _damaged(place: str, error: Exception) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return f"{place}: expected a complete image file, found a truncated or damaged one ({text}). Copy it again."
+@contextlib.contextmanager
+def _naming(place: str) -> Iterator[None]:
+    """Turn whatever a decoder raises into one message about the file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except NotOneImage as error:
+        raise InputError(f"{place}: expected one single-channel image, found {error}.") from None
+    except PermissionError:
+        raise InputError(f"{place}: the file may not be read. Change its permissions.") from None
+    except Exception as error:  # decoders raise anything on damaged files
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{place}: expected a complete image file, found a truncated or damaged one ({text}). Copy it again."
+        ) from None
+
+
+def _require_dtype(dtype: str, place: str) -> None:
+    if dtype not in DTYPES:
+        raise InputError(f"{place}: expected pixels of type {', '.join(DTYPES)}, found {dtype}. Save raw grey values.")
 
 
 def _tiff_header(path: Path) -> Header:

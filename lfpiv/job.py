@@ -93,8 +93,10 @@ def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> ran
 class _WarningCollector(logging.Handler):
     """Keeps the text of each warning once.
 
-    What vectors say of themselves the summary words pair by pair, and errors are those of pairs that failed.
+    What vectors and motion passes say of a pair the summary words pair by pair; errors are those of pairs that failed.
     """
+
+    PAIRWISE = ("lfpiv.vectors", "lfpiv.motion")
 
     def __init__(self, level: int):
         super().__init__(level)
@@ -102,7 +104,7 @@ class _WarningCollector(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
-        if record.levelno == logging.WARNING and text not in self.texts and record.name != "lfpiv.vectors":
+        if record.levelno == logging.WARNING and text not in self.texts and record.name not in self.PAIRWISE:
             self.texts.append(text)
 
 
@@ -243,12 +245,15 @@ class Job:
     def build_weights(self, calibration: Calibration) -> Weights:
         """Build the weights of the grid."""
         from lfpiv.calibration import warn_outside
+        from lfpiv.exposure import pair_warnings
         from lfpiv.view import require_seen
         from lfpiv.weights import build_weights, compare_with_count
 
         method = self.experiment.compute.weights
         require_seen(self.experiment.path, calibration, self.experiment.grid)
         warn_outside(calibration, self.experiment.grid)
+        for text in pair_warnings(self.experiment, calibration, self.numbers[0]):
+            log.warning("%s", text)
         if len(calibration.cameras) == 1:
             log.warning(
                 "one camera hardly sees depth: w and displacement_z are not to be trusted, nor is their validation"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import sys
 from collections.abc import Mapping
@@ -47,8 +48,13 @@ def read_toml(path: Path, model: type[Model]) -> Model:
         raise InputError(f"{path}: expected a TOML file, found no such file. Check the path.") from None
     except IsADirectoryError:
         raise InputError(f"{path}: expected a TOML file, found a folder. Name the .toml file in it.") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected a TOML text file in UTF-8, found other bytes. Is it an image?") from None
+    except UnicodeDecodeError as error:
+        if error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+            found = "UTF-16"
+        else:
+            line = error.object[: error.start].count(b"\n") + 1
+            found = f"the byte {error.object[error.start]:#04x} in line {line}, as Latin-1 text or an image has"
+        raise InputError(f"{path}: expected a TOML text file in UTF-8, found {found}. Save it as UTF-8.") from None
     except OSError as error:
         raise InputError(f"{path}: the file cannot be read ({error.strerror}). Check its permissions.") from None
     try:

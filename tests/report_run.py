@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scenes
 import xarray as xr
 
 import lfpiv
@@ -23,46 +24,10 @@ OMEGA, STRETCH = 40.0, 25.0
 DT_S, VOXEL_MM = 1e-3, 0.1
 PAIRS = 3
 """The last one has not a single valid vector."""
+SHEET_MM = 0.3
+"""Half the thickness of the light sheet in the volumes."""
 EDGE_LEVEL = 0.2
 """Brightness of the volumes outside the light sheet over that inside."""
-
-SCENE = f"""
-name = '''{NAME}'''
-seed = 3
-dt_s = {DT_S}
-[board]
-dots = [5, 5]
-spacing_mm = 0.3
-dot_diameter_mm = 0.1
-planes_mm = [-0.5, 0.0, 0.5]
-[volume]
-size_mm = [1.4, 1.2, 1.0]
-voxel_mm = {VOXEL_MM}
-[particles]
-count = 4
-pairs = {PAIRS}
-sigma_mm = 0.05
-[flow]
-kind = "uniform"
-displacement_mm = [0.05, 0.0, 0.0]
-[network]
-hidden = [6]
-epochs = 20
-"""
-
-CAMERA = """
-[[camera]]
-name = "{name}"
-focal_length_mm = 100.0
-magnification = -1.0
-f_number = 4.0
-microlens_pitch_mm = 0.1
-microlens_focal_length_mm = 0.8
-pixel_um = 8.0
-sensor_width_px = 280
-sensor_height_px = 260
-nominal_angle_deg = {angle}
-"""
 
 
 @dataclass(frozen=True)
@@ -84,9 +49,18 @@ class Run:
 
 
 def make_run(folder: Path) -> Run:
-    cameras = "".join(CAMERA.format(name=name, angle=angle) for name, angle in (("left", 35.0), ("right.2", -35.0)))
-    (folder / "scene.toml").write_text(SCENE + cameras, "utf-8")
-    experiment = lfpiv.open_experiment(simulate(folder / "scene.toml", folder / "data"))
+    scene = scenes.scene(
+        NAME,
+        [scenes.camera(name, angle, (280, 260)) for name, angle in (("left", 35.0), ("right.2", -35.0))],
+        planes_mm=(-0.5, 0.0, 0.5),
+        spacing_mm=0.3,
+        size_mm=(1.4, 1.2, 1.0),
+        particles={"count": 4, "pairs": PAIRS, "sigma_mm": 0.05},
+        displacement_mm=(0.05, 0.0, 0.0),
+        dt_s=DT_S,
+        network={"hidden": (6,), "epochs": 20},
+    )
+    experiment = lfpiv.open_experiment(simulate(scene, folder / "data"))
     calibration = lfpiv.calibrate(experiment)
     vectors = {}
     for pair in range(PAIRS):
@@ -124,9 +98,9 @@ def field(pair: int, shape: tuple[int, int, int] = (5, 6, 7)) -> xr.Dataset:
 
 def reconstruction() -> xr.Dataset:
     """Volumes of a light sheet that ends inside them."""
-    axes = {name: VOXEL_MM * (np.arange(n) - (n - 1) / 2) for name, n in (("z", 10), ("y", 12), ("x", 14))}
-    sheet = np.where(np.abs(axes["z"]) < 0.3, 1.0, EDGE_LEVEL)[:, None, None]
-    grain = np.random.default_rng(0).random((10, 12, 14))
+    axes = {name: VOXEL_MM * (np.arange(n) - (n - 1) / 2) for name, n in (("z", 14), ("y", 12), ("x", 14))}
+    sheet = np.where(np.abs(axes["z"]) < SHEET_MM, 1.0, EDGE_LEVEL)[:, None, None]
+    grain = np.random.default_rng(0).random((14, 12, 14))
     volume = xr.DataArray(
         (1000 * sheet * (0.5 + 0.5 * grain)).astype(np.float32),
         axes,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scenes
 import xarray as xr
 
 from lfpiv import pipeline
@@ -16,50 +17,8 @@ PAIRS = 4
 DISPLACEMENT_VOXEL = (0.8, -0.6, 0.4)
 """Uniform flow along x, y, z: off whole voxels on every axis."""
 
-SCENE = f"""
-name = "small"
-seed = 3
-dt_s = 1e-3
-[board]
-dots = [5, 5]
-spacing_mm = 0.5
-dot_diameter_mm = 0.1
-planes_mm = [-0.7, 0.0, 0.7]
-[volume]
-centre_mm = [0.0, 0.0, 0.0]
-size_mm = [2.0, 2.0, 1.2]
-voxel_mm = 0.1
-[particles]
-count = 120
-pairs = {PAIRS}
-sigma_mm = 0.05
-[flow]
-kind = "uniform"
-displacement_mm = [0.08, -0.06, 0.04]
-[correlation]
-windows = [[12, 16, 16], [12, 12, 12]]
-[smart]
-iterations = 8
-[network]
-hidden = [12]
-epochs = 60
-"""
-
-CAMERA = """
-[[camera]]
-name = "{name}"
-focal_length_mm = 100.0
-magnification = -1.0
-f_number = 4.0
-microlens_pitch_mm = 0.1
-microlens_focal_length_mm = 0.8
-pixel_um = 8.0
-sensor_width_px = 400
-sensor_height_px = 400
-nominal_angle_deg = {angle}
-true_yaw_deg = {true_angle}
-true_array_roll_deg = 0.05
-"""
+TRUE_ANGLE_DEG = -0.5
+"""Turn of each camera from where it is said to be."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +47,21 @@ class SmallRun:
 
 
 def make_small_run(folder: Path, device: str) -> SmallRun:
-    cameras = [CAMERA.format(name=name, angle=a, true_angle=a - 0.5) for name, a in (("left", 40), ("right", -40))]
-    (folder / "scene.toml").write_text(SCENE + "".join(cameras))
-    experiment = simulate(folder / "scene.toml", folder / "data")
+    cameras = [
+        scenes.camera(name, angle, (400, 400), true_yaw_deg=angle + TRUE_ANGLE_DEG, true_array_roll_deg=0.05)
+        for name, angle in (("left", 40.0), ("right", -40.0))
+    ]
+    scene = scenes.scene(
+        "small",
+        cameras,
+        planes_mm=(-0.7, 0.0, 0.7),
+        particles={"count": 120, "pairs": PAIRS, "sigma_mm": 0.05},
+        displacement_mm=(0.08, -0.06, 0.04),
+        correlation={"windows": [(12, 16, 16), (12, 12, 12)]},
+        smart={"iterations": 8},
+        network={"hidden": (12,), "epochs": 60},
+    )
+    experiment = simulate(scene, folder / "data")
     summary = pipeline.run(experiment, folder / "out", device=device, keep_volumes=True)
     return SmallRun(experiment, folder / "out", summary)
 

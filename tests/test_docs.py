@@ -4,6 +4,7 @@ somewhere. The gallery's scripts run when the pages are built."""
 import ast
 import doctest
 import importlib
+import importlib.resources
 import importlib.util
 import logging
 import pkgutil
@@ -21,9 +22,8 @@ from pydantic import BaseModel
 
 import lfpiv
 from lfpiv import cli, pipeline
-from lfpiv.scene import Scene
+from lfpiv.scene import Scene, open_scene
 from lfpiv.settings import ExperimentTable
-from lfpiv.simulate import simulate
 from lfpiv.toml import tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -33,36 +33,6 @@ SCRIPTS = sorted((DOCS / "gallery").glob("plot_*.py"))
 
 LONG = ("demo", "reproduce", "simulate")
 """Commands that are checked to be understood, and not run: each has tests of its own."""
-
-SCENE = {
-    "name": "demo",
-    "seed": 3,
-    "dt_s": 1e-4,
-    "camera": [
-        {
-            "name": name,
-            "focal_length_mm": 100.0,
-            "magnification": -1.0,
-            "f_number": 4.0,
-            "microlens_pitch_mm": 0.1,
-            "microlens_focal_length_mm": 0.8,
-            "pixel_um": 8.0,
-            "sensor_width_px": 400,
-            "sensor_height_px": 400,
-            "nominal_angle_deg": angle,
-            "true_yaw_deg": angle - 0.5,
-        }
-        for name, angle in (("left", 45.0), ("right", -45.0))
-    ],
-    "board": {"dots": [5, 5], "spacing_mm": 0.5, "dot_diameter_mm": 0.1, "planes_mm": [-1.0, 0.0, 1.0]},
-    "volume": {"size_mm": [2.0, 2.0, 1.8], "voxel_mm": 0.1},
-    "particles": {"count": 150, "pairs": 2, "sigma_mm": 0.05},
-    "flow": {"kind": "uniform", "displacement_mm": [0.08, -0.06, 0.04]},
-    "correlation": {"windows": [[12, 16, 16], [8, 8, 8]]},
-    "smart": {"iterations": 8},
-    "network": {"hidden": [12], "epochs": 60},
-}
-"""A rig with the names and files of the demonstration, of a tenth of its work."""
 
 
 def blocks(page):
@@ -83,13 +53,16 @@ def commands_of(page):
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory, device):
+def place(small_run, tmp_path_factory):
     """Folder as a reader has it: the demonstration's, finished, and an experiment of one's own beside it."""
-    folder = tmp_path_factory.mktemp("docs")
-    experiment = simulate(Scene.model_validate(SCENE), folder / "lfpiv-demo" / "experiment")
-    pipeline.run(experiment, folder / "lfpiv-demo")
-    shutil.copytree(experiment.parent, folder, dirs_exist_ok=True)
+    folder = tmp_path_factory.mktemp("docs") / "place"
+    small_run.results(folder / "lfpiv-demo")
+    experiment = small_run.images(folder / "lfpiv-demo" / "experiment")
+    text = experiment.read_text("utf-8")
+    experiment.write_text(text.replace("[12, 12, 12]", "[6, 8, 8]"), "utf-8")  # gradients need three vectors along z
+    pipeline.correlate(experiment, folder / "lfpiv-demo")
     shutil.copytree(folder / "lfpiv-demo", folder / "results", ignore=shutil.ignore_patterns("experiment"))
+    shutil.copytree(experiment.parent, folder, dirs_exist_ok=True)
     return folder
 
 
@@ -192,10 +165,48 @@ def parts(annotation):
 @pytest.fixture(scope="module")
 def tables():
     """The module that makes the tables of the pages."""
-    spec = importlib.util.spec_from_file_location("docs_tables", DOCS / "_ext" / "tables.py")
+    return extension("tables")
+
+
+def extension(name):
+    """A module of the pages' builder."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / "_ext" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def quoted():
+    """The module that compares the tutorial with the demonstration, which the build of the pages runs."""
+    return extension("quoted")
+
+
+def test_the_tutorial_quotes_the_demonstration(quoted):
+    """The run itself is compared when the pages are built; here the scene is, and that no figure escapes."""
+    text = quoted.TUTORIAL.read_text("utf-8")
+    with importlib.resources.as_file(importlib.resources.files("lfpiv") / "demo_scene.toml") as path:
+        scene = open_scene(path)
+    said = quoted.quotes(text)
+    assert quoted.of_scene(scene).items() <= said.items()
+    assert quoted.unknown_numbers(text) == ["0.04"]  # the published one
+    good = {
+        "calibration": {
+            name: {"dots_found": 343, "sigma_nor_test": sigma}
+            for name, sigma in zip(("left", "right"), said["sigma"], strict=True)
+        },
+        "demo": {"mean_error_voxel": said["error"][0], "largest_displacement_voxel": said["moved"][0]},
+        "valid_fraction": said["valid"][0] / 100,
+    }
+    assert quoted.differences(text, scene, good) == []
+    for changed in (
+        {"demo": good["demo"] | {"mean_error_voxel": 2 * said["error"][0]}},
+        {"demo": good["demo"] | {"mean_error_voxel": float("nan")}},
+        {"valid_fraction": 0.9},
+        {"calibration": good["calibration"] | {"left": {"dots_found": 342, "sigma_nor_test": 0.0025}}},
+        {"calibration": good["calibration"] | {"left": {"dots_found": 343, "sigma_nor_test": 0.005}}},
+    ):
+        assert len(quoted.differences(text, scene, good | changed)) == 1, changed
 
 
 @pytest.mark.parametrize("file", [ExperimentTable, Scene])

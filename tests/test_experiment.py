@@ -130,6 +130,16 @@ BAD_KEYS = {
         ["volume.centre_mm", "behind the lens"],
     ),
     "no TOML": ("pairs = 2", "pairs = = 2", ["TOML", "line"]),
+    "microlens unit": (
+        "microlens_focal_length_mm = 0.8",
+        "microlens_focal_length_mm = 800.0",
+        ["camera 'left', microlens_focal_length_mm", "200 mm", "800", "in mm"],
+    ),
+    "lens unit": (
+        "\nfocal_length_mm = 100.0",
+        "\nfocal_length_mm = 0.1",
+        ["camera 'left', microlens_focal_length_mm", "0.2 mm", "focal_length_mm in mm"],
+    ),
     "pixel unit": ("pixel_um = 10.0", "pixel_um = 0.01", ["microlens_pitch_mm", "pixel_um"]),
 }
 
@@ -143,6 +153,19 @@ def test_bad_key_is_named_with_what_was_expected(tiny_experiment, case):
     message = str(caught.value)
     assert all(word in message for word in [tiny_experiment.name, *words]), message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("encoding", "words"), [("latin-1", "0xb5 in line 2"), ("utf-16", "found UTF-16"), ("utf-8-sig", "")]
+)
+def test_text_of_another_encoding_is_named(tiny_experiment, encoding, words):
+    text = tiny_experiment.read_text("utf-8")
+    tiny_experiment.write_bytes(f"\n# pixels of 5.5 µm\n{text}".replace("\n", "\r\n").encode(encoding))
+    if words:
+        with pytest.raises(InputError, match=rf"experiment\.toml.*UTF-8.*{words}.*Save it as UTF-8"):
+            open_experiment(tiny_experiment)
+    else:  # the mark and the line ends of Windows do no harm
+        assert open_experiment(tiny_experiment).name == "tiny"
 
 
 @pytest.mark.parametrize("model", [ExperimentTable, Smart, Correlation, Network, Compute])
@@ -298,12 +321,29 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
     assert stamp.marks(path) == {"settings_hash": "0123"} and json.loads(back.attrs["smart"]) == {"iterations": 2}
     condensed = dataset.read_reconstruction(path)
     np.testing.assert_array_equal(condensed["projection_y"].values[1], pair["b"].values.max(1))
+    profile = pair["b"].values.mean((1, 2))
+    np.testing.assert_allclose(condensed["profile_z"].sel(frame="b"), profile, rtol=1e-6)  # single precision
     np.testing.assert_array_equal(condensed["residual"].values, [[0.9, 0.5, 0.4], [0.8, 0.6, np.nan]])
     dataset.write_volume(pair["a"], tmp_path / "volume.nc", attributes={"settings_hash": "4567"})
     again = dataset.read_volume(tmp_path / "volume.nc")
     xr.testing.assert_equal(again, pair["a"])
     xr.testing.assert_equal(dataset.build_reconstruction({"a": again, "b": pair["b"]}), reconstruction)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["pair_0000.nc", "volume.nc"]
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_files_of_earlier_versions_are_read(tmp_path, version):
+    """1: the group shares its axes' names with the vectors; 2: no profile over the depth."""
+    path = tmp_path / "pair_0000.nc"
+    reconstruction = dataset.build_reconstruction({"a": volume(1, [0.9])})
+    dataset.write_vectors(vectors().assign_attrs(schema_version=version), path, attributes={})
+    older = reconstruction if version == 3 else reconstruction.drop_vars("profile_z")
+    names = {} if version == 1 else {axis: f"voxel_{axis}" for axis in "zyx"}
+    older.assign_attrs(schema_version=version).rename(names).to_netcdf(
+        path, mode="a", group="reconstruction", engine="h5netcdf"
+    )
+    xr.testing.assert_equal(dataset.read_vectors(path), vectors())
+    xr.testing.assert_equal(dataset.read_reconstruction(path), older)
 
 
 def test_the_structure_of_the_images_travels_with_the_volumes(tmp_path):

@@ -209,6 +209,8 @@ def test_the_command_writes_and_says_where(run, tmp_path, capfd):
 
 # -- LaVision images ---------------------------------------------------------------------------------------------------
 
+PAIRS_RECORDED = 50
+
 
 class Plain(types.SimpleNamespace):
     """Something with attributes."""
@@ -223,12 +225,21 @@ def frame(pixels, *, mask=None, slope=1.0, offset=0.0, component="PIXEL", planes
     )
 
 
+class Buffers(dict):
+    """Frames of each file, and the files that were decoded, in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.decoded = []
+
+
 @pytest.fixture
 def lvpyio(monkeypatch):
-    """A stand-in for LaVision's library; buffers by the stem of their file."""
-    buffers = {}
+    """A stand-in for LaVision's library; buffers by the stem of their file, which notes what it decodes."""
+    buffers = Buffers()
 
     def read_buffer(path):
+        buffers.decoded.append(Path(path).stem)
         if Path(path).stem not in buffers:
             raise RuntimeError("Invalid header.")
         return buffers[Path(path).stem]
@@ -247,14 +258,14 @@ def test_frames_of_a_buffer_are_images(lvpyio, tmp_path):
     lvpyio["double"] = [frame(part) for part in pixels]
     lvpyio["single"] = [frame(pixels[3], slope=2.0, offset=-1.0)]
     for name in ("double.im7", "single.imx"):
-        (tmp_path / name).touch()
+        (tmp_path / name).write_bytes(b"packed")
     for number, part in enumerate(pixels):
         for path in (tmp_path / f"double.im7#{number}", tmp_path / f"double.im7#{number // 2}.{number % 2}"):
-            assert images.read_header(path, "test") == images.Header((5, 7), "uint16")
             image = images.read_image(path, "test", flip="both")
             np.testing.assert_array_equal(image, part[::-1, ::-1])
             assert image.dtype == np.float32 and image.flags.c_contiguous
     np.testing.assert_array_equal(images.read_image(tmp_path / "single.imx", "test"), 2.0 * pixels[3] - 1.0)
+    assert lvpyio.decoded == ["double", "single"]  # each once, however many of its frames are asked for
 
 
 @pytest.mark.parametrize(
@@ -275,11 +286,19 @@ def test_frames_of_a_buffer_are_images(lvpyio, tmp_path):
     ],
 )
 def test_what_is_no_single_image_is_refused_by_name(lvpyio, tmp_path, name, buffer, words):
-    (tmp_path / name.partition("#")[0]).touch()
+    (tmp_path / name.partition("#")[0]).write_bytes(b"packed")
     if buffer is not None:
         lvpyio["a"] = buffer
     with pytest.raises(lfpiv.InputError, match=rf"(?s){name.partition('#')[0]}.*white_image.*{words}"):
         images.read_image(tmp_path / name, "white_image of camera 'left'")
+
+
+@pytest.mark.parametrize(("name", "words"), [("a.im7#left", "'left'.*by number"), ("a.im7#0.2", "exposures 0 and 1")])
+def test_a_frame_that_cannot_be_is_refused_without_decoding(lvpyio, tmp_path, name, words):
+    (tmp_path / "a.im7").write_bytes(b"packed")
+    with pytest.raises(lfpiv.InputError, match=words):
+        images.read_header(tmp_path / name, "white_image of camera 'left'")
+    assert lvpyio.decoded == []
 
 
 def test_a_missing_extra_is_named(tmp_path, monkeypatch):
@@ -289,28 +308,52 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
         images.read_image(tmp_path / "a.im7#0", "white_image of camera 'left'")
 
 
-def test_an_experiment_of_buffers_opens(lvpyio, tiny_experiment):
-    """Both exposures of both cameras in one buffer; everything else as it was."""
+@pytest.fixture
+def recorded(lvpyio, tiny_experiment, monkeypatch):
+    """Experiment of many pairs, both exposures of both cameras of each in one buffer; the rest of it as it was."""
+    monkeypatch.setattr("lfpiv.experiment.DECODED_PIXELS", 4 * 2 * (48 * 64 + 56 * 40))  # four pairs
     rng = np.random.default_rng(1)
     shapes = {"left": (48, 64), "right": (56, 40)}
-    for pair in range(2):
+    for pair in range(PAIRS_RECORDED):
         name = f"B{pair:05d}"
         lvpyio[name] = [frame(rng.integers(0, 4096, shapes[camera], np.uint16)) for camera in shapes for _ in "ab"]
         (tiny_experiment.parent / f"{name}.im7").write_bytes(b"pixels of pair %d" % pair)
     text = tiny_experiment.read_text("utf-8").replace('"left"', '"0"').replace('"right"', '"1"')
-    text = text.replace('"board/{camera}/plane', '"board/{camera}/plane').replace(
+    text = text.replace("pairs = 2", f"pairs = {PAIRS_RECORDED}").replace(
         'images = "particles/{camera}/{pair:04d}{frame}.tif"',
         'images = "B{pair:05d}.im7#{camera}.{frame}"\nframes = ["0", "1"]',
     )
     tiny_experiment.write_text(text, "utf-8")
     for number, camera in enumerate(shapes):
         (tiny_experiment.parent / "board" / camera).rename(tiny_experiment.parent / "board" / str(number))
-    experiment = lfpiv.open_experiment(tiny_experiment)
+    return tiny_experiment
+
+
+def test_an_experiment_of_buffers_opens(lvpyio, recorded):
+    """Opening decodes the first pairs alone, however many there are; each frame of a file is an image of its own."""
+    experiment = lfpiv.open_experiment(recorded)
+    assert lvpyio.decoded == [f"B{pair:05d}" for pair in range(4)]
+    last = PAIRS_RECORDED - 1
     np.testing.assert_array_equal(
-        experiment.particle_image("1", 1, "0"), lvpyio["B00001"][2].components["PIXEL"].planes[0]
+        experiment.particle_image("1", last, "0"), lvpyio[f"B{last:05d}"][2].components["PIXEL"].planes[0]
     )
     hashes = {dataset.content_hash([path]) for pair in range(2) for path in experiment.pair_paths(pair)}
-    assert len(hashes) == 8  # each frame of a file counts as an image of its own
+    assert len(hashes) == 8
+
+
+def test_a_bad_buffer_is_named_at_once_where_it_can_be_and_where_it_is_used_otherwise(lvpyio, recorded):
+    lvpyio["B00020"][3] = frame(np.ones((48, 64), np.uint16))  # of the other camera's size
+    del lvpyio["B00030"]  # damaged
+    experiment = lfpiv.open_experiment(recorded)
+    for pair, words in ((20, r"expected \(56, 40\) pixels.*found \(48, 64\)"), (30, "damaged one")):
+        with pytest.raises(lfpiv.InputError, match=rf"B000{pair}\.im7#1\.1 \(.*pair {pair}.*{words}"):
+            experiment.particle_image("1", pair, "1")
+    (recorded.parent / "B00040.im7").write_bytes(b"")
+    with pytest.raises(lfpiv.InputError, match=r"B00040\.im7#0\.0.*the file is empty"):
+        lfpiv.open_experiment(recorded)
+    (recorded.parent / "B00040.im7").unlink()
+    with pytest.raises(lfpiv.InputError, match=r"B00040\.im7#0\.0.*no such file"):
+        lfpiv.open_experiment(recorded)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("lvpyio") is None, reason="the extra davis is not installed")

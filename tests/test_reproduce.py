@@ -183,7 +183,7 @@ def test_weights_agree_with_ray_tracing_and_with_counted_rays(figures):
 def test_network_and_ray_tracing_reconstruct_alike(figures):
     case = figures["fig12"]
     runs = {(run["particles"], run["mapping"], run["ppm"]): run for run in case["runs"]}
-    kinds = ["blobs"] * 4 + ["from_truth", "points"] + ["paper", "sieve"] * 2
+    kinds = ["blobs"] * 4 + ["from_truth", "points"] + ["paper", "no_sieve"] * 2
     assert sorted(run["particles"] for run in case["runs"]) == sorted(kinds) and len(runs) == len(kinds)
     assert case["q_mean"]["network"] == pytest.approx(
         np.mean([runs["blobs", "network", ppm]["q"] for ppm in (0.1, 0.5)])
@@ -196,6 +196,7 @@ def test_network_and_ray_tracing_reconstruct_alike(figures):
         runs["from_truth", "network", 0.5]["q"] > 0.9 > runs["blobs", "network", 0.5]["q"]
     )  # the truth is a fixed point
     assert runs["blobs", "network", 0.1]["q"] > 0.7  # sparse: hardly a ghost
+    assert all(runs["blobs", "network", ppm]["q"] > runs["no_sieve", "network", ppm]["q"] for ppm in (0.1, 0.5))
     assert (
         runs["points", "network", 0.1]["q"] < runs["blobs", "network", 0.1]["q"]
     )  # points do not fit the truth's blobs

@@ -106,7 +106,7 @@ def test_choices_are_held_against_the_defaults(figures):
 def test_only_what_changes_the_volumes_is_reconstructed():
     every = choices.OPEN | choices.OWN
     kept = {key for key, choice in every.items() if not choice.reconstructs}
-    assert kept == {"unsmoothed", "power_1", "windows_8", "windows_16"}
+    assert kept == {"power_1", "windows_8", "windows_16"}
     assert all(choice.like is None or choice.like in every for choice in every.values())
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
 import xarray as xr
 
 import lfpiv
@@ -13,7 +14,7 @@ from lfpiv.errors import InputError
 from lfpiv.network import train
 from lfpiv.reproduce import fig19, lsi, lsitwin, planarpiv, table1, table3, trainers
 from lfpiv.reproduce.rigs import Rig
-from lfpiv.scene import Noise, Scene, true_mapping
+from lfpiv.scene import Noise, true_mapping
 from lfpiv.simulate import simulate
 from lfpiv.trainers import Samples, forward, levenberg_marquardt
 
@@ -30,35 +31,22 @@ JET = 0.6  # the jet is slower on its axis and faster in its annulus than the bu
 TINY_LABELS = 0.05  # pitch; a tiny board's dots on a coarse sensor, a wrong frame or axis misses by pitches
 TINY_LATERAL_MM, TINY_DEPTH_MM = 0.02, 0.06  # a fifth and half of a dot's diameter
 
-TINY = {
-    "name": "tiny",
-    "seed": 5,
-    "dt_s": 1.0,
-    "board": {"dots": (5, 5), "spacing_mm": 0.5, "dot_diameter_mm": 0.1, "planes_mm": (-0.8, -0.4, 0.0, 0.4, 0.8)},
-    "volume": {"size_mm": (2.0, 2.0, 1.2), "voxel_mm": 0.1},
-    "particles": {"count": 8},
-    "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
-}
-CAMERA = {
-    "focal_length_mm": 100.0,
-    "magnification": -1.0,
-    "f_number": 4.0,
-    "microlens_pitch_mm": 0.1,
-    "microlens_focal_length_mm": 0.8,
-    "pixel_um": 8.0,
-    "sensor_width_px": 440,
-    "sensor_height_px": 440,
-}
-
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory, device):
     """Two small cameras, calibrated from a simulated board."""
-    cameras = [
-        CAMERA | {"name": name, "nominal_angle_deg": angle, "true_yaw_deg": angle + 0.4}
-        for name, angle in (("camera1", 20.0), ("camera2", -20.0))
-    ]
-    scene = Scene.model_validate(TINY | {"camera": cameras})
+    scene = scenes.scene(
+        "tiny",
+        [
+            scenes.camera(name, angle, (440, 440), true_yaw_deg=angle + 0.4)
+            for name, angle in (("camera1", 20.0), ("camera2", -20.0))
+        ],
+        planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8),
+        particles={"count": 8},
+        displacement_mm=(0.0, 0.0, 0.0),
+        seed=5,
+        dt_s=1.0,
+    )
     path = simulate(scene, tmp_path_factory.mktemp("tiny") / "data")
     experiment = lfpiv.open_experiment(path)
     return Rig(scene, experiment, lfpiv.calibrate(experiment))
