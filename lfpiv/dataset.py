@@ -24,8 +24,9 @@ import lfpiv
 from lfpiv.davis import split_frame
 from lfpiv.errors import InputError
 
-SCHEMA_VERSION = 2
-"""Version of the form of the files; readers refuse newer ones. 2: the group has dimensions of its own."""
+SCHEMA_VERSION = 3
+"""Version of the form of the files; readers refuse newer ones. 2: the group has dimensions of its own; 3: it holds
+``profile_z``, which older ones lack."""
 
 VECTOR_UNITS = {
     "u": "m/s",
@@ -41,7 +42,7 @@ VECTOR_UNITS = {
 """Variables of a vector dataset and their units."""
 
 RECONSTRUCTION = "reconstruction"
-"""NetCDF group beside the vectors of a pair: projections and residuals of its two volumes."""
+"""NetCDF group beside the vectors of a pair: projections, profiles and residuals of its two volumes."""
 
 _AXES = ("z", "y", "x")
 _GROUP_AXES = {axis: f"voxel_{axis}" for axis in _AXES}  # the group's axes in the file, where z, y, x are the vectors'
@@ -134,7 +135,7 @@ def versions() -> dict[str, str]:
 
 
 def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
-    """Condense the volumes of a pair to what a report shows: maximum projections and the residual history.
+    """Condense the volumes of a pair to what a report shows: maximum projections, brightness and residual history.
 
     Parameters
     ----------
@@ -146,6 +147,7 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
     -------
     Dataset
         ``projection_z`` (frame, y, x), ``projection_y`` (frame, z, x), ``projection_x`` (frame, z, y) [counts],
+        ``profile_z`` (frame, z), the mean brightness of each plane of voxels [counts],
         ``residual`` (frame, iteration), ``stop`` (frame) and, where known, ``structure`` (frame, camera).
     """
     frames = list(volumes)
@@ -155,6 +157,8 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
         kept = tuple(name for name in _AXES if name != axis)
         stack = np.stack([volume.max(axis).transpose(*kept).values for volume in volumes.values()])
         variables[f"projection_{axis}"] = (("frame", *kept), stack.astype(np.float32))
+    profiles = np.stack([volume.mean(["y", "x"], dtype=float).values for volume in volumes.values()])
+    variables["profile_z"] = (("frame", "z"), profiles.astype(np.float32))
     histories = [np.atleast_1d(np.asarray(volume.attrs["residual"], float)) for volume in volumes.values()]
     residual = np.full((len(frames), max(map(len, histories))), np.nan)
     for row, history in zip(residual, histories, strict=True):
@@ -241,7 +245,7 @@ def read_vectors(path: Path) -> xr.Dataset:
 
 
 def read_reconstruction(path: Path) -> xr.Dataset | None:
-    """Read the projections and residuals stored beside the vectors of a pair; None where there are none."""
+    """Read what `build_reconstruction` left beside the vectors of a pair; None where there is nothing."""
     try:
         stored = _read(path, RECONSTRUCTION)
     except InputError:
@@ -292,12 +296,11 @@ def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
     dataset = dataset.copy()
     own = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
     dataset.attrs = {key: _attribute(value) for key, value in own.items()}
+    packed = {"zlib": True, "complevel": 1, "shuffle": True}
     for name, item in dataset.variables.items():
         described = {**item.attrs, **_DESCRIPTIONS.get(str(name), {})}
         item.attrs = {key: _attribute(value) for key, value in described.items()}
-    packed = {"zlib": True, "complevel": 1, "shuffle": True}
-    for array in dataset.data_vars.values():
-        array.encoding = packed if array.ndim >= 2 and array.dtype.kind in "fiub" else {}
+        item.encoding = packed if item.ndim >= 2 and item.dtype.kind in "fiub" else {}
     return dataset
 
 

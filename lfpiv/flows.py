@@ -7,33 +7,26 @@ consistent with the flow to second order. Points and displacements are ordered (
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial import cKDTree
 
-from lfpiv.errors import InputError
 from lfpiv.settings import Flag, Number, Positive, Table
 from lfpiv.swirl import injector_profiles
+from lfpiv.tracers import TracerMap, interpolate, load_tracers
 from lfpiv.turbulence import TurbulentFlow
 
 Point = tuple[Number, Number, Number]
-TracerMap = tuple[Point, Point, tuple[Point, Point] | None, float | None]
-"""Size and centre of the box that tracers fill, the same box in their file, and their peak displacement."""
 Axis = Literal["x", "y", "z"]
 
 LAMB_OSEEN = 1.2564312086261697
 """Root a of exp(a) = 1 + 2 a: with it the tangential displacement of a Lamb-Oseen vortex peaks at the core radius."""
 
-NEIGHBOURS = 16
-"""Tracers of each local linear fit: four per unknown. Fewer follow noise, more blur what the tracers resolve."""
-
 CHUNK = 20_000
-"""Points evaluated at once, which bounds the memory of quadratures and local fits."""
+"""Points evaluated at once, which bounds the memory of quadratures."""
 
 
 class Uniform(Table):
@@ -236,18 +229,14 @@ class Tracers(Table):
         InputError
             If the file is missing or does not hold the two arrays.
         """
-        position, displacement, _ = _load_tracers(self.file, self.first, self.second, self._map())
+        position, displacement, _ = load_tracers(self.file, self.first, self.second, self._map())
         return position, displacement
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Displacement (n, 3) at points (n, 3) [mm]."""
         points_mm = _points(points_mm)
-        position, displacement, tree = _load_tracers(self.file, self.first, self.second, self._map())
-        inside = np.clip(points_mm, position.min(0), position.max(0))
-        found = [
-            _local_fit(tree, displacement, inside[first : first + CHUNK]) for first in range(0, len(inside), CHUNK)
-        ]
-        return np.concatenate([np.empty((0, 3)), *found])
+        position, displacement, tree = load_tracers(self.file, self.first, self.second, self._map())
+        return interpolate(tree, displacement, np.clip(points_mm, position.min(0), position.max(0)))
 
     def _map(self) -> TracerMap:
         return self.size_mm, self.centre_mm, self.box, self.peak_mm
@@ -256,57 +245,6 @@ class Tracers(Table):
 Flow = Uniform | Shear | Ring | Swirl | SwirlingJet | Tracers
 KINDS = {model.model_fields["kind"].default: model for model in (Uniform, Shear, Ring, Swirl, SwirlingJet, Tracers)}
 """The flows by the ``kind`` a scene file names."""
-
-
-@functools.lru_cache(maxsize=4)
-def _load_tracers(file: str, first: str, second: str, mapping: TracerMap) -> tuple[np.ndarray, np.ndarray, cKDTree]:
-    size, centre, box, peak = mapping
-    try:
-        with np.load(Path(file), allow_pickle=False) as data:
-            missing = [name for name in (first, second) if name not in data]
-            if missing:
-                raise InputError(
-                    f"{file}: expected the array {missing[0]!r}, found {', '.join(data)}. Set flow.first/second."
-                )
-            start, end = (np.asarray(data[name], float) for name in (first, second))
-    except FileNotFoundError:
-        raise InputError(f"flow.file: expected a .npz file of tracers, found no file {file}. Check the path.") from None
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"flow.file: {file} cannot be read as a .npz file of numbers ({error}).") from None
-    if start.ndim != 2 or start.shape[1] < 3 or start.shape != end.shape or len(start) <= NEIGHBOURS:
-        raise InputError(
-            f"{file}: expected two arrays of shape (tracer, 3 or more) with more than {NEIGHBOURS} tracers, "
-            f"found {first} {start.shape} and {second} {end.shape}."
-        )
-    start, end = start[:, :3], end[:, :3]
-    if not (np.isfinite(start).all() and np.isfinite(end).all()):
-        raise InputError(f"{file}: expected finite tracer positions, found NaN or infinity. Remove those tracers.")
-    middle, displacement = (start + end) / 2, end - start
-    low, high = (np.asarray(corner, float) for corner in (box if box is not None else (middle.min(0), middle.max(0))))
-    if not (high > low).all():
-        raise InputError(f"{file}: expected tracers that fill a volume, found them in a plane. Set flow.box.")
-    scale = np.asarray(size) / (high - low)
-    position = (middle - (low + high) / 2) * scale + centre
-    displacement = displacement * scale
-    largest = np.linalg.norm(displacement, axis=1).max()
-    if peak is not None and largest > 0:
-        displacement *= peak / largest
-    return position, displacement, cKDTree(position)
-
-
-def _local_fit(tree: cKDTree, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Weighted linear fit to the nearest tracers, evaluated at each point: exact where the field is linear."""
-    distance, index = tree.query(points, k=NEIGHBOURS + 1)
-    reach = np.maximum(distance[:, -1:], 1e-300)
-    index, weight = index[:, :-1], (1 - (distance[:, :-1] / reach) ** 2) ** 2 + 1e-6
-    arm = (tree.data[index] - points[:, None]) / reach[..., None]
-    design = np.concatenate([np.ones((*index.shape, 1)), arm], axis=2)
-    weighted = (design * weight[..., None]).transpose(0, 2, 1)
-    normal = weighted @ design
-    normal += 1e-10 * normal[:, :1, :1] * np.eye(4)
-    return np.linalg.solve(normal, weighted @ values[index])[:, 0]
 
 
 def _points(points_mm: np.ndarray) -> np.ndarray:

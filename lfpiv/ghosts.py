@@ -14,6 +14,7 @@ from scipy import ndimage, sparse, special
 from scipy.spatial import cKDTree
 
 from lfpiv.rig import Grid
+from lfpiv.voxelgrid import checked_points, checked_volume, voxel_place
 
 PEAK_SHARE = 0.1
 """Threshold of a peak where none is given, as a part of the median brightness found at the true particles. A ghost at a
@@ -27,8 +28,6 @@ BLOB_REACH = 5.0
 """Distance at which Gaussian blobs are cut [standard deviations]; 6e-7 of the light lies beyond it along each axis."""
 
 _CHUNK = 1 << 22  # values of blobs that are computed at once
-_DIMS = ("z", "y", "x")
-_SPACING_TOLERANCE = 1e-3  # unevenness of coordinates written as float32 decimals, relative to the spacing
 # neighbours that come before a voxel in storage order: of equal neighbours the first one is the peak
 _BEFORE = np.array([(z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if (z, y, x) < (0, 0, 0)])
 
@@ -118,7 +117,7 @@ def truth_volume(
     light = np.broadcast_to(light, len(positions_mm))
     if not (np.isfinite(sigma_voxel) and sigma_voxel >= 0):
         raise ValueError(f"sigma_voxel: expected a number >= 0, got {sigma_voxel!r}.")
-    place = _voxel_place(positions_mm, grid)
+    place = voxel_place(positions_mm, grid)
     reach = int(np.ceil(BLOB_REACH * sigma_voxel + 0.5))
     offset = np.arange(-reach, reach + 1)
     shape = np.array(grid.shape)
@@ -142,8 +141,8 @@ def truth_volume(
         np.add.at(volume, (flat + indices[2][:, None, None, :]).ravel(), blobs.ravel())
     return xr.DataArray(
         volume.reshape(grid.shape).astype(np.float32),
-        dims=_DIMS,
-        coords={name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate(_DIMS)},
+        dims=("z", "y", "x"),
+        coords={name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")},
         name="intensity",
         attrs={"long_name": "light of the true particles", "sigma_voxel": sigma_voxel, "voxel_mm": grid.voxel_mm},
     )
@@ -307,7 +306,7 @@ def particle_quality(
     """
     values, grid = checked_volume(volume, grid, "volume")
     true_mm = checked_points(true_mm, "true_mm")
-    place = _voxel_place(true_mm, grid)
+    place = voxel_place(true_mm, grid)
     inside = ((place >= -0.5) & (place < np.array(grid.shape) - 0.5)).all(1)
     true_mm, place = true_mm[inside], np.floor(place[inside] + 0.5).astype(int)
     if len(true_mm) == 0:
@@ -347,56 +346,3 @@ def elongation(sigma_voxel: np.ndarray) -> float:
         raise ValueError(f"sigma_voxel: expected shape (particle, 3), order (x, y, z), got {sigma_voxel.shape}.")
     x, y, z = sigma_voxel[np.isfinite(sigma_voxel).all(1)].T
     return float(np.median(z / np.sqrt(x * y))) if len(x) else float("nan")
-
-
-def checked_points(points: np.ndarray, name: str) -> np.ndarray:
-    """Return points as float64 of shape (n, 3), or raise ValueError."""
-    points = np.asarray(points, float)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        fault = "" if np.isfinite(points).all() else " with NaN or infinity"
-        raise ValueError(f"{name}: expected finite points (x, y, z) of shape (n, 3), got shape {points.shape}{fault}.")
-    return points
-
-
-def checked_volume(volume: xr.DataArray | np.ndarray, grid: Grid | None, name: str) -> tuple[np.ndarray, Grid]:
-    """Return a volume's finite values (z, y, x) and its grid, or raise ValueError."""
-    values = np.asarray(volume)
-    if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fiub":
-        raise ValueError(f"{name}: expected a volume of numbers (z, y, x), got {values.dtype} of shape {values.shape}.")
-    values = values.astype(np.float32 if values.dtype == np.float32 else np.float64, copy=False)
-    bad = values.size - int(np.isfinite(values).sum())
-    if bad:
-        raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
-    if isinstance(volume, xr.DataArray):
-        if grid is not None:
-            raise ValueError("grid: expected no value with a DataArray, whose coordinates tell it. Leave it out.")
-        return values, _grid_of(volume, name)
-    if grid is None or values.shape != tuple(grid.shape):
-        fault = "no grid" if grid is None else f"a grid of shape {grid.shape}"
-        raise ValueError(f"{name}: an array of shape {values.shape} needs the grid of its voxels, got {fault}.")
-    return values, grid
-
-
-def _grid_of(volume: xr.DataArray, name: str) -> Grid:
-    """Grid of a DataArray with coordinates in mm."""
-    if volume.dims != _DIMS or any(axis not in volume.coords for axis in _DIMS):
-        raise ValueError(
-            f"{name}: expected dims (z, y, x) with coordinates [mm], got {dict(volume.sizes)} with coordinates "
-            f"{list(volume.coords)}."
-        )
-    axes = [np.asarray(volume[axis], float) for axis in _DIMS]
-    steps = np.concatenate([np.diff(axis) for axis in axes])
-    voxel_mm = float(np.median(steps)) if len(steps) else float(volume.attrs.get("voxel_mm", 1.0))
-    if not voxel_mm > 0 or (np.abs(steps - voxel_mm) > _SPACING_TOLERANCE * voxel_mm).any():
-        raise ValueError(
-            f"{name}: expected evenly spaced cubic voxels, got steps of {steps.min()} to {steps.max()} mm."
-        )
-    nz, ny, nx = volume.shape
-    z, y, x = (float(axis[0]) for axis in axes)
-    return Grid(shape=(nz, ny, nx), voxel_mm=voxel_mm, first_centre_mm=(z, y, x))
-
-
-def _voxel_place(points_mm: np.ndarray, grid: Grid) -> np.ndarray:
-    """Points (x, y, z) [mm] as fractional voxel indices (z, y, x)."""
-    place: np.ndarray = (points_mm[:, ::-1] - np.asarray(grid.first_centre_mm)) / grid.voxel_mm
-    return place

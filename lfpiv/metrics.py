@@ -18,7 +18,6 @@ from skimage.metrics import structural_similarity
 from lfpiv.ghosts import (
     ParticleQuality,
     Particles,
-    checked_volume,
     elongation,
     find_particles,
     match_particles,
@@ -28,6 +27,7 @@ from lfpiv.ghosts import (
 )
 from lfpiv.rig import Grid
 from lfpiv.vectorfields import DisplacementError, displacement_difference, displacement_error, empirical_cdf
+from lfpiv.voxelgrid import checked_volume
 
 __all__ = [
     "DisplacementError",

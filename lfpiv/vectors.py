@@ -309,7 +309,8 @@ def _check_volume(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
     background = np.median(values.ravel()[:: 1 + values.size // _BACKGROUND_SAMPLES])
     values = values - background  # a copy
     values /= max(highest - float(background), float(background) - lowest, float(np.finfo(np.float32).tiny))
-    return values
+    checked: np.ndarray = values
+    return checked
 
 
 def _check_axes(

@@ -1,25 +1,19 @@
-"""Benchmark cases as data, and the operations they name: how to prepare one, what a run does, what a right result is.
-
-A rig is two cameras of Table 2 at +-45 degrees, each a thin lens with a small network on top, as a calibration gives
-them; the sensor is just large enough for the volume.
-"""
+"""Benchmark cases as data, and the operations they name: how to prepare one, what it does, what a right result is."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
-from scipy import ndimage, optimize, sparse
+from inputs import explicit, grid, nonzeros, particles, rig
+from scipy import ndimage, optimize
 from threadpoolctl import threadpool_limits
 
 import lfpiv
-from lfpiv.calibration import CalibratedCamera, Calibration
-from lfpiv.network import Network, train
-from lfpiv.rig import Grid, LensLattice, Optics
-from lfpiv.thinlens import thin_lens_model
+from lfpiv.network import train
+from lfpiv.rig import Grid
 from lfpiv.weightblocks import COUNT_POINTS
 from lfpiv.weights import COUNT_SAMPLES_ONE, compare_with_count
 from lfpiv_kernels import correlate, deform, mapping, runtime
@@ -82,101 +76,11 @@ def require(good: bool, message: str) -> None:
         raise WrongResult(message)
 
 
-class _Camera(CalibratedCamera):
-    @cached_property
-    def gain(self):
-        return np.ones(self.optics.sensor_shape, np.float32)
-
-
-def rig(sensor: tuple[int, int], bent_mm: float = 0.0) -> Calibration:
-    """Two calibrated cameras; `bent_mm` scales the network's part, of which about a third is of second order."""
-    optics = Optics(
-        focal_length_mm=100.0, magnification=-1.0, f_number=4.0, microlens_pitch_mm=0.1, pixel_mm=0.0055,
-        microlens_focal_length_mm=0.8, sensor_shape=sensor,
-    )  # fmt: skip
-    cameras = {}
-    for name, angle, roll, origin in (("cam1", 44.2, 0.05, (0.031, -0.022)), ("cam2", -45.9, -0.08, (-0.02, 0.04))):
-        rng, turn = np.random.default_rng(abs(int(angle))), np.radians(roll)
-        x, y = 0.1 * np.cos(turn), 0.1 * np.sin(turn)
-        network = Network(
-            weights=(rng.normal(0, 0.3, (5, 20)), rng.normal(0, 0.3, (20, 2))),
-            biases=(rng.normal(0, 0.5, 20), np.zeros(2)),
-            input_centre=np.zeros(5),
-            input_scale=np.array([7.0, 7.0, 7.0, optics.pupil_radius_mm, optics.pupil_radius_mm]),
-            output_centre=np.zeros(2),
-            output_scale=np.full(2, max(bent_mm, 1e-3)),
-        )
-        cameras[name] = _Camera(
-            name=name,
-            optics=optics,
-            lattice=LensLattice(origin_mm=origin, basis_mm=((x, -y), (y, x))),
-            decoder=None,
-            network=network,
-            baseline=thin_lens_model(optics, angle),
-        )
-    return Calibration(cameras)
-
-
-def grid(scale: dict) -> Grid:
-    return Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.1 * scale["voxels"],) * 3, voxel_mm=0.1)
-
-
-def nonzeros(weights) -> int:
-    """Weights above zero."""
-    return sum(int(weights.projector(name).count_lit().sum(dtype=np.int64)) for name in weights.cameras)
-
-
-def explicit(weights) -> dict[str, tuple[sparse.csr_array, sparse.csr_array]]:
-    """Each camera's weights as explicit matrices, (voxel, pixel) and (pixel, voxel): SciPy's fastest, both by rows."""
-    matrices = {}
-    for name in weights.cameras:
-        blocks = weights.projector(name).blocks
-        parts = [_rows_of(blocks, a, min(a + 2048, len(blocks.scale))) for a in range(0, len(blocks.scale), 2048)]
-        matrix = sparse.vstack(parts, format="csr")
-        matrices[name] = matrix, matrix.T.tocsr()
-    return matrices
-
-
-def _rows_of(blocks, first: int, last: int) -> sparse.csr_array:
-    """Rows of the explicit matrix (voxel, pixel) of some voxels."""
-    rays, profiles = blocks.microimages, blocks.form == "profiles"
-    part = slice(blocks.first_block[first], blocks.first_block[last])
-    height, width = blocks.height[part].astype(np.int64), blocks.width[part].astype(np.int64)
-    size = width + height if profiles else width * height
-    start = np.cumsum(size) - size + blocks.first_value[first]  # blocks lie one after the other
-    block = np.repeat(np.arange(len(height)), width * height)
-    row, column = np.divmod(
-        np.arange(len(block)) - np.repeat(np.cumsum(width * height) - width * height, width * height), width[block]
-    )
-    if profiles:
-        level = blocks.value[start[block] + column] * blocks.value[start[block] + width[block] + row].astype(np.float32)
-    else:
-        level = blocks.value[start[block] + width[block] * row + column].astype(np.float32)
-    ray = blocks.ray[part][block] + row * rays.edge + column
-    voxel = np.repeat(np.arange(last - first), np.diff(blocks.first_block[first : last + 1]))[block]
-    lit = (level > 0) & (rays.share[ray] > 0)
-    data = (level * blocks.scale[first + voxel] * rays.share[ray])[lit]
-    index = voxel[lit], rays.pixel[ray[lit]]
-    return sparse.csr_array((data, index), shape=(last - first, rays.sensor_shape[0] * rays.sensor_shape[1]))
-
-
 def relative(found, expected, limit: float) -> dict[str, float]:
     """Relative L2 difference of two arrays, which must stay below the limit."""
     difference = float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
     require(difference < limit, f"a relative difference of {difference:.1e}")
     return {"difference": difference}
-
-
-def particles(shape: tuple[int, int, int], shift=0.0, seed: int = 0) -> np.ndarray:
-    """Gaussian particles of 0.7 voxel standard deviation, 0.012 per voxel, moved by `shift`."""
-    rng = np.random.default_rng(seed)
-    at = rng.random((int(0.012 * np.prod(shape)), 3)) * shape + shift
-    stencil = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    voxel = np.rint(at).astype(int)[:, None] + stencil
-    light = np.exp(-((voxel - at[:, None]) ** 2).sum(-1) / (2 * 0.7**2))
-    inside = ((voxel >= 0) & (voxel < shape)).all(-1)
-    flat = np.ravel_multi_index(tuple(voxel[inside].T), shape)
-    return np.bincount(flat, light[inside], np.prod(shape)).reshape(shape).astype(np.float32)
 
 
 def _mapping(scale) -> Work:

@@ -1,6 +1,10 @@
-"""Run ``lfpiv demo`` once, before the gallery is: its scripts read the results, the pages show its scene and report."""
+"""Run ``lfpiv demo`` once, before the gallery is: its scripts read the results, the pages show its scene and report.
+
+The figures that the tutorial quotes are compared with that run; see `quoted`.
+"""
 
 import importlib.resources
+import json
 import logging
 import os
 import shutil
@@ -22,7 +26,25 @@ def prepare(app):
             demo.run(DEMO.name)
         finally:
             os.chdir(here)
+    _compare_with_the_tutorial()
     shutil.copy(DEMO / "report.html", EXTRA / "demo-report.html")
+
+
+def _compare_with_the_tutorial():
+    """Warn, which ends a build with -W, where the tutorial quotes other figures than came out."""
+    import quoted
+    from sphinx.util import logging as sphinx_logging
+
+    from lfpiv import demo
+    from lfpiv.scene import open_scene
+
+    with importlib.resources.as_file(importlib.resources.files("lfpiv") / "demo_scene.toml") as path:
+        scene = open_scene(path)
+    summary = json.loads((DEMO / "summary.json").read_text("utf-8")) | {"demo": demo.compare_with_truth(scene, DEMO)}
+    for text in quoted.differences(quoted.TUTORIAL.read_text("utf-8"), scene, summary):
+        sphinx_logging.getLogger(__name__).warning(
+            "tutorial.md quotes otherwise than the demonstration gives: %s", text
+        )
 
 
 def setup(app):

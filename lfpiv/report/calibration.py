@@ -26,6 +26,8 @@ _ROWS = (
     ("lens array off its lattice, rms [px]", "lens_array_rms_px", 4),
     ("microimage pitch [px]", "lens_array_pitch_px", 4),
     ("roll of the lens array [°]", "lens_array_rotation_deg", 3),
+    ("magnification in the board's middle", "magnification", 4),
+    ("turn from the nominal pose [°]", "turn_from_nominal_deg", 2),
     ("network's correction to the thin lens, rms [pitch]", "network_correction_pitch", 4),
     ("training epochs", "epochs", 0),
     ("training [s]", "training_s", 1),

@@ -106,11 +106,36 @@ def what_was_run(experiment: Experiment, summary: Mapping[str, Any]) -> str:
             f"{board.dots[0]} × {board.dots[1]} dots, {board.spacing_mm:g} mm apart, in {len(board.planes_mm)} planes "
             f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm",
         ),
+        ("Axes", _axes(experiment)),
         ("Image pairs", f"{len(summary['pairs']):,} of {experiment.pairs:,} finished"),
+        ("Motion passes", _motion(summary)),
         ("Weights", _weights(summary.get("weights") or {})),
         ("Computed on", f"{device['kind']}, {device['threads']} threads"),
     ]
     return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
+
+
+def _axes(experiment: Experiment) -> str:
+    """Say under which condition x, y, z are right-handed: no image tells, see the conventions."""
+    mirrored = {camera.name: camera.image_flip in ("none", "both") for camera in experiment.cameras}
+    words = {True: "are mirrored, as through one mirror", False: "show the scene as it is, not mirrored"}
+    if len(set(mirrored.values())) == 1:
+        condition = f"the recorded pictures {words[mirrored[experiment.cameras[0].name]]}"
+    else:
+        condition = ", ".join(f"those of {name} {words[state]}" for name, state in mirrored.items())
+    return f"right-handed if {condition}; otherwise left-handed, and vorticity has the other sign"
+
+
+def _motion(summary: Mapping[str, Any]) -> str:
+    """Say where both frames were reconstructed from what they share along the motion; nothing where none was asked."""
+    passes = summary["settings"]["smart"].get("motion_passes", 0)
+    if not passes:
+        return ""
+    followed = sum(bool(pair.get("motion", {}).get("followed")) for pair in summary["pairs"])
+    return (
+        f"{passes}: the motion was followed in {markup.count(followed, 'pair')} of {len(summary['pairs']):,}; the "
+        "uncertainty is that of each frame's volume by itself"
+    )
 
 
 def _weights(report: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from matplotlib.colors import Normalize
 
 from lfpiv import dataset
 from lfpiv.report import markup
+from lfpiv.report.lightsheet import ENOUGH, LightSheet, find_sheet
 from lfpiv.report.markup import number, percent
 from lfpiv.report.svg import INK, SERIES, colour_bar, new_panel, spread_ticks, style, to_svg
 
@@ -19,8 +20,6 @@ FEW_VOLUMES = 6
 """So many volumes have a line of their own; of more, the median and the range are drawn."""
 BAND = (5, 95)
 """Percentiles between which the range over many volumes lies."""
-END_SHARE = 0.1
-"""Part of the depth at either end that the brightness at the ends is taken over."""
 
 
 def section(summary: Mapping[str, Any], vectors: Mapping[int, Path]) -> str:
@@ -100,24 +99,41 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
 
 
 def _quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray]) -> str:
-    shown, tables = [], []
+    shown, tables, captions = [], [], []
     if histories:
         panel, table = _residuals(histories)
         shown.append(panel)
         tables.append(table)
-    panel, table, ends = _brightness(first)
-    shown.append(panel)
-    tables.append(table)
-    caption = "What the projections of the volume leave unexplained of the images, per iteration of SMART. " * bool(
-        histories
+        captions.append("What the projections of the volume leave unexplained of the images, per iteration of SMART.")
+    if "profile_z" in first:
+        profile = first["profile_z"].isel(frame=0).values
+        sheet = find_sheet(first["z"].values, profile)
+        panel, table = _brightness(first, sheet)
+        shown.append(panel)
+        tables.append(table)
+        captions.append(f"Mean brightness of the planes along z, pair {pair}. {_judgement(profile, sheet)}")
+    else:
+        captions.append("The brightness over the depth is not in the file, which an earlier version wrote.")
+    return markup.figure(shown, " ".join(captions), "".join(tables)) if shown else markup.paragraph(captions[0])
+
+
+def _judgement(profile: np.ndarray, sheet: LightSheet | None) -> str:
+    """Say what the brightness over the depth tells of ghosts."""
+    if sheet is None:
+        quarter = len(profile) // 4
+        middle = max(float(profile[quarter : len(profile) - quarter].mean()), 1e-30)
+        return (
+            "No end of the light sheet shows inside the volume, so particles and ghosts cannot be told apart; a volume "
+            f"deeper than the sheet would do that. The first plane is {percent(profile[0] / middle)} and the last "
+            f"{percent(profile[-1] / middle)} as bright as the middle half; well above 100 %, they take up light from "
+            "outside the volume."
+        )
+    verdict = "which is good" if sheet.ratio >= ENOUGH else "too little: dense seeding, or a wrong calibration"
+    return (
+        f"The light sheet (shaded) lies between z = {number(sheet.low_mm, 2)} and {number(sheet.high_mm, 2)} mm; all "
+        f"light outside it is ghosts. The volume is {number(sheet.ratio, 1)} times as bright inside as outside, "
+        f"{verdict}; {ENOUGH:g} is the least that is commonly asked for."
     )
-    caption += (
-        f"Brightness over the depth, pair {pair}: mean over all lines along x and along y of their brightest voxel. "
-        f"At its ends the volume is {percent(ends[0])} (low z) and {percent(ends[1])} (high z) as bright as in its "
-        "middle half. Where a light sheet ends inside the volume, what is left beyond its edges is ghosts; well above "
-        "100 %, the ends take up light from outside the volume."
-    )
-    return markup.figure(shown, caption, "".join(tables))
 
 
 def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
@@ -158,30 +174,49 @@ def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
     return svg, markup.table(["iteration", *columns], rows, caption="Residual per iteration of SMART")
 
 
-def _brightness(first: xr.Dataset) -> tuple[str, str, tuple[float, float]]:
-    """Brightness over the depth in both frames; at the ends over that in the middle half, of the first frame."""
+def _brightness(first: xr.Dataset, sheet: LightSheet | None) -> tuple[str, str]:
+    """Mean brightness over the depth in both frames; with the light sheet, where it ends inside the volume."""
     z = first["z"].values
-    profiles = {}
-    for k, frame in enumerate(first["frame"].values):
-        along_y, along_x = (first[f"projection_{axis}"].isel(frame=k) for axis in "yx")
-        profiles[str(frame)] = (along_y.mean("x").values + along_x.mean("y").values) / 2
+    profiles = dict(zip(map(str, first["frame"].values), first["profile_z"].values, strict=True))
+    digits = 0 if max(profile.max() for profile in profiles.values()) >= 100 else 2
     figure, (axes,) = new_panel()
+    if sheet is not None:
+        axes.axvspan(sheet.low_mm, sheet.high_mm, color=INK, alpha=0.15, linewidth=0)
+        levels = [sheet.inside, sheet.outside]
+        axes.hlines(levels, z[0], z[-1], color=INK, linewidth=0.8, linestyle=":")
     for k, (frame, profile) in enumerate(profiles.items()):
         axes.plot(
             z, profile, "-" if k % 2 == 0 else "--", color=SERIES[k % len(SERIES)], lw=1.4, label=f"frame {frame}"
         )
     axes.axhline(0, color=INK, linewidth=0.6)
-    axes.set(ylim=(0, None))
-    style(axes, title="brightness over the depth", xlabel="z [mm]", ylabel="intensity [counts]", legend=True)
+    axes.set(ylim=(0, 1.3 * axes.get_ylim()[1]))  # room for the legend
+    style(axes, title="brightness over the depth", xlabel="z [mm]", ylabel="mean intensity [counts]", legend=True)
     spread_ticks(axes)
-    profile = next(iter(profiles.values()))
-    end, quarter = max(round(END_SHARE * len(z)), 1), len(z) // 4
-    middle = max(float(profile[quarter : len(z) - quarter].mean()), 1e-30)
-    ends = float(profile[:end].mean() / middle), float(profile[-end:].mean() / middle)
-    svg = to_svg(figure, f"Brightness over z; the ends have {percent(ends[0])} and {percent(ends[1])} of the middle.")
-    rows = [[number(depth, 3), *(f"{profile[k]:.0f}" for profile in profiles.values())] for k, depth in enumerate(z)]
+    told = "" if sheet is None else f"; {number(sheet.ratio, 1)} times as bright inside the light sheet as outside"
+    svg = to_svg(figure, f"Mean brightness over z{told}.")
+    rows = [
+        [number(depth, 3), *(number(float(profile[k]), digits) for profile in profiles.values())]
+        for k, depth in enumerate(z)
+    ]
     titles = ["z [mm]", *(f"frame {frame} [counts]" for frame in profiles)]
-    return svg, markup.table(titles, rows, caption="Brightness over the depth"), ends
+    table = markup.table(titles, rows, caption="Brightness over the depth")
+    if sheet is not None:
+        table = _sheet_table(z, profiles) + table
+    return svg, table
+
+
+def _sheet_table(z: np.ndarray, profiles: Mapping[str, np.ndarray]) -> str:
+    """Tabulate the light sheet of each frame by itself."""
+    rows = []
+    for frame, profile in profiles.items():
+        sheet = find_sheet(z, profile)
+        values = [markup.NONE] * 5
+        if sheet is not None:
+            values = [number(sheet.low_mm, 2), number(sheet.high_mm, 2), number(sheet.inside, 2)]
+            values += [number(sheet.outside, 2), number(sheet.ratio, 2)]
+        rows.append([f"frame {frame}", *values])
+    titles = ["light sheet", "from z [mm]", "to z [mm]", "inside [counts]", "outside [counts]", "inside / outside"]
+    return markup.table(titles, rows, caption="Brightness inside and outside the light sheet")
 
 
 def _stops(summary: Mapping[str, Any]) -> list[list[str]]:

@@ -21,7 +21,7 @@ COLOURS = {
     "network": "#2f81d6",
     "drt": "#e0762a",
     "drt_plus_1deg": "#c2478f",
-    "sieve": "#2ca36b",
+    "no_sieve": "#2ca36b",
     "truth": "#30363c",
     "paper": "#808890",
 }
@@ -31,7 +31,7 @@ NAMES = {
     "drt_plus_1deg": "DRT, angle off by 1°",
     "drt_turned": "DRT, both cameras turned by 1° in one sense",
     "drt_rolled": "DRT, cameras rolled by +0.5° and −0.5°",
-    "sieve": "network, volumes made of blobs",
+    "no_sieve": "network, no sieve",
     "truth": "true particles",
 }
 """What is reconstructed with, and how figures and tables call it."""
