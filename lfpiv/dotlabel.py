@@ -330,8 +330,9 @@ def _views(dot: int, radius_mm: float) -> np.ndarray:
     golden = (np.sqrt(5) - 1) / 2
     number = np.arange(_VIEWS) + dot * golden % 1
     angle = 2 * np.pi * (number * golden + dot * np.sqrt(2))
-    directions: np.ndarray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return radius_mm * np.sqrt(number / _VIEWS)[:, None] * directions
+    distance = radius_mm * np.sqrt(number / _VIEWS)
+    points: np.ndarray = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return points
 
 
 def _integral_labels(
