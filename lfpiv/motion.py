@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from scipy import ndimage
-from scipy.interpolate import CubicSpline
 
-from lfpiv.vectors import CONTROL_SPACING, LOWEST_RIVAL, REFINE_SEARCH, correlate, missing_smoothing
+from lfpiv.predictor import Predictor
+from lfpiv.vectors import LOWEST_RIVAL, REFINE_SEARCH, correlate, missing_smoothing
 from lfpiv.volume import Stop, reconstruct
 from lfpiv.weights import Weights
 from lfpiv_kernels import deform
@@ -225,15 +225,14 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
         return vectors
     control, window = _Control(volumes[0], vectors), tuple(settings["windows"][-1])
     first, second = (deform.spline_coefficients(_correlated(volume[UNSHARED].values, settings)) for volume in volumes)
-    field = np.ascontiguousarray(np.moveaxis(control.middle, 0, -1), np.float32)
-    first, second = deform.deform_pair(first, second, field, tuple(control.spacing))
+    first, second = deform.deform_pair(first, second, control.midway.field, control.midway.spacing)
     step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(control.nodes, first.shape, strict=True))
     origin, count = window_grid(first.shape, window, step)
     scatter = displacement_deviation(first, second, window=window, origin=origin, step=step, count=count)
     search = (REFINE_SEARCH,) * 3
     left = correlate_windows(first, second, window=window, step=step, search=search, symmetric=True)
     measured = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
-    shown = np.moveaxis(control.window_means(window, origin, step, count), 0, -1) + left.displacement
+    shown = control.midway.window_means(origin, step, count, window) + left.displacement
     deviation = np.maximum(scatter, np.abs(shown - measured))
     deviation[~vectors["valid"].values] = np.nan
     stated = {f"uncertainty_{axis}": deviation[..., k] for k, axis in enumerate("zyx")}
@@ -294,60 +293,36 @@ def _gain(own: np.ndarray, partner: np.ndarray) -> np.ndarray:
 
 
 class _Control:
-    """A vector field on the points between which a deformation is linear; orders (z, y, x), [voxel]."""
+    """The motion between two frames, midway in time, on the points between which a deformation is linear; [voxel]."""
 
     def __init__(self, volume: xr.DataArray, vectors: xr.Dataset):
-        self.shape = volume.shape
         axes = [(volume[axis].values.astype(float), vectors[axis].values) for axis in "zyx"]
         self.nodes = [(centres - own[0]) * (len(own) - 1) / (own[-1] - own[0]) for own, centres in axes]
         """Places of the vectors along each axis [voxel]."""
-        counts = [max(2, math.ceil((n - 1) / CONTROL_SPACING) + 1) for n in self.shape]
-        self.points = [np.linspace(0, max(n - 1, 1), count) for n, count in zip(self.shape, counts, strict=True)]
-        self.spacing = np.array([p[1] - p[0] for p in self.points])
-        middle = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"]).astype(float)
+        nz, ny, nx = volume.shape
+        displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], axis=-1).astype(float)
+        self.midway = Predictor(displacement, self.nodes, (nz, ny, nx))
+        """Displacement of what is at a control point midway in time."""
         trust = vectors["valid"].values.astype(float)
-        for axis in range(3):
-            middle = _smooth(middle, self.nodes[axis], self.points[axis], axis + 1)
-            trust = _linear(trust, self.nodes[axis], np.arange(self.shape[axis]), axis)
-        self.middle = middle
-        """Displacement of what is at a control point midway in time, shape (3, z, y, x)."""
+        for axis, (nodes, count) in enumerate(zip(self.nodes, volume.shape, strict=True)):
+            trust = _linear(trust, nodes, np.arange(count), axis)
         self.trust = trust.astype(np.float32)
         """1 among valid vectors, 0 among replaced ones, on the voxels."""
 
     def displacement(self, sign: int) -> np.ndarray:
         """From the control points of one frame to the other: 1 from the first to the second, -1 back; (3, z, y, x)."""
-        start = np.stack(np.meshgrid(*self.points, indexing="ij")) - deform.OFFSET  # the kernel's field at x + OFFSET
-        moved = self.middle
+        points, spacing = self.midway.points, np.array(self.midway.spacing)[:, None, None, None]
+        start = np.stack(np.meshgrid(*points, indexing="ij")) - deform.OFFSET  # the kernel's field at x + OFFSET
+        middle = moved = np.moveaxis(self.midway.field.astype(float), -1, 0)
         for _ in range(FOLLOWED):
-            halfway = (start + sign * moved / 2) / self.spacing[:, None, None, None]
-            moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in self.middle])
+            halfway = (start + sign * moved / 2) / spacing
+            moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in middle])
         return sign * moved
-
-    def window_means(
-        self, window: Sequence[int], origin: Sequence[int], step: Sequence[int], count: Sequence[int]
-    ) -> np.ndarray:
-        """Mean displacement midway in time over windows, shape (3, z, y, x)."""
-        means = self.middle
-        for axis, (w, o, s, c) in enumerate(zip(window, origin, step, count, strict=True), start=1):
-            sampled = deform.OFFSET + np.arange(self.shape[axis - 1])
-            dense = np.moveaxis(_linear(means, self.points[axis - 1], sampled, axis), axis, 0)
-            means = np.stack([dense[o + k * s :][:w].mean(0) for k in range(c)], axis)
-        return means
 
     def carried(self, coefficients: np.ndarray, field: np.ndarray) -> np.ndarray:
         """Sample a volume, given by its spline, at x + field(x) for all voxels x; 0 outside."""
         half = np.moveaxis(2 * (field - deform.OFFSET), 0, -1)  # the kernel samples at x + OFFSET + half / 2
-        return deform.deform_pair(coefficients, coefficients, half.astype(np.float32), tuple(self.spacing))[1]
-
-
-def _smooth(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:
-    """Natural cubic spline through values at nodes along an axis, straight on beyond the outer ones."""
-    if len(nodes) == 1:
-        return np.repeat(values, len(points), axis)
-    spline, inside = CubicSpline(nodes, values, axis, bc_type="natural"), np.clip(points, nodes[0], nodes[-1])
-    beyond = (points - inside).reshape([-1 if k == axis else 1 for k in range(values.ndim)])
-    smooth: np.ndarray = spline(inside) + spline(inside, 1) * beyond
-    return smooth
+        return deform.deform_pair(coefficients, coefficients, half.astype(np.float32), self.midway.spacing)[1]
 
 
 def _linear(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:

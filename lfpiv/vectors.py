@@ -16,11 +16,11 @@ from functools import cached_property
 from typing import Any, TypeGuard
 
 import numpy as np
-import scipy.interpolate
 import scipy.ndimage
 import xarray as xr
 
 from lfpiv import validation
+from lfpiv.predictor import Predictor
 from lfpiv_kernels import correlate as kernel
 from lfpiv_kernels import deform
 from lfpiv_kernels.uncertainty import displacement_deviation
@@ -36,9 +36,6 @@ REFINE_SEARCH = 3
 """Largest lag of the passes after the first [voxel]; what the predictor leaves is found up to 2.5 voxels."""
 FIRST_SEARCH = 0.25
 """Largest displacement of the first pass, as a part of its window, where none is given (the one-quarter rule)."""
-CONTROL_SPACING = 4
-"""Largest distance of the points between which a deformation field is linear [voxel]."""
-
 LOWEST_RIVAL = 0.01
 """Coefficient that stands for lower ones in the peak ratio, which is then finite."""
 
@@ -185,7 +182,7 @@ class _MultiPass:
         centres = [o + (w - 1) / 2 + s * np.arange(n) for o, w, s, n in zip(origin, window, step, count, strict=True)]
         first, second, predicted = *self.volumes, np.zeros(3)
         if self.passes:
-            predictor = _Predictor(self.guess, self.centres, shape)
+            predictor = Predictor(self.guess, self.centres, shape)
             first, second = deform.deform_pair(*self.coefficients, predictor.field, predictor.spacing)
             predicted = predictor.window_means(origin, step, count, window)
             centres = [centre + deform.OFFSET for centre in centres]
@@ -390,62 +387,3 @@ def _triple(values: Iterable[int]) -> tuple[int, int, int]:
     """Values along z, y, x as a tuple."""
     z, y, x = values
     return z, y, x
-
-
-class _Predictor:
-    """Displacement field between window centres, as the deformation applies it.
-
-    It is not smoothed: it consists of window means, so iterating is stable without (five iterations at 75 % overlap
-    were), and smoothing it over neighbouring windows raised the error in a vortex ring by half.
-    """
-
-    def __init__(self, field: np.ndarray, nodes: list[np.ndarray], shape: tuple[int, int, int]):
-        counts = [max(2, math.ceil((n - 1) / CONTROL_SPACING) + 1) for n in shape]
-        points = [np.linspace(0, max(n - 1, 1), count) for n, count in zip(shape, counts, strict=True)]
-        z, y, x = (float(p[1] - p[0]) for p in points)
-        self.spacing = (z, y, x)
-        for axis in range(3):
-            field = _along(_spline_matrix(nodes[axis], points[axis]), field, axis)
-        self.field = field.astype(np.float32)
-        self._points, self._shape = points, shape
-
-    def window_means(
-        self,
-        origin: tuple[int, int, int],
-        step: tuple[int, int, int],
-        count: tuple[int, int, int],
-        window: tuple[int, int, int],
-    ) -> np.ndarray:
-        """Mean displacement over the windows, shape (z, y, x, 3) [voxel]."""
-        means = self.field.astype(float)
-        for axis in range(3):
-            linear = _linear_matrix(self._points[axis], deform.OFFSET + np.arange(self._shape[axis]))
-            first = origin[axis] + step[axis] * np.arange(count[axis])
-            matrix = np.stack([linear[start : start + window[axis]].mean(0) for start in first])
-            means = _along(matrix, means, axis)
-        return means
-
-
-def _along(matrix: np.ndarray, field: np.ndarray, axis: int) -> np.ndarray:
-    """Apply a matrix along one axis."""
-    return np.moveaxis(np.tensordot(matrix, field, (1, axis)), 0, axis)
-
-
-def _spline_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Matrix from values at nodes to values at points: natural cubic spline, straight on beyond the outer nodes."""
-    if len(nodes) == 1:
-        return np.ones((len(points), 1))
-    spline = scipy.interpolate.CubicSpline(nodes, np.eye(len(nodes)), bc_type="natural")
-    inside = np.clip(points, nodes[0], nodes[-1])
-    matrix: np.ndarray = spline(inside) + spline(inside, 1) * (points - inside)[:, None]
-    return matrix
-
-
-def _linear_matrix(points: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Matrix from values at evenly spaced points to values at positions, linear between and beyond the points."""
-    place = (positions - points[0]) / (points[1] - points[0])
-    cell = np.clip(place.astype(int), 0, len(points) - 2)
-    rows = np.arange(len(positions))
-    matrix = np.zeros((len(positions), len(points)))
-    matrix[rows, cell], matrix[rows, cell + 1] = 1 - (place - cell), place - cell
-    return matrix
