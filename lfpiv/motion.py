@@ -30,7 +30,7 @@ import xarray as xr
 from scipy import ndimage
 
 from lfpiv.predictor import Predictor
-from lfpiv.vectors import LOWEST_RIVAL, REFINE_SEARCH, correlate, missing_smoothing
+from lfpiv.vectors import LOWEST_RIVAL, REFINE_SEARCH, correlate, emphasise, missing_smoothing
 from lfpiv.volume import Stop, reconstruct
 from lfpiv.weights import Weights
 from lfpiv_kernels import deform
@@ -220,11 +220,17 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
             log.warning("motion: volumes without what each frame shows by itself; the uncertainty is too small")
         return vectors
     settings = json.loads(vectors.attrs["settings"])
-    settings["smoothing_voxel"] = missing_smoothing(settings["smoothing_voxel"], *volumes)
     if len(settings["windows"]) == 1 or not vectors["valid"].any():
         return vectors
     control, window = _Control(volumes[0], vectors), tuple(settings["windows"][-1])
-    first, second = (deform.spline_coefficients(_correlated(volume[UNSHARED].values, settings)) for volume in volumes)
+    missing = missing_smoothing(settings["smoothing_voxel"], *volumes)
+    alone = (volume[UNSHARED].values for volume in volumes)  # their scale does not matter
+    first, second = (
+        deform.spline_coefficients(
+            emphasise((light - np.median(light)).astype(np.float32), missing, settings["intensity_power"])
+        )
+        for light in alone
+    )
     first, second = deform.deform_pair(first, second, control.midway.field, control.midway.spacing)
     step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(control.nodes, first.shape, strict=True))
     origin, count = window_grid(first.shape, window, step)
@@ -241,16 +247,6 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     ratio = left.correlation / np.maximum(left.rival, LOWEST_RIVAL)
     stated["peak_ratio"] = np.where(left.correlation > 0, ratio, np.nan)
     return vectors.assign({name: vectors[name].copy(data=values.astype(np.float32)) for name, values in stated.items()})
-
-
-def _correlated(volume: np.ndarray, settings: Mapping[str, Any]) -> np.ndarray:
-    """Return a volume as `correlate` compares it: no background, smoothed, to a power; its scale does not matter."""
-    volume = (volume - np.median(volume)).astype(np.float32)
-    if settings["smoothing_voxel"] > 0:
-        volume = ndimage.gaussian_filter(volume, settings["smoothing_voxel"], mode="constant")
-    if settings["intensity_power"] != 1:
-        volume = np.maximum(volume, 0) ** np.float32(settings["intensity_power"])
-    return volume
 
 
 def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list[np.ndarray]:

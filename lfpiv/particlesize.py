@@ -22,6 +22,7 @@ import numpy as np
 from scipy import ndimage
 
 from lfpiv.camera import CalibratedCamera
+from lfpiv.raylayout import microimage_centres
 from lfpiv.smart import gaussian
 from lfpiv.weights import Weights
 
@@ -119,14 +120,8 @@ class _Views:
     def __init__(self, camera: CalibratedCamera, even: np.ndarray):
         """`even`: image of an evenly lit volume, shape (rows, columns)."""
         optics, lattice = camera.optics, camera.lattice
-        widening = (1 + optics.sensor_per_pupil) / optics.pixel_mm
         rows, columns = optics.sensor_shape
-        half = np.array([columns, rows]) / 2
-        corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * half / widening
-        index = (corners - lattice.origin_mm) @ np.linalg.inv(np.asarray(lattice.basis_mm))
-        first, last = np.floor(index.min(0)).astype(int), np.ceil(index.max(0)).astype(int)
-        lenses = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True))), axis=-1)
-        centre = lattice.centres_mm(lenses) * widening + half  # (j, i, 2) [pixel]
+        _, centre = microimage_centres(optics, lattice, 0.0)
         place = np.linspace(-PUPIL_SHARE, PUPIL_SHARE, VIEWS) * optics.pupil_radius_mm * optics.sensor_per_pupil
         offset = np.stack(np.meshgrid(place, place), axis=-1).reshape(-1, 1, 1, 2) / optics.pixel_mm
         column, row = np.moveaxis(np.floor(centre + offset).astype(int), -1, 0)

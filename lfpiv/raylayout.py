@@ -18,6 +18,39 @@ def microimage_edge(optics: Optics) -> int:
     return math.floor(2 * optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm) + 2
 
 
+def microimage_centres(optics: Optics, lattice: LensLattice, margin_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of the microimages on the sensor (Eq. 9), of all lenses whose nodes may lie on it.
+
+    Parameters
+    ----------
+    optics : Optics
+        The camera.
+    lattice : LensLattice
+        Its microlenses.
+    margin_px : float
+        How far beyond the sensor's edges centres are wanted, too [pixel].
+
+    Returns
+    -------
+    first : ndarray, shape (2,), int
+        Lattice indices (i, j) of the first lens.
+    centre : ndarray, shape (lenses along j, lenses along i, 2)
+        (column, row) [pixel]; pixel n spans n to n + 1.
+    """
+    widening = (1 + optics.sensor_per_pupil) / optics.pixel_mm
+    rows, columns = optics.sensor_shape
+    half = np.array([columns, rows]) / 2
+    reach = (half + margin_px) / widening
+    corners = (np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * reach - lattice.origin_mm) @ np.linalg.inv(
+        np.asarray(lattice.basis_mm)
+    )
+    first, last = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
+    index = np.stack(
+        np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True))), axis=-1
+    )  # (j, i, 2)
+    return first, lattice.centres_mm(index) * widening + half
+
+
 def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
     """Lay a sensor's pixels out as the rays of its lenses.
 
@@ -26,26 +59,16 @@ def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
     inside the pupil, whose middle lies inwards of its own: so a lens has more versions of its block, with shares for
     weights that fall or rise outwards.
     """
-    widening = (1 + optics.sensor_per_pupil) / optics.pixel_mm
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
     edge = microimage_edge(optics)
     rows, columns = optics.sensor_shape
-    half = np.array([columns, rows]) / 2
-    reach = (half + radius + 1) / widening
-    corners = (np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * reach - lattice.origin_mm) @ np.linalg.inv(
-        np.asarray(lattice.basis_mm)
-    )
-    first, last = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
-    index = np.stack(
-        np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True))), axis=-1
-    )  # (j, i, 2)
-    centre = lattice.centres_mm(index) * widening + half  # [pixel], pixel n spans n to n + 1
+    first, centre = microimage_centres(optics, lattice, radius + 1)
     corner = np.floor(centre - radius).astype(np.int32)
-    count = LAYERS * index[..., 0].size * edge**2
+    count = LAYERS * centre[..., 0].size * edge**2
     pixel, share = np.full(count + LANES, -1, np.int32), np.zeros(count + LANES, np.float32)
     step = np.arange(edge, dtype=np.int32)
-    pixel_rows, share_rows = (array[:count].reshape(len(index), LAYERS, -1, edge, edge) for array in (pixel, share))
-    for j in range(len(index)):  # row by row of lenses: bounds the scratch memory
+    pixel_rows, share_rows = (array[:count].reshape(len(centre), LAYERS, -1, edge, edge) for array in (pixel, share))
+    for j in range(len(centre)):  # row by row of lenses: bounds the scratch memory
         column = corner[j, :, None, None, 0] + step
         row = corner[j, :, None, None, 1] + step[:, None]
         seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)

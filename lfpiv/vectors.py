@@ -132,10 +132,8 @@ def correlate(
         raise ValueError(f"intensity_power: expected a value > 0, got {intensity_power!r}.")
     schedule = _check_windows(windows, first.shape)
     search = _first_search(max_displacement_voxel, schedule[0], first.shape)
-    if (missing := missing_smoothing(smoothing_voxel, volume_a, volume_b)) > 0:
-        first, second = (scipy.ndimage.gaussian_filter(v, missing, mode="constant") for v in (first, second))
-    if intensity_power != 1:
-        first, second = (np.maximum(v, 0) ** np.float32(intensity_power) for v in (first, second))
+    missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
+    first, second = (emphasise(volume, missing, intensity_power) for volume in (first, second))
     multi_pass = _MultiPass(first, second, symmetric=len(schedule) > 1)
     for number, window in enumerate(schedule):
         shared = overlap if number == len(schedule) - 1 else max(overlap, COARSE_OVERLAP)
@@ -278,6 +276,13 @@ def missing_smoothing(smoothing_voxel: float, *volumes: xr.DataArray | np.ndarra
         float(volume.attrs.get("sieve_voxel", 0.0)) if isinstance(volume, xr.DataArray) else 0.0 for volume in volumes
     )
     return math.sqrt(max(smoothing_voxel**2 - sieve**2, 0.0)) if sieve > 0 else smoothing_voxel
+
+
+def emphasise(volume: np.ndarray, smoothing_voxel: float, intensity_power: float) -> np.ndarray:
+    """Return a volume without background, shape (z, y, x), float32, as it is compared: smoothed, to a power."""
+    if smoothing_voxel > 0:
+        volume = scipy.ndimage.gaussian_filter(volume, smoothing_voxel, mode="constant")
+    return volume if intensity_power == 1 else np.maximum(volume, 0) ** np.float32(intensity_power)
 
 
 def _is_finite(value: object) -> TypeGuard[float]:

@@ -217,14 +217,16 @@ class Weights:
             return
         runtime.device()
         with ThreadPoolExecutor(1) as ahead:  # the next camera's rays are laid out while this one's kernels run
-            laid_out = [ahead.submit(getattr, camera, "microimages") for camera in self.cameras.values()]
+            asked = self.cameras.values() if self.method == "footprint" else ()
+            laid_out = [ahead.submit(getattr, camera, "microimages") for camera in asked]
             for number, name in enumerate(self.cameras):
-                laid_out[number].result()
 
                 def step(fraction: float, number: int = number) -> None:
                     if progress is not None:
                         progress((number + fraction) / len(self.cameras))
 
+                if laid_out:
+                    laid_out[number].result()
                 self._projectors[name] = Projector(self._blocks(name, step))
 
     def _blocks(self, name: str, progress: Progress) -> Blocks:
