@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from . import runtime
-from .correlation_memory import launch, to_device
+from .correlation_memory import Call, launch, to_device
 from .correlation_plan import largest_factor
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -72,13 +72,7 @@ def _sum_along(volume: np.ndarray, axis: int, width: int) -> np.ndarray:
     for terms, spacing in ((part, pitch), (width // part, part * pitch)):
         if terms > 1:
             rows_out = wp.array(ptr=written.ptr, dtype=Row, shape=(rows,), device=written.device)
-            launch(
-                _box_sum,
-                -(-rows // batch),
-                (),
-                [_overlapping(taken), spacing, terms, rows, batch],
-                [rows_out],
-            )
+            launch(Call(_box_sum, -(-rows // batch), [_overlapping(taken), spacing, terms, rows, batch], [rows_out]))
             taken, written = written, taken
     return taken.numpy()[: volume.size].reshape(volume.shape)
 

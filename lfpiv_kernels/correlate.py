@@ -23,9 +23,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from . import correlation_kernels as kernels
 from . import peak_kernels, plane_kernels, runtime, spectral_kernels
 from .correlation_kernels import LANES
-from .correlation_memory import free_memory, launch, new_array
+from .correlation_memory import Call, free_memory, launch, new_array
 from .correlation_plan import GROUP, Plan, make_plan, whole_groups, window_grid
-from .correlation_sides import Side
+from .correlation_sides import Side, make_sides
 from .correlation_transforms import Planes, Spectrum
 from .spectral_kernels import ROWS
 
@@ -104,8 +104,7 @@ def correlate_windows(
             raise ValueError(f"{name}: expected finite values whose squares add up to a float32, got others.")
     free_memory()
     searches = (search if symmetric else (0, 0, 0)), search
-    first_side, second_side = map(Side, (plan, plan), (first, second), squares, searches)
-    peaks = _measure(plan, (first_side, second_side), symmetric, method)
+    peaks = _measure(plan, make_sides(plan, (first, second), squares, searches), symmetric, method)
     return WindowPeaks(
         displacement=np.moveaxis(peaks[:3], 0, -1).copy(),
         second_displacement=np.moveaxis(peaks[3:6], 0, -1).copy(),
@@ -127,18 +126,18 @@ def _measure(plan: Plan, sides: tuple[Side, Side], symmetric: bool, method: str)
     lags, step, depth = math.prod(plan.lags), plan.block_step[0], _slab_depth(plan, symmetric)
     ring = (depth - 1) * step + plan.block_count[0]
     spare = plan.block_count[1] * plan.pitch + plan.block_count[2] + 2 * LANES  # read by lanes that hold no window
-    sums = [new_array((ring * lags * plan.lanes + spare,)) for _ in range(1 + symmetric)]
+    sums = [new_array(ring * lags * plan.lanes + spare) for _ in range(1 + symmetric)]
     group = 1
     if on_cpu:
         group = LANES * min(-(-plan.lanes // LANES), max(1, _SCORE_BYTES // (4 * LANES * lags)))
     groups = -(-plan.lanes // group)
     rows = lags + math.prod(plan.lags[:2])  # coefficients, and the highest of each row of lags
     slot_pitch = rows * group + group + plan.block_count[2] + LANES
-    scratch = new_array((runtime.CHUNKS * slot_pitch if on_cpu else depth * groups * rows,))
-    peaks = new_array((8, plan.count[0], plan.lanes))
+    scratch = new_array(runtime.CHUNKS * slot_pitch if on_cpu else depth * groups * rows)
+    peaks = new_array(8 * plan.count[0] * plan.lanes)
     work = _Work.empty(plan, sides, ring if method == "direct" else 0)
     first, second = sides
-    statistics = [first.mean.flat, first.scale.flat, second.mean.flat, second.scale.flat]
+    statistics = [first.mean.values, first.scale.values, second.mean.values, second.scale.values]
     offsets = [*first.mean.offsets, *second.mean.offsets]
     pitches = wp.vec2i(first.mean.plane, second.mean.plane)
     gathered = on_cpu and min(plan.block_count[1:]) > 2  # windows that share rows of blocks add them up once
@@ -154,7 +153,7 @@ def _measure(plan: Plan, sides: tuple[Side, Side], symmetric: bool, method: str)
                 _correlate_layers(plan, a, b, layers, ring, work, sum_)
             if gathered:
                 layout = [*plan.block_count[1:], plan.pitch, plan.lanes, lags, ring, layers.start]
-                launch(kernels._gather_blocks, len(layers) * lags, (), layout, [sum_])
+                launch(Call(kernels._gather_blocks, len(layers) * lags, layout, [sum_]))
         layout = [
             pitches,
             wp.vec3i(*first.search),
@@ -172,16 +171,10 @@ def _measure(plan: Plan, sides: tuple[Side, Side], symmetric: bool, method: str)
         ]
         inputs = [sums[0], sums[-1], int(symmetric), *statistics, *offsets, *layout]
         size = (end - begin) * groups
-        launch(
-            peak_kernels._find_peaks,
-            size,
-            (),
-            inputs,
-            [scratch, peaks.flatten()],
-            slots=True,
-            after_slot=[slot_pitch, group if on_cpu else size, plan.count[0] * plan.lanes],
-        )
-    lattice = peaks.numpy()[:, :, : plan.block_grid[1] * plan.pitch].reshape(8, plan.count[0], -1, plan.pitch)
+        after_slot = [slot_pitch, group if on_cpu else size, plan.count[0] * plan.lanes]
+        launch(Call(peak_kernels._find_peaks, size, inputs, [scratch, peaks], after_slot))
+    windows = peaks.numpy().reshape(8, plan.count[0], -1)[..., : plan.block_grid[1] * plan.pitch]
+    lattice = windows.reshape(8, plan.count[0], -1, plan.pitch)
     along_y, along_x = (slice(0, (c - 1) * m + 1, m) for c, m in zip(plan.count[1:], plan.block_step[1:], strict=True))
     return lattice[:, :, along_y, along_x]
 
@@ -211,9 +204,9 @@ class _Work:
         else:
             edges = zip(plan.block[1:], plan.lags[1:], strict=True)
             pitch = LANES * plan.block[0] * (math.prod(plan.block[1:]) + math.prod(b + n - 1 for b, n in edges))
-        taps, near = (new_array((max(1, spectra),)) for _ in range(2))
+        taps, near = (new_array(max(1, spectra)) for _ in range(2))
         on_cpu = runtime.device().kind == "cpu"
-        return cls(taps, near, new_array((runtime.CHUNKS * pitch if on_cpu else 1,)), pitch)
+        return cls(taps, near, new_array(runtime.CHUNKS * pitch if on_cpu else 1), pitch)
 
 
 def _lanes_past(plan: Plan) -> int:
@@ -226,56 +219,47 @@ def _correlate_layers(
 ) -> None:
     """Sum the products of the blocks of some layers at all lags."""
     on_cpu = runtime.device().kind == "cpu"
-    taps, near = _shifted(first, first.search), second.voxels.flat
+    taps, near = _shifted(first, first.search), second.voxels.values
     pitches, lags = wp.vec2i(first.voxels.plane, second.voxels.plane), wp.vec3i(*plan.lags)
     if plan.spectral:
         spectrum = Spectrum.of(plan.block, plan.search)
-        _transform_planes(spectrum.planes[0], taps[0], layers, plan.stride[0], first.voxels.plane, work, work.taps)
-        _transform_planes(spectrum.planes[1], near, layers, plan.stride[0], second.voxels.plane, work, work.near)
+        volumes = (taps[0], first.voxels.plane, work.taps), (near, second.voxels.plane, work.near)
+        launch(
+            *(
+                _transform_planes(planes, *volume, layers, plan.stride[0], work)
+                for planes, volume in zip(spectrum.planes, volumes, strict=True)
+            )
+        )
         quads, matrices = spectrum.arrays
         inputs = [work.taps, work.near, *taps[1:], *second.voxels.offsets, pitches, quads, wp.vec3i(*spectrum.counts)]
         inputs += [matrices, wp.vec2i(*spectrum.size), plan.stride[2], wp.vec3i(*plan.block)]
         groups = -(-plan.lanes // GROUP)
         inputs += [lags, layers.start, ring, groups, GROUP, _lanes_past(plan), plan.lanes, work.scratch_pitch]
-        launch(
-            spectral_kernels._correlate_spectra,
-            len(layers) * groups,
-            (),
-            inputs,
-            [work.scratch, sums],
-            slots=True,
-        )
+        launch(Call(spectral_kernels._correlate_spectra, len(layers) * groups, inputs, [work.scratch, sums], []))
         return
     group, parts = (LANES, 1) if on_cpu else (1, plan.lags[0])
     groups = plan.lanes // group
     inputs = [taps[0], near, *taps[1:], *second.voxels.offsets, pitches, plan.stride[0], wp.vec3i(*plan.block), lags]
     inputs += [layers.start, ring, groups, group, parts]
     size = len(layers) * groups * parts
-    launch(kernels._correlate_blocks, size, (), [*inputs, work.scratch_pitch], [work.scratch, sums], slots=True)
+    launch(Call(kernels._correlate_blocks, size, [*inputs, work.scratch_pitch], [work.scratch, sums], []))
 
 
 def _transform_planes(
-    planes: Planes, volume: wp.array, layers: range, stride: int, plane: int, work: _Work, out: wp.array
-) -> None:
+    planes: Planes, volume: wp.array, plane: int, out: wp.array, layers: range, stride: int, work: _Work
+) -> Call:
     """Transform the planes of each layer, (layer, row, element of a plane)."""
     quads, rows, matrix = planes.arrays
     layout = [layers.start * stride, stride, plane, _PART]
     inputs = [volume, quads, len(planes.quads) // 4, rows, wp.vec4i(*planes.counts), matrix, *layout]
-    launch(
-        plane_kernels._transform_planes,
-        len(layers) * -(-plane // _PART),
-        (),
-        inputs,
-        [work.scratch, out],
-        slots=True,
-        after_slot=[work.scratch_pitch],
-    )
+    size = len(layers) * -(-plane // _PART)
+    return Call(plane_kernels._transform_planes, size, inputs, [work.scratch, out], after_slot=[work.scratch_pitch])
 
 
 def _shifted(side: Side, search: tuple[int, int, int]) -> tuple[wp.array, wp.array, wp.array]:
     """Voxels of a side and offsets, counted from its blocks instead of from the farthest lag."""
     voxels = side.voxels
-    flat = voxels.flat
+    flat = voxels.values
     start = search[0] * voxels.plane
     planes = wp.array(ptr=flat.ptr + 4 * start, dtype=float, shape=(flat.size - start,), device=flat.device)
     planes._owner = flat  # the view must not outlive the memory

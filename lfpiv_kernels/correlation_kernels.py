@@ -242,23 +242,23 @@ def _correlate_blocks(
 
 
 _SPLIT = """
-    const int ny = shape[1], nx = shape[2], total = phases[0] * phases[1];
-    float* out = split_out.data + (int64_t)plane * total * lanes;
+    const int ny = shape[1], nx = shape[2], rows = (lanes + pitch - 1) / pitch;
     const int z = corner[0] + plane;
-    for (int ky = 0; ky * pitch < lanes; ++ky) for (int ry = 0; ry < phases[0]; ++ry) {
-        const int y = corner[1] + ky * stride[0] + ry, some = lanes - ky * pitch < pitch ? lanes - ky * pitch : pitch;
-        const bool inside = z >= 0 && z < shape[0] && y >= 0 && y < ny;
-        const float* row = volume.data + (inside ? ((int64_t)z * ny + y) * nx : 0);
-        for (int rx = 0; rx < phases[1]; ++rx) {
-            float* to = out + (int64_t)(ry * phases[1] + rx) * lanes + ky * pitch;
-            const int x = corner[2] + rx;  // of lane 0
-            int low = x < 0 ? (-x + stride[1] - 1) / stride[1] : 0;
-            int high = x < nx ? (nx - x + stride[1] - 1) / stride[1] : 0;
-            high = inside && high > 0 ? (high < some ? high : some) : 0;
-            low = low < high ? low : high;
-            for (int k = 0; k < low; ++k) to[k] = 0.0f;
-            for (int k = low; k < high; ++k) to[k] = row[x + k * stride[1]];
-            for (int k = high; k < some; ++k) to[k] = 0.0f;
+    float* to = split_out.data + (int64_t)plane * phases[0] * phases[1] * lanes;
+    for (int ry = 0; ry < phases[0]; ++ry) for (int rx = 0; rx < phases[1]; ++rx, to += lanes) {
+        const int x = corner[2] + rx;  // of lane 0
+        const int low = x < 0 ? (-x + stride[1] - 1) / stride[1] : 0;
+        const int high = x < nx ? (nx - x + stride[1] - 1) / stride[1] : 0;
+        for (int ky = 0; ky < rows; ++ky) {  // written one after the other; what is read stays in the cache
+            const int y = corner[1] + ky * stride[0] + ry, rest = lanes - ky * pitch;
+            const int some = rest < pitch ? rest : pitch;
+            const bool inside = z >= 0 && z < shape[0] && y >= 0 && y < ny;
+            const int last = !inside || high < 0 ? 0 : high < some ? high : some, first = low < last ? low : last;
+            const float* row = volume.data + (inside ? ((int64_t)z * ny + y) * nx : 0) + x;
+            float* lane = to + ky * pitch;
+            for (int k = 0; k < first; ++k) lane[k] = 0.0f;
+            for (int k = first; k < last; ++k) lane[k] = row[k * stride[1]];
+            for (int k = last; k < some; ++k) lane[k] = 0.0f;
         }
     }
 """

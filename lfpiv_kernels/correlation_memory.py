@@ -1,7 +1,8 @@
 """Memory and launches of the correlation's kernels."""
 
-import math
 import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -43,13 +44,12 @@ def free_memory() -> None:
     _arena.reset()
 
 
-def new_array(shape: tuple[int, ...]) -> wp.array:
-    """Uninitialised float array on the running device, on the CPU valid until `free_memory`."""
+def new_array(size: int) -> wp.array:
+    """Uninitialised floats on the running device, on the CPU valid until `free_memory`."""
     where = runtime.device()
     if where.kind == "cpu":
-        size = math.prod(shape)
-        return wp.array(_arena.take(size)[:size].reshape(shape), dtype=float, device=where.warp, copy=False)
-    return wp.empty(shape, dtype=float, device=where.warp)
+        return wp.array(_arena.take(size)[:size], dtype=float, device=where.warp, copy=False)
+    return wp.empty(size, dtype=float, device=where.warp)
 
 
 def to_device(values: np.ndarray, dtype: type = float) -> wp.array:
@@ -58,17 +58,37 @@ def to_device(values: np.ndarray, dtype: type = float) -> wp.array:
     return wp.array(values, dtype=dtype, device=where.warp, copy=where.kind != "cpu")
 
 
-def launch(kernel, size, inner, inputs, outputs, *, slots=False, after_slot=()) -> None:
-    """Launch over (size, *inner), threaded on the CPU; the kernel's last input is the first index of its part.
+@dataclass(frozen=True)
+class Call:
+    """A kernel to launch over `size` threads; its last input is the first index of the part it is launched for."""
 
-    With `slots` the input before says which scratch memory is the part's own; -1 on CUDA.
-    """
+    kernel: wp.Kernel
+    size: int
+    inputs: Sequence[object]
+    outputs: Sequence[object]
+    after_slot: Sequence[object] | None = None
+    """Inputs behind the number of the scratch memory that is the part's own, -1 on CUDA; None: the kernel has none."""
+
+
+def launch(*calls: Call) -> None:
+    """Launch kernels that do not depend on each other, threaded on the CPU; returns when all are done."""
     where = runtime.device()
-    wp.load_module(kernel.module, device=where.warp)  # before threads start: compilation is not thread-safe
+    for call in calls:
+        wp.load_module(call.kernel.module, device=where.warp)  # before threads start: compilation is not thread-safe
+    on_cpu = where.kind == "cpu"
+    chunks = min(runtime.CHUNKS // len(calls), 2 * where.threads) if on_cpu else 1  # a launch costs 0.1 ms of Python
+    free = list(range(runtime.CHUNKS))  # memory that was used last is the first to be used again: it is in the caches
 
-    def part(chunk: int, begin: int, end: int) -> None:
-        own = [chunk if where.kind == "cpu" else -1] if slots else []
-        arguments = [*inputs, *own, *after_slot, begin]
-        wp.launch(kernel, dim=(end - begin, *inner), inputs=arguments, outputs=outputs, device=where.warp)
+    def part(_: int, begin: int, end: int) -> None:
+        for index in range(begin, end):
+            call, chunk = calls[index // chunks], index % chunks
+            first, last = (call.size * k // chunks for k in (chunk, chunk + 1))
+            if first == last:
+                continue
+            slot = free.pop() if on_cpu else -1
+            own = [] if call.after_slot is None else [slot, *call.after_slot]
+            inputs = [*call.inputs, *own, first]
+            wp.launch(call.kernel, dim=last - first, inputs=inputs, outputs=call.outputs, device=where.warp)
+            free.append(slot)
 
-    runtime.run_chunks(size, part, chunks=min(runtime.CHUNKS, 2 * where.threads))  # a launch costs 0.1 ms of Python
+    runtime.run_chunks(len(calls) * chunks, part, chunks=len(calls) * chunks)

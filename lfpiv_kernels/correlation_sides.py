@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,27 +13,11 @@ import warp as wp
 from . import correlation_kernels as kernels
 from . import runtime, window_kernels
 from .correlation_kernels import LANES
-from .correlation_memory import launch, new_array, to_device
+from .correlation_memory import Call, launch, new_array, to_device
 from .correlation_plan import Plan, largest_factor, whole_groups
 
 SIGNAL_FLOOR = 1e-4
 """A window whose variance is below this part of the whole volume's variance holds no signal."""
-
-
-class Side:
-    """One volume as the kernels take it: split by phase, with the statistics of its windows at every lag."""
-
-    def __init__(self, plan: Plan, volume: np.ndarray, squares: float, search: tuple[int, int, int]):
-        self.volume, self.search = np.ascontiguousarray(volume, np.float32), search
-        self.lags = tuple(2 * r + 1 for r in search)
-        reach = [b + n - 1 for b, n in zip(plan.block, self.lags, strict=True)]
-        corner = tuple(o - r for o, r in zip(plan.origin, search, strict=True))
-        self.voxels = Split.empty(plan, reach)
-        phases, lanes = wp.vec2i(*self.voxels.shape[1:3]), self.voxels.shape[3]
-        layout = [wp.vec3i(*plan.shape), wp.vec3i(*corner), wp.vec2i(*plan.stride[1:]), phases, plan.pitch, lanes]
-        inputs = [to_device(self.volume.ravel()), *layout]
-        launch(kernels._split, self.voxels.shape[0], (), inputs, [self.voxels.flat])
-        self.mean, self.scale = _statistics(plan, self.volume, squares, search)
 
 
 @dataclass(frozen=True)
@@ -40,7 +25,8 @@ class Split:
     """Values at the lattice of blocks and at every offset from it, (plane, phase y, phase x, lane)."""
 
     shape: tuple[int, int, int, int]
-    array: wp.array
+    values: wp.array
+    """Flat."""
     offsets: tuple[wp.array, wp.array]
     """Distance in memory for every offset in voxels along y and x."""
 
@@ -52,12 +38,7 @@ class Split:
         lanes = whole_groups(plan.lanes + past[1] * plan.pitch + past[2] + LANES)
         shape = ((plan.block_grid[0] - 1) * plan.stride[0] + reach[0], phases[1], phases[2], lanes)
         along_y = _offsets(reach[1], plan.stride[1], phases[2] * lanes, plan.pitch)
-        return cls(shape, new_array(shape), (along_y, _offsets(reach[2], plan.stride[2], lanes, 1)))
-
-    @property
-    def flat(self) -> wp.array:
-        """The array as the kernels index it."""
-        return self.array.flatten()
+        return cls(shape, new_array(math.prod(shape)), (along_y, _offsets(reach[2], plan.stride[2], lanes, 1)))
 
     @property
     def plane(self) -> int:
@@ -72,33 +53,82 @@ def _offsets(reach: int, stride: int, phase_pitch: int, lane_pitch: int) -> wp.a
     return to_device(offset % stride * phase_pitch + offset // stride * lane_pitch, int)
 
 
-def _statistics(plan: Plan, volume: np.ndarray, squares: float, search: tuple[int, int, int]) -> tuple[Split, Split]:
-    """Mean of the windows at every lag, and 1 / sqrt(sum of squared deviations), 0 where there is no signal."""
-    window, shape, where = wp.vec3i(*plan.window), wp.vec3i(*plan.shape), runtime.device()
-    on_cpu = where.kind == "cpu"
-    sums = tuple(n + 2 * r - w + 1 for n, r, w in zip(plan.shape, search, plan.window, strict=True))
-    rows = plan.shape[0], *sums[1:]
-    total, square = (new_array(rows) for _ in range(2))
-    lags = tuple(2 * r + 1 for r in search)
-    phases = tuple(min(s, n) for s, n in zip(plan.stride, lags, strict=True))
-    pitch = whole_groups(plan.shape[2] + 2 * search[2] + LANES)
-    scratch_pitch = pitch * (4 + 2 * plan.shape[1] + 2 * (plan.shape[1] + 2 * search[1] + 1))
-    scratch = new_array(((runtime.CHUNKS if on_cpu else plan.shape[0]) * scratch_pitch,))
-    inputs = [
-        to_device(volume.ravel()),
-        shape,
-        wp.vec3i(*search),
-        window,
-        wp.vec2i(*map(largest_factor, plan.window[1:])),
-    ]
-    inputs += [plan.origin[1], plan.stride[1], phases[1]]
-    outputs = [array.flatten() for array in (scratch, total, square)]
-    launch(window_kernels._sum_planes, plan.shape[0], (), inputs, outputs, slots=True, after_slot=[scratch_pitch])
-    variance = squares / volume.size - float(volume.mean()) ** 2
+@dataclass(frozen=True)
+class Side:
+    """One volume as the kernels take it: split by phase, with the statistics of its windows at every lag."""
+
+    volume: np.ndarray
+    search: tuple[int, int, int]
+    """Largest lags at which windows are taken; lag 0 alone where they do not move."""
+    voxels: Split
+    mean: Split
+    """Mean of the windows at every lag."""
+    scale: Split
+    """1 / sqrt(sum of squared deviations) of the same, 0 where there is no signal."""
+
+    @classmethod
+    def empty(cls, plan: Plan, volume: np.ndarray, search: tuple[int, int, int]) -> Side:
+        """Room for one side."""
+        lags = tuple(2 * r + 1 for r in search)
+        reach = tuple(b + n - 1 for b, n in zip(plan.block, lags, strict=True))
+        mean, scale = (Split.empty(plan, lags) for _ in range(2))
+        return cls(np.ascontiguousarray(volume, np.float32), search, Split.empty(plan, reach), mean, scale)
+
+
+def make_sides(
+    plan: Plan,
+    volumes: tuple[np.ndarray, np.ndarray],
+    squares: Sequence[float],
+    searches: tuple[tuple[int, int, int], tuple[int, int, int]],
+) -> tuple[Side, Side]:
+    """Prepare both volumes, given their sums of squares and the largest lags at which their windows are taken."""
+    first, second = (Side.empty(plan, *pair) for pair in zip(volumes, searches, strict=True))
+    sums = [_plane_sums(plan, side) for side in (first, second)]
+    launch(_split(plan, first), _split(plan, second), *(call for call, _ in sums))
+    of_both = zip((first, second), squares, (room for _, room in sums), strict=True)
+    launch(*(_statistics(plan, *of) for of in of_both))
+    return first, second
+
+
+def _split(plan: Plan, side: Side) -> Call:
+    """Store the volume split by phase."""
+    voxels = side.voxels
+    corner = tuple(o - r for o, r in zip(plan.origin, side.search, strict=True))
+    phases, lanes = wp.vec2i(*voxels.shape[1:3]), voxels.shape[3]
+    layout = [wp.vec3i(*plan.shape), wp.vec3i(*corner), wp.vec2i(*plan.stride[1:]), phases, plan.pitch, lanes]
+    return Call(kernels._split, voxels.shape[0], [to_device(side.volume.ravel()), *layout], [voxels.values])
+
+
+def _sums_shape(plan: Plan, side: Side) -> tuple[int, int, int]:
+    """Planes of the volume, and the windows that fit along y and x with zeros around it."""
+    depth, *along = plan.shape
+    reach = zip(along, side.search[1:], plan.window[1:], strict=True)
+    return depth, *(n + 2 * r - w + 1 for n, r, w in reach)
+
+
+def _plane_sums(plan: Plan, side: Side) -> tuple[Call, list[wp.array]]:
+    """Sum over the windows' y and x, and where these sums and those of squares go."""
+    sums = [new_array(math.prod(_sums_shape(plan, side))) for _ in range(2)]
+    pitch = whole_groups(plan.shape[2] + 2 * side.search[2] + LANES)
+    scratch_pitch = pitch * (4 + 2 * plan.shape[1] + 2 * (plan.shape[1] + 2 * side.search[1] + 1))
+    on_cpu = runtime.device().kind == "cpu"
+    scratch = new_array((runtime.CHUNKS if on_cpu else plan.shape[0]) * scratch_pitch)
+    factors = wp.vec2i(*map(largest_factor, plan.window[1:]))
+    layout = [wp.vec3i(*plan.shape), wp.vec3i(*side.search), wp.vec3i(*plan.window), factors]
+    rows = [plan.origin[1], plan.stride[1], side.mean.shape[1]]
+    inputs = [to_device(side.volume.ravel()), *layout, *rows]
+    return Call(window_kernels._sum_planes, plan.shape[0], inputs, [scratch, *sums], after_slot=[scratch_pitch]), sums
+
+
+def _statistics(plan: Plan, side: Side, squares: float, sums: list[wp.array]) -> Call:
+    """Statistics of the windows from what `_plane_sums` summed."""
+    variance = squares / side.volume.size - float(side.volume.mean()) ** 2
     floor = SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
-    mean, scale = (Split.empty(plan, lags) for _ in range(2))
+    phases = [min(s, 2 * r + 1) for s, r in zip(plan.stride, side.search, strict=True)]
     lattice = [wp.vec3i(*plan.origin), wp.vec3i(*plan.stride), wp.vec3i(*phases)]
-    layout = [wp.vec3i(*rows), search[0], window, floor, *lattice]
-    inputs = [*outputs[1:], *layout, mean.shape[0], plan.pitch, mean.shape[3]]
-    launch(window_kernels._window_statistics, sums[1], (), inputs, [mean.flat, scale.flat])
-    return mean, scale
+    shape = _sums_shape(plan, side)
+    layout = [wp.vec3i(*shape), side.search[0], wp.vec3i(*plan.window), floor, *lattice]
+    planes, _, _, lanes = side.mean.shape
+    inputs = [*sums, *layout, planes, plan.pitch, lanes]
+    outputs = [side.mean.values, side.scale.values]
+    return Call(window_kernels._window_statistics, shape[1], inputs, outputs)
