@@ -11,7 +11,7 @@ import pytest
 import lfpiv
 from lfpiv import cli, reproduce, weightcheck
 from lfpiv.errors import InputError
-from lfpiv.reproduce import fig10, fig12, fig14, page, plots, rigs, store
+from lfpiv.reproduce import angles, fig10, fig12, fig14, page, plots, rigs, store
 
 # -- the framework, with cases that take no time -----------------------------------------------------------------------
 
@@ -208,9 +208,20 @@ def test_vectors_are_those_of_the_flow(figures):
     assert error["network"] == pytest.approx(error["drt"], rel=0.3)  # true geometry again
     assert error["network"] < peak and case["contrast"] == pytest.approx(error["drt_plus_1deg"] / error["drt"])
     assert set(case["below_043"]) == {"network", "drt", "drt_plus_1deg"}
-    assert case["error_voxel_by_angle_error"].keys() == {"drt", "drt_plus_1deg", "drt_turned", "drt_rolled"}
+    for kind, errors in case["error_voxel_by_angle_error"].items():
+        assert case["angle_error_deg"] == [0, 1, 2, 4] and len(errors) == 4, kind
+        assert all(0 < value < 2 * peak for value in errors), kind
     truth = [run for run in case["runs"] if run["mapping"] == "truth"]
     assert truth and all(run["error_analytic_voxel"] < 0.3 * peak for run in truth)
+
+
+def test_the_angle_error_at_a_contrast_lies_between_those_computed():
+    assert angles.SIZES_DEG == (0, 1, 2, 4)
+    assert angles.reached([0.1, 0.11, 0.2, 0.3], 1.5) == pytest.approx(1 + 4 / 9)
+    assert angles.reached([0.1, 0.11, 0.12, 0.16], 1.2) == pytest.approx(2)
+    assert angles.reached([0.1, 0.11, 0.12, 0.14], 1.5) is None
+    text = angles.describe({kind: [0.1, 0.11, 0.12, 0.16] for kind in angles.LABELS}, 0.03, 1.1, 1.5, 0.5)
+    assert text.count("from 3.5 degrees") == 3 and "contrast of 2 is not found: 1.10" in text
 
 
 def test_equal_angle_errors_stretch_the_volume_and_roll_tears_it(tiny):
@@ -218,7 +229,7 @@ def test_equal_angle_errors_stretch_the_volume_and_roll_tears_it(tiny):
     rng = np.random.default_rng(3)
     points = rng.uniform(-2, 2, (200, 3))
     chief = np.zeros((200, 2))
-    true, wrong, rolled = (rig.ray_tracing(name).cameras for name in ("drt", "drt_plus_1deg", "drt_rolled"))
+    true, wrong, rolled = (rig.ray_tracing(name).cameras for name in ("drt", "drt_plus_1deg", "drt_rolled_1deg"))
     library = lfpiv.thin_lens(rig.experiment, angle_error_deg=1.0).cameras
     half = np.radians([45.0, 46.0])
     stretch = np.array([np.cos(half[0]) / np.cos(half[1]), 1.0, np.sin(half[0]) / np.sin(half[1])])

@@ -29,8 +29,6 @@ NAMES = {
     "network": "network",
     "drt": "DRT",
     "drt_plus_1deg": "DRT, angle off by 1°",
-    "drt_turned": "DRT, both cameras turned by 1° in one sense",
-    "drt_rolled": "DRT, cameras rolled by +0.5° and −0.5°",
     "no_sieve": "network, no sieve",
     "truth": "true particles",
 }

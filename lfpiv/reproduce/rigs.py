@@ -43,15 +43,22 @@ OPTICS = {
 """Table 2: main lens, microlenses, and the numerical column's pixels."""
 ANGLES_DEG = (45.0, -45.0)
 """Separation angles of the two cameras."""
-TURNED_DEG = {
-    "drt": ((0.0, 0.0), (0.0, 0.0)),
-    "drt_plus_1deg": ((1.0, 0.0), (-1.0, 0.0)),
-    "drt_turned": ((1.0, 0.0), (1.0, 0.0)),
-    "drt_rolled": ((0.0, 0.5), (0.0, -0.5)),
+ANGLE_ERRORS = {
+    "plus": ((1.0, 0.0), (-1.0, 0.0)),
+    "turned": ((1.0, 0.0), (1.0, 0.0)),
+    "rolled": ((0.0, 0.5), (0.0, -0.5)),
 }
-"""Errors (yaw, roll) of each camera's angle that direct ray tracing is given [degree]. "drt_plus_1deg": both
-separation angles overestimated (Eqs. 11-12); "drt_turned": the same error in the same sense; "drt_rolled": the
-cameras are rolled about their axes by half a degree each, one degree between them."""
+"""Errors (yaw, roll) of each camera's angle that direct ray tracing is given, per degree. "plus": both separation
+angles overestimated (Eqs. 11-12); "turned": the same error in the same sense; "rolled": the cameras are rolled about
+their axes, half a degree each."""
+ANGLE_ERRORS_DEG = (1, 2, 4)
+"""Sizes of these errors [degree]; the paper has 1."""
+TURNED_DEG = {"drt": ((0.0, 0.0), (0.0, 0.0))} | {
+    f"drt_{kind}_{size}deg": tuple((size * yaw, size * roll) for yaw, roll in errors)
+    for kind, errors in ANGLE_ERRORS.items()
+    for size in ANGLE_ERRORS_DEG
+}
+"""All of them by name: errors (yaw, roll) of each camera [degree]."""
 BLOB_VOXEL = 0.7
 """Standard deviation of the particles, Gaussian blobs, in images and in the truth [voxel]."""
 FULL_SCALE = 4095
