@@ -144,7 +144,7 @@ def _measure(plan: Plan, sides: tuple[Side, Side], symmetric: bool, method: str)
     done = 0
     for begin in range(0, plan.count[0], depth):
         end = min(begin + depth, plan.count[0])
-        layers = range(done, (end - 1) * step + plan.block_count[0])
+        layers = range(max(done, begin * step), (end - 1) * step + plan.block_count[0])  # none that no window needs
         done = layers.stop
         for sum_, (a, b) in zip(sums, (sides, sides[::-1]), strict=False):
             if method == "fft":

@@ -221,7 +221,7 @@ def test_the_angle_error_at_a_contrast_lies_between_those_computed():
     assert angles.reached([0.1, 0.11, 0.12, 0.16], 1.2) == pytest.approx(2)
     assert angles.reached([0.1, 0.11, 0.12, 0.14], 1.5) is None
     text = angles.describe({kind: [0.1, 0.11, 0.12, 0.16] for kind in angles.LABELS}, 0.03, 1.1, 1.5, 0.5)
-    assert text.count("from 3.5 degrees") == 3 and "contrast of 2 is not found: 1.10" in text
+    assert text.count("at 3.5 degrees") == 3 and "contrast of 2 is not found: 1.10" in text
 
 
 def test_equal_angle_errors_stretch_the_volume_and_roll_tears_it(tiny):

@@ -168,6 +168,7 @@ def peaks_twin(score, search):
         ((8, 8, 8), (4, 4, 4), (3, 3, 3)),
         ((7, 9, 10), (7, 3, 5), (2, 5, 3)),
         ((16, 16, 16), (16, 8, 8), (4, 4, 4)),
+        ((8, 8, 8), (12, 4, 4), (3, 3, 3)),  # layers of blocks that no window needs, between those of two slabs
         ((12, 12, 8), (6, 4, 2), (3, 2, 6)),  # several blocks along y and x, two parts of the lags along x
         (
             (9, 10, 5),

@@ -64,11 +64,11 @@ def describe(errors: Errors, stretch_voxel: float, contrast: float, goal: float,
     )
     if contrast < goal:
         text += f"The paper's contrast of 2 is not found: {contrast:.2f}. The stretch is too small an error for it. "
-    text += f"At {ppm} ppm the mean error is {goal:g} times that of the right angles "
+    text += f"At {ppm} ppm the mean error grows to {goal:g} times that of the right angles: "
     ends = []
     for kind, label in LABELS.items():
         size = reached(errors[kind], goal)
-        ends.append(f"from {size:.1f} degrees ({label})" if size else f"not even at {SIZES_DEG[-1]} degrees ({label})")
+        ends.append(f"{label}, " + (f"at {size:.1f} degrees" if size else f"not within {SIZES_DEG[-1]} degrees"))
     return text + "; ".join(ends) + ". All this grows with the volume. The network needs none of these angles."
 
 
