@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 
-from lfpiv.lightfield import disc_fraction
 from lfpiv.rig import LensLattice, Optics
-from lfpiv_kernels.footprint_source import LAYER_FALL, LAYERS, SIDE_LAYERS
+from lfpiv_kernels import microimages
 from lfpiv_kernels.microimages import Microimages
 from lfpiv_kernels.raymodel import LANES
 
@@ -60,36 +59,11 @@ def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
     weights that fall or rise outwards.
     """
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
-    edge = microimage_edge(optics)
-    rows, columns = optics.sensor_shape
     first, centre = microimage_centres(optics, lattice, radius + 1)
-    corner = np.floor(centre - radius).astype(np.int32)
-    count = LAYERS * centre[..., 0].size * edge**2
-    pixel, share = np.full(count + LANES, -1, np.int32), np.zeros(count + LANES, np.float32)
-    step = np.arange(edge, dtype=np.int32)
-    pixel_rows, share_rows = (array[:count].reshape(len(centre), LAYERS, -1, edge, edge) for array in (pixel, share))
-    for j in range(len(centre)):  # row by row of lenses: bounds the scratch memory
-        column = corner[j, :, None, None, 0] + step
-        row = corner[j, :, None, None, 1] + step[:, None]
-        seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        if not seen.any():
-            continue
-        offset = np.empty((*seen.shape, 2), np.float32)
-        offset[..., 0] = column + 0.5 - centre[j, :, None, None, 0]
-        offset[..., 1] = row + 0.5 - centre[j, :, None, None, 1]
-        inside = np.where(seen, disc_fraction(offset, radius)[0], 0.0)
-        for layer in range(LAYERS):  # the middle of the part inside lies (1 - inside) / 2 inwards of the pixel's
-            fall = LAYER_FALL * (layer - SIDE_LAYERS)
-            share_rows[j, layer] = inside * (1 + fall * (1 - inside) / 2)
-        pixel_rows[j] = np.where(seen, row * columns + column, -1)
-    return Microimages(
-        first_lens=(int(first[0]), int(first[1])),
-        corner=corner,
-        edge=edge,
-        pixel=pixel,
-        share=share,
-        sensor_shape=(rows, columns),
+    rays: Microimages = microimages.lay_out(
+        (int(first[0]), int(first[1])), centre, radius, microimage_edge(optics), optics.sensor_shape
     )
+    return rays
 
 
 def plain(sensor_shape: tuple[int, int]) -> Microimages:

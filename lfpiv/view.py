@@ -6,6 +6,7 @@ The nominal rig is right only to some degrees and millimetres, so it refuses wha
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from lfpiv.rig import Grid, Optics
 if TYPE_CHECKING:
     from lfpiv.calibration import CalibratedCamera, Calibration
     from lfpiv.settings import Board
+    from lfpiv.weights import Weights
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +34,12 @@ SAMPLES = 8
 """Voxels along each axis that tell how much of a volume a camera sees."""
 FEW = 0.5
 """Part of the volume below which a camera sees so little of it that a warning is due."""
+
+SEEN_SHARE = 0.1
+"""Least sum of a voxel's weights in a camera that sees it, as a share of the largest one in the volume: a tenth of the
+pupil."""
+LEAST_ALONE = 0.01
+"""Part of the volume, seen by fewer than two cameras, above which a warning is due."""
 
 
 def field_mm(optics: Optics) -> np.ndarray:
@@ -115,21 +123,88 @@ def require_seen(path: Path, calibration: Calibration, grid: Grid) -> None:
                 f"{_place(grid)} of which camera {camera.name!r} sees nothing by its calibration. Check "
                 "volume.centre_mm and size_mm against the board's extent."
             )
-        if share < FEW:
-            log.warning("%s: sees only about %.0f %% of the volume", camera.name, 100 * share)
+    for text in sight_warnings(calibration, grid):
+        log.warning("%s", text)
+
+
+def sight_warnings(calibration: Calibration, grid: Grid) -> list[str]:
+    """Say of every calibrated camera that sees less than half of a volume how much it sees, and what two do not see."""
+    sampled = {camera.name: _sees(camera, grid) for camera in calibration.cameras.values()}
+    texts = [
+        f"{name}: sees only about {100 * seen.mean():.0f} % of the volume"
+        for name, seen in sampled.items()
+        if seen.mean() < FEW
+    ]
+    if len(sampled) > 1:
+        texts += _alone(np.sum(list(sampled.values()), 0), _sampled_axes(grid))
+    return texts
 
 
 def seen_share(camera: CalibratedCamera, grid: Grid) -> float:
     """Part of a volume's voxels of which some ray through the pupil meets a camera's sensor, by a sample of them."""
-    axes = [np.unique(np.linspace(0, n - 1, SAMPLES).round().astype(int)) for n in grid.shape]
-    z, y, x = np.meshgrid(*(grid.axis_mm(axis)[index] for axis, index in enumerate(axes)), indexing="ij")
+    return float(_sees(camera, grid).mean())
+
+
+def _sampled_axes(grid: Grid) -> list[np.ndarray]:
+    """Places of some planes of voxels along z, y, x [mm], the outer ones among them."""
+    return [
+        grid.axis_mm(axis)[np.unique(np.linspace(0, n - 1, SAMPLES).round().astype(int))]
+        for axis, n in enumerate(grid.shape)
+    ]
+
+
+def _sees(camera: CalibratedCamera, grid: Grid) -> np.ndarray:
+    """Whether some ray from a voxel through the pupil meets the sensor, for voxels on all of the sampled planes."""
+    z, y, x = np.meshgrid(*_sampled_axes(grid), indexing="ij")
     points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
     half = np.array(camera.optics.sensor_shape[::-1]) * camera.optics.pixel_mm / 2
     seen = np.zeros(len(points), bool)
     for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
         pupil = np.tile(0.9 * camera.optics.pupil_radius_mm * np.array([u, v], float), (len(points), 1))
         seen |= (np.abs(camera.map(points, pupil)) <= half).all(1)
-    return float(seen.mean())
+    return seen.reshape(x.shape)
+
+
+def column_sums(weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+    """Sum the weights of every voxel and count the cameras that see it; warn where but one of several does.
+
+    Returns
+    -------
+    total : ndarray, shape (z, y, x), float32
+        Sum of a voxel's weights over all pixels of all cameras.
+    views : ndarray, shape (z, y, x), uint8
+        Number of cameras in which that sum is above `SEEN_SHARE` of its largest.
+    """
+    total = np.zeros(weights.grid.size, np.float32)
+    views = np.zeros(weights.grid.size, np.uint8)
+    for name, camera in weights.cameras.items():
+        before = total.copy()
+        weights.projector(name).back_project(np.asarray(camera.gain, np.float32).reshape(-1), total)
+        own = total - before
+        views += own > SEEN_SHARE * own.max()
+    views = weights.stored.restore(views)
+    if len(weights.cameras) > 1:
+        for text in _alone(views, [weights.grid.axis_mm(axis) for axis in range(3)]):
+            log.warning("%s", text)
+    return weights.stored.restore(total), views
+
+
+def _alone(views: np.ndarray, axes_mm: Sequence[np.ndarray]) -> list[str]:
+    """Say how much of a volume fewer than two cameras see, and where; `views` counts them at places along z, y, x."""
+    seen = views >= 2
+    if 1 - seen.mean() < LEAST_ALONE:
+        return []
+    where = "none of it is seen by two"
+    if seen.any():
+        reach = []
+        for axis, name in ((2, "x"), (1, "y"), (0, "z")):
+            inside = axes_mm[axis][seen.any(tuple({0, 1, 2} - {axis}))]
+            reach.append(f"{name} {inside[0]:.3g} to {inside[-1]:.3g}")
+        where = f"two see no more than {', '.join(reach)} mm"
+    share = 100 * (1 - seen.mean())
+    return [
+        f"about {share:.0f} % of the volume is seen by fewer than two cameras; vectors there are not valid: {where}"
+    ]
 
 
 def _place(grid: Grid) -> str:

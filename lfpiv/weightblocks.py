@@ -1,8 +1,7 @@
-"""Weights of all voxels of a grid for one camera, as blocks: integrated in closed form, or counted rays (Eq. 10)."""
+"""Weights of voxels for one camera: blocks integrated in closed form, and rays counted in windows of the sensor."""
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -10,13 +9,15 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from lfpiv.raylayout import microimage_edge, plain
+from lfpiv.errors import InputError
+from lfpiv.raylayout import microimage_edge
 from lfpiv.raymodel import fit_rays, grid_models, ray_models
 from lfpiv.rig import Grid
 from lfpiv_kernels import footprint, runtime
-from lfpiv_kernels.lattice import Lattice, cell_frame, cell_rectangles, pack_lattice
+from lfpiv_kernels.lattice import Lattice, cell_frame, cell_steps, pack_lattice
 from lfpiv_kernels.project import Blocks
 from lfpiv_kernels.raymodel import LANES, LEVELS
 from lfpiv_kernels.trace import count_rays
@@ -24,24 +25,22 @@ from lfpiv_kernels.trace import count_rays
 if TYPE_CHECKING:
     from lfpiv.camera import CalibratedCamera
 
-log = logging.getLogger(__name__)
-
 Progress = Callable[[float], None]
+Cuts = tuple[int, int, int]
+"""Parts of a voxel along x, y, z whose footprints are integrated apart and added."""
 
+WHOLE: Cuts = (1, 1, 1)
+"""A voxel in one piece."""
 CHUNK_VOXELS = 16384
 """Voxels whose ray models are held at once."""
 SAMPLED_VOXELS = 1024
 """Voxels from which the memory of all is estimated."""
+MOST_BLOCKS = np.iinfo(np.int32).max
+"""Blocks of a camera at most: their numbers have 32 bits."""
 BLOCK_BYTES, VOXEL_BYTES = 6, 16
 """Memory of a block beside its values, and of a voxel beside its blocks [byte]."""
 COUNT_POINTS = 8
 """Object points per voxel edge: 512 per voxel, the paper has 500."""
-COUNT_SAMPLES = 36
-"""Pupil points per axis when every voxel is counted, about 1,000 per object point."""
-COUNT_CHUNK = 64
-"""Voxels counted at once: each has a window of the sensor."""
-COUNT_TALLEST = 128
-"""Rows of a block of counts at most."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class StoredGrid:
         """Return the stored index of voxel (iz, iy, ix)."""
         return int(np.ravel_multi_index([voxel[axis] for axis in self.order], self.shape))
 
-    def store(self, volume: np.ndarray) -> np.ndarray:
+    def store(self, volume: ArrayLike) -> np.ndarray:
         """Voxels of a (z, y, x) volume in stored order, shape (voxel,), float32, contiguous.
 
         Raises
@@ -115,9 +114,9 @@ class CameraKernels:
     lattice: Lattice
     cell_mm: float
     frame: np.ndarray
-    rectangles: np.ndarray
+    outline: np.ndarray
 
-    def footprints(self, form: str) -> footprint.Footprints:
+    def footprints(self, form: str, cuts: Cuts = WHOLE) -> footprint.Footprints:
         """Return what computes this camera's blocks of a form."""
         return footprint.Footprints(
             self.camera,
@@ -125,8 +124,9 @@ class CameraKernels:
             self.cell_mm,
             self.setup.microimages,
             frame=self.frame,
-            rectangles=self.rectangles,
+            outline=self.outline,
             form=form,
+            cuts=cuts,
         )
 
 
@@ -150,7 +150,7 @@ def pack_camera(camera: CalibratedCamera) -> CameraKernels:
         lattice=pack_lattice(np.asarray(lattice.origin_mm), basis),
         cell_mm=float(cell),
         frame=cell_frame(basis, lattice.layout),
-        rectangles=cell_rectangles(lattice.layout),
+        outline=cell_steps(lattice.layout),
     )
 
 
@@ -180,15 +180,22 @@ def footprint_blocks(
     form: str,
     progress: Progress,
     allow: Callable[[int], None] = lambda _: None,
+    cuts: Cuts = WHOLE,
 ) -> Blocks:
     """Compute the blocks of one camera.
 
     `allow` is called with the memory they will take [byte], known from a sample of the voxels, and may raise.
+
+    Raises
+    ------
+    InputError
+        If there are more blocks than can be numbered: before they are computed.
     """
     size = stored.grid.size
     plane = size // stored.shape[0]
     pack = pack_camera(camera)
-    blocks, values = sample_blocks(pack, stored, form)
+    blocks, values = sample_blocks(pack, stored, form, cuts)
+    require_numbers(size * blocks, stored.grid.shape)
     allow(int(size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)))
     outer, middle, inner = (2 - axis for axis in stored.order)
     planes = grid_models(camera, stored.shape, stored.positions_mm, (outer, middle, inner))
@@ -200,18 +207,32 @@ def footprint_blocks(
                 yield np.concatenate(list(islice(planes, step)))
                 progress(min(first + step, stored.shape[0]) / stored.shape[0])
 
-    return blocks_of(pack, batches(), form, (int(size * blocks), int(size * values)))
+    return blocks_of(pack, batches(), form, (int(size * blocks), int(size * values)), cuts)
 
 
-def sample_blocks(pack: CameraKernels, stored: StoredGrid, form: str) -> tuple[float, float]:
+def require_numbers(blocks: float, shape: tuple[int, ...]) -> None:
+    """Refuse more blocks than 32-bit numbers can tell apart."""
+    if blocks > MOST_BLOCKS:
+        voxels = " x ".join(map(str, shape))
+        raise InputError(
+            f"volume: the weights of {voxels} voxels on one camera need {blocks:.2g} blocks, but "
+            f"{MOST_BLOCKS:.2g} can be numbered. Raise volume.voxel_mm, or shrink volume.size_mm."
+        )
+
+
+def sample_blocks(pack: CameraKernels, stored: StoredGrid, form: str, cuts: Cuts = WHOLE) -> tuple[float, float]:
     """Blocks and values per voxel, from a sample of a grid's voxels."""
     sample = np.unique(np.linspace(0, stored.grid.size - 1, SAMPLED_VOXELS).astype(np.int64))
     model = ray_models(pack.setup, stored.centres_mm(sample), stored.grid.voxel_mm)
-    blocks, values = (np.concatenate(counts) for counts in zip(*pack.footprints(form).compute(model), strict=True))
+    blocks, values = (
+        np.concatenate(counts) for counts in zip(*pack.footprints(form, cuts).compute(model), strict=True)
+    )
     return float(blocks.mean()), float(values.mean())
 
 
-def blocks_of(pack: CameraKernels, models: Iterable[np.ndarray], form: str, expected: tuple[int, int]) -> Blocks:
+def blocks_of(
+    pack: CameraKernels, models: Iterable[np.ndarray], form: str, expected: tuple[int, int], cuts: Cuts = WHOLE
+) -> Blocks:
     """Compute the blocks of voxels from their ray models, batch by batch.
 
     Parameters
@@ -224,8 +245,10 @@ def blocks_of(pack: CameraKernels, models: Iterable[np.ndarray], form: str, expe
         Form of the blocks.
     expected : tuple of int
         Blocks and values to be expected: what is reserved at first.
+    cuts : tuple of int
+        Parts of the voxels, where the form is "pixels".
     """
-    footprints = pack.footprints(form)
+    footprints = pack.footprints(form, cuts)
     blocks, values = (int(1.02 * count) + LANES for count in expected)
     ray, height, width = (_Growing(dtype, blocks) for dtype in (np.int32, np.uint8, np.uint8))
     value = _Growing(np.uint8, values)
@@ -241,6 +264,7 @@ def blocks_of(pack: CameraKernels, models: Iterable[np.ndarray], form: str, expe
     first_block, first_value = (
         np.concatenate([[0], *(count[k] for count in counts)]).cumsum(dtype=np.int64) for k in range(2)
     )
+    require_numbers(first_block[-1], (len(first_block) - 1,))
     return Blocks(
         form=form,
         first_block=first_block.astype(np.int32),
@@ -255,7 +279,13 @@ def blocks_of(pack: CameraKernels, models: Iterable[np.ndarray], form: str, expe
 
 
 def count_voxels(
-    camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float, *, samples: int, seed: int = 0
+    camera: CalibratedCamera,
+    centres_mm: np.ndarray,
+    voxel_mm: float,
+    *,
+    samples: int,
+    points: int = COUNT_POINTS,
+    seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Trace rays from stratified points in voxels and count them per pixel (Eq. 10).
 
@@ -269,6 +299,8 @@ def count_voxels(
         Voxel edge [mm].
     samples : int
         Pupil points per axis.
+    points : int
+        Object points per voxel edge.
     seed : int
         Seed of the positions inside the strata.
 
@@ -284,10 +316,10 @@ def count_voxels(
     runtime.device()
     rng = np.random.default_rng(seed)
     pack, optics = pack_camera(camera), camera.optics
-    strata = np.stack(np.meshgrid(*[np.arange(COUNT_POINTS)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    inside = (strata + rng.random((len(centres_mm), len(strata), 3))) / COUNT_POINTS - 0.5
-    points = (np.asarray(centres_mm)[:, None] + inside * voxel_mm).reshape(-1, 3)
-    rays = fit_rays(camera, points, degree=3)
+    strata = np.stack(np.meshgrid(*[np.arange(points)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    inside = (strata + rng.random((len(centres_mm), len(strata), 3))) / points - 0.5
+    objects = (np.asarray(centres_mm)[:, None] + inside * voxel_mm).reshape(-1, 3)
+    rays = fit_rays(camera, objects, degree=3)
     # the window: where the rays of a voxel meet the array, one lens and one microimage around it
     radius = optics.pupil_radius_mm
     corner = rays.reshape(len(centres_mm), len(strata), 2, -1)
@@ -301,7 +333,7 @@ def count_voxels(
     columns, rows = (np.ceil(high).astype(int) - first_pixel).max(0) + 1
     count, total = count_rays(
         rays,
-        rng.random((len(points), 2)).astype(np.float32),
+        rng.random((len(objects), 2)).astype(np.float32),
         np.repeat(np.arange(len(centres_mm), dtype=np.int32), len(strata)),
         first_pixel,
         pack.camera,
@@ -313,68 +345,37 @@ def count_voxels(
     return count, total, first_pixel
 
 
-def count_blocks(stored: StoredGrid, camera: CalibratedCamera, progress: Progress) -> Blocks:
-    """Count the rays of every voxel and pack the counts into blocks."""
-    rays, size = plain(camera.optics.sensor_shape), stored.grid.size
-    log.warning("%s: counting rays for %d voxels; 'footprint' is about a thousand times faster", camera.name, size)
-    parts = []
-    for first in range(0, size, COUNT_CHUNK):
-        last = min(first + COUNT_CHUNK, size)
-        counts, total, corner = count_voxels(
-            camera, stored.centres_mm(np.arange(first, last)), stored.grid.voxel_mm, samples=COUNT_SAMPLES, seed=first
-        )
-        parts.append(_pack_windows(counts / total[:, None, None], corner, camera.optics.sensor_shape, rays.edge))
-        progress(last / size)
-    blocks, rows, ray, height, value, scale = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return Blocks(
-        form="pixels",
-        first_block=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
-        first_value=np.concatenate([[0], LANES * np.cumsum(rows)]).astype(np.int64),
-        ray=ray,
-        height=height,
-        width=np.full(len(ray), LANES, np.uint8),
-        value=np.append(value, np.zeros(LANES, np.uint8)),
-        scale=scale,
-        microimages=rays,
-    )
+def largest_weight(blocks: Blocks) -> float:
+    """Largest weight of a ray: of a pixel, where it is not reached through two lenses."""
+    order = 2 if blocks.form == "profiles" else 1
+    share = blocks.microimages.share
+    bound = blocks.scale.astype(np.float64) * LEVELS**order * share.max(initial=0.0)
+    best = 0.0
+    firsts = np.arange(0, len(bound), CHUNK_VOXELS)
+    for first in firsts[np.argsort(-np.maximum.reduceat(bound, firsts))] if len(firsts) else ():
+        last = min(first + CHUNK_VOXELS, len(bound))
+        if bound[first:last].max() <= best:
+            break
+        bound[first:last] *= _levels(blocks, first, last) / LEVELS**order
+        for voxel in first + np.argsort(-bound[first:last]):
+            if bound[voxel] <= best:
+                break
+            ray, weight = blocks.entries(int(voxel))
+            best = max(best, float((weight * share[ray]).max(initial=0.0)))
+    return best
 
 
-def _pack_windows(
-    windows: np.ndarray, corner: np.ndarray, sensor_shape: tuple[int, int], stride: int
-) -> tuple[np.ndarray, ...]:
-    """Pack windows of weights, shape (voxel, rows, columns), into blocks of one column of tiles each.
-
-    Returns blocks and rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
-    """
-    lanes = LANES
-    row = corner[:, 1, None] + np.arange(windows.shape[1])
-    column = corner[:, 0, None] + np.arange(windows.shape[2])
-    seen = ((row >= 0) & (row < sensor_shape[0]))[:, :, None] & ((column >= 0) & (column < sensor_shape[1]))[:, None]
-    windows = np.where(seen, windows, 0.0)
-    windows = np.pad(windows, ((0, 0), (0, 0), (0, -windows.shape[2] % lanes)))
-    tiles = windows.reshape(*windows.shape[:2], -1, lanes).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
-    scale = tiles.max((1, 2, 3)) / LEVELS
-    lit = tiles.any(-1)
-    place = np.arange(lit.shape[2]) % COUNT_TALLEST
-    starts = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (1, 0)))[:, :, :-1] & (place > 0)))
-    ends = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (0, 1)))[:, :, 1:] & (place < COUNT_TALLEST - 1)))
-    voxel, tile, first = starts.T
-    # a tile may begin left of the sensor: its block's pixel then lies at the end of the row above, where weights are 0
-    pixel = (corner[voxel, 1] + first) * stride + corner[voxel, 0] + tile * lanes
-    unit = np.where(scale > 0, scale, 1.0)
-    value = np.rint(tiles[lit] / unit[np.nonzero(lit)[0], None]).astype(np.uint8)
-    shift = np.maximum(-pixel, 0)  # above the sensor's first pixel: move the block's lanes instead
-    if shift.any():
-        rows_of = np.repeat(shift, ends[:, 2] - first + 1)
-        for amount in np.unique(rows_of[rows_of > 0]):
-            some = rows_of == amount
-            value[some] = np.roll(value[some], -amount, axis=1)
-        pixel = pixel + shift
-    return (
-        np.bincount(voxel, minlength=len(windows)),
-        np.bincount(voxel, weights=ends[:, 2] - first + 1, minlength=len(windows)).astype(np.int64),
-        pixel.astype(np.int32),
-        (ends[:, 2] - first + 1).astype(np.uint8),
-        value,
-        scale.astype(np.float32),
-    )
+def _levels(blocks: Blocks, first: int, last: int) -> np.ndarray:
+    """Largest level of each voxel from `first` to `last`; of profiles the product of two."""
+    some = slice(blocks.first_block[first], blocks.first_block[last])
+    width, height = (array[some].astype(np.int64) for array in (blocks.width, blocks.height))
+    largest = np.zeros(last - first)
+    if not len(width):
+        return largest
+    profiles = blocks.form == "profiles"
+    sizes = np.stack([width, height], axis=1).ravel() if profiles else width * height
+    level = blocks.value[blocks.first_value[first] : blocks.first_value[last]]
+    tops = np.maximum.reduceat(level, np.cumsum(sizes) - sizes).astype(float)
+    of_voxel = np.repeat(np.arange(last - first), np.diff(blocks.first_block[first : last + 1]))
+    np.maximum.at(largest, of_voxel, tops[::2] * tops[1::2] if profiles else tops)
+    return largest

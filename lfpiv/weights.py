@@ -11,28 +11,30 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.rig import Grid
+from lfpiv.view import column_sums
+from lfpiv.voxelgrid import in_order
 from lfpiv.weightblocks import (
     BLOCK_BYTES,
     CHUNK_VOXELS,
     VOXEL_BYTES,
+    Cuts,
     StoredGrid,
-    count_blocks,
     count_voxels,
     footprint_blocks,
+    largest_weight,
     pack_camera,
     sample_blocks,
 )
-from lfpiv.weightcheck import CountedVoxels, add_entries, add_window, profiles_serve
+from lfpiv.weightcheck import Choice, CountedVoxels, add_entries, add_window, choose_cuts, choose_form, count_blocks
 from lfpiv_kernels import footprint, runtime
 from lfpiv_kernels.project import Blocks, Projector
-from lfpiv_kernels.raymodel import LEVELS, MODEL_SIZE
+from lfpiv_kernels.raymodel import MODEL_SIZE
 
 if TYPE_CHECKING:
     from lfpiv.camera import CalibratedCamera, Calibration
@@ -54,6 +56,9 @@ class Weights:
     Made by `build_weights`. ``weights(volume)`` returns a dict camera -> image, ``weights.T(images)`` a volume.
     """
 
+    _views: np.ndarray | None = None
+    _largest: float | None = None
+
     def __init__(
         self,
         cameras: Mapping[str, CalibratedCamera],
@@ -69,6 +74,8 @@ class Weights:
         self.stored = StoredGrid.for_cameras(grid, self.cameras.values())
         self.forms: dict[str, str] = {}
         """Camera name -> form in which its weights are stored."""
+        self.cuts: dict[str, Cuts] = {}
+        """Camera name -> parts of a voxel along x, y, z whose footprints were added."""
         self.profile_errors: dict[str, list[float]] = {}
         """Camera name -> difference of profiles from counted rays, where these decided the form."""
         self._asked, self._limit_bytes = form, limit_bytes
@@ -116,7 +123,7 @@ class Weights:
         ValueError
             If a shape does not fit the grid or the sensors.
         """
-        flat = self.stored.store(volume)
+        flat = self.stored.store(in_order(volume, "volume"))
         images = {}
         for name, camera in self.cameras.items():
             projector = self.projector(name)
@@ -164,9 +171,16 @@ class Weights:
     def column_sum(self) -> np.ndarray:
         """Sum of each voxel's weights over all pixels of all cameras, shape (z, y, x), float32."""
         if self._column_sum is None:
-            ones = {name: np.ones(camera.optics.sensor_shape, np.float32) for name, camera in self.cameras.items()}
-            self._column_sum = self.T(ones)
+            self._column_sum, self._views = column_sums(self)
         return self._column_sum
+
+    @property
+    def views(self) -> np.ndarray:
+        """Number of cameras that see each voxel, shape (z, y, x), uint8."""
+        if self._views is None:
+            total, self._views = column_sums(self)
+            self._column_sum = total if self._column_sum is None else self._column_sum
+        return self._views
 
     @property
     def affected_pixels(self) -> np.ndarray:
@@ -182,12 +196,14 @@ class Weights:
 
     @property
     def largest(self) -> float:
-        """Largest weight of all (Eq. 5 is scaled by it)."""
-        self._build()
-        return max(
-            float(blocks.scale.max()) * LEVELS ** (2 if blocks.form == "profiles" else 1)
-            for blocks in (projector.blocks for projector in self._projectors.values())
-        )
+        """Largest weight of all, which Eq. 5 is scaled by; white-image gain left out.
+
+        That of a pixel that a voxel reaches through two lenses counts as two.
+        """
+        if self._largest is None:
+            self._build()
+            self._largest = max(largest_weight(projector.blocks) for projector in self._projectors.values())
+        return self._largest
 
     @property
     def memory_bytes(self) -> int:
@@ -216,66 +232,50 @@ class Weights:
         if len(self._projectors) == len(self.cameras):
             return
         runtime.device()
-        with ThreadPoolExecutor(1) as ahead:  # the next camera's rays are laid out while this one's kernels run
-            asked = self.cameras.values() if self.method == "footprint" else ()
-            laid_out = [ahead.submit(getattr, camera, "microimages") for camera in asked]
-            for number, name in enumerate(self.cameras):
+        for number, name in enumerate(self.cameras):
 
-                def step(fraction: float, number: int = number) -> None:
-                    if progress is not None:
-                        progress((number + fraction) / len(self.cameras))
+            def step(fraction: float, number: int = number) -> None:
+                if progress is not None:
+                    progress((number + fraction) / len(self.cameras))
 
-                if laid_out:
-                    laid_out[number].result()
-                self._projectors[name] = Projector(self._blocks(name, step))
+            self._projectors[name] = Projector(self._blocks(name, step))
 
     def _blocks(self, name: str, progress: Progress) -> Blocks:
         camera = self.cameras[name]
         if self.method == "count":
             return count_blocks(self.stored, camera, progress)
-        self.forms[name] = self._choose(name, camera)
-        return footprint_blocks(self.stored, camera, self.forms[name], progress, self._allow(name))
+        choice = self._choose(name, camera)
+        self.forms[name], self.cuts[name] = choice.form, choice.cuts
+        return footprint_blocks(self.stored, camera, choice.form, progress, self._allow(name), choice.cuts)
 
     def _allow(self, name: str) -> Callable[[int], None]:
         """Check of one camera's memory before it is taken."""
+        form, errors, other = self.forms[name], self.profile_errors.get(name), ""
+        if errors and form == "pixels":
+            other = f", or set compute.weights_form to 'profiles', {100 * np.mean(errors):.0f} % from counted rays here"
+        what = f"{' x '.join(map(str, self.grid.shape))} voxels (z, y, x) on camera {name!r}"
 
         def allow(needed: int) -> None:
             left = self._limit_bytes - self.memory_bytes
             if needed > left:
-                errors = self.profile_errors.get(name)
-                other = (
-                    f", or set compute.weights_form to 'profiles', {100 * np.mean(errors):.0f} % from counted rays here"
-                    if errors and self.forms[name] == "pixels"
-                    else ""
-                )
-                shape = " x ".join(map(str, self.grid.shape))
                 raise InputError(
-                    f"volume: the weights of {shape} voxels (z, y, x) on camera {name!r} "
-                    f"need {needed / 2**30:.1f} GiB as {self.forms[name]}, {max(left, 0) / 2**30:.1f} GiB are left. "
-                    f"Raise volume.voxel_mm, shrink volume.size_mm{other}."
+                    f"volume: the weights of {what} need {needed / 2**30:.1f} GiB as {form}, "
+                    f"{max(left, 0) / 2**30:.1f} GiB are left. Raise volume.voxel_mm, shrink volume.size_mm{other}."
                 )
 
         return allow
 
-    def _choose(self, name: str, camera: CalibratedCamera) -> str:
+    def _choose(self, name: str, camera: CalibratedCamera) -> Choice:
         """Form of a camera's weights: profiles where counted rays say that they serve."""
-        if self._asked != "auto":
-            return self._asked
-        if camera.lattice.layout != "square":
-            log.info("%s: weights pixel by pixel: profiles need a square microlens layout", name)
-            return "pixels"
-        errors = self.counted(name).errors_of_form("profiles", self.grid.voxel_mm)
-        self.profile_errors[name] = errors
-        form = "profiles" if profiles_serve(errors) else "pixels"
-        if errors:
-            log.info(
-                "%s: profiles differ from counted rays by %.1f %% (worst voxel %.1f %%): weights %s",
-                name,
-                100 * np.mean(errors),
-                100 * max(errors),
-                "as products of profiles" if form == "profiles" else "pixel by pixel",
-            )
-        return form
+        if self._asked == "profiles":
+            return Choice(form="profiles")
+        if self._asked == "pixels" or camera.lattice.layout != "square":
+            if self._asked == "auto":
+                log.info("%s: weights pixel by pixel: profiles need a square microlens layout", name)
+            return Choice(form="pixels", cuts=choose_cuts(self.stored, camera))
+        choice = choose_form(self.counted(name))
+        self.profile_errors[name] = choice.profile_errors
+        return choice
 
 
 class Adjoint:
@@ -394,9 +394,14 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     """Relative L2 difference of stored weights from counted rays, for a few random voxels of every camera.
 
-    Returns camera name -> one figure per voxel that the camera sees; the count's own noise is subtracted.
+    Returns camera name -> one figure per voxel that the camera sees; the count's own noise is subtracted. Warns where
+    weights whose form the counts did not choose are further from them than aimed at.
     """
-    return {name: weights.counted(name).errors(weights.projector(name).blocks) for name in weights.cameras}
+    errors = {name: weights.counted(name).errors(weights.projector(name).blocks) for name in weights.cameras}
+    for name, some in errors.items():
+        if name not in weights.profile_errors and weights.method == "footprint":
+            weights.counted(name).warn(weights.forms[name], some, asked=True)
+    return errors
 
 
 def _checked_image(images: Mapping[str, np.ndarray], name: str, camera: CalibratedCamera) -> np.ndarray:

@@ -8,25 +8,29 @@ through the centre of its lens at P = -(X - c (1 + r)) / r, r = f_m/s_i (Eq. 9 s
 - the ray's offset from the lens centre is g = (I - K)^-1 ((s, t)(P) - c): moving it by g moves the pupil point too;
 - the pixel's cell on the pupil has the area h^2 |det (I - K)^-1|, h the pixel's width on the pupil;
 - g is smeared by the voxel's three projected edges and by the pixel's cell: boxes, of which along each lattice axis the
-  widest stays a box and the others become one box of the same variance. The axes are taken as independent: the
-  projection of a cube has the same variance in all directions and no covariance, whatever the camera's angles;
+  widest stays a box and the others become one box of the same variance. The axes are taken as independent, which they
+  are where every edge lies along one of them: where a camera is upright to its array. The projection of a cube has no
+  covariance at any angle, but that is not enough: cut into parts, as below, it is integrated at any angle;
 - the weight is amplitude x probability that the smeared g lies in the lens's cell. How much of the pixel lies inside
   the pupil is the ray's own share, see ``microimages``.
 
 Two forms of the same integral: "pixels" follows the slopes and the offset pixel by pixel; "profiles" takes them as
 linear and without cross terms under a lens, so that a square cell's weights are the product of a profile along the
-columns and one along the rows (rank 1), a third of the memory. Blocks are at most LANES pixels wide, one vector load,
+columns and one along the rows (rank 1), a third of the memory. Pixels may add up the footprints of parts of the voxel,
+cut along x, y, z: what is not independent within a part, its fourth-order moments, falls with the fourth power of its
+size. It takes time for every part, and no more memory. Blocks are at most LANES pixels wide, one vector load,
 and end where the weights round to zero or the pupil ends. The computation is C++ on vectors of lenses and of pixels
 (``raymodel``): Taichi's loops took four times as long. Twin: ``reference.footprint``; source: ``footprint_source``.
 """
 
+import math
 import sys
 
 import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.footprint_source import FILL, MEASURE, PACK
+from lfpiv_kernels.footprint_source import FILL, MEASURE, MOST_PARTS, PACK
 from lfpiv_kernels.raymodel import GEOMETRY_SIZE, Camera
 
 wp.set_module_options(
@@ -58,6 +62,7 @@ def _measure(
     lenses: wp.vec4i,
     corners: wp.array(dtype=int),
     profiles: bool,
+    cuts: wp.vec3i,
     voxel: int,
     blocks_out: wp.array(dtype=int),
     bytes_out: wp.array(dtype=int),
@@ -70,10 +75,11 @@ def _fill(
     geometry: wp.array(dtype=float),
     lenses: wp.vec4i,
     corners: wp.array(dtype=int),
-    rectangles: wp.array(dtype=float),
-    rectangle_count: int,
+    outline: wp.array(dtype=float),
+    steps: int,
     square: bool,
     profiles: bool,
+    cuts: wp.vec3i,
     voxel: int,
     first_block: wp.array(dtype=int),
     first_value: wp.array(dtype=int),
@@ -115,12 +121,13 @@ def _measure_blocks(
     lenses: wp.vec4i,
     corners: wp.array(dtype=int),  # (lens along j, lens along i, 2), flat
     profiles: bool,
+    cuts: wp.vec3i,
     # out
     blocks_out: wp.array(dtype=int),
     bytes_out: wp.array(dtype=int),
 ):
     voxel = first_voxel + wp.tid()
-    _measure(model, geometry, lenses, corners, profiles, voxel, blocks_out, bytes_out)
+    _measure(model, geometry, lenses, corners, profiles, cuts, voxel, blocks_out, bytes_out)
 
 
 @wp.kernel
@@ -131,10 +138,11 @@ def _fill_blocks(
     geometry: wp.array(dtype=float),
     lenses: wp.vec4i,
     corners: wp.array(dtype=int),
-    rectangles: wp.array(dtype=float),  # (rectangle, 4), flat
-    rectangle_count: int,
+    outline: wp.array(dtype=float),  # of a lens's cell, (step, 2), flat
+    steps: int,
     square: bool,
     profiles: bool,
+    cuts: wp.vec3i,  # parts of a voxel along x, y, z
     first_block: wp.array(dtype=int),  # room for each voxel's blocks and values, (voxel + 1,)
     first_value: wp.array(dtype=int),
     # out
@@ -148,8 +156,8 @@ def _fill_blocks(
 ):
     voxel = first_voxel + wp.tid()
     _fill(
-        model, geometry, lenses, corners, rectangles, rectangle_count, square, profiles, voxel, first_block,
-        first_value, ray_out, height_out, width_out, value_out, scale_out, blocks_out, bytes_out,
+        model, geometry, lenses, corners, outline, steps, square, profiles, cuts, voxel,
+        first_block, first_value, ray_out, height_out, width_out, value_out, scale_out, blocks_out, bytes_out,
     )  # fmt: skip
 
 
@@ -190,20 +198,24 @@ class Footprints:
         Half extent of a lens's cell along s and t [mm].
     microimages : Microimages
         How the rays lie in memory.
-    frame, rectangles
-        The lens's cell, from ``lattice.cell_frame`` and ``lattice.cell_rectangles``.
+    frame, outline
+        The lens's cell, from ``lattice.cell_frame`` and ``lattice.cell_steps``.
     form : {"profiles", "pixels"}
         See `FORMS`.
+    cuts : tuple of int
+        Parts of a voxel along x, y, z whose footprints are added, at most `MOST_PARTS` in all; profiles have one.
 
     Raises
     ------
     ValueError
-        If profiles are asked for a cell of several rectangles.
+        If profiles are asked for a cell that is not a square, or for too many parts.
     """
 
-    def __init__(self, camera, lattice, cell_mm, microimages, *, frame, rectangles, form):
-        if form == "profiles" and len(rectangles) != 1:
+    def __init__(self, camera, lattice, cell_mm, microimages, *, frame, outline, form, cuts=(1, 1, 1)):
+        if form == "profiles" and len(outline) != 1:
             raise ValueError("form: profiles need a square microlens layout; use 'pixels' for a hexagonal one.")
+        if not 1 <= math.prod(cuts) <= MOST_PARTS or (form == "profiles" and math.prod(cuts) > 1):
+            raise ValueError(f"cuts: expected at most {MOST_PARTS} parts, one for profiles, got {tuple(cuts)}.")
         self._device = runtime.device()
         geometry = np.concatenate(
             [camera.to_numpy(), lattice.to_numpy(), [cell_mm], np.ravel(frame)], dtype=np.float32, casting="same_kind"
@@ -215,8 +227,9 @@ class Footprints:
             wp.vec4i(*microimages.first_lens, columns, rows),
             self._put(microimages.corner.ravel()),
         ]
-        self._cell = [self._put(np.ravel(rectangles)), len(rectangles), len(rectangles) == 1]
+        self._cell = [self._put(np.ravel(outline)), len(outline), len(outline) == 1]
         self._profiles = form == "profiles"
+        self._cuts = wp.vec3i(*cuts)
         self._scratch: dict[str, wp.array] = {}
         wp.load_module(sys.modules[__name__], device=self._device.warp)  # before threads use it
 
@@ -235,7 +248,9 @@ class Footprints:
         """
         model = np.ascontiguousarray(model, np.float32)
         room = [wp.empty(len(model), dtype=int, device=self._device.warp) for _ in range(2)]
-        self._launch(_measure_blocks, len(model), [self._put(model.ravel()), *self._rays, self._profiles], room)
+        self._launch(
+            _measure_blocks, len(model), [self._put(model.ravel()), *self._rays, self._profiles, self._cuts], room
+        )
         blocks, values = (most.numpy() for most in room)
         edges = np.flatnonzero(np.diff(np.cumsum(values, dtype=np.int64) // SCRATCH_BYTES)) + 1
         for first, last in zip([0, *edges], [*edges, len(model)], strict=True):
@@ -255,7 +270,7 @@ class Footprints:
         self._launch(
             _fill_blocks,
             len(model),
-            [self._put(model.ravel()), *self._rays, *self._cell, self._profiles, *self._room],
+            [self._put(model.ravel()), *self._rays, *self._cell, self._profiles, self._cuts, *self._room],
             [*self._blocks, self._scale, *counts],
         )
         self._counts = [count.numpy() for count in counts]

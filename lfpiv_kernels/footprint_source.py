@@ -1,6 +1,6 @@
 """C++ of the area-integrated weights: how much room a voxel's blocks need, and the blocks; see ``footprint``."""
 
-from lfpiv_kernels.raymodel import LANES, LEVELS, RAYS, VECTORS
+from lfpiv_kernels.raymodel import LANES, LEVELS, RAYS, SMEARS, VECTORS
 
 SIDE_LAYERS = 1
 """Versions of a microimage to either side of the plain one, for weights that fall or rise outwards at its edge."""
@@ -13,6 +13,10 @@ TALLEST = 64
 """Rows of a block at most."""
 RIM = 0.05
 """Width around the pupil within which a pixel still counts as touching it [pixel]: more than its share's rounding."""
+MOST_PARTS = 64
+"""Parts of a voxel at most."""
+MOST_STEPS = 8
+"""Steps of a cell's outline at most."""
 
 
 def _source(text: str) -> str:
@@ -26,9 +30,11 @@ def _source(text: str) -> str:
         ("LEVELS", f"{LEVELS}f"),
         ("HEADROOM", f"{HEADROOM}f"),
         ("RIM", f"{RIM}f"),
+        ("MOST_PARTS", MOST_PARTS),
+        ("MOST_STEPS", MOST_STEPS),
     ):
         text = text.replace(f"@{name}", str(value))
-    return VECTORS + RAYS + text
+    return VECTORS + RAYS + SMEARS + text
 
 
 MEASURE = _source("""
@@ -85,34 +91,11 @@ FILL = _source("""
         put(lane_row, k, (float)(k / 8));
     }
 
-    // widest smear times the probability that a position, `away` from the middle and smeared, lies within half a pitch:
-    // a trapezium, smoothed by the narrower smear; `smeared` is given what depends on the smears alone
-    auto ramp = [&](auto x, auto narrow, auto bend) {  // integral of a step smoothed by `narrow`, which ends at x = 0
-        const decltype(x) above = most(x, decltype(x){}), bent = least(above, decltype(x){} + narrow);
-        return above + bent * (bent * bend - 1.0f);
-    };
-    auto trapezium = [&](auto away, auto wide, auto narrow) {
-        const auto outer = 0.5f * (1.0f + wide + narrow), inner = 0.5f * (size(1.0f - wide) + narrow);
-        const auto bend = 0.5f / narrow, x = size(away);
-        return ramp(outer - x, narrow, bend) - ramp(inner - x, narrow, bend)
-            - ramp(narrow - inner - x, narrow, bend);
-    };
-    struct smear { float outer, inner, wide, narrow, bend; };
-    auto smeared = [&](V away, const smear& e) {
-        const V x = size(away);
-        V y = ramp(e.outer - x, e.narrow, e.bend) - ramp(e.inner - x, e.narrow, e.bend);
-        if (e.narrow > e.inner) y -= ramp(e.narrow - e.inner - x, e.narrow, e.bend);
-        return y;
-    };
-    auto below = [&](V x, const smear& e) {  // widest smear times the probability that a smeared 0 lies below x
-        const float half = 0.5f * e.wide, rise = 0.5f * e.narrow;
-        return ramp(x + (half + rise), e.narrow, e.bend) - ramp(x + (rise - half), e.narrow, e.bend);
-    };
     // about a pupil point, in the lens's frame (a, b) [pitch]: the turn of offsets from the lens, the change from pixel
-    // to pixel, the smears (widest along a, b, narrower along a, b), the pixel's area on the pupil
-    auto local_frame = [&](auto u, auto v, const auto* k, auto* turn, auto* step, auto* smears) {
+    // to pixel, the voxel's edges along a, then b, the smears' widths, the pixel's area on the pupil
+    auto local_frame = [&](auto u, auto v, const auto* k, auto* turn, auto* step, auto* edge, auto* smears) {
         auto s = u, t = v;
-        decltype(s) less[4] = {1.0f - k[0], -k[1], -k[2], 1.0f - k[3]}, jacobian[4], edge[2][3];
+        decltype(s) less[4] = {1.0f - k[0], -k[1], -k[2], 1.0f - k[3]}, jacobian[4];
         const auto area = size(invert(less, jacobian));
         for (int n = 0; n < 2; ++n) for (int c = 0; c < 2; ++c)
             turn[2 * n + c] = frame[2 * n] * jacobian[c] + frame[2 * n + 1] * jacobian[2 + c];
@@ -120,20 +103,28 @@ FILL = _source("""
             step[2 * n + c] = (turn[2 * n] * k[c] + turn[2 * n + 1] * k[2 + c]) * pupil_pixel;
         for (int axis = 0; axis < 3; ++axis) {
             voxel_edge(axis, u, v, s, t);
-            for (int n = 0; n < 2; ++n) edge[n][axis] = turn[2 * n] * s + turn[2 * n + 1] * t;
+            for (int n = 0; n < 2; ++n) edge[3 * n + axis] = turn[2 * n] * s + turn[2 * n + 1] * t;
         }
-        for (int n = 0; n < 2; ++n) {
-            const auto* e = edge[n];
-            two_widths(e[0], e[1], e[2], step[2 * n], step[2 * n + 1], smears[n], smears[2 + n]);
-        }
+        smear_widths(edge, step, smears);
         return area;
     };
 
     // what one level stands for: the largest value, from the smears and the area at the pupil's centre
-    float top_turn[4], top_step[4], top[4];
-    const float top_area = @HEADROOM * local_frame(0.0f, 0.0f, centre_slope, top_turn, top_step, top);
-    const float top_a = @HEADROOM * trapezium(0.0f, top[0], top[2]) / top[0];
-    const float top_b = @HEADROOM * trapezium(0.0f, top[1], top[3]) / top[1];
+    float top_turn[4], top_step[4], top_edge[6], top[4];
+    const float top_area = @HEADROOM * local_frame(0.0f, 0.0f, centre_slope, top_turn, top_step, top_edge, top);
+    float top_a = @HEADROOM * trapezium(0.0f, top[0], top[2]) / top[0];
+    float top_b = @HEADROOM * trapezium(0.0f, top[1], top[3]) / top[1];
+    if (parts > 1) {
+        const float* e = top_edge;
+        float sum = 0.0f, of_part[6];
+        for (int n = 0; n < 6; ++n) of_part[n] = e[n];
+        cut_edges(of_part);
+        smear_widths(of_part, top_step, top);
+        for (int part = 0; part < parts; ++part)
+            sum += trapezium(middle_of_part(part, e[0], e[1], e[2]), top[0], top[2])
+                * trapezium(middle_of_part(part, e[3], e[4], e[5]), top[1], top[3]);
+        top_a = @HEADROOM * @HEADROOM * sum / (parts * top[0] * top[1]), top_b = 1.0f;
+    }
     const float amplitude = pupil_pixel * pupil_pixel / (3.14159265f * radius * radius);
     const float top_level = profiles ? @LEVELS * @LEVELS : @LEVELS;
     scale_out.data[voxel] = reached > 0 ? amplitude * top_area * top_a * top_b / top_level : 0.0f;
@@ -166,9 +157,9 @@ FILL = _source("""
         // per lens: what its pixels need, about the middle of their box
         const V columns = box[1] - box[0] + 1.0f, rows = box[3] - box[2] + 1.0f, none = V{};
         const V middle_column = 0.5f * (columns - 1.0f), middle_row = 0.5f * (rows - 1.0f);
-        V k[4], turn[4], step[4], smears[4], s, t;
+        V k[4], turn[4], step[4], edge[6], smears[4], part_smears[4], s, t;
         slope(middle[0], middle[1], k);
-        const V area = local_frame(middle[0], middle[1], k, turn, step, smears);
+        const V area = local_frame(middle[0], middle[1], k, turn, step, edge, smears);
         // the pixel's pupil point is linear in its column and row
         const V u0 = ((1.0f + r) * centre_s - (box[0] + (0.5f - half_columns)) * pixel) / r;
         const V v0 = ((1.0f + r) * centre_t - (box[2] + (0.5f - half_rows)) * pixel) / r;
@@ -177,16 +168,23 @@ FILL = _source("""
         s -= centre_s, t -= centre_t;
         enum { COLUMNS, FIRST_COLUMN, FIRST_ROW, COLUMN, ROW, SMEAR_A, SMEAR_B = SMEAR_A + 5, TO_A = SMEAR_B + 5, TO_B,
                AT_A, AT_B, STEP_A, STEP_B,  // of profiles
-               OFFSET_S = TO_B + 1, OFFSET_T, SLOPE, FRAME = SLOPE + 4, PARAMETERS = FRAME + 4 };  // of pixels
+               OFFSET_S = TO_B + 1, OFFSET_T, SLOPE, FRAME = SLOPE + 4, EDGE = FRAME + 4,  // of pixels
+               PARAMETERS = EDGE + 6 };
         V lens_value[PARAMETERS];
         lens_value[COLUMNS] = lit ? columns : none;
         lens_value[FIRST_COLUMN] = box[0], lens_value[FIRST_ROW] = box[2];
         lens_value[COLUMN] = middle_column, lens_value[ROW] = middle_row;
+        for (int c = 0; c < 4; ++c) part_smears[c] = smears[c];
+        if (parts > 1) {
+            for (int c = 0; c < 6; ++c) lens_value[EDGE + c] = edge[c];
+            cut_edges(edge);
+            smear_widths(edge, step, part_smears);
+        }
         for (int c = 0; c < 2; ++c) {
-            const V wide = smears[c], narrow = smears[2 + c];
+            const V wide = part_smears[c], narrow = part_smears[2 + c];
             V* e = lens_value + SMEAR_A + 5 * c;
             e[0] = 0.5f * (1.0f + wide + narrow), e[1] = 0.5f * (size(1.0f - wide) + narrow);
-            e[2] = wide, e[3] = narrow, e[4] = 0.5f / narrow;
+            e[2] = narrow, e[3] = 0.5f / narrow, e[4] = wide;
         }
         if (profiles) {
             lens_value[TO_A] = @LEVELS * area / (top_a * top_area * smears[0]);
@@ -195,7 +193,8 @@ FILL = _source("""
             lens_value[STEP_A] = step[0], lens_value[STEP_B] = step[3];
         } else {
             slope(u, v, k);
-            lens_value[TO_A] = @LEVELS / (top_a * top_b * top_area * frame_area * smears[0] * smears[1]);
+            lens_value[TO_A] = @LEVELS / (top_a * top_b * top_area * frame_area * part_smears[0] * part_smears[1]);
+            if (parts > 1) lens_value[TO_A] /= (float)parts;
             lens_value[OFFSET_S] = s, lens_value[OFFSET_T] = t;
             for (int c = 0; c < 4; ++c) lens_value[SLOPE + c] = -pupil_pixel * k[c];
             for (int c = 0; c < 2; ++c) {
@@ -250,9 +249,27 @@ FILL = _source("""
                 const int some = (int)p[W * COLUMNS] - tile * @LANES;
                 const uint64_t mask = bytes_below(some);
                 const float *e = p + W * SMEAR_A, *f = p + W * SMEAR_B;
-                const smear smear_a = {e[0], e[W], e[2 * W], e[3 * W], e[4 * W]};
-                const smear smear_b = {f[0], f[W], f[2 * W], f[3 * W], f[4 * W]};
+                const smear smear_a = {e[0], e[W], e[2 * W], e[3 * W]};
+                const smear smear_b = {f[0], f[W], f[2 * W], f[3 * W]};
+                smear step_a[@MOST_STEPS], step_b[@MOST_STEPS];  // the same for the cell's steps instead of a square
+                for (int q = 0; !square && q < steps; ++q) {
+                    const float width = 2.0f * outline.data[2 * q], height = 2.0f * outline.data[2 * q + 1];
+                    const float wide_a = e[4 * W], wide_b = f[4 * W];
+                    step_a[q] = {0.5f * (width + wide_a + smear_a.narrow),
+                                 0.5f * (size(width - wide_a) + smear_a.narrow), smear_a.narrow, smear_a.bend};
+                    step_b[q] = {0.5f * (height + wide_b + smear_b.narrow),
+                                 0.5f * (size(height - wide_b) + smear_b.narrow), smear_b.narrow, smear_b.bend};
+                }
                 const float to_a = p[W * TO_A];
+                float part_a[@MOST_PARTS], part_b[@MOST_PARTS];
+                part_a[0] = part_b[0] = 0.0f;
+                if (parts > 1) {
+                    const float* e = p + W * EDGE;
+                    for (int part = 0; part < parts; ++part) {
+                        part_a[part] = middle_of_part(part, e[0], e[W], e[2 * W]);
+                        part_b[part] = middle_of_part(part, e[3 * W], e[4 * W], e[5 * W]);
+                    }
+                }
                 const int layer_row = (int)of_lens_tile[2 * W + l] + @SIDE_LAYERS;
                 const int lens_row = (lens[2 * l + 1] - lenses[1]) * @LAYERS + layer_row;
                 const int lens_block = lens_row * lenses[2] + lens[2 * l] - lenses[0];
@@ -315,13 +332,20 @@ FILL = _source("""
                                 const V inverse = 1.0f / (k0 * k3 - k1 * k2);
                                 const V a = (k3 * ds - k1 * dt) * inverse, b = (k0 * dt - k2 * ds) * inverse;
                                 V inside_cell = none;
-                                if (square) {
+                                if (square && parts == 1) {
                                     inside_cell = smeared(a, smear_a) * smeared(b, smear_b);
+                                } else if (square) {
+                                    for (int part = 0; part < parts; ++part)
+                                        inside_cell += smeared(a - part_a[part], smear_a)
+                                            * smeared(b - part_b[part], smear_b);
                                 } else {
-                                    for (int q = 0; q < rectangle_count; ++q) {
-                                        const float* edge = rectangles.data + 4 * q;
-                                        inside_cell += (below(edge[1] - a, smear_a) - below(edge[0] - a, smear_a))
-                                            * (below(edge[3] - b, smear_b) - below(edge[2] - b, smear_b));
+                                    for (int part = 0; part < parts; ++part) {
+                                        V lower = none;
+                                        for (int q = 0; q < steps; ++q) {
+                                            const V higher = smeared(b - part_b[part], step_b[q]);
+                                            inside_cell += smeared(a - part_a[part], step_a[q]) * (higher - lower);
+                                            lower = higher;
+                                        }
                                     }
                                 }
                                 const V level = size(inverse) * inside_cell * to_a + 0.5f;

@@ -7,10 +7,10 @@ microimage lies in one piece of memory. The loops are C++: as Warp's they take t
 """
 
 import sys
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
-from scipy import sparse
 
 from lfpiv_kernels import runtime
 from lfpiv_kernels.microimages import Microimages
@@ -93,6 +93,57 @@ _SPREAD = (
 )
 
 
+# Two sweeps over the lit rays: the first numbers the pixels that see them, as they come, and counts their rays,
+# the second puts each pixel's rays side by side. One thread's work, bound by memory.
+_LIGHT = """
+    auto for_places = [&](auto lit_place, auto dark_place) {
+        for (int part = 0; part + 1 < parts.shape[0]; ++part) {
+            const int shift = starts.data[part] - parts.data[part];
+            for (int place = parts.data[part]; place < parts.data[part + 1]; ++place) {
+                if (light.data[place] == 0.0f) continue;
+                const int ray = place + shift;
+                if (share.data[ray] > 0.0f) lit_place(place, ray);
+                else dark_place(place);
+            }
+        }
+    };
+"""
+
+_NUMBER = (
+    _LIGHT
+    + """
+    int pixels = 0, rays = 0, darks = 0;
+    for_places(
+        [&](int, int ray) {
+            int& number = number_out.data[pixel.data[ray]];
+            if (!number) {
+                pixel_out.data[pixels] = pixel.data[ray];
+                number = ++pixels;
+            }
+            ++first_out.data[number + 1];
+            ++rays;
+        },
+        [&](int) { ++darks; });
+    for (int k = 2; k < pixels + 2; ++k) first_out.data[k] += first_out.data[k - 1];
+    count_out.data[0] = pixels, count_out.data[1] = rays, count_out.data[2] = darks;
+"""
+)
+
+_SORT = (
+    _LIGHT
+    + """
+    int darks = 0;
+    for_places(
+        [&](int place, int ray) {
+            const int n = first_out.data[number.data[pixel.data[ray]]]++;
+            place_out.data[n] = place;
+            share_out.data[n] = share.data[ray];
+        },
+        [&](int place) { dark_out.data[darks++] = place; });
+"""
+)
+
+
 @wp.func_native(_COLLECT)
 def _collect_run(run: int, map: Rays, rays: wp.array(dtype=float), image_out: wp.array(dtype=float)): ...
 
@@ -125,6 +176,70 @@ def _spread(
     _spread_run(first_run + wp.tid(), map, image, rays_out)
 
 
+@wp.func_native(_NUMBER)
+def _number(
+    light: wp.array(dtype=float),
+    parts: wp.array(dtype=int),
+    starts: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    share: wp.array(dtype=float),
+    number_out: wp.array(dtype=int),
+    pixel_out: wp.array(dtype=int),
+    first_out: wp.array(dtype=int),
+    count_out: wp.array(dtype=int),
+): ...
+
+
+@wp.func_native(_SORT)
+def _sort(
+    light: wp.array(dtype=float),
+    parts: wp.array(dtype=int),
+    starts: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    share: wp.array(dtype=float),
+    number: wp.array(dtype=int),
+    first_out: wp.array(dtype=int),
+    place_out: wp.array(dtype=int),
+    share_out: wp.array(dtype=float),
+    dark_out: wp.array(dtype=int),
+): ...
+
+
+@wp.kernel
+def _number_pixels(
+    # in
+    light: wp.array(dtype=float),
+    parts: wp.array(dtype=int),  # where each part's rays begin in `light`, and the end of the last
+    starts: wp.array(dtype=int),  # the first ray of each part
+    pixel: wp.array(dtype=int),  # of each ray
+    share: wp.array(dtype=float),
+    # out
+    number_out: wp.array(dtype=int),  # (sensor pixel,): 1, 2, ... as light comes to them; 0 in the dark
+    pixel_out: wp.array(dtype=int),
+    first_out: wp.array(dtype=int),  # (sensor pixel + 2,): where the rays of each number begin
+    count_out: wp.array(dtype=int),  # pixels, rays, dark places
+):
+    _number(light, parts, starts, pixel, share, number_out, pixel_out, first_out, count_out)
+
+
+@wp.kernel
+def _sort_rays(
+    # in
+    light: wp.array(dtype=float),
+    parts: wp.array(dtype=int),
+    starts: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    share: wp.array(dtype=float),
+    number: wp.array(dtype=int),
+    # out
+    first_out: wp.array(dtype=int),  # where the rays of each number end, that is those of the next begin
+    place_out: wp.array(dtype=int),
+    share_out: wp.array(dtype=float),
+    dark_out: wp.array(dtype=int),
+):
+    _sort(light, parts, starts, pixel, share, number, first_out, place_out, share_out, dark_out)
+
+
 class RayMap:
     """The linear map from rays to pixels and its adjoint on the running device.
 
@@ -132,36 +247,38 @@ class RayMap:
     ----------
     microimages : Microimages
         All rays of the camera.
-    place : ndarray, shape (ray,), int32
-        Where in memory the rays lie that voxels light, ascending.
-    ray : ndarray, shape (ray,), int32
-        Which rays they are; one ray may lie in several places, whose light adds up.
+    light : ndarray, shape (place,), float32
+        Light of the rays where they lie in memory, part after part; those that voxels light are not zero.
+    parts : sequence of int
+        Where each part's rays begin, and the end of the last.
+    starts : sequence of int
+        The first ray of each part; one ray may lie in several parts, whose light adds up.
     """
 
-    def __init__(self, microimages: Microimages, place: np.ndarray, ray: np.ndarray):
+    def __init__(self, microimages: Microimages, light: np.ndarray, parts: Sequence[int], starts: Sequence[int]):
         device = runtime.device().warp
-        share, pixel = microimages.share[ray], microimages.pixel[ray]
-        lit = share > 0
-        dark, place, share, pixel = place[~lit], place[lit], share[lit], pixel[lit]
-        entry = np.arange(len(pixel), dtype=np.int32)
-        order = np.zeros(int(np.prod(microimages.sensor_shape)), np.int32)
-        order[pixel[::-1]] = entry[::-1]  # the first entry of each pixel: it is assigned last
-        self.pixel: np.ndarray = pixel[order[pixel] == entry]
+        for where in {"cpu", device}:
+            wp.load_module(sys.modules[__name__], device=where)  # before threads use it
+        size = int(np.prod(microimages.sensor_shape))
+        rays = [light, *(np.array(ends, np.int32) for ends in (parts, starts)), microimages.pixel, microimages.share]
+        number, seen, first, count = (np.zeros(length, np.int32) for length in (size, size, size + 2, 3))
+        _on_cpu(_number_pixels, rays, [number, seen, first, count])
+        pixels, lit, darks = (int(n) for n in count)
+        place, share, dark = np.empty(lit, np.int32), np.empty(lit, np.float32), np.empty(darks, np.int32)
+        _on_cpu(_sort_rays, [*rays, number], [first, place, share, dark])
+        self.pixel: np.ndarray = seen[:pixels].copy()
         """Sensor pixels that voxels light, in the order of their first rays, shape (pixel,), int32."""
-        order[self.pixel] = np.arange(len(self.pixel), dtype=np.int32)
-        shape = len(self.pixel), int(place.max(initial=0)) + 1
-        by_pixel = sparse.csr_array((share, (order[pixel], place)), shape=shape)
         self.rays = Rays()
-        for name, array in (
-            ("pixel", self.pixel),
-            ("first", by_pixel.indptr),
-            ("place", by_pixel.indices),
-            ("dark", dark),
-        ):
-            setattr(self.rays, name, wp.array(np.asarray(array, np.int32), dtype=int, device=device, copy=False))
-        self.rays.share = wp.array(by_pixel.data, dtype=float, device=device, copy=False)
-        self.rays.runs = -(-max(len(self.pixel), min(len(dark), 1)) // RUN)
-        wp.load_module(sys.modules[__name__], device=device)  # before threads use it
+        arrays = {
+            "pixel": self.pixel,
+            "first": first[: pixels + 1].copy(),
+            "place": place,
+            "share": share,
+            "dark": dark,
+        }
+        for name, array in arrays.items():
+            setattr(self.rays, name, wp.array(array, device=device, copy=False))
+        self.rays.runs = -(-max(pixels, min(darks, 1)) // RUN)
 
     def spread(self, image: wp.array, rays_out: wp.array) -> None:
         """Give every ray its pixel's light times its share: the adjoint of `collect`."""
@@ -178,3 +295,9 @@ class RayMap:
             wp.launch(kernel, dim=last - first, inputs=[first, self.rays, *inputs], outputs=[out], device=where)
 
         runtime.run_chunks(self.rays.runs, launch)
+
+
+def _on_cpu(kernel, inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
+    """Run a kernel once on arrays in the CPU's memory."""
+    inputs, outputs = ([wp.array(array, device="cpu", copy=False) for array in some] for some in (inputs, outputs))
+    wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu")

@@ -67,6 +67,7 @@ RAYS = (
     const float* frame = g + 19;
     const float pupil_pixel = pixel / r;
     const float* m = model.data + (int64_t)MODEL_SIZE * voxel;
+    const int parts = profiles ? 1 : cuts[0] * cuts[1] * cuts[2];
 
     // (s, t) of the ray through the pupil point (u, v)
     auto position = [&](auto u, auto v, auto& s, auto& t) {
@@ -124,8 +125,14 @@ RAYS = (
         for (int n = 0; n < 2; ++n) {
             auto wide = u, narrow = v;
             const auto *e = edge[n], *along = k + 2 * n;
-            two_widths(e[0], e[1], e[2], along[0] * pupil_pixel, along[1] * pupil_pixel, wide, narrow);
-            const auto box = cell * (size(1.0f - along[n]) + size(along[1 - n]));
+            auto box = cell * (size(1.0f - along[n]) + size(along[1 - n]));
+            if (parts == 1) {
+                two_widths(e[0], e[1], e[2], along[0] * pupil_pixel, along[1] * pupil_pixel, wide, narrow);
+            } else {  // the outermost parts of the voxel
+                two_widths(e[0] / (float)cuts[0], e[1] / (float)cuts[1], e[2] / (float)cuts[2],
+                    along[0] * pupil_pixel, along[1] * pupil_pixel, wide, narrow);
+                for (int axis = 0; axis < 3; ++axis) box += (0.5f - 0.5f / cuts[axis]) * size(e[axis]);
+            }
             const auto inner = least(wide, 2.0f * box);
             const auto tail = root(narrow * inner * (1.0f / LEVELS));
             half[n] = box + 0.5f * (wide + narrow) - least(tail, 0.5f * narrow);
@@ -251,4 +258,43 @@ RAYS = (
 )
 """The ray model of `voxel` as functions, and the lenses its rays can reach. Reads the arguments `model` (voxel,
 MODEL_SIZE), `geometry` (GEOMETRY_SIZE,), `lenses` (first i, first j, lenses along i, along j), `corners` (lens along j,
-along i, 2), `voxel` and `profiles`."""
+along i, 2), `voxel`, `profiles` and `cuts`, the parts of the voxel along x, y, z."""
+
+SMEARS = """
+    // widest smear times the probability that a position, `away` from the middle and smeared, lies within half a pitch:
+    // a trapezium, smoothed by the narrower smear; `smeared` is given what depends on the smears alone
+    auto ramp = [&](auto x, auto narrow, auto bend) {  // integral of a step smoothed by `narrow`, which ends at x = 0
+        const decltype(x) above = most(x, decltype(x){}), bent = least(above, decltype(x){} + narrow);
+        return above + bent * (bent * bend - 1.0f);
+    };
+    auto trapezium = [&](auto away, auto wide, auto narrow) {
+        const auto outer = 0.5f * (1.0f + wide + narrow), inner = 0.5f * (size(1.0f - wide) + narrow);
+        const auto bend = 0.5f / narrow, x = size(away);
+        return ramp(outer - x, narrow, bend) - ramp(inner - x, narrow, bend)
+            - ramp(narrow - inner - x, narrow, bend);
+    };
+    struct smear { float outer, inner, narrow, bend; };
+    auto smeared = [&](V away, const smear& e) {
+        const V x = size(away);
+        V y = ramp(e.outer - x, e.narrow, e.bend) - ramp(e.inner - x, e.narrow, e.bend);
+        if (e.narrow > e.inner) y -= ramp(e.narrow - e.inner - x, e.narrow, e.bend);
+        return y;
+    };
+    // widths of the smears by three edges, given along a, then b, and by a pixel's cell: widest along a, b, narrower
+    auto smear_widths = [&](const auto* edge, const auto* step, auto* smears) {
+        for (int n = 0; n < 2; ++n) {
+            const auto* e = edge + 3 * n;
+            two_widths(e[0], e[1], e[2], step[2 * n], step[2 * n + 1], smears[n], smears[2 + n]);
+        }
+    };
+    // the parts into which the voxel is cut: where the middle of each lies, from the voxel's edges
+    auto middle_of_part = [&](int part, float x, float y, float z) {
+        const int across = part % cuts[0], down = part / cuts[0] % cuts[1], deep = part / (cuts[0] * cuts[1]);
+        return ((across + 0.5f) / cuts[0] - 0.5f) * x + ((down + 0.5f) / cuts[1] - 0.5f) * y
+            + ((deep + 0.5f) / cuts[2] - 0.5f) * z;
+    };
+    auto cut_edges = [&](auto* edge) {
+        for (int n = 0; n < 6; ++n) edge[n] = edge[n] / (float)cuts[n % 3];
+    };
+"""
+"""How the edges of a voxel, or of its parts, and a pixel's cell smear a position: functions that follow `RAYS`."""

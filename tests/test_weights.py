@@ -9,9 +9,12 @@ import warp as wp
 from ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
-from lfpiv import weightblocks
+from lfpiv import notices, weightblocks, weightcheck
+from lfpiv.lightfield import disc_fraction
+from lfpiv.raylayout import lay_out, microimage_centres
 from lfpiv.raymodel import NEAR_PITCH, grid_models, ray_models
-from lfpiv.weightblocks import count_voxels
+from lfpiv.weightblocks import StoredGrid, blocks_of, count_voxels, pack_camera
+from lfpiv.weightcheck import WHOLE, CountedVoxels, add_entries, choose_cuts, choose_form
 from lfpiv.weights import compare_with_count, estimate_memory
 from lfpiv_kernels import footprint, footprint_source, project, raymodel, reference, runtime, trace
 from lfpiv_kernels.lattice import cell_frame, cell_rectangles, pack_lattice
@@ -20,10 +23,14 @@ VOXEL_MM = 0.1
 LEVEL = 0.5 / raymodel.LEVELS * 1.1  # rounding to 8 bits, in units of the largest weight; the bound is 4-10 % above it
 TOLERANCE_TWIN = 2e-3  # float32 polynomials against float64, of the largest weight
 TOLERANCE_ADJOINT = 1e-5  # the issue's figure; float32 sums of about 1e5 terms with random signs
+TOLERANCE_SHARE = 2e-6  # [pixel] float32 distances of up to 20 pixels: twice half a unit in the last place
 TOLERANCE_EDGE = 0.012  # relative L2: at the pupil's edge the kernels know how weights fall in steps of LAYER_FALL
 TOLERANCE_EDGES = 0.002  # of a projected edge: what interpolated rays, half a voxel more apart, make of NEAR_PITCH
 FOOTPRINT_MEAN, FOOTPRINT_WORST = 0.02, 0.035  # relative L2 against a converged count: the project's goal
-SAMPLES = 100  # pupil points per axis: counting noise of about 1 %, subtracted by the two halves' difference
+POINTS, SAMPLES = 12, 30  # per voxel edge and pupil axis: noise below 1 %, subtracted by the two counts' difference
+TOLERANCE_PARTS = 0.004  # relative L2: parts share the voxel's slopes and edges of the pupil; a voxel is 1/2000 of so
+TOLERANCE_ESTIMATE = 0.06  # of a thousand sampled voxels' mean bytes: they vary by a third of it, on a regular grid
+SPHERICAL = 0.12  # [pitch at the pupil's edge] third order, which weights do not follow in either form
 
 VOXELS_MM = np.array([(0.0, 0.0, 0.05), (0.13, 0.2, 0.9), (0.5, 0.6, -0.7), (-0.6, -0.5, 0.8)])
 
@@ -35,7 +42,23 @@ RIGS = {
         "hexagonal", rotation(-45), optics=optics(layout="hexagonal"), lattice=lattice("hexagonal", roll_deg=0.4)
     ),
     "mild coma": IdealCamera("mild coma", rotation(45), coma=0.01),
+    "rolled 12": IdealCamera("rolled 12", rotation(45, 0, 12)),
+    "rolled 40": IdealCamera("rolled 40", rotation(45, 0, 40)),
+    "any angle": IdealCamera("any angle", rotation(30, -30, 25), lattice=lattice(roll_deg=-20.0)),
+} | {
+    f"hexagonal {roll}": IdealCamera(
+        f"hexagonal {roll}", rotation(45), optics=optics(layout="hexagonal"), lattice=lattice("hexagonal", roll)
+    )
+    for roll in (15, 30, 60)  # lens rows stand or lie along the sensor, by either neighbour, and half way between
 }
+
+
+class Spherical(IdealCamera):
+    """A camera with a third-order aberration."""
+
+    def map(self, points, pupil):
+        unit = np.asarray(pupil) / self.optics.pupil_radius_mm
+        return super().map(points, pupil) + SPHERICAL * self.lattice.pitch_mm * unit * (unit**2).sum(-1, keepdims=True)
 
 
 def whole(image, window, corner):
@@ -46,20 +69,23 @@ def whole(image, window, corner):
     return padded[1000:-1000, 1000:-1000]
 
 
-def counted(camera, centre, seed):
-    counts, total, corner = count_voxels(camera, centre[None], VOXEL_MM, samples=SAMPLES, seed=seed)
+def counted(camera, centre, seed, voxel_mm):
+    counts, total, corner = count_voxels(camera, centre[None], voxel_mm, samples=SAMPLES, points=POINTS, seed=seed)
     return whole(camera.gain, counts[0] / total[0], corner[0])
 
 
-@pytest.mark.parametrize("name", RIGS)
-def test_footprint_agrees_with_a_converged_count(name):
-    camera = RIGS[name]
+@pytest.mark.parametrize(
+    ("name", "microlenses"), [*((name, 1) for name in RIGS), ("rolled 40", 0.5), ("rolled 40", 2), ("hexagonal 15", 2)]
+)
+def test_footprint_agrees_with_a_converged_count(name, microlenses):
+    """At any angle of camera, array and pose, for voxels from half a microlens to two."""
+    camera, voxel_mm = RIGS[name], VOXEL_MM * microlenses
     errors = []
     for centre in VOXELS_MM:
-        grid = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=VOXEL_MM, first_centre_mm=tuple(centre[::-1]))
+        grid = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=voxel_mm, first_centre_mm=tuple(centre[::-1]))
         weights = lfpiv.build_weights(IdealRig({name: camera}), grid)
         image = weights.image(name, (0, 0, 0)).astype(float)
-        first, second = counted(camera, centre, 1), counted(camera, centre, 2)
+        first, second = (counted(camera, centre, seed, voxel_mm) for seed in (1, 2))
         reference_image = (first + second) / 2
         noise = np.linalg.norm(first - second) / 2  # of the mean of two independent counts
         error = np.sqrt(max(np.linalg.norm(image - reference_image) ** 2 - noise**2, 0.0))
@@ -93,6 +119,33 @@ def test_footprint_kernel_equals_its_twin(name, form):
     assert np.linalg.norm(image - twin) <= TOLERANCE_EDGE * np.linalg.norm(twin)
 
 
+@pytest.mark.parametrize(("name", "cuts"), [("any angle", (2, 1, 1)), ("hexagonal 15", (1, 1, 2))])
+def test_footprints_of_parts_equal_the_twins_of_smaller_voxels(name, cuts):
+    coarse = replace(RIGS[name].optics, pixel_mm=0.011, sensor_shape=(200, 240))  # the twin takes its time
+    camera = replace(RIGS[name], optics=coarse)
+    model = ray_models(camera, VOXELS_MM[1:2], VOXEL_MM)
+    image = np.zeros(camera.optics.sensor_shape, np.float32)
+    add_entries(image, blocks_of(pack_camera(camera), [model], "pixels", (0, 0), cuts), 0)
+    twin = np.zeros(image.shape)
+    edges = model[0, 12:18].reshape(3, 2), model[0, 18:30].reshape(3, 2, 2)
+    for part in np.ndindex(*cuts):
+        place = (np.array(part) + 0.5) / cuts - 0.5  # of the part in the voxel, in edges
+        smaller = model[0].astype(float)
+        smaller[[0, 6]] += place @ edges[0]
+        smaller[[[1, 2], [7, 8]]] += np.einsum("a,apu->pu", place, edges[1])
+        smaller[12:18] /= np.repeat(cuts, 2)
+        smaller[18:30] /= np.repeat(cuts, 4)
+        twin += reference.footprint(
+            smaller,
+            optics=camera.optics,
+            lattice=camera.lattice,
+            frame=cell_frame(camera.lattice.basis_mm, camera.lattice.layout),
+            rectangles=cell_rectangles(camera.lattice.layout),
+            local=True,
+        ) / np.prod(cuts)
+    assert np.linalg.norm(image - twin) <= (TOLERANCE_EDGE + TOLERANCE_PARTS) * np.linalg.norm(twin)
+
+
 @pytest.mark.parametrize(("waves", "step"), [(0, 8), (1, 2), (7, 1)], ids=["smooth", "curved", "rough"])
 def test_ray_models_of_a_grid_are_those_of_its_voxels(waves, step, monkeypatch):
     """Interpolated as coarsely as the mapping allows; `waves` of a tenth of a pitch over the grid's length."""
@@ -116,6 +169,51 @@ def test_ray_models_of_a_grid_are_those_of_its_voxels(waves, step, monkeypatch):
     assert rays.max() <= 2 * NEAR_PITCH * camera.lattice.pitch_mm  # a few voxels may be further off than those probed
     if step > 1:  # half the difference of neighbours is not that of opposite faces on waves of three voxels
         assert np.abs((found - exact)[:, 12:18]).max() <= TOLERANCE_EDGES * VOXEL_MM
+
+
+@pytest.mark.parametrize("layout", ["square", "hexagonal"])
+@pytest.mark.parametrize("f_number", [2.5, 4.0, 16.0])  # microimages overlap, touch, are a few pixels wide
+def test_rays_lie_where_their_lenses_put_them(layout, f_number):
+    eye, lenses = replace(optics(90, 130, layout), f_number=f_number), lattice(layout, roll_deg=2.0)
+    radius = eye.pupil_radius_mm * eye.sensor_per_pupil / eye.pixel_mm
+    rays = lay_out(eye, lenses)
+    first, centre = microimage_centres(eye, lenses, radius + 1)
+    assert tuple(first) == rays.first_lens
+    step = np.arange(rays.edge)
+    column = rays.corner[..., None, None, 0] + step
+    row = rays.corner[..., None, None, 1] + step[:, None]
+    seen = (column >= 0) & (column < 130) & (row >= 0) & (row < 90)
+    offset = np.stack(np.broadcast_arrays(column, row), -1) + 0.5 - centre[..., None, None, :]
+    inside = np.where(seen, disc_fraction(offset.astype(np.float32), radius)[0], 0.0)
+    shape = (len(centre), footprint_source.LAYERS, *inside.shape[1:])
+    pixel, share = (array[: np.prod(shape)].reshape(shape) for array in (rays.pixel, rays.share))
+    for layer in range(footprint_source.LAYERS):
+        fall = footprint_source.LAYER_FALL * (layer - footprint_source.SIDE_LAYERS)
+        np.testing.assert_array_equal(pixel[:, layer], np.where(seen, 130 * row + column, -1))
+        np.testing.assert_allclose(share[:, layer], inside * (1 + fall * (1 - inside) / 2), atol=TOLERANCE_SHARE)
+    assert (rays.pixel[np.prod(shape) :] == -1).all() and not rays.share[np.prod(shape) :].any()
+    covered = np.bincount(rays.pixel[rays.share > 0], minlength=90 * 130)  # no lens is missing
+    lit = np.hypot(*np.moveaxis(offset, -1, 0)) < radius
+    assert (covered[(row * 130 + column)[seen & lit]] > 0).all()
+
+
+def test_a_pixel_knows_its_rays(small):
+    projector = small.projector("cam1")
+    rays, map = projector.blocks.microimages, projector.map.rays
+    projector.scatter(np.ones(small.grid.size, np.float32))
+    place = np.flatnonzero(projector.rays.numpy())
+    part = np.searchsorted(projector._places, place, side="right") - 1
+    ray = place - projector._places[part] + np.array([start for start, _ in projector._spans])[part]
+    lit = rays.share[ray] > 0
+    np.testing.assert_array_equal(map.dark.numpy(), place[~lit])
+    pixel, first = np.unique(rays.pixel[ray[lit]], return_index=True)
+    np.testing.assert_array_equal(projector.map.pixel, pixel[np.argsort(first)])
+    counts = np.diff(map.first.numpy())
+    assert map.first.numpy()[0] == 0 and counts.min() > 0
+    order = np.lexsort((map.place.numpy(), np.repeat(projector.map.pixel, counts)))
+    expected = np.lexsort((place[lit], rays.pixel[ray[lit]]))
+    np.testing.assert_array_equal(map.place.numpy()[order], place[lit][expected])
+    np.testing.assert_array_equal(map.share.numpy()[order], rays.share[ray[lit]][expected])
 
 
 @pytest.mark.parametrize("form", footprint.FORMS)
@@ -278,6 +376,40 @@ def test_a_voxel_outside_the_field_has_no_weights():
     assert not weights.column_sum.any()
 
 
+@pytest.mark.parametrize("form", footprint.FORMS)
+def test_memory_estimate_tells_what_the_weights_themselves_take(form):
+    """Rays, which do not depend on the grid, take the larger part of an estimate: without them."""
+    rig = two_cameras(optics=optics(rows=100, columns=110))
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.6, 0.8, 2.0), voxel_mm=0.05)
+    nothing = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=0.05, first_centre_mm=(0.0, 50.0, 0.0))
+    estimate = estimate_memory(rig, grid, form) - estimate_memory(rig, nothing, form)
+    assert estimate == pytest.approx(lfpiv.build_weights(rig, grid, form=form).memory_bytes, rel=TOLERANCE_ESTIMATE)
+
+
+@pytest.mark.parametrize("form", footprint.FORMS)
+def test_largest_weight_is_that_of_a_ray(small, form):
+    weights = lfpiv.build_weights(IdealRig(small.cameras), small.grid, form=form)
+    largest, bound = [], []
+    for name in small.cameras:
+        blocks = weights.projector(name).blocks
+        entries = [blocks.entries(voxel) for voxel in range(small.grid.size)]
+        largest += [(weight * blocks.microimages.share[ray]).max() for ray, weight in entries]
+        bound.append(blocks.scale.max() * raymodel.LEVELS ** (2 if form == "profiles" else 1))
+    assert weights.largest == pytest.approx(max(largest), rel=1e-12)
+    assert max(bound) > 1.03 * weights.largest  # what no weight exceeds is not what one reaches
+
+
+def test_more_blocks_than_numbers_are_refused(small, monkeypatch):
+    camera = small.cameras["cam1"]
+    model = ray_models(camera, VOXELS_MM, VOXEL_MM)
+    blocks = len(blocks_of(pack_camera(camera), [model], "profiles", (0, 0)).ray)
+    monkeypatch.setattr(weightblocks, "MOST_BLOCKS", blocks - 1)
+    with pytest.raises(ValueError, match="voxels on one camera need"):
+        blocks_of(pack_camera(camera), [model], "profiles", (0, 0))
+    with pytest.raises(ValueError, match=r"5 x 6 x 7 voxels .* blocks.*Raise volume.voxel_mm"):
+        lfpiv.build_weights(IdealRig(small.cameras), small.grid, form="profiles")
+
+
 def test_memory_estimate_holds_before_building():
     rig = two_cameras(optics=optics(rows=100, columns=110))
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.0, 2.0, 2.0), voxel_mm=0.05)
@@ -291,14 +423,62 @@ def test_memory_estimate_holds_before_building():
 def test_form_follows_the_optics_and_the_limit_is_kept():
     grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
     cameras = {"straight": RIGS["misaligned"], "bent": IdealCamera("bent", rotation(-45), coma=0.02)}
-    cameras["hexagonal"] = RIGS["hexagonal"]
+    cameras |= {"hexagonal": RIGS["hexagonal"], "rolled": RIGS["rolled 40"]}
     weights = lfpiv.build_weights(IdealRig(cameras), grid)
-    assert weights.forms == {"straight": "profiles", "bent": "pixels", "hexagonal": "pixels"}
+    assert weights.forms == {"straight": "profiles", "bent": "pixels", "hexagonal": "pixels", "rolled": "pixels"}
+    assert {name for name, cuts in weights.cuts.items() if cuts != WHOLE} == {"rolled"}  # parts only where they tell
+    plain = weights.counted("rolled").errors_of_form("pixels")
+    assert np.mean(plain) > 0.9 * np.mean(weights.profile_errors["rolled"])  # pixels alone would be bought for nothing
     assert min(weights.profile_errors["bent"]) > FOOTPRINT_MEAN
     for name, errors in compare_with_count(weights).items():
         assert errors and np.mean(errors) <= FOOTPRINT_MEAN and max(errors) <= FOOTPRINT_WORST, name
     with pytest.raises(ValueError, match=r"camera 'bent'.* as pixels.*weights_form to 'profiles'"):
         lfpiv.build_weights(IdealRig(cameras), grid, limit_bytes=weights.memory_bytes // 4)
+
+
+def test_a_voxel_is_cut_only_along_edges_that_matter():
+    grid = lfpiv.Grid.from_extent(centre_mm=(0.0, 0.0, 0.2), size_mm=(1.2, 1.2, 1.2), voxel_mm=2 * VOXEL_MM)
+    stored = StoredGrid(grid, (1, 0, 2))
+    for pose, cut in [((45, 0, 0), ""), ((0, 0, 30), "xy"), ((45, 30, 0), "xz"), ((45, 0, 25), "xyz")]:
+        cuts = choose_cuts(stored, IdealCamera("c", rotation(*pose)))
+        assert "".join(axis for axis, parts in zip("xyz", cuts, strict=True) if parts > 1) == cut, pose
+
+
+def test_profiles_stay_where_pixels_are_hardly_nearer_and_a_warning_says_why():
+    grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
+    rig = IdealRig({"spherical": Spherical("spherical", rotation(45)), "rolled": RIGS["rolled 40"]})
+    with notices.collected() as texts:
+        weights = lfpiv.build_weights(rig, grid)
+    assert weights.forms == {"spherical": "profiles", "rolled": "pixels"}
+    errors = weights.profile_errors["spherical"]
+    assert np.mean(errors) > FOOTPRINT_MEAN
+    (text,) = texts
+    assert text.startswith(f"spherical: weights as profiles differ from counted rays by {100 * np.mean(errors):.1f} %")
+    assert "aberrations beyond the second order" in text
+    with notices.collected() as texts:
+        compare_with_count(lfpiv.build_weights(IdealRig({"rolled": RIGS["rolled 40"]}), grid, form="profiles"))
+    assert len(texts) == 1 and "set compute.weights_form to 'auto'" in texts[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_only_voxels_that_are_seen_judge(seed):
+    """A camera that sees a small part of a volume judges by that part."""
+    camera = IdealCamera("bent", rotation(45), coma=0.03)
+    grid = lfpiv.Grid.from_extent(centre_mm=(1.2, 0.8, 0), size_mm=(12.0, 10.0, 1.6), voxel_mm=VOXEL_MM)
+    stored = StoredGrid(grid, (1, 0, 2))
+    chief = camera.map(grid.centres_mm(), np.zeros((grid.size, 2)))
+    assert (np.abs(chief) < 1.1).all(1).mean() < 0.1  # six voxels at random would mostly show nothing
+    judge = CountedVoxels(stored, camera, seed)
+    choice = choose_form(judge)
+    assert len(choice.profile_errors) == weightcheck.VOXELS and choice.form == "pixels"
+
+
+def test_weights_that_nothing_judges_say_so():
+    grid = lfpiv.Grid(shape=(1, 1, 2), voxel_mm=VOXEL_MM, first_centre_mm=(0.0, 9.0, 0.0))
+    with notices.collected() as texts:
+        weights = lfpiv.build_weights(two_cameras(), grid)
+    assert len(texts) == 2 and all("unchecked" in text for text in texts)
+    assert compare_with_count(weights) == {"cam1": [], "cam2": []}
 
 
 @pytest.mark.parametrize(
