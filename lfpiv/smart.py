@@ -18,6 +18,7 @@ vanishes where the gradient does, so solutions stay solutions; that the misfit f
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -58,13 +59,13 @@ class View:
     """One camera's image and its weights; arrays are float32, shape (pixel,)."""
 
     image: np.ndarray
-    """Counts >= 0, zero where `gain` is."""
+    """Counts >= 0, zero where `gain` is and where no voxel lights a pixel."""
     gain: np.ndarray
     """What a pixel records per unit of light."""
     floor: float
     """Noise floor b [counts]."""
     projector: Projector
-    """Holds the light of one volume or image at a time: nobody else may use it while SMART iterates."""
+    """Holds the light of one volume or image at a time: `kept` while SMART iterates."""
 
     @cached_property
     def comparison(self) -> Comparison:
@@ -179,6 +180,15 @@ def iterate(
             volume = sieve(coefficients)
             misfit = compare(views, volume)
     yield volume, misfit
+
+
+@contextlib.contextmanager
+def kept(views: Sequence[View]) -> Iterator[None]:
+    """Keep everybody else from the views' projectors while SMART iterates."""
+    with contextlib.ExitStack() as held:
+        for view in views:
+            held.enter_context(view.projector.kept())
+        yield
 
 
 def compare(views: Sequence[View], volume: np.ndarray) -> Misfit:

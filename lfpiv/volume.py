@@ -5,13 +5,17 @@ from __future__ import annotations
 import enum
 import logging
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from scipy import ndimage
 
 from lfpiv.particlesize import matching_sieve
-from lfpiv.smart import View, gaussian, iterate, sharpen
+from lfpiv.recording import Recording, record
+from lfpiv.smart import View, gaussian, iterate, kept, sharpen
+from lfpiv.volumepair import VIEWS, is_finite
+from lfpiv.voxelgrid import in_order
 from lfpiv.weights import Weights
 
 log = logging.getLogger(__name__)
@@ -65,9 +69,10 @@ def reconstruct(
     Parameters
     ----------
     weights : Weights
-        The operator.
+        The operator. Threads that share it take turns; while one reconstructs, its `progress` may not project.
     images : mapping of str to ndarray
-        Camera name -> image, shape (rows, columns) [counts], background subtracted; negative counts are taken as zero.
+        Camera name -> image, shape (rows, columns) [counts], background subtracted; negative counts are taken as zero,
+        and pixels that no voxel lights are left out. Cameras may be of unlike brightness: `lfpiv.recording` finds it.
     iterations : int
         Number of iterations, >= 0.
     relaxation : float
@@ -75,10 +80,11 @@ def reconstruct(
     floor : float or mapping of str to float, optional
         Noise floor b [counts] added to images and projections alike: one dark pixel must not kill a voxel. Default: the
         noise of each image's background, the root mean square of its negative counts, and at least 1e-4 of its
-        brightest count.
+        brightest counts, hot pixels left out. A floor given is at least 1e-6 of these.
     floor_share : float
-        The floor is at least this share of each image's brightness, sum I^2 / sum I: particles smaller than a voxel
-        light fewer pixels than it, and the dark ones beside them are no evidence against it. 0 takes `floor` as it is.
+        The floor is at least this share of each image's brightness, sum I^2 / sum I, hot pixels left out: particles
+        smaller than a voxel light fewer pixels than it, and the dark ones beside them are no evidence against it. 0
+        takes `floor` as it is.
     normalisation : {"column", "paper"}
         See above.
     accelerate : bool
@@ -105,14 +111,21 @@ def reconstruct(
     Returns
     -------
     xarray.DataArray, shape (z, y, x), float32
-        Volume [counts per unit weight] with coordinates in mm. Attributes: `residual`, ||I - P|| / ||I||, and `misfit`,
+        Volume [counts per unit weight] with coordinates in mm; where fewer than two of a rig's cameras see part of it,
+        with the coordinate ``views``, how many see each voxel. Attributes: `residual`, ||I - P|| / ||I||, and `misfit`,
         the Kullback-Leibler divergence sum P' log(P'/I') - P' + I' with P' = P + b, I' = I + b, which SMART lowers
-        [counts]: both before each iteration and after the last; `stop`, the verdict; the settings.
+        [counts]: both before each iteration and after the last, over the pixels that voxels light; `light_outside`, by
+        camera, the part of an image's light in the others: from particles beyond the volume, or reflections;
+        `camera_gain`, by camera, its brightness relative to the brightest, in whose counts the volume is; `stop`, the
+        verdict; the settings.
 
     Raises
     ------
     ValueError
-        If an argument is out of its range, or an image is missing, has the wrong shape or holds no finite light.
+        If an argument is out of its range, or an image is missing, has the wrong shape or holds no finite light where
+        the volume is seen.
+    RuntimeError
+        If `progress` projects with the same weights, or reconstructs.
     """
     _check(
         iterations,
@@ -124,16 +137,13 @@ def reconstruct(
         sieve_voxel=sieve_voxel,
         tolerance=tolerance,
     )
-    recorded = {name: _light(weights, images, name) for name in weights.cameras}
-    floors = _floors(floor, weights, images)
+    recordings = record(weights, images, floor=floor, floor_share=floor_share)
     if isinstance(sieve_voxel, str):
         sieve_voxel = matching_sieve(weights, images)
-    for name, image in recorded.items():
-        floors[name] = max(floors[name], floor_share * _brightness(image))
-    views = [_view(weights, name, recorded[name], floors[name]) for name in weights.cameras]
+    views = [_view(weights, name, recording) for name, recording in recordings.items()]
 
     sieve = gaussian(sieve_voxel, weights.stored.shape)
-    column_sum = weights.stored.store(weights.column_sum)
+    column_sum = _column_sum(weights, views, recordings)
     lit = column_sum > 1e-6 * column_sum.max()
     if normalisation == "column":
         step, unblurred = (
@@ -144,7 +154,10 @@ def reconstruct(
         pixels = weights.stored.store(weights.affected_pixels)
         step = np.divide(relaxation / weights.largest, pixels, out=np.zeros_like(column_sum), where=lit & (pixels > 0))
         unblurred = step
-    volume = _first_guess(views, column_sum, lit) if first is None else _given(first, weights) * lit
+    if first is None:
+        volume = _first_guess(views, [recording.peak for recording in recordings.values()], column_sum, lit)
+    else:
+        volume = _given(first, weights) * lit
     if active_share > 0:
         volume[volume < active_share * volume.max()] = 0.0
 
@@ -173,26 +186,29 @@ def reconstruct(
         smooth=smooth,
         sharp=sharp if accelerate and sieve_voxel > 0 else None,
     )
-    for count, (volume, current) in enumerate(steps):  # noqa: B007 - the last one is returned
-        residual.append(float(np.sqrt(current.squares)) / norm)
-        misfit.append(current.divergence)
-        if progress is not None:
-            progress((count + 1) / (iterations + 1))
-        if count in (0, iterations):
-            continue
-        if misfit[-1] > DIVERGENCE * misfit[0]:
-            stop = Stop.DIVERGED
-            break
-        if tolerance > 0 and misfit[-2] - misfit[-1] < tolerance * misfit[-2]:
-            stop = Stop.CONVERGED
-            break
+    with kept(views):
+        for count, (volume, current) in enumerate(steps):  # noqa: B007 - the last one is returned
+            residual.append(float(np.sqrt(current.squares)) / norm)
+            misfit.append(current.divergence)
+            if progress is not None:
+                progress((count + 1) / (iterations + 1))
+            if count > 0 and not misfit[-1] <= DIVERGENCE * misfit[0]:  # NaN, too
+                stop = Stop.DIVERGED
+                break
+            if tolerance > 0 and 0 < count < iterations and misfit[-2] - misfit[-1] < tolerance * misfit[-2]:
+                stop = Stop.CONVERGED
+                break
     if stop is Stop.DIVERGED:
         log.warning("SMART: %s", stop.value)
     grid = weights.grid
+    coordinates: dict[str, Any] = {name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")}
+    if len(weights.cameras) > 1 and weights.views.min() < 2:
+        about = {"units": "1", "long_name": "number of cameras that see the voxel"}
+        coordinates[VIEWS] = (("z", "y", "x"), weights.views, about)
     return xr.DataArray(
         weights.stored.restore(volume),
         dims=("z", "y", "x"),
-        coords={name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")},
+        coords=coordinates,
         name="intensity",
         attrs={
             "long_name": "particle intensity",
@@ -203,7 +219,9 @@ def reconstruct(
             "stop": stop.value,
             "iterations": len(residual) - 1,
             "relaxation": relaxation,
-            "floor": list(floors.values()),
+            "floor": [recording.floor for recording in recordings.values()],
+            "camera_gain": [recording.camera_gain for recording in recordings.values()],
+            "light_outside": [recording.light_outside for recording in recordings.values()],
             "normalisation": normalisation,
             "accelerate": int(accelerate),
             "smoothing_voxel": smoothing_voxel,
@@ -213,64 +231,28 @@ def reconstruct(
     )
 
 
-def _floors(
-    floor: float | Mapping[str, float] | None, weights: Weights, images: Mapping[str, np.ndarray]
-) -> dict[str, float]:
-    """Noise floor of every camera [counts]."""
-    if floor is None:
-        floors = {}
-        for name in weights.cameras:
-            image = np.asarray(images[name], np.float32)
-            below = image[image < 0]
-            noise = float(np.sqrt(np.mean(below**2))) if below.size else 0.0
-            floors[name] = max(noise, 1e-4 * float(image.max()))
-        return floors
-    given = floor if isinstance(floor, Mapping) else dict.fromkeys(weights.cameras, floor)
-    missing = [name for name in weights.cameras if name not in given]
-    if missing:
-        raise ValueError(f"floor: camera {missing[0]!r} is missing; found {', '.join(given) or 'none'}.")
-    floors = {name: given[name] for name in weights.cameras}
-    if any(not (np.isfinite(value) and value >= 0) for value in floors.values()):
-        raise ValueError(f"floor: expected a number >= 0, got {floor}.")
-    return floors
+def _column_sum(weights: Weights, views: list[View], recordings: Mapping[str, Recording]) -> np.ndarray:
+    """Sum of each voxel's weights over all pixels, each camera's by its gain, shape (voxel,), float32."""
+    if all(recording.camera_gain == 1 for recording in recordings.values()):
+        return weights.stored.store(weights.column_sum)
+    total = np.zeros(weights.grid.size, np.float32)
+    for view in views:
+        view.projector.back_project(view.gain, total)
+    return total
 
 
-def _light(weights: Weights, images: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    """One camera's image, checked, without negative counts and dead pixels."""
-    camera = weights.cameras[name]
-    if name not in images:
-        raise ValueError(f"images: camera {name!r} is missing; found {', '.join(images) or 'none'}.")
-    image = np.asarray(images[name], np.float32)
-    if image.shape != camera.optics.sensor_shape:
-        raise ValueError(f"images[{name!r}]: expected shape {camera.optics.sensor_shape}, got {image.shape}.")
-    if not np.isfinite(image).all():
-        raise ValueError(f"images[{name!r}]: expected finite counts, got NaN or infinity.")
-    image = np.where(camera.gain > 0, np.maximum(image, 0.0), 0.0)
-    if not image.any():
-        raise ValueError(f"images[{name!r}]: expected some light, got no positive count; check the background.")
-    return image.reshape(-1)
+def _view(weights: Weights, name: str, recording: Recording) -> View:
+    gain = np.ascontiguousarray(weights.cameras[name].gain, np.float32).reshape(-1)
+    if recording.camera_gain != 1:
+        gain = gain * np.float32(recording.camera_gain)
+    return View(image=recording.image, gain=gain, floor=recording.floor, projector=weights.projector(name))
 
 
-def _brightness(image: np.ndarray) -> float:
-    """Mean count of an image, each count weighted by itself [counts]: dark pixels do not count, nor does a hot one."""
-    return float(np.square(image, dtype=np.float64).sum() / image.sum(dtype=np.float64))
-
-
-def _view(weights: Weights, name: str, image: np.ndarray, floor: float) -> View:
-    return View(
-        image=image,
-        gain=np.ascontiguousarray(weights.cameras[name].gain, np.float32).reshape(-1),
-        floor=floor,
-        projector=weights.projector(name),
-    )
-
-
-def _first_guess(views: list[View], column_sum: np.ndarray, lit: np.ndarray) -> np.ndarray:
+def _first_guess(views: list[View], peaks: list[float], column_sum: np.ndarray, lit: np.ndarray) -> np.ndarray:
     """Multiplicative first guess, scaled so that its projection holds the images' light."""
     logarithm = np.zeros_like(column_sum)
-    for view in views:
-        floor = max(view.floor, 1e-3 * float(view.image.max()))
-        view.projector.back_project(view.gain * np.log1p(view.image / floor), logarithm)
+    for view, peak in zip(views, peaks, strict=True):
+        view.projector.back_project(view.gain * np.log1p(view.image / max(view.floor, 1e-3 * peak)), logarithm)
     guess = np.expm1(np.divide(logarithm, column_sum, out=np.zeros_like(column_sum), where=lit))
     guess = np.where(lit, np.maximum(guess, 1e-6 * guess.max()), 0.0).astype(np.float32)
     seen = light = 0.0
@@ -278,14 +260,12 @@ def _first_guess(views: list[View], column_sum: np.ndarray, lit: np.ndarray) -> 
         modelled = view.gain * view.projector.project(guess, np.empty_like(view.image))
         seen += float(view.image[modelled > 0].sum(dtype=np.float64))
         light += float(modelled.sum(dtype=np.float64))
-    if not seen > 0:
-        raise ValueError("images: no light where the volume is seen; check the volume's position and the calibration.")
     return (guess * (seen / light)).astype(np.float32)
 
 
 def _given(first: np.ndarray, weights: Weights) -> np.ndarray:
     """First guess of the caller in stored order, checked."""
-    values = np.asarray(first)
+    values = np.asarray(in_order(first, "first"))
     if values.shape != weights.grid.shape:
         raise ValueError(f"first: expected shape {weights.grid.shape} (z, y, x), got {values.shape}.")
     if not np.isfinite(values).all() or values.min() < 0 or not values.any():
@@ -299,15 +279,15 @@ def _check(
     whole = isinstance(iterations, (int, np.integer)) and not isinstance(iterations, bool)
     if not (whole and iterations >= 0):
         raise ValueError(f"iterations: expected a whole number >= 0, got {iterations!r}.")
-    if not (np.isfinite(relaxation) and relaxation > 0):
+    if not (is_finite(relaxation) and relaxation > 0):
         raise ValueError(f"relaxation: expected a number > 0, got {relaxation!r}.")
     if normalisation not in NORMALISATIONS:
         raise ValueError(f"normalisation: expected one of {', '.join(NORMALISATIONS)}, got {normalisation!r}.")
-    if not 0 <= active_share < 1:
+    if not (is_finite(active_share) and 0 <= active_share < 1):
         raise ValueError(f"active_share: expected a number from 0 to below 1, got {active_share!r}.")
     for name, value in not_negative.items():
-        if name == "sieve_voxel" and value == AUTO:
+        if name == "sieve_voxel" and isinstance(value, str) and value == AUTO:
             continue
-        if isinstance(value, str) or not (np.isfinite(value) and value >= 0):
+        if not (is_finite(value) and value >= 0):
             wanted = f'a number >= 0 or "{AUTO}"' if name == "sieve_voxel" else "a number >= 0"
             raise ValueError(f"{name}: expected {wanted}, got {value!r}.")

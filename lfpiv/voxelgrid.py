@@ -39,6 +39,15 @@ def checked_volume(volume: xr.DataArray | np.ndarray, grid: Grid | None, name: s
     return values, grid
 
 
+def in_order(volume: xr.DataArray | np.ndarray, name: str) -> xr.DataArray | np.ndarray:
+    """Return a volume as it is, or raise ValueError where its named dimensions are in another order than (z, y, x)."""
+    if isinstance(volume, xr.DataArray) and volume.dims != _DIMS:
+        raise ValueError(
+            f"{name}: expected dims (z, y, x), got ({', '.join(map(str, volume.dims))}). Use .transpose('z', 'y', 'x')."
+        )
+    return volume
+
+
 def _grid_of(volume: xr.DataArray, name: str) -> Grid:
     """Grid of a DataArray with coordinates in mm."""
     if volume.dims != _DIMS or any(axis not in volume.coords for axis in _DIMS):

@@ -7,8 +7,11 @@ fixed order; on CUDA it adds atomically. The innermost loops are C++: as Warp's 
 long on the CPU. Twin: ``reference.dense``.
 """
 
+import contextlib
 import itertools
 import sys
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -228,10 +231,14 @@ class Projector:
     rays keep it, in memory of their own for every part of the voxels that a CPU launch takes: so no two threads write
     one ray, and results do not depend on their number. A ray that voxels of two parts light lies in both.
 
+    `project` and `back_project` may be called from several threads, which take turns. Whoever calls `scatter` and
+    `gather`, and counts on the light on the rays in between, does so inside `kept`.
+
     Arrays in and out are float32, C-contiguous and flat; on the CPU they are used in place.
     """
 
     def __init__(self, blocks: Blocks):
+        self._turn, self._kept = threading.RLock(), False
         self.blocks = blocks
         self._device = runtime.device()
         self._matrix = Matrix()
@@ -247,7 +254,7 @@ class Projector:
         wp.load_module(sys.modules[__name__], device=self._device.warp)  # before threads use it
         self._spans = self._find_spans()
         self._places = np.cumsum([0] + [stop - start for start, stop in self._spans])
-        self.rays = wp.zeros(max(int(self._places[-1]), 1), dtype=float, device=self._device.warp)
+        self.rays = self._put(np.empty(max(int(self._places[-1]), 1), np.float32), float)  # `scatter` writes it first
         """The light on the rays, part after part."""
         self._parts = [  # each as if it began with the camera's first ray, where the blocks count from
             wp.array(ptr=self.rays.ptr + 4 * (int(place) - start), dtype=float, shape=(stop,), device=self.rays.device)
@@ -276,10 +283,28 @@ class Projector:
     def _map_rays(self):
         """Map of the rays that voxels light to pixels."""
         self.scatter(np.ones(len(self.blocks.scale), np.float32))
-        place = np.flatnonzero(self.rays.numpy()).astype(np.int32)
-        shift = [start - int(first) for first, (start, _) in zip(self._places, self._spans, strict=False)]
-        counts = np.diff(np.searchsorted(place, self._places))
-        return RayMap(self.blocks.microimages, place, place + np.repeat(np.array(shift, np.int32), counts))
+        return RayMap(self.blocks.microimages, self.rays.numpy(), self._places, [start for start, _ in self._spans])
+
+    @contextlib.contextmanager
+    def kept(self) -> Iterator[None]:
+        """Keep the light on the rays: other threads wait meanwhile.
+
+        Raises
+        ------
+        RuntimeError
+            If this thread is inside `kept` already: it would overwrite the light on the rays.
+        """
+        with self._turn:
+            if self._kept:
+                raise RuntimeError(
+                    "weights: these are in use by a reconstruction of the same thread, whose `progress` cannot project "
+                    "with them. Do so before or after it, or build weights of its own."
+                )
+            self._kept = True
+            try:
+                yield
+            finally:
+                self._kept = False
 
     def scatter(self, volume: np.ndarray) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays."""
@@ -332,10 +357,11 @@ class Projector:
 
     def project(self, volume: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Write the image of `volume`, shape (voxel,), into `out`, shape (pixel,); returns `out`."""
-        self.scatter(volume)
-        out.fill(0.0)  # pixels that no voxel lights
-        image = self._put(out, float)
-        self.map.collect(self.rays, image)
+        with self.kept():
+            self.scatter(volume)
+            out.fill(0.0)  # pixels that no voxel lights
+            image = self._put(out, float)
+            self.map.collect(self.rays, image)
         if self._device.kind == "cuda":
             out[:] = image.numpy()
         return out
@@ -345,8 +371,9 @@ class Projector:
 
         Returns `out`.
         """
-        self.map.spread(self._put(image, float), self.rays)
-        return self.gather(out)
+        with self.kept():
+            self.map.spread(self._put(image, float), self.rays)
+            return self.gather(out)
 
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32."""

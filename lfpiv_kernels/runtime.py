@@ -7,6 +7,7 @@ import contextlib
 import io
 import logging
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -37,6 +38,8 @@ class Device:
 
 _device: Device | None = None
 _pool: ThreadPoolExecutor | None = None
+_starting = threading.Lock()
+_forked = False
 
 
 def start(request: str = "auto", *, threads: int | None = None) -> Device:
@@ -54,11 +57,22 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
     ValueError
         If `request` is none of the three.
     RuntimeError
-        If "cuda" was requested and none is visible, or the runtime already runs on another device.
+        If "cuda" was requested and none is visible, the runtime already runs on another device, or it ran when this
+        process was forked: its threads stayed behind.
     """
-    global _device, _pool
     if request not in ("auto", "cpu", "cuda"):
         raise ValueError(f"device: expected 'auto', 'cpu' or 'cuda', got {request!r}.")
+    with _starting:
+        return _start(request, threads)
+
+
+def _start(request: str, threads: int | None) -> Device:
+    global _device, _pool
+    if _forked:
+        raise RuntimeError(
+            "device: kernels ran before this process was forked, and cannot run in it. Start processes by 'spawn' or "
+            "'forkserver', as in multiprocessing.get_context('spawn'), or fork before kernels run."
+        )
     if _device is not None:
         if request not in ("auto", _device.kind):
             raise RuntimeError(
@@ -87,11 +101,19 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
             offline_cache=True,
             fast_math=True,
         )
-    _device = Device(kind, count, reason)
     _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
+    _device = Device(kind, count, reason)
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_leave_behind)
     if reason:
         log.info("kernels run on the CPU (%d %s): %s", count, "thread" if count == 1 else "threads", reason)
     return _device
+
+
+def _leave_behind() -> None:
+    """In a process forked from this one: neither the pool's threads nor Taichi's are there, so jobs would never end."""
+    global _device, _pool, _forked
+    _device, _pool, _forked = None, None, True
 
 
 def cores() -> int:
@@ -101,8 +123,13 @@ def cores() -> int:
 
 @contextlib.contextmanager
 def _quiet_stderr() -> Iterator[None]:
-    """Send what native code writes to standard error to nowhere."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    """Send what native code writes to standard error to nowhere; where that is closed, it goes there anyway."""
+    try:
+        kept = os.dup(2)
+    except OSError:
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
         yield

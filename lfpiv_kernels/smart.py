@@ -125,6 +125,8 @@ def _extrapolate(
 class Comparison:
     """One camera's image beside the projections of volumes: Eq. 5's logarithm of their ratio, and their misfit.
 
+    Only pixels that voxels light count: what the others recorded, no volume can explain.
+
     Parameters
     ----------
     projector : Projector
@@ -139,12 +141,6 @@ class Comparison:
         self.projector = projector
         self._floor = float(floor)
         pixels, where = projector.map.pixel, runtime.device()
-        dark = np.ones(len(image), bool)
-        dark[pixels] = False
-        unlit = image[dark]
-        logarithm = np.log1p(unlit / np.float32(floor)).sum(dtype=np.float64) if floor > 0 else 0.0
-        # misfit of the pixels that no voxel lights
-        self._dark = (np.square(unlit).sum(dtype=np.float64), unlit.sum(dtype=np.float64) - floor * logarithm)
         self._image, self._gain = (
             wp.array(array[pixels], dtype=float, device=where.warp, copy=False) for array in (image, gain)
         )
@@ -174,8 +170,8 @@ class Comparison:
             )
 
         runtime.run_chunks(runs, launch, chunks=_chunks(runs, LEAST_RUNS))
-        squares, divergence = (lit.numpy().sum() + dark for lit, dark in zip(self._sums, self._dark, strict=True))
-        return float(squares), float(divergence)
+        squares, divergence = (float(sums.numpy().sum()) for sums in self._sums)
+        return squares, divergence
 
 
 def update(volume, exponent, step):

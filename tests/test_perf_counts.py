@@ -21,8 +21,8 @@ CAMERAS = 2
 STORED_BYTES_PER_WEIGHT = {"pixels": 1.4, "profiles": 0.4}
 """By form: one byte per weight, and what dark corners and blocks' heads add to it, 1.27 on this rig; or two profiles
 per block, 0.33."""
-SMART_IMAGES, SMART_VOLUMES = 6, 12
-"""Sensor images and volumes that SMART may allocate at once for both cameras; it holds 5 images here."""
+SMART_IMAGES, SMART_VOLUMES = 5, 12
+"""Sensor images and volumes that SMART may allocate at once for both cameras; it holds 4 images here."""
 EPOCHS = 10
 """Epochs that Levenberg-Marquardt may take to come within a tenth of the samples' noise; it takes 5."""
 

@@ -1,16 +1,19 @@
 """SMART: convergence to the minimum of its divergence, its invariants, and a particle that comes back in its place."""
 
+import logging
+import re
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from ideal_rig import optics, two_cameras
+import xarray as xr
+from ideal_rig import IdealCamera, IdealRig, optics, two_cameras
 from scipy import ndimage
 from scipy.optimize import minimize
 
 import lfpiv
-from lfpiv import particlesize, smart
+from lfpiv import dataset, particlesize, smart, view
 from lfpiv.raylayout import plain
 from lfpiv.weightblocks import StoredGrid
 from lfpiv.weights import Weights
@@ -146,11 +149,8 @@ def test_smart_equals_its_dense_twin(normalisation, floor):
         accelerate=False,
         first=first.reshape(weights.grid.shape),
     )
-    # "paper" scales the weights to a largest one of 1: the twin works on the scaled system
-    unit = raymodel.LEVELS * max(float(p.blocks.scale.max()) for p in weights._projectors.values())
-    scale = unit / matrix.max() if normalisation == "paper" else 1.0
     twin = reference.smart(
-        matrix, image, first, iterations=50, relaxation=0.9 / scale, floor=floor, paper=normalisation == "paper"
+        matrix, image, first, iterations=50, relaxation=0.9, floor=floor, paper=normalisation == "paper"
     )
     assert np.abs(volume.values.ravel() / twin - 1).max() <= TOLERANCE_F32
 
@@ -219,12 +219,33 @@ def test_comparison_equals_its_twin_far_from_the_minimum_and_at_it(distance):
     ratio = np.log((image + floor) / (projected + floor))
     terms = image - projected - (projected + floor) * ratio
     squares, misfit = comparison.compare(volume)
-    assert squares == pytest.approx(np.square(image - projected).sum(), rel=TOLERANCE_NEAR)
-    assert misfit == pytest.approx(terms.sum(), rel=TOLERANCE_NEAR)
+    lit = matrix.sum(1) > 0  # what the others recorded is none of the voxels' business
+    assert squares == pytest.approx(np.square(image - projected)[lit].sum(), rel=TOLERANCE_NEAR)
+    assert misfit == pytest.approx(terms[lit].sum(), rel=TOLERANCE_NEAR)
     seen, added = rng.random(len(volume)) < 0.5, np.ones_like(volume)
     projector.gather(added, active=seen.astype(np.float32))
     expected = 1 + seen * (matrix.T @ (gain * ratio))
     assert np.abs(added - expected).max() <= TOLERANCE_RATIO * matrix.sum(0).max()
+
+
+def test_threads_that_share_weights_take_turns():
+    """Each camera holds the light of one volume at a time: of two threads one waits, and a callback is refused."""
+    weights = lfpiv.build_weights(
+        two_cameras(), lfpiv.Grid.from_extent(centre_mm=(0,) * 3, size_mm=(1.5,) * 3, voxel_mm=0.1)
+    )
+    volumes = np.random.default_rng(0).random((8, *weights.grid.shape)).astype(np.float32)
+    alone = [weights(volume) for volume in volumes]
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(weights, volumes))
+    assert all((a[name] == b[name]).all() for a, b in zip(alone, together, strict=True) for name in a)
+    one, other = (lfpiv.reconstruct(weights, images, 5).values for images in alone[:2])
+    with ThreadPoolExecutor(2) as threads:
+        both = list(threads.map(lambda images: lfpiv.reconstruct(weights, images, 5).values, alone[:2]))
+    assert both[0].tobytes() == one.tobytes() and both[1].tobytes() == other.tobytes()
+    for meddle in (lambda _: weights(volumes[0]), lambda _: lfpiv.reconstruct(weights, alone[0], 1, first=volumes[0])):
+        with pytest.raises(RuntimeError, match="in use by a reconstruction of the same thread"):
+            lfpiv.reconstruct(weights, alone[0], 5, progress=meddle)
+    assert lfpiv.reconstruct(weights, alone[0], 5).values.tobytes() == one.tobytes()  # the refusal left nothing behind
 
 
 def test_threads_change_nothing(monkeypatch):
@@ -517,6 +538,23 @@ def test_verdicts():
     assert early.iterations < 500
 
 
+@pytest.mark.parametrize("iterations", [1, 5])
+def test_a_misfit_beyond_all_numbers_is_divergence(iterations):
+    weights = random_system(7)
+    images, _ = noisy_images(weights, 7)
+    keywords = {"relaxation": 1e4, "accelerate": False}
+    assert "misfit rises" in lfpiv.reconstruct(weights, images, iterations, **keywords).stop
+
+
+def test_dark_pixels_without_a_floor_do_not_end_it():
+    """One dark pixel among many that shine has an infinite misfit without a floor: the least one keeps it finite."""
+    weights = random_system(10)
+    images, _ = noisy_images(weights, 10)
+    volume = lfpiv.reconstruct(weights, images, 40, floor=0.0, floor_share=0.0)
+    assert np.isfinite(volume.misfit).all() and volume.misfit[-1] < 0.5 * volume.misfit[0]
+    assert np.isfinite(volume.values).all() and (volume.values > 0).any()
+
+
 def test_particles_come_back_in_their_places():
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.6, 1.4, 1.2), voxel_mm=0.1)
     weights = lfpiv.build_weights(two_cameras(), grid)
@@ -556,17 +594,21 @@ def test_light_outside_the_volume_and_dead_pixels_do_not_break_it():
         ({"relaxation": 0.0}, "relaxation: expected a number > 0"),
         ({"normalisation": "rows"}, "normalisation: expected one of"),
         ({"relaxation": float("nan")}, "relaxation: expected a number > 0"),
+        ({"relaxation": "1"}, "relaxation: expected a number > 0"),
         ({"smoothing_voxel": -0.1}, "smoothing_voxel: expected"),
         ({"sieve_voxel": float("nan")}, "sieve_voxel: expected"),
         ({"sieve_voxel": "0.6"}, 'sieve_voxel: expected a number >= 0 or "auto"'),
+        ({"sieve_voxel": None}, 'sieve_voxel: expected a number >= 0 or "auto"'),
         ({"tolerance": -0.1}, "tolerance: expected"),
         ({"floor_share": float("nan")}, "floor_share: expected"),
         ({"active_share": 1.0}, "active_share: expected"),
         ({"floor": float("nan")}, "floor: expected"),
+        ({"floor": "auto"}, "floor: expected a number >= 0, or one for each camera"),
         ({"floor": {"one": 1.0}}, "floor: camera 'two' is missing"),
         ({"first": np.zeros((3, 4, 5))}, "first: expected finite values >= 0"),
         ({"first": np.full((3, 4, 5), np.nan)}, "first: expected finite values >= 0"),
         ({"first": np.ones((4, 4, 5))}, "first: expected shape"),
+        ({"first": xr.DataArray(np.ones((5, 4, 3)), dims=("x", "y", "z"))}, r"first: expected dims \(z, y, x\)"),
     ],
 )
 def test_wrong_arguments_are_named(keywords, message):
@@ -583,6 +625,7 @@ def test_wrong_arguments_are_named(keywords, message):
         (lambda images: images.update(one=np.zeros((3, 3))), r"images\['one'\]: expected shape"),
         (lambda images: images.update(one=np.zeros((4, 8))), "expected some light"),
         (lambda images: images.update(one=np.full((4, 8), np.nan)), "expected finite counts"),
+        (lambda images: images.update(one=images["one"] * 1j), "expected an array of counts"),
     ],
 )
 def test_wrong_images_are_named(change, message):
@@ -591,3 +634,91 @@ def test_wrong_images_are_named(change, message):
     change(images)
     with pytest.raises(ValueError, match=message):
         lfpiv.reconstruct(weights, images)
+
+
+FEW_RAYS, MANY_RAYS = 0.05, 0.2
+"""Parts of a voxel's rays by which a camera surely does not see it, or does: the threshold between is a tenth, and 27
+points in the voxel, whose rays meet the sensor through 69 points of the pupil or do not, tell the part to 0.05."""
+
+
+def half_seen_rig():
+    """Two cameras of which the second sees the middle of a tall volume only."""
+    wide = two_cameras(optics=optics(400, 260)).cameras
+    return IdealRig({"cam1": wide["cam1"], "cam2": IdealCamera("cam2", wide["cam2"].pose, optics=optics(200, 260))})
+
+
+def test_a_volume_tells_what_fewer_than_two_cameras_see(tmp_path, caplog):
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.8, 1.8, 0.8), voxel_mm=0.1)
+    weights = lfpiv.build_weights(half_seen_rig(), grid)
+    with caplog.at_level(logging.WARNING):
+        views = weights.views
+    z, y, x = (grid.axis_mm(axis)[:, None] + 0.1 * np.array([-1, 0, 1]) / 3 for axis in range(3))
+    points = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).reshape(-1, 3)
+    u, v = np.meshgrid(*[np.linspace(-0.9, 0.9, 9)] * 2)
+    pupil = 12.5 * np.stack([u, v], -1)[np.hypot(u, v) < 1]  # f = 100 mm, f/4
+    share = np.zeros((2, *grid.shape))
+    for number, camera in enumerate(weights.cameras.values()):
+        half = np.array(camera.optics.sensor_shape[::-1]) * camera.optics.pixel_mm / 2
+        met = (np.abs(camera.map_fan(points, pupil)) < half).all(-1).mean(1)
+        nz, ny, nx = grid.shape
+        share[number] = met.reshape(nx, 3, ny, 3, nz, 3).mean((1, 3, 5)).T
+    assert np.ptp(share[1]) == 1  # all, and nothing
+    sure = ((share < FEW_RAYS) | (share > MANY_RAYS)).all(0)
+    assert sure.mean() > 0.9
+    np.testing.assert_array_equal(views[sure], (share > MANY_RAYS).sum(0)[sure])
+    ones = {name: np.ones(camera.optics.sensor_shape, np.float32) for name, camera in weights.cameras.items()}
+    np.testing.assert_array_equal(weights.column_sum, weights.T(ones))
+    alone = round(100 * (views < 2).mean())
+    assert 30 < alone < 70 and f"{alone} % of the volume is seen by fewer than two cameras" in caplog.text
+    (said,) = view.sight_warnings(half_seen_rig(), grid)  # of a sample of eight planes each way, before any weights
+    assert re.match(r"about \d\d % of the volume is seen by fewer than two cameras; vectors there are not valid", said)
+    assert abs(int(said.split()[1]) - alone) <= 2 * 100 / view.SAMPLES  # a plane at either end
+
+    positions = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)) * (0.8, 1.8, 0.8)
+    images = weights(lfpiv.metrics.truth_volume(positions, None, grid, 0.07))
+    volume = lfpiv.reconstruct(weights, images, iterations=2)
+    np.testing.assert_array_equal(volume["views"], views)
+    dataset.write_volume(volume, tmp_path / "volume.nc", attributes={})
+    read = dataset.read_volume(tmp_path / "volume.nc")
+    vectors = lfpiv.correlate(read, read, dt_s=1.0, windows=((8, 8, 8), (8, 6, 8)))
+    assert 0 < vectors.attrs["seen_fraction"] < 1
+    middle = np.abs(vectors["y"].values)
+    assert vectors["valid"].values[:, middle < 0.2].all() and not vectors["valid"].values[:, middle > 0.5].any()
+    pair = lfpiv.reconstruct_pair(weights, [images, images], iterations=2, correlation={"windows": ((8, 8, 8),)})
+    assert all("views" in frame.coords for frame in pair)
+
+
+def test_a_volume_that_all_see_tells_nothing_and_neither_does_one_camera(caplog):
+    rig = half_seen_rig()
+    for cameras, height in ((rig.cameras, 0.4), ({"cam2": rig.cameras["cam2"]}, 1.8)):
+        grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.4, height, 0.4), voxel_mm=0.1)
+        weights = lfpiv.build_weights(IdealRig(cameras), grid)
+        with caplog.at_level(logging.WARNING):
+            volume = lfpiv.reconstruct(weights, weights(np.ones(grid.shape, np.float32)), iterations=0)
+        assert "views" not in volume.coords and "fewer than two" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"size_mm": (0.04, 1, 1)}, r"size_mm: expected \(x, y, z\) of at least a voxel"),
+        ({"size_mm": (1, -1, 1)}, "size_mm: expected"),
+        ({"size_mm": (1, 1, float("inf"))}, "size_mm: expected"),
+        ({"voxel_mm": 0.0}, "voxel_mm: expected a length > 0"),
+        ({"voxel_mm": float("nan")}, "voxel_mm: expected a length > 0"),
+        ({"centre_mm": (0, 0, float("nan"))}, "first_centre_mm: expected three finite lengths"),
+    ],
+)
+def test_grids_without_voxels_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        lfpiv.Grid.from_extent(**{"centre_mm": (0, 0, 0), "size_mm": (1, 1, 1), "voxel_mm": 0.1} | change)
+    with pytest.raises(ValueError, match="shape: expected three whole numbers"):
+        lfpiv.Grid(shape=(0, 3, 4), voxel_mm=0.1, first_centre_mm=(0.0, 0.0, 0.0))
+
+
+def test_a_volume_with_its_axes_in_another_order_is_not_projected():
+    weights = random_system(0, voxels=(4, 4, 4))
+    volume = xr.DataArray(np.random.default_rng(0).random((4, 4, 4)), dims=("z", "y", "x"))
+    assert (weights(volume)["one"] == weights(volume.values)["one"]).all()
+    with pytest.raises(ValueError, match="volume: expected dims"):
+        weights(volume.transpose("x", "y", "z"))
