@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
+from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from lfpiv.boardfind import DotBoard, find_dots
@@ -18,9 +19,19 @@ from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
 from lfpiv.rig import Optics
 
-__all__ = ["ESTIMATORS", "BoardDots", "DotBoard", "measure_board"]
+__all__ = ["ESTIMATORS", "BoardDots", "DotBoard", "Planes", "agreeing_dots", "measure_board"]
 
 log = logging.getLogger(__name__)
+
+OUTLIER, OUTLIER_PITCH = 6.0, 0.1
+"""A dot is left out where its labels disagree with its neighbours by more than this many times the typical
+disagreement, and by more than this fraction of the microlens pitch: wrongly named or damaged."""
+NEIGHBOURS = 16
+"""Neighbouring dots, in space, that a dot is compared with."""
+FEW_ACROSS_PX = 7.0
+"""Diameter of microimages below which dots in focus may light too few pixels for the integrated model [pixel]."""
+HELD_BYTES = 16
+"""What a sensor's pixel may take in the planes' images together; planes beyond that are read anew when needed."""
 
 _SATURATED_PIXELS = 10  # so many pixels at the very same highest value are taken for saturated,
 _SATURATED_SIGMA = 20.0  # if they are this far above the dark level
@@ -85,13 +96,14 @@ def measure_board(
     *,
     nominal_angle_deg: float,
     estimator: str = "lens_integral",
+    dark: np.ndarray | None = None,
 ) -> BoardDots:
     """Find, name and label the dots of one camera in all planes of its board.
 
     Parameters
     ----------
     images : sequence of ndarray, shape (rows, columns)
-        Raw image of each plane [counts]; dots brighter or darker than the board.
+        Raw image of each plane [counts], dark level and all; dots brighter or darker than the board.
     decoder : LightFieldDecoder
         The camera's decoder.
     board : DotBoard
@@ -102,6 +114,9 @@ def measure_board(
         "lens_integral" fits each dot to all its raw pixels, integrated over the microlenses. "gaussian" fits a Gaussian
         to the few lenses around the dot in each sub-aperture view (section 3.1 (2) of the paper), which is biased
         towards the lens centres because a dot is hardly wider than a lens.
+    dark : ndarray, shape (rows, columns), optional
+        Image with the lens capped [counts]. Saturation is told before it is subtracted: afterwards saturated pixels
+        scatter as the dark image does.
 
     Raises
     ------
@@ -116,33 +131,79 @@ def measure_board(
         raise ValueError(f"nominal_angle_deg: expected a finite angle [degree], got {nominal_angle_deg}.")
     if len(images) != len(board.planes_mm):
         raise InputError(f"images: expected one per plane, {len(board.planes_mm)}, got {len(images)}.")
-    signals = _Signals(images, decoder)
+    signals = _Signals(images, decoder, dark)
     with threadpool_limits(1, user_api="blas"):  # on matrices this small threads only get in each other's way
         detection = find_dots(signals, decoder, board, nominal_angle_deg)
         if estimator == "gaussian":
             labels = label_by_gaussian(signals, decoder, board, detection)
         else:
-            labels = label_by_integral(signals, signals.noise, decoder, board, detection)
+            try:
+                labels = label_by_integral(signals, signals.noise, decoder, board, detection)
+            except InputError as error:
+                raise InputError(f"{error}{few_pixels(decoder.optics)}") from None
     return _collect(labels, board, detection.in_field)
+
+
+def few_pixels(optics: Optics) -> str:
+    """Say, to end a message about missing dots, what to do where microimages are small; empty where they are not."""
+    across = 2 * optics.pupil_radius_mm / optics.pupil_pixel_mm
+    if across >= FEW_ACROSS_PX:
+        return ""
+    return (
+        f" Microimages of {across:.1f} pixels across leave the dots few pixels to be fitted to: set "
+        'network.estimator = "gaussian".'
+    )
+
+
+class Planes(Sequence[np.ndarray]):
+    """Images read when they are asked for; whole counts of the first ones are held, as many as `HELD_BYTES` allow."""
+
+    def __init__(self, read: Callable[[int], np.ndarray], count: int):
+        self._read, self._count = read, count
+        self._held: dict[int, np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, plane: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, plane: slice) -> Sequence[np.ndarray]: ...
+    def __getitem__(self, plane: int | slice) -> np.ndarray | Sequence[np.ndarray]:
+        if isinstance(plane, slice):
+            return [self[n] for n in range(*plane.indices(len(self)))]
+        if not 0 <= plane < self._count:
+            raise IndexError(plane)
+        if plane not in self._held:
+            image = self._read(plane)
+            if image.min() < 0 or image.max() > np.iinfo(np.uint16).max:
+                return image
+            counts = image.astype(np.uint16)
+            if (len(self._held) + 1) * counts.itemsize > HELD_BYTES or not np.array_equal(counts, image):
+                return image
+            self._held[plane] = counts
+        return self._held[plane]
 
 
 class _Signals(Sequence[np.ndarray]):
     """The planes' images above their dark levels, nan where saturated; only the last one asked for is kept as float."""
 
-    def __init__(self, images: Sequence[np.ndarray], decoder: LightFieldDecoder):
-        self._images = images
+    def __init__(self, images: Sequence[np.ndarray], decoder: LightFieldDecoder, dark: np.ndarray | None):
+        self._images, self._dark = images, dark
         self._plane, self._signal = -1, np.empty((0, 0), np.float32)
+        shape = tuple(decoder.optics.sensor_shape)
+        if dark is not None and np.shape(dark) != shape:
+            raise InputError(f"dark: expected an image of shape {shape}, got {np.shape(dark)}.")
         levels = []
         for plane, image in enumerate(images):
-            if np.shape(image) != tuple(decoder.optics.sensor_shape):
+            if np.shape(image) != shape:
                 raise InputError(
-                    f"plane {plane} of the board: expected an image of shape {tuple(decoder.optics.sensor_shape)}, "
-                    f"got {np.shape(image)}."
+                    f"plane {plane} of the board: expected an image of shape {shape}, got {np.shape(image)}."
                 )
             bad = np.size(image) - np.count_nonzero(np.isfinite(image))
             if bad:
                 raise InputError(f"plane {plane} of the board: expected finite counts, got {bad} pixels that are not.")
-            levels.append(decoder.background(image))
+            levels.append(decoder.background(self._undarkened(image)))
         self._levels = levels
         self.noise = float(np.median([sigma for _, sigma in levels]))
 
@@ -159,12 +220,38 @@ class _Signals(Sequence[np.ndarray]):
         if plane != self._plane:
             image = np.asarray(self._images[plane])
             level, sigma = self._levels[plane]
-            signal = image.astype(np.float32) - np.float32(level)
-            top = image == image.max()
-            if np.count_nonzero(top) >= _SATURATED_PIXELS and signal[top][0] > _SATURATED_SIGMA * sigma:
+            signal = self._undarkened(image)
+            signal -= np.float32(level)
+            top = image == image.max()  # of the raw image, where all saturated pixels are alike
+            if np.count_nonzero(top) >= _SATURATED_PIXELS and np.median(signal[top]) > _SATURATED_SIGMA * sigma:
                 signal[top] = np.nan
             self._plane, self._signal = plane, signal
         return self._signal
+
+    def _undarkened(self, image: np.ndarray) -> np.ndarray:
+        """Copy of an image without the dark one [counts], float32."""
+        light = np.array(image, np.float32)
+        if self._dark is not None:
+            light -= self._dark
+        return light
+
+
+def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) -> np.ndarray:
+    """Labels of the dots that agree with their neighbours: bool, shape (n,).
+
+    `departure_mm` (n, 2) is each label's distance from a fitted thin lens. Real optics depart from that smoothly, so
+    each dot's mean departure is compared with the median of its neighbours' in space.
+    """
+    number, first, inverse = np.unique(dots.dot, return_index=True, return_inverse=True)
+    count = np.bincount(inverse)
+    mean = np.stack([np.bincount(inverse, weights=column) / count for column in departure_mm.T], axis=1)
+    _, neighbour = cKDTree(dots.points_mm[first]).query(dots.points_mm[first], k=min(NEIGHBOURS + 1, len(number)))
+    misfit = np.linalg.norm(mean - np.median(mean[neighbour[:, 1:]], axis=1), axis=1)
+    bad = misfit > max(OUTLIER * 1.4826 * float(np.median(misfit)), OUTLIER_PITCH * pitch_mm)
+    if bad.any():
+        log.info("%d dots disagree with their neighbours and are left out: %s", bad.sum(), number[bad].tolist())
+    good: np.ndarray = ~bad[inverse]
+    return good
 
 
 def _collect(labels: Labels, board: DotBoard, in_field: np.ndarray) -> BoardDots:

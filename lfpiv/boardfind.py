@@ -13,8 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lfpiv import notices
 from lfpiv.boardoutline import MARGIN, Extent, numbered, outline, require_stated
-from lfpiv.boardpose import CameraPose, Rectified, Rectifier, match_lattice, search_radius_mm, strong_enough
+from lfpiv.boardpose import (
+    BIN_PITCHES,
+    CameraPose,
+    Rectified,
+    Rectifier,
+    match_lattice,
+    search_radius_mm,
+    strong_enough,
+)
 from lfpiv.dotfit import spread_over_pupil
 from lfpiv.errors import InputError
 from lfpiv.lightfield import LightFieldDecoder
@@ -30,7 +39,8 @@ _FEWEST_PART = 0.25  # of the dots in the field must be on the lattice
 _REGULAR = 0.5  # of the strongest blobs must lie on one lattice
 _JUDGED_DOTS = 6  # fewer blobs of a plane, or a search radius of fewer elements, do not tell a board from chance
 _JUDGED_BINS = 3
-_CHANCE = 0.2  # of the search radius: boards scatter by less than 0.1 of it about their places, chance by 0.2 to 0.5
+_CHANCE = 0.2  # of the search radius: boards scatter by less than 0.1 of it about their places, chance by 0.2 to 0.6
+_CHANCE_PITCHES = 0.5  # but dots in focus are known to a lens only: they scatter by up to this
 _WHOLLY_SEEN = 0.9  # of a dot's light on lit pixels: its absence means something
 _LIT_GAIN = 0.3  # of a typical pixel's: less is a vignetted corner or a dead lens
 
@@ -141,7 +151,7 @@ def find_dots(
         chiefs.append(rays[named])
     dot, chief = np.concatenate(dots), np.concatenate(chiefs)
     if any(shift):
-        log.warning("the board's dots were renamed by %d columns and %d rows to match its outline", *shift)
+        notices.warn(log, "the board's dots were renamed by %d columns and %d rows to match its outline", *shift)
         pose = plan.fitted(board.of_dots_mm(dot), chief, optics)
     in_field = np.stack([_in_field(pose, board.points_mm(p), optics) for p in range(len(signals))])
     return Detection(pose, sign, dot, chief, in_field)
@@ -197,7 +207,7 @@ def _on_lattice(miss: np.ndarray, targets: np.ndarray, board: DotBoard, bin_mm: 
         solution = np.linalg.lstsq(design * weight[:, None], miss * weight[:, None], rcond=None)[0]
         distance = np.hypot(*(miss - design @ solution).T)
         weight = 1 / (1 + (distance / (2 * max(np.median(distance), 1e-9))) ** 2)
-    return bool(np.median(distance) < _CHANCE * radius)
+    return bool(np.median(distance) < max(_CHANCE * radius, _CHANCE_PITCHES * bin_mm / BIN_PITCHES))
 
 
 def _near_lattice(
@@ -231,7 +241,8 @@ def _shift_to_edges(
 
 
 def _warn_of_open(extent: Extent, axis: str, board: DotBoard) -> None:
-    log.warning(
+    notices.warn(
+        log,
         "no edge of the board is in view along %s (%d dots, %d stated): they are named right only where the "
         "camera's axis meets the board within half a spacing (%g mm) of its middle",
         axis,

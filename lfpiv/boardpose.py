@@ -14,9 +14,11 @@ from scipy.optimize import least_squares
 from lfpiv.lightfield import LightFieldDecoder
 from lfpiv.rig import Optics
 
+BIN_PITCHES = 0.35
+"""Element of a rectified image, in microlens pitches seen on the board."""
+
 _PRIOR = {"angle_deg": 7.0, "tilt_deg": 3.0, "offset_mm": 0.7, "relative": 0.05}  # how far a rig strays from its plan
 _ROBUST_PITCHES = 0.5  # dots that miss the pose by more than this count ever less
-_BIN_PITCHES = 0.35  # bin of a rectified image, in microlens pitches seen on the board
 _USED_COVERAGE = 0.9
 _PIXELS_ACROSS = 8  # pixels across a microimage that are enough to find dots
 _SIGNIFICANT = 6.0  # a dot stands out of the rectified image by this many standard deviations
@@ -183,7 +185,7 @@ class Rectifier:
     def __call__(self, signal: np.ndarray, pose: CameraPose, z_mm: float) -> Rectified:
         """Rectify one image, dark level subtracted, nan where saturated, and filter it for blobs of the dots' size."""
         top = np.nanmax(signal)
-        bin_mm = _BIN_PITCHES * self._cell_mm
+        bin_mm = BIN_PITCHES * self._cell_mm
         shape = tuple(int(2 * half / bin_mm) + 1 for half in self._half_width[::-1])
         corner = -np.array(self._half_width)
         at = pose.on_plane(self._lens_mm, self._pupil_mm, z_mm) - corner.astype(np.float32)

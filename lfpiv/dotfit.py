@@ -37,9 +37,10 @@ TERMS = 6
 BENDS = len(_POWERS) - TERMS
 """Terms of the bend per coordinate: u^3, u^2 v, u v^2, v^3."""
 
-FEWEST_PIXELS = 60
-"""Pixels a dot must light to be fitted."""
+FEWEST_PIXELS = 16
+"""Pixels a dot must light to be fitted: more than it has unknowns,"""
 
+_FEWEST_SHARE, _ENOUGH = 0.5, 60  # and half a microimage's or so many, lest dots cut by the sensor's edge come in
 _SIZE_STEP = 0.15  # tables come in sizes this far apart on a log scale
 _TABLE_AGE = 0.02  # F is tabulated anew when the pixels' blur changes by this part of a lens
 _ROBUST_SIGMA = 4.0  # residuals beyond this count linearly (Huber)
@@ -87,7 +88,7 @@ class DotFit:
     relative_misfit: float
     """Root mean square of the residuals over the light of a fully seen dot."""
     converged: bool
-    """False when the iteration limit was reached."""
+    """False when the iteration limit was reached, or too few pixels were left."""
     pupil_mm: np.ndarray
     """Pupil points of the pixels in which the dot was seen [mm], (m, 2), float32."""
     share: np.ndarray
@@ -134,8 +135,9 @@ class LensIntegral:
         self.bend_mm = bend_mm  # (BENDS, 2)
         self.pupil_radius_mm = decoder.optics.pupil_radius_mm
         self._pixel_on_pupil = decoder.optics.pupil_pixel_mm
-        self._noise_variance = noise**2
-        self._counts_per_photon = counts_per_photon
+        half = _FEWEST_SHARE * np.pi * (self.pupil_radius_mm / self._pixel_on_pupil) ** 2
+        self._fewest = int(np.clip(half, FEWEST_PIXELS, _ENOUGH))
+        self._noise_variance, self._counts_per_photon = noise**2, counts_per_photon
         self._radius = diameter_mm / 2
         self._blur_px = blur_px
         self._basis = np.asarray(decoder.lattice.basis_mm)
@@ -217,7 +219,7 @@ class LensIntegral:
         state = self._state(pixels, terms, theta, table, None, sign)
         damping, converged = 1e-3, False
         for _ in range(_ITERATIONS):
-            if np.count_nonzero(state.share > _SEEN_SHARE) < FEWEST_PIXELS:
+            if np.count_nonzero(state.share > _SEEN_SHARE) < self._fewest:
                 return None  # no dot's light in these pixels, or the fit wandered off them
             moved = np.abs(slope_of(state.theta, self.pupil_radius_mm) - slope).max() * self._pixel_on_pupil
             if moved > _TABLE_AGE * self._reach.min():  # the pixels' blur has changed
@@ -248,6 +250,7 @@ class LensIntegral:
             if small:
                 converged = True
                 break
+        converged &= int(np.count_nonzero(state.share > _SEEN_SHARE)) >= self._fewest
         return self._summary(pixels, state, prior_mean, prior_information, converged)
 
     def _variance(self, pixels: DotPixels, state: _State) -> np.ndarray:

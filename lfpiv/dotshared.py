@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from lfpiv import notices
 from lfpiv.dotfit import BENDS, TERMS, DotFit, LensIntegral, ray_terms
 from lfpiv.lightfield import LightFieldDecoder
 
@@ -95,7 +96,7 @@ def settle(
             break
     if abs(at[0]) > _NOTABLE:
         seen = nominal_diameter_mm * np.exp(at[0])
-        log.warning("the board's dots look %.3g mm wide, not %.3g mm", seen, nominal_diameter_mm)
+        notices.warn(log, "the board's dots look %.3g mm wide, not %.3g mm", seen, nominal_diameter_mm)
     return _shared(at, nominal_diameter_mm, pitch)
 
 

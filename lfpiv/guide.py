@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
 _ORDER = 4  # of the polynomial in board position and pupil point together, each at most cubic
-_LOOSE = 3.0  # the guide is this many times looser than the polynomial's misfit,
+_LOOSE = 3.0  # the guide is this many times looser than the polynomial's misfit and its own error,
 _LEAST_PITCHES = 0.005  # which is never taken for less than this
+_TOLD = 1e-9  # of the best known combination of terms: what is known less well than this is not known
 _DOTS_PER_TERM = 2  # fewer dots than this for each term in (x, y, z) lower its order
+
+
+Guide = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""Given the training part's indices, what `between_dots` returns for it."""
+
+
+def guide_between(
+    points: np.ndarray, pupil: np.ndarray, outputs: np.ndarray, std: np.ndarray, *, pitch_mm: float, seed: int
+) -> Guide:
+    """Return `between_dots` of the part of the labels that a network is trained on; arguments as there."""
+
+    def guide(part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return between_dots(points[part], pupil[part], outputs[part], std[part], pitch_mm=pitch_mm, seed=seed)
+
+    return guide
 
 
 def between_dots(
     points: np.ndarray, pupil: np.ndarray, outputs: np.ndarray, std: np.ndarray, *, pitch_mm: float, seed: int
-) -> tuple[np.ndarray, np.ndarray, float]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return samples between the dots by a polynomial through the labels, for `lfpiv.network.train`.
 
     A network of tens of nodes can pass through every plane, row and column of dots and be wrong in between, where
@@ -41,8 +58,9 @@ def between_dots(
         Places (x, y, z, u, v) [mm].
     outputs : ndarray, shape (m, 2)
         The polynomial there [mm].
-    std : float
-        Their standard deviation [mm].
+    std : ndarray, shape (m,)
+        Their standard deviations [mm]: the polynomial's misfit, and what the dots leave open of it there, which is
+        much where planes stand close together and far from the others.
     """
     where = np.hstack([points, pupil])
     middle, half = where.mean(0), np.maximum(np.ptp(where, axis=0) / 2, 1e-9)
@@ -62,10 +80,17 @@ def between_dots(
         return np.stack([np.prod(scaled**power, axis=1) for power in powers], axis=1)
 
     have = design(where)
-    coefficients = np.linalg.lstsq(have / std[:, None], outputs / std[:, None], rcond=None)[0]
+    misses = np.linalg.qr(np.hstack([have, outputs]) / std[:, None])[1][: len(powers)]
+    left, strength, right = np.linalg.svd(misses[:, : len(powers)])
+    known = strength > _TOLD * strength[0]
+    coefficients = right[known].T @ ((left.T @ misses[:, len(powers) :])[known] / strength[known, None])
     misfit = float(np.sqrt(np.mean((outputs - have @ coefficients) ** 2)))
     rng = np.random.default_rng(seed)
     first, second = rng.integers(len(where), size=(2, len(where) // 2))
     part = rng.random((len(first), 1))
     inputs = part * where[first] + (1 - part) * where[second]
-    return inputs, design(inputs) @ coefficients, _LOOSE * max(misfit, _LEAST_PITCHES * pitch_mm)
+    want = design(inputs)
+    open_mm2 = ((want @ right.T / np.maximum(strength, _TOLD * strength[0])) ** 2).sum(1)  # of labels that err apart,
+    open_share = open_mm2 / np.mean(std**2) * len(where) / dots  # but those of a dot err together
+    misfit = _LOOSE * max(misfit, _LEAST_PITCHES * pitch_mm)
+    return inputs, want @ coefficients, misfit * np.sqrt(1 + open_share)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lfpiv import notices
 from lfpiv.errors import InputError
 from lfpiv.lensbasis import cell_angle_deg, find_basis, find_phase, indices_inside, lattice_pitch
 from lfpiv.microimage import BLUR_REACH_PX, cut_patches, measure, robust_fit
@@ -234,7 +235,8 @@ def _fit_lattice(
         shift, lit, _ = measure(cut_patches(image, centres, half), centres, basis, microimage)
         centres = centres + shift
     if lit.mean() < 0.5:
-        log.warning("lens array: only %d of %d microimages are lit; the others are extrapolated.", lit.sum(), len(lit))
+        text = "lens array: only %d of %d microimages are lit; the others are extrapolated."
+        notices.warn(log, text, lit.sum(), len(lit))
     index, centres = index[lit], centres[lit]
     origin, basis, kept = _robust_lattice(index, centres, origin, basis)
     residual = centres - origin - index @ basis
@@ -283,7 +285,8 @@ def _warn_of_distortion(places: np.ndarray, residual: np.ndarray) -> None:
     rms, rest = (math.sqrt((part**2).sum(1).mean()) for part in (smooth, residual - smooth))
     chance = rest * math.sqrt(terms.shape[1] / len(places))
     if rms > max(DISTORTION_PX, 3 * chance):
-        log.warning(
+        notices.warn(
+            log,
             "lens array: the microimages leave their lattice by a smooth distortion of %.3f px rms, %.3f px at most; "
             "centres follow the lattice.",
             rms,

@@ -23,6 +23,8 @@ CELL_TOLERANCE = 0.03
 """Largest misfit of a neighbour to the layout [pitch]; real arrays stay within 1 %."""
 CANDIDATES = 200
 """Shortest lags tried as lattice vector."""
+DISC_RADII = np.arange(0.2, 0.81, 0.02)
+"""Radii of microimages tried [pitch]; of the largest, four overlap in the middle between their lenses."""
 
 
 # Lattice vectors from the autocorrelation ----------------------------------------------------------------------------
@@ -216,7 +218,8 @@ def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
     """Place of a lens centre (column, row) [pixel] near the image's middle, good to about a pixel.
 
     The mean cell looks the same after a quarter (sixth) turn about a lens centre. In a square array also about the
-    gaps between four lenses, which are darker.
+    gaps between four lenses. Discs of some size about the lens centres explain it better than discs about the gaps,
+    even where microimages overlap so far that a gap, between four bright overlaps, is brighter than a centre.
     """
     pitch = lattice_pitch(basis, layout)
     crop = _evened(_middle(image), pitch)
@@ -230,13 +233,23 @@ def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
     symmetry = (cell.reshape(-1, 1) * cell[turned[..., 0], turned[..., 1]]).sum(0)
     centre = place[np.argmax(symmetry)]
     if layout == "square":
-        inner = (offset + bins // 2) % bins - bins // 2
-        disc = (np.hypot(*(inner @ basis / bins).T) <= 0.3 * np.hypot(*basis[0])).T
-        brightness = [(cell.ravel()[disc[:, c[0] * bins + c[1]]]).mean() for c in (centre, (centre + bins // 2) % bins)]
-        centre = centre if brightness[0] >= brightness[1] else (centre + bins // 2) % bins
+        centre = max(centre, (centre + bins // 2) % bins, key=lambda middle: _disc_likeness(cell, basis, middle))
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape[::-1]]
     phase: np.ndarray = centre / bins @ basis + start
     return phase
+
+
+def _disc_likeness(cell: np.ndarray, basis: np.ndarray, centre: np.ndarray) -> float:
+    """Correlation of a cell with equal discs about the lattice nodes that `centre` belongs to, of the best radius."""
+    bins = len(cell)
+    place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 1, 2) - centre
+    around = bins * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1), indexing="ij"), -1).reshape(1, -1, 2)
+    inner = (place + bins // 2) % bins - bins // 2
+    pitch = np.hypot(*basis[0])
+    away = np.linalg.norm((inner - around) @ basis / bins, axis=-1)
+    found = [np.clip((radius * pitch - away) * bins / pitch + 0.5, 0, 1).sum(1) for radius in DISC_RADII]
+    even = cell.ravel() - cell.mean()
+    return max(float(even @ (disc - disc.mean())) / max(float(disc.std()), 1e-9) for disc in found)
 
 
 def _mean_cell(crop: np.ndarray, basis: np.ndarray, bins: int) -> np.ndarray:

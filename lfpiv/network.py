@@ -11,7 +11,6 @@ References
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +19,8 @@ from itertools import pairwise
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from lfpiv.guide import Guide
 from lfpiv.trainers import Fit, Samples, Stop, forward, levenberg_marquardt, normal_equations
-
-log = logging.getLogger(__name__)
 
 CHUNK_POINTS = 1 << 16
 """Points evaluated at once: bounds the memory of the hidden layers."""
@@ -266,7 +264,7 @@ def train(
     split: tuple[float, float, float] = (0.70, 0.15, 0.15),
     groups: np.ndarray | None = None,
     std: np.ndarray | None = None,
-    guide: tuple[np.ndarray, np.ndarray, float] | None = None,
+    guide: Guide | None = None,
     shrink: bool = False,
     seed: int = 0,
     unit: float = 1.0,
@@ -292,8 +290,9 @@ def train(
         dots that training never saw.
     std : ndarray, shape (n,), optional
         Standard deviation of each sample's outputs; a sample counts by its inverse square in training and validation.
-    guide : tuple of ndarray, ndarray, float, optional
-        Inputs and outputs of further samples for training alone, and their standard deviation.
+    guide : callable, optional
+        Given the training part's indices, inputs and outputs of further samples for training alone, and the standard
+        deviation of each: they must not know of the dots held out.
     shrink : bool
         The outputs are corrections to a baseline, such as the residual of a fitted thin lens, so that 0 is the safe
         answer: multiply the network by the factor, from 0 to 1, that fits the validation part best. A network that
@@ -333,20 +332,14 @@ def train(
 
     training, validation = samples(parts[0]), samples(parts[1])
     if guide is not None:
-        weight = np.full((len(guide[0]), 1), 1 / guide[2] / np.sqrt(np.mean(weights[parts[0]] ** 2)))
+        further, told, known = guide(parts[0])
+        weight = (1 / known / np.sqrt(np.mean(weights[parts[0]] ** 2)))[:, None]
         training = Samples(
-            inputs=np.vstack([training.inputs, (guide[0] - centre) / scale]),
-            outputs=np.vstack([training.outputs, (guide[1] - output_centre) / output_scale]),
+            inputs=np.vstack([training.inputs, (further - centre) / scale]),
+            outputs=np.vstack([training.outputs, (told - output_centre) / output_scale]),
             weights=np.vstack([training.weights, weight]),
         )
     sizes = (inputs.shape[1], *hidden, outputs.shape[1])
-    parameters = sum((a + 1) * b for a, b in pairwise(sizes))
-    if training.outputs.size < parameters:
-        log.warning(
-            "network: %d training values for %d parameters: expect overfitting; use fewer nodes or more dots.",
-            training.outputs.size,
-            parameters,
-        )
     # BLAS on one thread: the trainers thread by blocks of samples, and on a shared machine BLAS's own spinning threads
     # make small products up to a hundred times slower.
     with threadpool_limits(limits=1, user_api="blas"):

@@ -9,7 +9,9 @@ import tifffile
 from scipy.spatial import cKDTree
 
 from lfpiv.board import DotBoard, measure_board
+from lfpiv.boardfind import _on_lattice
 from lfpiv.boardoutline import MARGIN, outline, require_stated
+from lfpiv.boardpose import BIN_PITCHES, search_radius_mm
 from lfpiv.dotfit import BENDS, TERMS, DotFit, LensIntegral, ray_terms
 from lfpiv.dotshared import Shared, update_bend
 from lfpiv.errors import InputError
@@ -391,6 +393,19 @@ def test_a_bend_is_found_by_all_dots_together_and_none_is_made_of_noise(count):
     assert np.abs(shared.bend_mm - true).max() < 5 * 2 / np.sqrt(count) * 1.5  # five standard errors, and thin dots
     change = following[:, 2:] @ (shared.bend_mm - start.bend_mm).T.ravel()
     assert np.allclose(moved[0].coefficients.T.ravel(), change)
+
+
+@pytest.mark.parametrize("spacing_pitches", [3.2, 4.5, 7.0])
+def test_fine_boards_in_focus_are_told_from_chance(spacing_pitches):
+    """A lens hides where in it a focused dot lies, so dots scatter by half a lens; blobs by chance lie anywhere."""
+    random, pitch = np.random.default_rng(2), 0.1
+    board = DotBoard(dots=(7, 7), spacing_mm=spacing_pitches * pitch, diameter_mm=0.1, planes_mm=(0.0,))
+    places = board.points_mm(0)[:, :2]
+    focused = random.uniform(-pitch / 2, pitch / 2, places.shape)
+    angle, radius = 2 * np.pi * random.random(49), search_radius_mm(board.spacing_mm) * np.sqrt(random.random(49))
+    anywhere = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert _on_lattice(focused, places, board, BIN_PITCHES * pitch)
+    assert not _on_lattice(anywhere, places, board, BIN_PITCHES * pitch)
 
 
 def seen_board(true, stated, view, offset=(0, 0), planes=3, hidden=()):

@@ -3,17 +3,24 @@
 import dataclasses
 import json
 import logging
+import re
 import shutil
 
 import numpy as np
 import pytest
 import tifffile
 from ideal_rig import rotation
+from scipy import ndimage
+from test_lensarray import basis_of, render
 
 import lfpiv
-from lfpiv import summary, view
-from lfpiv.calibration import _agreeing_dots, warn_outside
+from lfpiv import boardcheck, summary, view
+from lfpiv.board import HELD_BYTES, Planes, agreeing_dots
+from lfpiv.calibration import warn_outside
+from lfpiv.exposure import APERTURE, microimage_px, stated_px
 from lfpiv.flows import KINDS, window_mean
+from lfpiv.lightfield import LightFieldDecoder
+from lfpiv.rig import LensLattice, Optics
 from lfpiv.scene import true_mapping
 from lfpiv.simulate import simulate
 from lfpiv.thinlens import thin_lens_model
@@ -151,10 +158,10 @@ def test_a_wrongly_named_dot_is_left_out(rig):
     dots = calibration.cameras["only"].dots
     rng = np.random.default_rng(0)
     departure = 0.0003 * rng.normal(size=dots.array_mm.shape) + 0.02 * dots.points_mm[:, :2] ** 2  # smooth distortion
-    assert _agreeing_dots(dots, departure, 0.1).all()
+    assert agreeing_dots(dots, departure, 0.1).all()
     wrong = dots.dot == dots.measured_dot[37]
     departure[wrong] += 0.5
-    assert (_agreeing_dots(dots, departure, 0.1) == ~wrong).all()
+    assert (agreeing_dots(dots, departure, 0.1) == ~wrong).all()
 
 
 @pytest.mark.parametrize("mistake", ["planes", "angle"])
@@ -200,10 +207,138 @@ def test_planes_without_dots_are_named_and_left_out(rig, tmp_path, caplog):
         lfpiv.calibrate(spoiled(experiment, tmp_path / "four", dict(enumerate(noise))))
 
 
+def some_planes(experiment, *planes_mm):
+    """The experiment with these depths of its first planes."""
+    return dataclasses.replace(experiment, board=experiment.board.model_copy(update={"planes_mm": planes_mm}))
+
+
+def test_saturated_dots_are_left_out_with_a_dark_image_too(rig, tmp_path):
+    """Dots five times too bright; less a dark image, the pixels at the range's end are no longer all alike."""
+    experiment, spec, _ = rig
+    rng = np.random.default_rng(0)
+    bright = {}
+    for plane in range(3):
+        image = experiment.board_image("only", plane)
+        level = np.median(image)
+        bright[plane] = np.clip(np.rint(level + 5 * (image - level)), 0, 4095).astype(np.uint16)
+    experiment = some_planes(spoiled(experiment, tmp_path / "data", bright), -0.8, -0.4, 0.0)
+    dark = tmp_path / "dark.tif"
+    tifffile.imwrite(dark, np.rint(level + 3 * rng.standard_normal((400, 420))).astype(np.uint16))
+    setup = dataclasses.replace(experiment.cameras[0], dark_path=dark)
+    camera = lfpiv.calibrate(dataclasses.replace(experiment, cameras=(setup,))).cameras["only"]
+    assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0]) <= MAPPING_AIM_PITCH
+    assert any("saturated and left out" in text for text in camera.report["warnings"])
+
+
+def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(rig, tmp_path):
+    experiment, spec, _ = rig
+    copy = experiment.board_image("only", 2).astype(np.uint16)
+    with pytest.raises(lfpiv.InputError, match=r"plane_03\.tif.*found the same image as .*plane_02\.tif"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "data", {3: copy}))
+    camera = lfpiv.calibrate(some_planes(experiment, -0.8, -0.4, 0.1, 0.4, 0.8)).cameras["only"]
+    (text,) = (text for text in camera.report["warnings"] if "do not fit the others" in text)
+    assert "25 of 25 dots of plane 2" in text and "z = 0.1 mm" in text and "plane_02.tif" in text
+    assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8]) <= MAPPING_AIM_PITCH  # it goes without them
+
+
+def test_few_dots_and_a_poor_mapping_are_warned_of(rig):
+    """Eight dots have six to train with; their labels are many, but tell no more than the dots' ray models."""
+    _, _, calibration = rig
+    camera = calibration.cameras["only"]
+    assert camera.report["warnings"] == []
+    for training_dots, sigma, expected in ((88, 0.004, []), (6, 0.09, ["72 values for its 162", "0.090 pitch off"])):
+        report = camera.report | {"sigma_nor_test": sigma, "warnings": []}
+        boardcheck.warn(dataclasses.replace(camera, report=report), "lens_integral", training_dots)
+        assert len(report["warnings"]) == len(expected)
+        assert all(part in text for part, text in zip(expected, report["warnings"], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("pitch_px", "layout", "fill", "blur", "dark"),
+    [
+        (12.5, "square", 1.0, 1.0, False),
+        (12.6, "square", 0.5, 0.6, False),
+        (12.6, "square", 1.1, 0.7, True),
+        (23.3, "hexagonal", 0.85, 1.5, False),
+        (9.1, "hexagonal", 1.0, 1.0, True),
+        (7.0, "square", 0.75, 0.5, False),
+    ],
+)
+def test_the_white_image_tells_the_diameter_of_the_microimages(pitch_px, layout, fill, blur, dark):
+    """Whatever aperture is stated; dust, dead lenses, and light that falls towards the edges included."""
+    rng = np.random.default_rng(4)
+    side, level = max(220, int(14 * pitch_px)), 100
+    lenses = {"brightness": lambda centres: (rng.random(len(centres)) > 0.03) * (1.2 - centres[:, 0] / side)}
+    basis = basis_of(pitch_px, 0.4, layout)
+    light = render((side, side), np.array([side / 2, side / 2]), basis, fill * pitch_px, **lenses)
+    white = rng.normal(level + 1500 * ndimage.gaussian_filter(light, blur), 5)
+    capped = np.full(white.shape, float(level)) if dark else None
+    for stated in (0.85, 1.0, 1.15, 1.4):
+        pixel_mm = 0.1 / pitch_px
+        optics = Optics(
+            focal_length_mm=100, magnification=-1, f_number=100 * 0.8 / 200 / (stated * fill * 0.1),
+            microlens_pitch_mm=0.1 / 1.004, microlens_focal_length_mm=0.8, pixel_mm=pixel_mm,
+            sensor_shape=white.shape, layout=layout,
+        )  # fmt: skip
+        origin = optics.sensor_mm(np.array([side / 2, side / 2])) / 1.004
+        vectors = tuple(map(tuple, basis * pixel_mm / 1.004))
+        lattice = LensLattice(origin_mm=tuple(origin), basis_mm=vectors, layout=layout)
+        decoder = LightFieldDecoder.from_white(optics, lattice, white, capped)
+        assert stated_px(optics) == pytest.approx(stated * fill * pitch_px)
+        wrong = microimage_px(white, capped, decoder) / (fill * pitch_px) - 1
+        assert abs(wrong) < APERTURE  # the right optics raise no warning, others one or more
+
+
+def test_a_wrong_f_number_is_refused_or_warned_of(rig):
+    experiment, _, _ = rig
+
+    def with_f_number(number):
+        setup = experiment.cameras[0]
+        optics = dataclasses.replace(setup.optics, f_number=number)
+        wrong = dataclasses.replace(experiment, cameras=(dataclasses.replace(setup, optics=optics),))
+        return lfpiv.thin_lens(wrong).cameras["only"].report["warnings"]
+
+    assert with_f_number(4.0) == []
+    (text,) = with_f_number(3.6)
+    assert re.search(r"not 13\.9 px as f_number = 3\.6 .*; f_number = (3\.9\d|4|4\.0\d) would fit", text)
+    for number in (0.4, 2.8, 5.6):
+        with pytest.raises(lfpiv.InputError, match="white"):
+            with_f_number(number)
+
+
+def test_small_microimages_leave_enough_pixels(rig, tmp_path):
+    """At f/8 they are six pixels across."""
+    small = SCENE.replace("f_number = 4.0", "f_number = 8.0").replace("[-0.8, -0.4, 0.0, 0.4, 0.8]", "[-0.8, 0.0, 0.8]")
+    (tmp_path / "scene.toml").write_text(small)
+    experiment = lfpiv.open_experiment(simulate(tmp_path / "scene.toml", tmp_path / "data"))
+    spec = json.loads((tmp_path / "data" / "truth" / "spec.json").read_text())["camera"][0]
+    camera = lfpiv.calibrate(experiment).cameras["only"]
+    assert camera.report["dots_found"] >= 0.9 * 75
+    points, pupil = rays_in([-1, -1, -0.8], [1, 1, 0.8], radius=6.25)
+    miss = np.linalg.norm(camera.map(points, pupil) - true_mapping(spec)(points, pupil), axis=1)
+    assert miss.mean() / 0.1 <= MAPPING_AIM_PITCH
+
+
+def test_board_images_are_held_as_far_as_memory_allows():
+    rng, asked = np.random.default_rng(0), []
+    whole = rng.integers(0, 4096, (12, 6, 7)).astype(np.float32)
+    whole[1] += 0.5  # no whole counts
+
+    def read(plane):
+        asked.append(plane)
+        return whole[plane]
+
+    planes = Planes(read, len(whole))
+    for _ in range(3):
+        assert all(np.array_equal(image, true) for image, true in zip(planes, whole, strict=True))
+    held = HELD_BYTES // 2
+    assert [asked.count(plane) for plane in range(12)] == [1, 3, *[1] * (held - 1), *[3] * (11 - held)]
+
+
 def test_particle_images_in_place_of_boards_are_refused(rig, tmp_path):
     experiment, _, _ = rig
     frames = [experiment.particle_image("only", 0, frame).astype(np.uint16) for frame in "ab"]
-    wrong = {plane: frames[plane % 2][:: 1 - 2 * (plane // 2 % 2)] for plane in range(5)}
+    wrong = {plane: frames[plane % 2][:: 1 - 2 * (plane // 2 % 2), :: 1 - 2 * (plane // 4)] for plane in range(5)}
     with pytest.raises(lfpiv.InputError, match="board images"):
         lfpiv.calibrate(spoiled(experiment, tmp_path / "data", wrong))
 

@@ -78,6 +78,8 @@ def worst_error(array, origin, basis):
         (10.31, -9.0, "square", 1.08),
         (7.3, 0.4, "square", 0.9),
         (31.7, 9.5, "square", 1.0),
+        (14.6, 1.3, "square", 1.3),  # gaps between four lenses are brighter than lenses
+        (16.9, -3.0, "square", 1.55),  # and there are none
         (18.25, 0.05, "hexagonal", 1.0),
         (12.6, 30.2, "hexagonal", 0.8),
         (20.4, 17.0, "hexagonal", 1.06),

@@ -461,4 +461,38 @@ def test_the_guide_is_exact_for_a_polynomial_and_stays_among_the_dots():
     outputs = mapping(*points.T, *pupil.T)
     inputs, guided, std = between_dots(points, pupil, outputs, np.full(360, 0.01), pitch_mm=0.1, seed=0)
     assert np.abs(guided - mapping(*inputs.T)).max() < 1e-12  # sums of a hundred terms of order 1 in float64
-    assert (inputs[:, :3] >= 0).all() and (inputs[:, :3] <= [2, 2, 1]).all() and std > 0
+    assert (inputs[:, :3] >= 0).all() and (inputs[:, :3] <= [2, 2, 1]).all() and (std > 0).all()
+
+
+def test_the_guide_knows_nothing_of_dots_held_out():
+    rng = np.random.default_rng(1)
+    inputs = rng.uniform(-1, 1, (400, 5))
+    groups, told = np.repeat(np.arange(40), 10), []
+
+    def guide(part):
+        told.append(part)
+        return inputs[part], inputs[part, :2], np.full(len(part), 0.1)
+
+    train(inputs, inputs[:, :2], hidden=(5,), epochs=3, groups=groups, guide=guide)
+    (part,) = told
+    assert 0.6 < len(part) / len(inputs) < 0.8
+    assert not set(groups[part]) & set(np.delete(groups, part))
+
+
+HONEST = 1.0  # error over stated deviation: three times the error is stated
+TIGHT_PITCH = 0.03  # three times 0.005, and what dots at even distances leave open: under a pitch of 0.1 no restraint
+
+
+def test_the_guide_lets_go_where_planes_leave_the_mapping_open():
+    """Three planes close together and one far off: a cubic meets the noise of all four, and is anything between."""
+    deviation = []
+    for planes in ((-3.0, -2.9, -2.8, 3.0), (-3.0, -1.0, 1.0, 3.0)):
+        rng, axis = np.random.default_rng(3), np.linspace(-1, 1, 5)
+        dots = np.stack(np.meshgrid(axis, axis, planes, indexing="ij"), -1).reshape(-1, 3)
+        noise = 0.004 * PITCH * rng.standard_normal((len(dots), 2))  # shared by the labels of a dot; the truth is 0
+        points, pupil, labels = np.repeat(dots, 37, axis=0), disc(37 * len(dots), rng), np.repeat(noise, 37, axis=0)
+        std = np.full(len(points), 0.004 * PITCH)
+        _, guided, stated = between_dots(points, pupil, labels, std, pitch_mm=PITCH, seed=0)
+        assert np.sqrt(np.mean((guided / stated[:, None]) ** 2)) < HONEST
+        deviation.append(np.median(stated) / PITCH)
+    assert deviation[1] < TIGHT_PITCH and np.abs(stated).max() < 10 * np.abs(stated).min()

@@ -13,6 +13,7 @@ import numpy as np
 
 from lfpiv.board import BoardDots, DotBoard, measure_board
 from lfpiv.calibration import MODEL_ERROR_PITCH
+from lfpiv.guide import guide_between
 from lfpiv.network import sigma_nor, train
 from lfpiv.reproduce import Progress, page, plots, store
 from lfpiv.reproduce.rigs import Rig, numerical_rig
@@ -148,9 +149,9 @@ def fit(
 ) -> dict[str, Any]:
     """Train one network on the labels of one camera: errors on held-out dots and against the true rays [pitch].
 
-    Whole dots are held out, so the test part holds none that training saw. Labels of more than one kind count by their
-    standard errors only where the thin lens is the baseline, as `lfpiv.calibrate` does; the paper's network takes all
-    alike.
+    Whole dots are held out, so the test part holds none that training saw. Where the thin lens is the baseline, labels
+    count by their standard errors and a polynomial guides the network between the dots, as in `lfpiv.calibrate`; the
+    paper's network takes all labels alike, and nothing else.
     """
     camera = next(camera for camera in rig.scene.camera if camera.name == name)
     pitch = rig.calibration.cameras[name].lattice.pitch_mm
@@ -158,15 +159,20 @@ def fit(
     if samples is not None and samples < len(chosen):
         chosen = np.sort(np.random.default_rng([seed, 13]).permutation(chosen)[:samples])
     points, pupil, array = dots.points_mm[chosen], dots.pupil_mm[chosen], dots.array_mm[chosen]
-    lens = fit_thin_lens(points, pupil, array, camera.optics) if baseline == "thin_lens" else None
+    lens, target, std, guide = None, array, None, None
+    if baseline == "thin_lens":
+        lens = fit_thin_lens(points, pupil, array, camera.optics)
+        target, std = array - lens(points, pupil), np.hypot(dots.std_mm[chosen], MODEL_ERROR_PITCH * pitch)
+        guide = guide_between(points, pupil, target, std, pitch_mm=pitch, seed=seed)
     training = train(
         np.hstack([points, pupil]),
-        array if lens is None else array - lens(points, pupil),
+        target,
         hidden=hidden,
         trainer=TRAINERS[trainer],
         epochs=epochs,
         groups=dots.dot[chosen],
-        std=None if lens is None else np.hypot(dots.std_mm[chosen], MODEL_ERROR_PITCH * pitch),
+        std=std,
+        guide=guide,
         shrink=lens is not None,
         seed=seed,
         unit=pitch,
@@ -203,6 +209,7 @@ def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
         ),
         nominal_angle_deg=experiment.camera(name).nominal_angle_deg,
         estimator="gaussian",
+        dark=experiment.dark(name),
     )
 
 
