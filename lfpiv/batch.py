@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 
-from lfpiv import memory
+from lfpiv import memory, notices
 from lfpiv.errors import InputError
 from lfpiv.experiment import Experiment
 from lfpiv.pair import Outcome, PairWork
@@ -121,7 +121,8 @@ def lowered(planned: Plan, experiment: Experiment, weights: int, device: Device)
     fits = memory.fitting_workers(experiment, weights, planned.workers)
     if fits == planned.workers:
         return planned
-    log.warning(
+    notices.warn(
+        log,
         "%d %s instead of %d: beside %.1f GiB of weights each takes %.1f GiB of memory",
         fits,
         "worker" if fits == 1 else "workers",
@@ -136,7 +137,8 @@ def unasked(planned: Plan, device: Device) -> Plan:
     """Several workers that nobody asked for need a package that nobody need have installed; without it, take one."""
     if planned.workers == 1 or importlib.util.find_spec("distributed") is not None:
         return planned
-    log.warning(
+    notices.warn(
+        log,
         "one of %d GPUs is used: several processes need the package `distributed`. "
         "Install it: pip install 'lfpiv[distributed]'",
         len(set(planned.devices)),

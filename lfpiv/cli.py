@@ -373,9 +373,10 @@ def _parse_pairs(text: str) -> tuple[int, int | None]:
 
 
 def _end(summary: dict[str, Any]) -> None:
-    """Name the pairs that failed; with any, the exit status is 3."""
+    """Name the pairs that failed; with any of this invocation, the exit status is 3."""
     if summary["failed"]:
         terminal.tell_failed(summary, sys.stderr if _voice.quiet or _voice.json else sys.stdout)
+    if terminal.failed_now(summary):
         raise typer.Exit(3)
 
 

@@ -41,6 +41,10 @@ VECTOR_UNITS = {
 }
 """Variables of a vector dataset and their units."""
 
+ROUNDING = 1e-5
+"""Largest difference of a velocity from what its displacement tells, relative or in voxels: both are rounded to single
+precision, and so may be what a user computes from them."""
+
 RECONSTRUCTION = "reconstruction"
 """NetCDF group beside the vectors of a pair: projections, profiles and residuals of its two volumes."""
 
@@ -134,6 +138,11 @@ def versions() -> dict[str, str]:
     return found
 
 
+OF_IMAGES = ("structure", "camera_gain", "light_outside")
+"""What is known of each camera's image: how far light of near pixels correlates, the camera's brightness relative to
+the brightest one, and the part of its light in pixels that no voxel lights."""
+
+
 def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
     """Condense the volumes of a pair to what a report shows: maximum projections, brightness and residual history.
 
@@ -141,14 +150,14 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
     ----------
     volumes : dict
         Frame name -> volume (z, y, x) with ``residual`` (one number per iteration) and ``stop`` in its attributes, and
-        ``cameras`` with the ``structure`` of their images, where known.
+        ``cameras`` with what is known of their images by the names of `OF_IMAGES`.
 
     Returns
     -------
     Dataset
         ``projection_z`` (frame, y, x), ``projection_y`` (frame, z, x), ``projection_x`` (frame, z, y) [counts],
         ``profile_z`` (frame, z), the mean brightness of each plane of voxels [counts],
-        ``residual`` (frame, iteration), ``stop`` (frame) and, where known, ``structure`` (frame, camera).
+        ``residual`` (frame, iteration), ``stop`` (frame) and those of `OF_IMAGES` that are known (frame, camera).
     """
     frames = list(volumes)
     first = volumes[frames[0]]
@@ -166,11 +175,13 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
     variables["residual"] = (("frame", "iteration"), residual)
     variables["stop"] = (("frame",), [str(volume.attrs["stop"]) for volume in volumes.values()])
     coordinates: dict[str, Any] = {"frame": frames}
-    if "structure" in first.attrs:
-        structure = [np.atleast_1d(np.asarray(volume.attrs["structure"], float)) for volume in volumes.values()]
-        variables["structure"] = (("frame", "camera"), np.stack(structure))
+    if "cameras" in first.attrs:
         cameras = first.attrs["cameras"]
         coordinates["camera"] = json.loads(cameras) if isinstance(cameras, str) else list(cameras)
+        for name in OF_IMAGES:
+            if name in first.attrs:
+                rows = [np.atleast_1d(np.asarray(volume.attrs[name], float)) for volume in volumes.values()]
+                variables[name] = (("frame", "camera"), np.stack(rows))
     coordinates |= {axis: (axis, first[axis].values, {"units": "mm"}) for axis in _AXES}
     return xr.Dataset(variables, coordinates)
 
@@ -181,11 +192,14 @@ def check_vectors(vectors: xr.Dataset) -> None:
     Raises
     ------
     ValueError
-        If a variable, a coordinate or a unit is missing or wrong, or u, v, w do not follow from the displacements.
+        If a variable, a coordinate, a unit or the attribute ``dt_s`` or ``voxel_mm`` is missing or wrong, or u, v, w do
+        not follow from the displacements.
     """
     for axis in _AXES:
         if axis not in vectors.coords or vectors[axis].dims != (axis,):
             raise ValueError(f"vectors: expected the coordinate {axis} in mm, found {list(vectors.coords)}.")
+        if (unit := vectors[axis].attrs.get("units")) != "mm":
+            raise ValueError(f"vectors: expected the coordinate {axis} in mm, found it in {unit or 'no unit'}.")
     for name, unit in VECTOR_UNITS.items():
         if name not in vectors:
             raise ValueError(f"vectors: expected the variable {name!r}, found {list(vectors.data_vars)}.")
@@ -197,6 +211,19 @@ def check_vectors(vectors: xr.Dataset) -> None:
         raise ValueError(f"vectors: expected 'valid' to be boolean, found {vectors['valid'].dtype}.")
     if not vectors.attrs.get("dt_s", 0) > 0:
         raise ValueError(f"vectors: expected the attribute dt_s > 0, found {vectors.attrs.get('dt_s')}.")
+    voxel_mm = np.asarray(vectors.attrs.get("voxel_mm", ()))
+    if voxel_mm.shape != (3,) or voxel_mm.dtype.kind not in "fiu" or not (voxel_mm > 0).all():
+        found = vectors.attrs.get("voxel_mm")
+        raise ValueError(f"vectors: expected the attribute voxel_mm, edges (z, y, x) > 0, found {found}.")
+    for name, axis, edge_mm in zip("wvu", _AXES, voxel_mm, strict=True):
+        displacement = vectors[f"displacement_{axis}"].values
+        moved = vectors[name].values / (1e-3 * edge_mm / vectors.attrs["dt_s"])
+        wrong = ~np.isclose(moved, displacement, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
+        if wrong.any():
+            raise ValueError(
+                f"vectors: expected {name!r} to be 'displacement_{axis}' times voxel_mm / dt_s, found {wrong.sum()} of "
+                f"{wrong.size} that are not. Change both, or keep what you derive under another name."
+            )
 
 
 def write_vectors(

@@ -6,6 +6,8 @@ Every file appears under its name only when it is complete; one that is there al
 from __future__ import annotations
 
 import enum
+import json
+import logging
 import math
 import os
 import tempfile
@@ -22,6 +24,8 @@ from lfpiv import dataset, derived
 from lfpiv.errors import InputError
 from lfpiv.folder import FRAME_NAMES, Folder, make_writable, writing
 from lfpiv.results import open_results
+
+log = logging.getLogger(__name__)
 
 Progress = Callable[[str, float], None]
 """Called as ``progress(step, fraction)``, fraction from 0 to 1."""
@@ -172,23 +176,42 @@ def _write_vti(
 ) -> list[Path]:
     times = dict(zip(results["pair"].values.tolist(), _times(results, interval_s).tolist(), strict=True))
     collections: dict[str, dict[Path, float]] = {}
+    strange: list[Path] = []
     for pair, vectors in _each_pair(results, tick):
         path = target / f"pair_{pair:04d}.vti"
         _write_image(_vector_arrays(vectors), vectors, path)
         collections.setdefault("vectors", {})[path] = times[pair]
         for frame, name in enumerate(FRAME_NAMES):
             stored = folder.volume(pair, frame)
-            if stored.is_file():
-                volume = dataset.read_volume(stored)
-                path = target / f"volume_{pair:04d}_{name}.vti"
-                _write_image({"intensity": volume.values}, volume, path)
-                collections.setdefault(f"volumes_{name}", {})[path] = times[pair]
+            if not stored.is_file():
+                continue
+            if not _belongs(stored, folder.vectors(pair)):
+                strange.append(stored)
+                continue
+            volume = dataset.read_volume(stored)
+            path = target / f"volume_{pair:04d}_{name}.vti"
+            _write_image({"intensity": volume.values}, volume, path)
+            collections.setdefault(f"volumes_{name}", {})[path] = times[pair]
+    if strange:
+        log.warning(
+            "%s%s: not exported, made with other settings or images than the vectors. Run `lfpiv run` with "
+            "--keep-volumes for volumes that fit",
+            strange[0],
+            f" and {len(strange) - 1} other volumes" if len(strange) > 1 else "",
+        )
     written = []
     for name, files in collections.items():
         path = target / f"{name}.pvd"
         _write_collection(files, path)
         written.append(path)
     return written
+
+
+def _belongs(volume: Path, vectors: Path) -> bool:
+    """Whether a volume was made as the vectors were: of what both depend on nothing differs; raw images may be gone."""
+    one, other = (json.loads(dataset.read_attributes(path).get("depends_on", "{}")) for path in (volume, vectors))
+    known = (name for name in one.keys() & other.keys() if name != "images" or None not in (one[name], other[name]))
+    return all(one[name] == other[name] for name in known)
 
 
 def _vector_arrays(vectors: xr.Dataset) -> dict[str, Any]:

@@ -6,20 +6,19 @@ brighter than the sensor's range all give volumes and vectors that agree with th
 
 from __future__ import annotations
 
-import contextlib
+import collections
+import enum
 import hashlib
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from typing import TypedDict
 
 import numpy as np
 from scipy import ndimage
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import Experiment
 from lfpiv.lightfield import LightFieldDecoder
-
-if TYPE_CHECKING:
-    from lfpiv.camera import Calibration
+from lfpiv.rig import Optics
+from lfpiv.structure import EMPTY, NOISE
 
 GAP_LIGHT = 0.1
 """Light between the microimages, over that inside them, above which an image hardly belongs to the white image and the
@@ -27,6 +26,11 @@ stated optics. Simulated images have 0.001, real ones 0.01; a shift by a tenth o
 15 % gives 0.1, an arbitrary shift up to 1."""
 NO_PLACE = 0.5
 """The same, above which it certainly does not."""
+APERTURE = 0.05
+"""Relative difference of the microimages' diameter from the stated one that is worth a look. Rendered ones, blurred and
+touching, are told to 0.02."""
+OTHER_APERTURE = 0.2
+"""The same, above which the stated optics are certainly not those of the white image."""
 SATURATED = 0.02
 """Of the pixels brighter than half the sensor's range, the part at its end above which an image is saturated."""
 UNEVEN = 4.0
@@ -45,6 +49,16 @@ _BRIGHTEST = 99.9  # percentile at which pixels are clipped, so that no hot ones
 _SIGNIFICANT = 5.0  # standard deviations of a covariance between pixels of independent noise
 _FEWEST_PIXELS = 500  # pairs of pixels between, and inside, microimages that tell anything
 _FEWEST_SATURATED = 20
+_TILE_PX = 1024  # of the white image's middle; further out other stops may cut the pupil
+_HEART_PITCHES = 0.15  # within this of its centre a microimage is evenly bright
+_LIT_LENS = 0.3  # of a typical lens's light: others are dead or dark
+_WHOLE_LENS = 0.8  # of a typical lens's pixels: others are cut by the edge
+_RING_PX = 0.25  # width of the rings of a microimage's profile
+_CLEAR_PX = {
+    True: 0.5,
+    False: 2.0,
+}  # what lies beyond a microimage's edge: without a dark image it tells the dark level
+_MEDIAN_SAMPLES = 100_000  # pixels whose median is taken for the background
 _LIT_SHARE = 0.04  # of all light in a ninth of the sensor; in darker ones single particles count
 _RANGES = {(1 << bits) - 1 << shift for bits in range(8, 17) for shift in (0, 16 - bits)}  # right- and left-justified
 
@@ -83,6 +97,56 @@ def gap_light(image: np.ndarray, decoder: LightFieldDecoder) -> float:
     return max(between, 0.0) / inside if inside > 0 else 0.0
 
 
+def microimage_px(white: np.ndarray, dark: np.ndarray | None, decoder: LightFieldDecoder) -> float | None:
+    """Diameter of the microimages as the white image shows it, whatever is stated [pixel].
+
+    It is told twice, and what is nearer to the stated diameter is taken: by the distance at which the mean microimage
+    is half as bright as in its heart, which uneven light hardly moves, and by all light over that of the hearts, to
+    which blur and overlap do nothing.
+
+    Parameters
+    ----------
+    white, dark : ndarray, shape (rows, columns)
+        White and dark image [counts]; without the latter the darkest pixels give the dark level.
+    decoder : LightFieldDecoder
+        The camera's decoder.
+
+    Returns
+    -------
+    float or None
+        None where too little is dark between the microimages, or too few of them are lit, to tell.
+    """
+    optics, pitch = decoder.optics, decoder.optics.microimage_pitch_px
+    middle = tuple(slice((n - size) // 2, (n + size) // 2) for n in white.shape for size in [min(n // 2, _TILE_PX)])
+    light = (white[middle] - (np.percentile(white, 1) if dark is None else dark[middle])).ravel().astype(float)
+    away = np.linalg.norm(decoder.pupil_mm[middle], axis=-1).ravel() / optics.pupil_pixel_mm
+    lens = np.unique(decoder.lens_index[middle].reshape(-1, 2) @ [1 << 16, 1], return_inverse=True)[1]
+    pixels = np.bincount(lens)
+    mean = np.bincount(lens, light) / pixels
+    whole = pixels > _WHOLE_LENS * np.median(pixels)
+    lit = (whole & (mean > _LIT_LENS * np.median(mean[whole])))[lens]
+    if np.count_nonzero(lit) < _FEWEST_PIXELS:
+        return None
+    order = np.argsort(away[lit])
+    light, away = (light[lit] / mean[lens[lit]])[order], away[lit][order]
+    heart = max(float(np.median(light[away < max(_HEART_PITCHES * pitch, 1.0)])), 1e-9)
+    rings = np.split(np.arange(len(away)), np.flatnonzero(np.diff(away // _RING_PX)) + 1)
+    radius, profile = np.array([(away[ring].mean(), np.median(light[ring]) / heart) for ring in rings]).T
+    edge = int(np.flatnonzero(profile >= 0.5).max(initial=0))
+    cell = pitch**2 * (3**0.5 / 2 if optics.layout == "hexagonal" else 1)
+    told = [2 * (float(light.mean() / heart) * cell / np.pi) ** 0.5]
+    if radius[-1] - radius[edge] > _CLEAR_PX[dark is not None]:
+        told.append(2 * float(np.interp(0.5, profile[[edge + 1, edge]], radius[[edge + 1, edge]])))
+    elif dark is None:
+        return None
+    return float(min(told, key=lambda diameter: abs(diameter - stated_px(optics))))
+
+
+def stated_px(optics: Optics) -> float:
+    """Diameter of the microimages by the stated optics, 2 R f_m/s_i [pixel]."""
+    return 2 * optics.pupil_radius_mm / optics.pupil_pixel_mm
+
+
 def _covariance(image: np.ndarray, chosen: np.ndarray) -> float:
     """Covariance of chosen pixels with chosen ones beside them; 0 where that is no more than noise has by chance."""
     pair = chosen[:, 1:] & chosen[:, :-1]
@@ -116,50 +180,103 @@ def dark_blocks(first: np.ndarray, second: np.ndarray) -> int:
     """
     light = []
     for frame in (first, second):
-        above = np.maximum(frame - np.median(frame), 0)
+        above = np.maximum(frame - np.median(frame.ravel()[:: 1 + frame.size // _MEDIAN_SAMPLES]), 0)
         light.append([block.sum() for band in np.array_split(above, 3, 0) for block in np.array_split(band, 3, 1)])
     low, high = np.sort(light, axis=0)
     return int(np.count_nonzero((high > _LIT_SHARE * high.sum()) & (high > UNEVEN * low)))
 
 
-def pair_warnings(experiment: Experiment, calibration: Calibration, pair: int) -> list[str]:
-    """Say what is suspicious about the images of a pair; nothing where they cannot be read.
+class Finding(TypedDict):
+    """What is suspicious about the images of a pair, in the form in which it is stored with the results."""
+
+    what: str
+    """A `Fault` by its value."""
+    camera: str
+    frame: str
+    """Empty where both frames are meant."""
+    value: float
+    """How much of it: what the function of that name returned."""
+
+
+class Fault(enum.Enum):
+    """Kinds of findings; what each means for a reader, `lfpiv.cautions` words."""
+
+    MISPLACED = "misplaced"
+    SATURATED = "saturated"
+    UNEVEN = "uneven"
+    DIM = "dim"
+    EMPTY = "empty"
+
+
+def frame_findings(
+    raw: np.ndarray, light: np.ndarray, decoder: LightFieldDecoder, camera: str, frame: str
+) -> list[Finding]:
+    """Look at one image: misplaced or saturated light.
 
     Parameters
     ----------
-    experiment : Experiment
-        Its particle images are looked at.
-    calibration : Calibration
-        The microimages of its cameras.
-    pair : int
-        Number of the pair.
+    raw, light : ndarray, shape (rows, columns)
+        The image as recorded, and without its dark level [counts].
+    decoder : LightFieldDecoder
+        The camera's decoder.
+    camera, frame : str
+        Their names.
     """
-    texts: list[str] = []
+    looks = (
+        (Fault.MISPLACED, gap_light(light, decoder), GAP_LIGHT),
+        (Fault.SATURATED, saturated_share(raw), SATURATED),
+    )
+    return [_finding(fault, camera, frame, value) for fault, value, limit in looks if value > limit]
+
+
+def camera_findings(first: np.ndarray, second: np.ndarray, camera: str) -> list[Finding]:
+    """Compare the light of both frames of a camera, images of shape (rows, columns) [counts]."""
+    dark = dark_blocks(first, second)
+    return [_finding(Fault.UNEVEN, camera, "", dark)] if dark else []
+
+
+def structure_findings(shown: Mapping[str, float], frame: str) -> list[Finding]:
+    """Judge the structure of a frame's images, by camera: particles, hardly any, or nothing but noise."""
+    found = []
+    for camera, value in shown.items():
+        if value < NOISE:
+            found.append(_finding(Fault.EMPTY if value < EMPTY else Fault.DIM, camera, frame, value))
+    return found
+
+
+def unmeasured(findings: Iterable[Finding], cameras: int) -> bool:
+    """Whether the findings on a pair say that in some frame fewer than two of several cameras saw particles."""
+    empty = collections.Counter(finding["frame"] for finding in findings if finding["what"] == Fault.EMPTY.value)
+    return bool(empty) and cameras - max(empty.values()) < min(cameras, 2)
+
+
+def _finding(fault: Fault, camera: str, frame: str, value: float) -> Finding:
+    return {"what": fault.value, "camera": camera, "frame": frame, "value": float(value)}
+
+
+def require_different(images: Iterable[tuple[str, bytes]]) -> None:
+    """Refuse a pair of which two images are the same, pixel by pixel: no camera records that, one was copied.
+
+    Parameters
+    ----------
+    images : iterable of (str, bytes)
+        Where each image is from, and its `fingerprint`.
+
+    Raises
+    ------
+    InputError
+        Names both.
+    """
     seen: dict[bytes, str] = {}
-    with contextlib.suppress(InputError):
-        for camera in experiment.cameras:
-            frames = [experiment.particle_image(camera.name, pair, frame) for frame in experiment.frames]
-            for frame, image in zip(experiment.frames, frames, strict=True):
-                where = f"{camera.name}, pair {pair}, frame {frame}"
-                same = seen.setdefault(hashlib.blake2b(image.tobytes()).digest(), where)
-                if same != where:
-                    texts.append(f"{where}: the same image as {same}; check particles.images, and what was copied")
-                texts += [f"{where}: {text}" for text in _image_warnings(image, calibration, camera.name)]
-            dark = dark_blocks(*frames)
-            if dark:
-                texts.append(
-                    f"{camera.name}, pair {pair}: {dark} of 9 parts of the sensor are {UNEVEN:g} times and more as "
-                    "bright in one frame as in the other; check the laser's pulses and the shutter"
-                )
-    return texts
+    for where, mark in images:
+        other = seen.setdefault(mark, where)
+        if other != where:
+            raise InputError(
+                f"{where}: expected an image of its own, found the same image as {other}. Check particles.images, and "
+                "what was copied."
+            )
 
 
-def _image_warnings(image: np.ndarray, calibration: Calibration, name: str) -> Iterator[str]:
-    if gap_light(image, calibration.cameras[name].decoder) > GAP_LIGHT:
-        yield MISPLACED
-    share = saturated_share(image)
-    if share > SATURATED:
-        yield (
-            f"{100 * share:.0f} % of the bright pixels are saturated; clipped particles make ghosts, lower the laser's "
-            "power or the camera's gain"
-        )
+def fingerprint(image: np.ndarray) -> bytes:
+    """Hash of an image's pixels."""
+    return hashlib.blake2b(image.tobytes(), digest_size=16).digest()

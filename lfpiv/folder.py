@@ -14,12 +14,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from lfpiv import notices
 from lfpiv.errors import InputError, StorageError
 
 log = logging.getLogger(__name__)
 
 FRAME_NAMES = "ab"
 """Names of the two frames in output files, whatever the images call them."""
+
+RETIRED = ".outdated"
+"""Suffix, in place of ``.nc``, of results of a pair that failed since its images changed."""
 
 MIB = 1 << 20
 
@@ -101,7 +105,9 @@ def _locked(path: Path) -> int | None:
             holder = os.pread(file, 1000, 0)
             os.close(file)
             if error.errno not in (errno.EAGAIN, errno.EACCES):
-                log.warning("%s: this file system knows no locks: start no second run on this folder", path.parent)
+                notices.warn(
+                    log, "%s: this file system knows no locks: start no second run on this folder", path.parent
+                )
                 return None
             raise InputError(
                 f"{path.parent}: expected a folder that no other run writes to, found it held by {_named(holder)}. "
@@ -126,6 +132,11 @@ def _named(holder: bytes) -> str:
         return f"process {found['process']} on {found['host']} since {found['since']}"
     except (ValueError, KeyError, TypeError):  # it is about to write its name
         return "another process"
+
+
+def retire(path: Path) -> Path:
+    """Rename a result so that nobody takes it for one, and return its new path; the next success removes it."""
+    return path.replace(path.with_suffix(RETIRED))
 
 
 @contextlib.contextmanager

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv import dataset, memory, stamp, summary
+from lfpiv import dataset, memory, notices, stamp, summary
+from lfpiv.cautions import NAMED, ONE_CAMERA, named
 from lfpiv.errors import InputError
 from lfpiv.experiment import Experiment, check_pairs, read_experiment
-from lfpiv.folder import Folder, make_writable, writing
+from lfpiv.folder import Folder, make_writable, retire, writing
 from lfpiv.pair import Outcome, PairWork
 from lfpiv_kernels import runtime
 
@@ -29,9 +30,6 @@ log = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
 """Called as ``progress(step, fraction)``, fraction from 0 to 1."""
 
-NAMED = 5
-"""Pairs that a message names one by one."""
-
 
 @contextlib.contextmanager
 def open_job(
@@ -43,7 +41,7 @@ def open_job(
     *,
     writes_results: bool = True,
 ) -> Iterator[Job]:
-    """Check everything, start the device, collect the warnings; leave no empty folder behind on failure.
+    """Check everything, start the device, keep the warnings; leave no empty folder behind on failure.
 
     Jobs that write results hold the folder for themselves; `writes_results` is False for one that only reports.
     """
@@ -54,12 +52,9 @@ def open_job(
     numbers = _select(experiment, pairs)
     memory.require(memory.least_bytes(experiment), experiment, "volumes of")
     made = make_writable(folder.path)
-    collector = _WarningCollector(level=logging.WARNING)
-    loggers = [logging.getLogger(name) for name in ("lfpiv", "lfpiv_kernels")]
-    for logger in loggers:
-        logger.addHandler(collector)
     try:
         with contextlib.ExitStack() as stack:
+            warnings = stack.enter_context(notices.collected())
             if writes_results:
                 stack.enter_context(folder.held())
                 folder.sweep()
@@ -70,10 +65,8 @@ def open_job(
                 raise InputError(str(error)) from None
             stack.enter_context(threadpool_limits(running.threads))
             request = device or experiment.compute.device
-            yield Job(experiment, folder, numbers, progress, request, running, collector.texts, start)
+            yield Job(experiment, folder, numbers, progress, request, running, warnings, start)
     finally:
-        for logger in loggers:
-            logger.removeHandler(collector)
         for path in made:
             with contextlib.suppress(OSError):  # not empty: the run got somewhere
                 path.rmdir()
@@ -88,24 +81,6 @@ def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> ran
             f"found {first}:{after}."
         )
     return range(first, after)
-
-
-class _WarningCollector(logging.Handler):
-    """Keeps the text of each warning once.
-
-    What vectors and motion passes say of a pair the summary words pair by pair; errors are those of pairs that failed.
-    """
-
-    PAIRWISE = ("lfpiv.vectors", "lfpiv.motion")
-
-    def __init__(self, level: int):
-        super().__init__(level)
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
-        if record.levelno == logging.WARNING and text not in self.texts and record.name not in self.PAIRWISE:
-            self.texts.append(text)
 
 
 class Job:
@@ -136,6 +111,7 @@ class Job:
         self.seconds: dict[str, float] = {}
         self.failed: dict[int, str] = {}
         """Pair -> why this invocation has no result of it."""
+        self.tried: set[int] = set()
         self.weights_report: dict[str, Any] = {}
         self.workers_report: dict[str, Any] = {"count": 1, "threads": device.threads, "peak_memory_mib": None}
         self.calibration: Calibration | None = None
@@ -178,25 +154,38 @@ class Job:
             )
         for reason, pairs in changed.items():
             if reason:
-                log.info("%s changed: %s made anew", reason, _listed(pairs))
+                log.info("%s changed: %s made anew", reason, named(pairs))
         return todo
 
-    def check_images(self, todo: Sequence[int]) -> None:
-        """Warn of pairs whose images cannot be used; they are tried and left out when their turn comes.
+    def check_images(self, todo: Sequence[int]) -> list[int]:
+        """Warn of pairs whose images cannot be used, and return those that are worth any work.
+
+        They are tried and left out when their turn comes; where all are such, none is worth it, and all have failed.
 
         Raises
         ------
         InputError
-            If the first one's images cannot be used: they show whether the experiment file is right.
+            If the first one's images cannot be used and no finished pair shows that the experiment file is right.
         """
-        bad = dict(check_pairs(self.experiment, todo))
-        if bad and todo[0] in bad:
+        bad = dict(check_pairs(self.experiment, [pair for pair in todo if not self.has_volumes(pair)]))
+        if bad and todo[0] in bad and not any(map(self.is_finished, range(self.experiment.pairs))):
             others = f" To do the pairs after it, use --pairs {todo[0] + 1}:." if len(bad) < len(todo) else ""
             raise InputError(bad[todo[0]] + others)
+        if len(bad) == len(todo):
+            for pair, reason in bad.items():
+                self.note(Outcome(pair=pair, reason=reason))
+            return []
         for reason in list(bad.values())[:NAMED]:
             log.error("%s The other pairs will be done.", reason)
         if len(bad) > NAMED:
-            log.error("%d pairs have images that cannot be used: %s", len(bad), _listed(list(bad)))
+            log.error("%d pairs have images that cannot be used: %s", len(bad), named(list(bad)))
+        return list(todo)
+
+    def is_finished(self, pair: int) -> bool:
+        """Whether vectors or both volumes of a pair are in the folder and fit."""
+        found = stamp.marks(self.folder.vectors(pair))
+        wanted = stamp.of_vectors(self.experiment, self.calibration_stamp.hash, pair)
+        return (found is not None and not wanted.changes(found)) or self.has_volumes(pair)
 
     def has_volumes(self, pair: int) -> bool:
         """Whether both volumes of a pair are in the folder and fit."""
@@ -245,35 +234,33 @@ class Job:
     def build_weights(self, calibration: Calibration) -> Weights:
         """Build the weights of the grid."""
         from lfpiv.calibration import warn_outside
-        from lfpiv.exposure import pair_warnings
         from lfpiv.view import require_seen
         from lfpiv.weights import build_weights, compare_with_count
 
         method = self.experiment.compute.weights
         require_seen(self.experiment.path, calibration, self.experiment.grid)
         warn_outside(calibration, self.experiment.grid)
-        for text in pair_warnings(self.experiment, calibration, self.numbers[0]):
-            log.warning("%s", text)
         if len(calibration.cameras) == 1:
-            log.warning(
-                "one camera hardly sees depth: w and displacement_z are not to be trusted, nor is their validation"
-            )
-        with self.timed("weights"):
-            weights = build_weights(
-                calibration,
-                self.experiment.grid,
-                method,
-                form=self.experiment.compute.weights_form,
-                limit_bytes=memory.left_for_weights(self.experiment),
-                progress=self.step("weights"),
-            )
-        self.weights_report = {"method": method, "memory_mib": weights.memory_bytes / memory.MIB}
+            log.warning(ONE_CAMERA)
+        with notices.collected() as warnings:
+            with self.timed("weights"):
+                weights = build_weights(
+                    calibration,
+                    self.experiment.grid,
+                    method,
+                    form=self.experiment.compute.weights_form,
+                    limit_bytes=memory.left_for_weights(self.experiment),
+                    progress=self.step("weights"),
+                )
+                _ = weights.column_sum  # made once for all pairs, and warns of what fewer than two cameras see
+            counted = compare_with_count(weights) if method == "footprint" else {}
+        self.weights_report = {"method": method, "memory_mib": weights.memory_bytes / memory.MIB, "warnings": warnings}
         if method == "footprint":
-            self.weights_report["form"] = dict(weights.forms)
+            self.weights_report |= {"form": dict(weights.forms), "cuts": dict(weights.cuts)}
             self.weights_report["profiles_check_l2"] = {
                 name: [round(error, 4) for error in errors] for name, errors in weights.profile_errors.items()
             }
-            errors = [error for camera in compare_with_count(weights).values() for error in camera]
+            errors = [error for camera in counted.values() for error in camera]
             self.weights_report["count_check_l2"] = [round(error, 4) for error in errors]
             if errors:  # of the few voxels drawn some camera may see none
                 share = 100 * np.mean(errors)
@@ -294,16 +281,29 @@ class Job:
         )
 
     def note(self, outcome: Outcome) -> None:
-        """Keep what came of a pair."""
-        if outcome.reason:
-            self.failed[outcome.pair] = outcome.reason
-            log.error("pair %d failed and is left out: %s", outcome.pair, outcome.reason)
+        """Keep what came of a pair; where it failed, put results aside that were made of other images of it."""
+        pair = outcome.pair
+        self.tried.add(pair)
+        if not outcome.reason:
+            return
+        self.failed[pair] = outcome.reason
+        log.error("pair %d failed and is left out: %s", pair, outcome.reason)
+        made = [(self.folder.vectors(pair), stamp.of_vectors)]
+        made += [(self.folder.volume(pair, frame), stamp.of_volumes) for frame in (0, 1)]
+        for path, mark in made:
+            found = stamp.marks(path)
+            wanted = mark(self.experiment, self.calibration_stamp.hash, pair)
+            if found is None or "images" not in wanted.changes(found):
+                continue
+            with writing(path):
+                aside = retire(path)
+            log.warning("%s: made of other images than there are now; renamed %s", path, aside.name)
 
     def finish(self, *, report: bool) -> dict[str, Any]:
         """Write summary.json of all that the folder holds, and report.html where asked; return the summary."""
         if self.calibration is None:
             raise InputError(f"{self.folder.calibration}: expected a calibration, found none. Run `lfpiv calibrate`.")
-        vectors, pairs = {}, []
+        vectors, pairs, reconstructed = {}, [], []
         for pair in range(self.experiment.pairs):
             path = self.folder.vectors(pair)
             found = stamp.marks(path)
@@ -312,13 +312,21 @@ class Job:
             ):
                 vectors[pair] = path
                 pairs.append(summary.pair_entry(pair, path, found))
+            elif self.has_volumes(pair):
+                marks = [stamp.marks(self.folder.volume(pair, frame)) for frame in (0, 1)]
+                reconstructed.append(summary.volumes_entry(pair, filter(None, marks)))
         earlier = {entry["pair"]: entry["reason"] for entry in self.previous.get("failed", ())}
+        done = {*self.tried, *vectors}
         result = summary.build(
             experiment=self.experiment,
             calibration=self.calibration,
             calibration_path=self.folder.calibration,
             pairs=pairs,
-            failed={pair: reason for pair, reason in {**earlier, **self.failed}.items() if pair not in vectors},
+            reconstructed=reconstructed,
+            failed=self.failed,
+            failed_earlier={
+                pair: reason for pair, reason in earlier.items() if pair < self.experiment.pairs and pair not in done
+            },
             previous=self.previous,
             weights_s=self.seconds.get("weights"),
             weights=self.weights_report,
@@ -345,14 +353,6 @@ class Job:
         earlier = self.previous.get("peak_memory_mib") if self.reused else None
         peaks = (memory.peak_mib(), earlier, self.workers_report["peak_memory_mib"])
         result["peak_memory_mib"] = max(peak or 0.0 for peak in peaks)
-
-
-def _listed(pairs: Sequence[int]) -> str:
-    """Name some pairs, and say how many there are where they are many."""
-    names = ", ".join(map(str, pairs[:NAMED]))
-    return f"pair{'s' if len(pairs) > 1 else ''} {names}" + (
-        f" and {len(pairs) - NAMED} more" if len(pairs) > NAMED else ""
-    )
 
 
 def _mark(file: io.BytesIO, **attributes: Any) -> None:

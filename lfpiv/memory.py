@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +33,12 @@ BYTES_PER_PIXEL = 64
 
 BASE_BYTES = GIB // 2
 """Python, its libraries and compiled kernels."""
+
+GROUPS = Path("/sys/fs/cgroup")
+"""Control groups of the machine, or of the container."""
+
+OWN_GROUPS = Path("/proc/self/cgroup")
+"""Names those that this process belongs to."""
 
 
 def least_bytes(experiment: Experiment) -> int:
@@ -81,19 +89,11 @@ def allowed_bytes(experiment: Experiment) -> int:
 
 
 def available_bytes() -> int:
-    """Return the memory this process may take [byte]: what the machine has free or its control group allows."""
+    """Return the memory this process may take [byte]: what the machine has free or its control groups allow."""
     free = _meminfo("MemAvailable")
     if free is None:
         free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-    ):
-        try:
-            free = min(free, int(Path(limit).read_text()) - int(Path(used).read_text()))
-        except (OSError, ValueError):  # no such control group, or "max"
-            continue
-    return max(free, 0)
+    return max(0, min([free, *_left_in_groups()]))
 
 
 def left_for_weights(experiment: Experiment) -> int:
@@ -138,6 +138,44 @@ def _meminfo(key: str) -> int | None:
     except OSError:
         return None
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(key + ":")), None)
+
+
+def _left_in_groups() -> Iterator[int]:
+    """Memory that each control group of this process with a limit, its own one or one above, leaves it [byte].
+
+    Files in the page cache count as used there, but the kernel drops them when memory is asked for.
+    """
+    names = ("memory.max", "memory.current", "inactive_file", "active_file")
+    older = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file", "total_active_file")
+    for controller, place, files in (("", GROUPS, names), ("memory", GROUPS / "memory", older)):
+        for group in _groups(controller, place):
+            yield _left_in(group, files)
+
+
+def _groups(controller: str, place: Path) -> list[Path]:
+    """Folders of this process's group and of those above it up to `place`; controllers of version 2 have no name."""
+    try:
+        lines = [line.split(":", 2) for line in OWN_GROUPS.read_text().splitlines()]
+    except OSError:
+        lines = []
+    own = next((group for _, names, group in lines if controller in names.split(",")), "/")
+    if ".." in own:  # outside of what a container sees
+        own = "/"
+    path = place / own.strip("/")
+    return [path, *(parent for parent in path.parents if parent.is_relative_to(place))]
+
+
+def _left_in(group: Path, names: tuple[str, str, str, str]) -> int:
+    """Memory that one group leaves its processes [byte]; no end of it where there is no such group, or no limit."""
+    limit, used, *dropped = names
+    try:
+        left = int((group / limit).read_text()) - int((group / used).read_text())
+    except (OSError, ValueError):  # not there, or "max"
+        return sys.maxsize
+    with contextlib.suppress(OSError):
+        lines = (line.split() for line in (group / "memory.stat").read_text().splitlines())
+        left += sum(int(value) for name, value in lines if name in dropped)
+    return left
 
 
 def _nominal_cameras(experiment: Experiment) -> Calibration:

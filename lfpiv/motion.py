@@ -52,7 +52,7 @@ FAINTEST = 1e-6
 ITERATION_SHARE = 0.4
 """Iterations of a pass, as a share of those of the first reconstruction: it starts close to its end."""
 LEAST_VALID = 0.3
-"""Least part of valid vectors: with fewer there is no motion to follow."""
+"""Least part of valid vectors, of those that two cameras see: with fewer there is no motion to follow."""
 FOLLOWED = 4
 """Steps of the fixed point that turns displacements midway in time into those of the particles of one frame."""
 
@@ -158,7 +158,7 @@ def reconstruct_pair(
     for _ in range(motion_passes):
         vectors = correlate(*volumes, dt_s=1.0, **correlation)
         valid.append(round(float(vectors.attrs["valid_fraction"]), 4))
-        if valid[-1] < LEAST_VALID:
+        if valid[-1] < LEAST_VALID * float(vectors.attrs["seen_fraction"]):
             verdict = Motion.LOST
             log.warning("motion: %.0f %% of the vectors are valid; %s", 100 * valid[-1], verdict.value)
             break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 import traceback
@@ -15,12 +16,13 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 import lfpiv
-from lfpiv import dataset, stamp, summary
+from lfpiv import cautions, dataset, exposure, stamp, summary
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment import Experiment
-from lfpiv.folder import Folder, writing
+from lfpiv.exposure import Finding
+from lfpiv.folder import RETIRED, Folder, writing
 from lfpiv.settings import Correlation
-from lfpiv.structure import structure
+from lfpiv.structure import seen_structure
 
 if TYPE_CHECKING:
     from lfpiv.weights import Weights
@@ -35,6 +37,26 @@ WRITES = 0.99
 
 Fraction = Callable[[float], None]
 """Called with the finished fraction of a pair, from 0 to 1."""
+
+
+NO_PARTICLES = "no particles in the images: none of the vectors counts"
+"""Verdict on the vectors of a pair of which the images of a frame show nothing but noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameLight:
+    """The images of one frame, by camera, and what they tell by themselves."""
+
+    light: dict[str, np.ndarray]
+    """Images without dark and background [counts]."""
+    noise: dict[str, float]
+    """Noise of that background [counts]."""
+    fingerprints: dict[str, bytes]
+    """What tells images from copies of each other."""
+    findings: list[Finding]
+    """What is suspicious about them."""
+    seconds: float
+    """Time that reading and looking at them took."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,44 +134,78 @@ class PairWork:
                 f"{self.folder.volume(pair, 0)}: expected the two volumes of pair {pair} made with the present "
                 "settings, found none. Run `lfpiv reconstruct` first."
             )
-        read = [self.read_light(pair, frame) for frame in self.experiment.frames]
+        frames = self.experiment.frames
+        read = [self.read_light(pair, frame) for frame in frames]
+        exposure.require_different(
+            (f"{name}, pair {pair}, frame {frame}", mark)
+            for frame, one in zip(frames, read, strict=True)
+            for name, mark in one.fingerprints.items()
+        )
+        findings = [list(one.findings) for one in read]
+        for name in read[0].light:  # what concerns both frames is kept with the first one
+            findings[0] += exposure.camera_findings(read[0].light[name], read[1].light[name], name)
+        shown = [self._structure(one.light) for one in read]
+        for frame, found, structure in zip(frames, findings, shown, strict=True):
+            found += exposure.structure_findings(structure, frame)
+        self._say(pair, [finding for found in findings for finding in found])
         volumes = _volumes(self.weights, read, self.experiment, pair, progress)
-        for volume, (light, _, seconds) in zip(volumes, read, strict=True):
-            shown = {name: structure(image, self.weights.cameras[name].decoder) for name, image in light.items()}
-            volume.attrs |= {"cameras": list(shown), "structure": list(shown.values())}
-            volume.attrs["seconds"] += seconds
+        for volume, one, found, structure in zip(volumes, read, findings, shown, strict=True):
+            volume.attrs |= {"cameras": list(structure), "structure": list(structure.values())}
+            volume.attrs["findings"] = json.dumps(found)
+            volume.attrs["seconds"] += one.seconds
         return volumes
+
+    def _structure(self, light: Mapping[str, np.ndarray]) -> dict[str, float]:
+        assert self.weights is not None
+        return {name: seen_structure(image, self.weights.cameras[name].decoder) for name, image in light.items()}
+
+    @cached_property
+    def said(self) -> set[str]:
+        """Kinds of findings that this process has warned of; the summary names all pairs."""
+        return set()
+
+    def _say(self, pair: int, findings: Sequence[Finding]) -> None:
+        new = [finding for finding in findings if finding["what"] not in self.said]
+        for text in cautions.of_images([{"pair": pair, "findings": new}]):
+            log.warning("%s", text)
+        self.said.update(finding["what"] for finding in new)
 
     @cached_property
     def darks(self) -> dict[str, np.ndarray | None]:
         """Dark image of every camera [counts], None where there is none; read once."""
         return {camera.name: self.experiment.dark(camera.name) for camera in self.experiment.cameras}
 
-    def read_light(self, pair: int, frame: str) -> tuple[dict[str, np.ndarray], dict[str, float], float]:
-        """Images of one frame without dark and background [counts], the noise of that background [counts], seconds."""
+    def read_light(self, pair: int, frame: str) -> FrameLight:
+        """Read the images of one frame and look at each by itself."""
         assert self.weights is not None
         start = time.perf_counter()
-        light, noise = {}, {}
-        for camera in self.experiment.cameras:
-            image, dark = self.experiment.particle_image(camera.name, pair, frame), self.darks[camera.name]
-            image = image if dark is None else image - dark
-            level, noise[camera.name] = self.weights.cameras[camera.name].decoder.background(image)
-            light[camera.name] = image - np.float32(level)
-        return light, noise, time.perf_counter() - start
+        light, noise, fingerprints, findings = {}, {}, {}, list[Finding]()
+        for name in (camera.name for camera in self.experiment.cameras):
+            raw, dark = self.experiment.particle_image(name, pair, frame), self.darks[name]
+            decoder = self.weights.cameras[name].decoder
+            image = raw if dark is None else raw - dark
+            level, noise[name] = decoder.background(image)
+            light[name] = image - np.float32(level)
+            fingerprints[name] = exposure.fingerprint(raw)
+            findings += exposure.frame_findings(raw, light[name], decoder, name, frame)
+        seconds = time.perf_counter() - start
+        return FrameLight(light=light, noise=noise, fingerprints=fingerprints, findings=findings, seconds=seconds)
 
     def _write_volumes(self, pair: int, volumes: Sequence[xr.DataArray]) -> None:
         mark = stamp.of_volumes(self.experiment, self.calibration_hash, pair).attributes
         for number, (volume, frame) in enumerate(zip(volumes, self.experiment.frames, strict=True)):
             path = self.folder.volume(pair, number)
-            attributes = {**mark, "seconds": volume.attrs["seconds"], "pair": pair, "frame": frame}
+            own = {key: volume.attrs[key] for key in ("seconds", "findings")}
+            attributes = {**mark, **own, "pair": pair, "frame": frame}
             with writing(path):
                 dataset.write_volume(volume, path, attributes=attributes)
+                path.with_suffix(RETIRED).unlink(missing_ok=True)
 
     def correlate(self, pair: int, volumes: Sequence[xr.DataArray], progress: Fraction) -> None:
         """Correlate the volumes of a pair and write its vectors, the figures of the summary with them."""
         experiment, start = self.experiment, time.perf_counter()
         vectors = lfpiv.correlate(*volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
-        vectors = _with_motion(vectors, volumes)
+        vectors = _with_findings(_with_motion(vectors, volumes), volumes)
         vectors.attrs["reconstruction_s"] = sum(float(volume.attrs["seconds"]) for volume in volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         condensed = dataset.build_reconstruction(dict(zip(experiment.frames, volumes, strict=True)))
@@ -165,12 +221,13 @@ class PairWork:
         progress(WRITES)
         with writing(path):
             dataset.write_vectors(vectors, path, attributes=attributes, reconstruction=condensed)
+            path.with_suffix(RETIRED).unlink(missing_ok=True)
         log.info("pair %d: %.0f %% of the vectors valid", pair, 100 * float(vectors["valid"].mean()))
 
 
 def _volumes(
     weights: Weights,
-    read: Sequence[tuple[Mapping[str, np.ndarray], Mapping[str, float], float]],
+    read: Sequence[FrameLight],
     experiment: Experiment,
     pair: int,
     progress: Fraction,
@@ -183,8 +240,8 @@ def _volumes(
     try:
         volumes = reconstruct_pair(
             weights,
-            [light for light, _, _ in read],
-            floor=[noise for _, noise, _ in read],
+            [one.light for one in read],
+            floor=[one.noise for one in read],
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
             progress=progress,
             **experiment.smart.model_dump(),
@@ -207,4 +264,17 @@ def _with_motion(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dat
         return vectors
     vectors = unshared_quality(vectors, volumes)
     vectors.attrs |= {"motion": told["motion"], "motion_valid": np.atleast_1d(told["motion_valid"]).tolist()}
+    return vectors
+
+
+def _with_findings(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dataset:
+    """Vectors that know what is suspicious about their images, and count for nothing where those are empty."""
+    findings = [finding for volume in volumes for finding in json.loads(volume.attrs.get("findings", "[]"))]
+    vectors.attrs["findings"] = json.dumps(findings)
+    cameras = volumes[0].attrs.get("cameras", [])
+    if exposure.unmeasured(findings, len(json.loads(cameras) if isinstance(cameras, str) else cameras)):
+        vectors["valid"] = xr.zeros_like(vectors["valid"])  # keeps its attributes
+        for name in [name for name in vectors.data_vars if str(name).startswith("uncertainty")]:
+            vectors[name] = vectors[name].where(vectors["valid"])
+        vectors.attrs |= {"verdict": NO_PARTICLES, "valid_fraction": 0.0}
     return vectors

@@ -70,7 +70,7 @@ def run(
         raise InputError("--workers, --scheduler: expected one of them: a cluster has workers of its own.")
     with open_job(experiment, out, device, progress, pairs) as job:
         todo = job.unfinished(volumes=keep_volumes)
-        planned = _plan(job, todo, workers, scheduler)
+        todo, planned = _plan(job, todo, workers, scheduler)
         calibration = job.calibrate()
         if todo:
             _do(job, _outcomes(job, calibration, todo, planned, scheduler, keep_volumes))
@@ -101,7 +101,7 @@ def reconstruct(
     """Reconstruct the volumes of some pairs into ``volumes/``; calibrates first where need be. Returns the summary."""
     with open_job(experiment, out, device, progress, pairs) as job:
         todo = job.unfinished(vectors=False, volumes=True)
-        _plan(job, todo, 1, None)
+        todo, _ = _plan(job, todo, 1, None)
         calibration = job.calibrate()
         if todo:
             work = job.work(job.build_weights(calibration), keep_volumes=True, vectors=False)
@@ -151,25 +151,26 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
         return job.finish(report=True)
 
 
-def _plan(job: Job, todo: Sequence[int], workers: int | None, scheduler: str | None) -> batch.Plan | None:
-    """Check images, memory and workers before any work; None where a cluster does it."""
+def _plan(job: Job, todo: list[int], workers: int | None, scheduler: str | None) -> tuple[list[int], batch.Plan | None]:
+    """Check images, memory and workers before any work; return the pairs worth it, and None where a cluster does it."""
     from lfpiv import memory
 
     gpus = batch.visible_gpus() if job.device.kind == "cuda" else ()
     planned = batch.plan(len(todo), workers, job.device, gpus)
     if todo:
-        job.check_images(todo)
+        todo = job.check_images(todo)
+    if todo:
         weights = memory.weights_bytes(job.experiment) if not all(map(job.has_volumes, todo)) else 0
         if workers is None:
             planned = batch.lowered(batch.unasked(planned, job.device), job.experiment, weights, job.device)
         batch.require_memory(job.experiment, weights, 1 if scheduler else planned.workers)
     if scheduler:
-        return None
+        return todo, None
     if planned.workers > 1:
         from lfpiv import machine
 
         machine.warm_up(planned.kind)
-    return planned
+    return todo, planned
 
 
 def _outcomes(

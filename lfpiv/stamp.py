@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -59,13 +60,13 @@ class Stamp:
 
 
 def marks(path: Path) -> dict[str, Any] | None:
-    """Stamp and figures in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
+    """Stamp, figures and findings in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
     import h5py
 
     found = {}
     try:
         with h5py.File(path, "r") as file:
-            for name in ("settings_hash", "depends_on", "figures"):
+            for name in ("settings_hash", "depends_on", "figures", "findings"):
                 with contextlib.suppress(KeyError):
                     found[name] = file.attrs[name]
     except OSError:
@@ -101,7 +102,8 @@ def of_volumes(experiment: Experiment, calibration: str, pair: int) -> Stamp:
             "smart": experiment.smart.model_dump(),
             "motion": reach if experiment.smart.motion_passes else None,
             "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
-            "images": _identity(experiment.pair_paths(pair)),
+            "particles": {"images": experiment.particle_images, "frames": list(experiment.frames)},
+            "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
         }
     )
 
@@ -112,10 +114,10 @@ def of_vectors(experiment: Experiment, calibration: str, pair: int) -> Stamp:
     return Stamp({**volumes, "correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s})
 
 
-def _identity(paths: list[Path]) -> list[list[Any]] | None:
-    """Tell images from others at the price of a glance: by name, size and time of the last change."""
+def _identity(paths: list[Path], start: Path) -> list[list[Any]] | None:
+    """Tell images from others at the price of a glance: by path from `start`, size and time of the last change."""
     try:
         found = [(path, split_frame(path)[0].stat()) for path in paths]
     except OSError:
         return None
-    return [[path.name, status.st_size, status.st_mtime_ns] for path, status in found]
+    return [[os.path.relpath(path, start), status.st_size, status.st_mtime_ns] for path, status in found]

@@ -17,6 +17,9 @@ from lfpiv.derived import COMPONENTS, check_velocity
 STRESSES = ("uu", "vv", "ww", "uv", "uw", "vw")
 """Components of the Reynolds stress tensor, which is symmetric."""
 
+LARGEST_PART = 0.75
+"""Largest part of all pairs of pairs whose correlation is summed up: those farther apart are too few to tell it."""
+
 _TRANSFORM_SIZE = 1 << 22  # numbers that are transformed at once
 
 
@@ -147,10 +150,15 @@ def turbulent_kinetic_energy(vectors: xr.Dataset) -> xr.DataArray:
 def standard_error(vectors: xr.Dataset) -> xr.Dataset:
     """Estimate the standard error of the mean velocity: few of many correlated pairs are independent.
 
-    The variance of the mean of n correlated pairs is sigma^2 (1 + 2 sum (n_k / n) rho_k) / n, n_k the number of pairs k
-    apart. Their correlation rho_k is averaged over the volume and summed up to where it is not positive [1]_.
-    A series not much longer than its correlation hides it, and the error is then too small. One component of all pairs
-    is held in memory.
+    The variance of the mean of n correlated pairs is V = sigma^2 (1 + 2 sum (n_k / n) rho_k) / n, n_k the number of
+    pairs k apart. Their products about the mean of the pairs themselves, averaged over the volume, each lack that V
+    [2]_, which is added: the sum is linear in V and solved for it. It goes up to where the correlation is not positive,
+    and counts none as higher than one before [1]_.
+
+    A series not much longer than its correlation hides it. With rho_k = rho^k the error comes out as 0.9 to 1.1 of the
+    true one for rho = 0.5 and 10 pairs or more, and for rho = 0.8 and 50; as 0.8 to 0.9 for rho = 0.8 and 20 pairs, 0.7
+    for 10. Of independent pairs it is 1.0 where the flow differs from place to place; where all vectors move as one,
+    1.2 for 10 pairs and 1.1 for 50. One component of all pairs is held in memory.
 
     Parameters and errors are those of `mean`.
 
@@ -162,7 +170,10 @@ def standard_error(vectors: xr.Dataset) -> xr.Dataset:
 
     References
     ----------
-    .. [1] C. J. Geyer, "Practical Markov chain Monte Carlo", Statist. Sci. 7 (1992) 473-483, for where to stop.
+    .. [1] C. J. Geyer, "Practical Markov chain Monte Carlo", Statist. Sci. 7 (1992) 473-483: initial positive and
+       monotone sequences.
+    .. [2] F. H. C. Marriott, J. A. Pope, "Bias in the estimation of autocorrelations", Biometrika 41 (1954) 390-402,
+       doi:10.1093/biomet/41.3-4.390.
 
     Examples
     --------
@@ -181,8 +192,8 @@ def standard_error(vectors: xr.Dataset) -> xr.Dataset:
     for name, axis in COMPONENTS.items():
         series = measured[name].transpose("pair", ...).compute()
         count = series.count("pair")
-        shared = _pairs_per_independent(series.values, order)
-        error = (series.std("pair", ddof=1) * np.sqrt(shared / count.where(count > 1))).where(count > 1)
+        shared, factor = _correlated(series.values, order)
+        error = (series.std("pair", ddof=1) * np.sqrt(factor / count.where(count > 1))).where(count > 1)
         error.attrs = {
             "units": "m/s",
             "long_name": f"standard error of the mean velocity along {axis}",
@@ -225,8 +236,8 @@ def _with_axes(result: xr.Dataset, vectors: xr.Dataset) -> xr.Dataset:
     return result
 
 
-def _pairs_per_independent(series: np.ndarray, order: np.ndarray) -> float:
-    """Sum of the correlation over all pairs of pairs, 1 + 2 sum (n_k / n) rho_k, n_k of them k apart.
+def _correlated(series: np.ndarray, order: np.ndarray) -> tuple[float, float]:
+    """Sum up the correlation over all pairs of pairs, 1 + 2 sum (n_k / n) rho_k, n_k of them k apart.
 
     Parameters
     ----------
@@ -234,30 +245,48 @@ def _pairs_per_independent(series: np.ndarray, order: np.ndarray) -> float:
         One component, NaN where it does not count.
     order : ndarray of int, shape (pair,)
         Numbers of the pairs; gaps are pairs that are missing.
+
+    Returns
+    -------
+    pairs_per_independent : float
+        That sum.
+    factor : float
+        n times the variance of a mean over the variance seen about it: the sum, and what is not seen.
     """
     flat = series.reshape(len(series), -1)
     place = order - order.min()
     length = int(place.max()) + 1
     step = max(1, _TRANSFORM_SIZE // length)
-    power = np.zeros(length + 1)
+    products, pairs, places = np.zeros(length), np.zeros(length), 0
     for start in range(0, flat.shape[1], step):
         part = flat[:, start : start + step]
         counts = np.isfinite(part)
+        counts &= counts.sum(0) > 1
         means = np.where(counts, part, 0).sum(0) / np.maximum(counts.sum(0), 1)
-        values = np.zeros((length, part.shape[1]))
-        values[place] = np.where(counts, part - means, 0)
-        power += _power(values).sum(1)
-    products = np.fft.irfft(power)[:length]  # sums of products of fluctuations k apart: n_k rho_k sigma^2
+        products += _sums_apart(np.where(counts, part - means, 0), place, length)
+        pairs += _sums_apart(counts, place, length)
+        places += int(counts.any(0).sum())
     if not products[0] > 0:
-        return 1.0
-    present = np.zeros((length, 1))
-    present[place] = 1
-    occurs = np.fft.irfft(_power(present)[:, 0])[:length] > 0.5  # distances that there are, not hidden by gaps
-    correlation = products[occurs] / products[0]
-    stop = np.flatnonzero(correlation <= 0)
-    return float(1 + 2 * correlation[1 : stop[0] if len(stop) else None].sum())
+        return 1.0, 1.0
+    occurs = pairs > 0.5  # distances that there are, not hidden by gaps
+    seen = np.minimum.accumulate(products[occurs] / pairs[occurs])
+    share = 2 * pairs[occurs] / pairs[0]
+    share[0] = 1
+    count = pairs[0] / places
+    farthest = np.flatnonzero(share.cumsum() <= LARGEST_PART * count)[-1] + 1
+    lost = seen[0] / (count - 1)
+    for _ in range(2):  # the variance of the mean tells where the correlation ends, and that tells it better
+        ends = np.flatnonzero(seen[:farthest] + lost <= 0)
+        stop = ends[0] if len(ends) else farthest
+        lost = (share * seen)[:stop].sum() / (count - share[:stop].sum())
+    total = (share * (seen + lost))[:stop].sum() / (seen[0] + lost)
+    return float(total), float(total * (seen[0] + lost) * (count - 1) / (count * seen[0]))
 
 
-def _power(values: np.ndarray) -> np.ndarray:
-    """Squared spectrum along the first axis, whose inverse holds the products at all distances; ends do not meet."""
-    return np.abs(np.fft.rfft(values, 2 * len(values), axis=0)) ** 2
+def _sums_apart(values: np.ndarray, place: np.ndarray, length: int) -> np.ndarray:
+    """Sum the products of values 0, 1, ... `length` - 1 apart along the first axis, over everything else."""
+    spread = np.zeros((length, values.shape[1]))
+    spread[place] = values
+    power = np.abs(np.fft.rfft(spread, 2 * length, axis=0)) ** 2  # twice as long: ends do not meet
+    sums: np.ndarray = np.fft.irfft(power.sum(1))[:length]
+    return sums

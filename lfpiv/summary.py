@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from lfpiv import dataset
+from lfpiv import cautions, dataset
 from lfpiv.experiment import Experiment
-from lfpiv.structure import NOISE
-from lfpiv.vectors import Verdict
 
 if TYPE_CHECKING:
     from lfpiv.calibration import CalibratedCamera, Calibration
@@ -34,7 +32,9 @@ def build(
     calibration: Calibration,
     calibration_path: Path,
     pairs: Sequence[Mapping[str, Any]],
+    reconstructed: Sequence[Mapping[str, Any]],
     failed: Mapping[int, str],
+    failed_earlier: Mapping[int, str],
     previous: Mapping[str, Any],
     weights_s: float | None,
     weights: Mapping[str, Any],
@@ -56,8 +56,10 @@ def build(
         The calibration and its file.
     pairs : sequence of dict
         Figures of the finished pairs, from `pair_entry`.
-    failed : dict
-        Pair -> why it has no result.
+    reconstructed : sequence of dict
+        Number and findings of pairs that have volumes and no vectors yet, from `volumes_entry`.
+    failed, failed_earlier : dict
+        Pair -> why it has no result: of this invocation, and of earlier ones.
     previous : dict
         Earlier summary of the folder, or nothing.
     weights_s, weights
@@ -67,7 +69,8 @@ def build(
     device : Device
         Where the kernels ran.
     warnings, reused : sequence of str
-        What was warned of, and what was kept from an earlier invocation.
+        What this invocation warned of by itself, and what was kept from an earlier one. What is doubtful about the
+        results is told from the results, in every invocation.
 
     Returns
     -------
@@ -83,15 +86,14 @@ def build(
         "reconstruction": sum(pair["reconstruction_s"] for pair in pairs),
         "correlation": sum(pair["correlation_s"] for pair in pairs),
     }
-    empty = [text for pair in pairs for text in _without_particles(pair)]
-    said = [text for report in reports.values() for text in report.get("warnings", ())]
-    poor = [
-        f"pair {pair['pair']}: {100 * pair['valid_fraction']:.0f} % of the vectors are valid; {pair['verdict']}"
-        for pair in pairs
-        if pair["verdict"] != Verdict.GOOD.value
-    ]
-    lost = [text for pair in pairs for text in _without_motion(pair)]
     grid = experiment.grid
+    weights = dict(weights) or previous.get("weights", {})
+    said = [
+        *cautions.of_rig(calibration, grid),
+        *weights.get("warnings", ()),
+        *cautions.of_images([*pairs, *reconstructed]),
+        *cautions.of_pairs(pairs),
+    ]
     return {
         "schema_version": SCHEMA_VERSION,
         "experiment": {
@@ -114,12 +116,16 @@ def build(
         "timings_s": {stage: timings[stage] for stage in _STAGES},
         "peak_memory_mib": None,
         "calibration": {name: _scalars(report) for name, report in reports.items()},
-        "weights": dict(weights) or previous.get("weights", {}),
+        "weights": weights,
         "pairs": list(pairs),
-        "failed": [{"pair": pair, "reason": reason} for pair, reason in sorted(failed.items())],
+        "failed": sorted(
+            [{"pair": pair, "reason": reason} for pair, reason in failed.items()]
+            + [{"pair": pair, "reason": reason, "earlier": True} for pair, reason in failed_earlier.items()],
+            key=lambda entry: entry["pair"],
+        ),
         "valid_fraction": _mean(pair["valid_fraction"] for pair in pairs),
         "finite_fraction": _mean(pair["finite_fraction"] for pair in pairs),
-        "warnings": list(dict.fromkeys([*said, *warnings, *empty, *lost, *poor])),
+        "warnings": list(dict.fromkeys([*said, *warnings])),
         "reused": list(reused),
     }
 
@@ -163,6 +169,11 @@ def pair_entry(number: int, path: Path, marks: Mapping[str, Any]) -> dict[str, A
     return {"pair": number, "file": path.name, **figures}
 
 
+def volumes_entry(number: int, marks: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the findings of a pair whose vectors are not there yet, from the marks of its volumes."""
+    return {"pair": number, "findings": [found for mark in marks for found in json.loads(mark.get("findings", "[]"))]}
+
+
 def pair_figures(vectors: xr.Dataset, reconstruction: xr.Dataset | None) -> dict[str, Any]:
     """Figures of a pair's vectors and of what is left of its volumes; stored with the vectors."""
     valid = vectors["valid"].values
@@ -171,7 +182,9 @@ def pair_figures(vectors: xr.Dataset, reconstruction: xr.Dataset | None) -> dict
         "vectors": list(vectors["u"].shape),
         "valid_fraction": float(valid.mean()),
         "finite_fraction": float(finite.mean()),
+        "seen_fraction": float(vectors.attrs.get("seen_fraction", 1.0)),
         "verdict": str(vectors.attrs["verdict"]),
+        "findings": json.loads(vectors.attrs.get("findings", "[]")),
         "reconstruction_s": float(vectors.attrs["reconstruction_s"]),
         "correlation_s": float(vectors.attrs["correlation_s"]),
         "velocity_m_per_s": {name: _spread(vectors[name], valid & finite) for name in ("u", "v", "w")},
@@ -190,38 +203,15 @@ def pair_figures(vectors: xr.Dataset, reconstruction: xr.Dataset | None) -> dict
         frames = [str(frame) for frame in reconstruction["frame"].values]
         history = reconstruction["residual"].values
         result["residual"] = {frame: row[np.isfinite(row)].tolist() for frame, row in zip(frames, history, strict=True)}
-        if "structure" in reconstruction:
-            cameras = [str(name) for name in reconstruction["camera"].values]
-            result["structure"] = {
-                frame: dict(zip(cameras, map(float, row), strict=True))
-                for frame, row in zip(frames, reconstruction["structure"].values, strict=True)
-            }
+        for name in dataset.OF_IMAGES:
+            if name in reconstruction:
+                cameras = [str(camera) for camera in reconstruction["camera"].values]
+                result[name] = {
+                    frame: dict(zip(cameras, map(float, row), strict=True))
+                    for frame, row in zip(frames, reconstruction[name].values, strict=True)
+                }
         result["stop"] = {frame: str(stop) for frame, stop in zip(frames, reconstruction["stop"].values, strict=True)}
     return result
-
-
-def _without_particles(pair: Mapping[str, Any]) -> list[str]:
-    """Warnings of a pair's images that show nothing but noise, one per frame."""
-    texts = []
-    for frame, cameras in pair.get("structure", {}).items():
-        names = [name for name, value in cameras.items() if value < NOISE]
-        if names:
-            lowest = max(cameras[name] for name in names)
-            texts.append(
-                f"pair {pair['pair']}, frame {frame}: no particles, only noise in the image of {', '.join(names)} "
-                f"(light of near pixels correlates by {max(lowest, 0):.3f}; particles give 0.2 or more): check laser, "
-                "trigger and file. Vectors of this pair mean nothing, valid or not."
-            )
-    return texts
-
-
-def _without_motion(pair: Mapping[str, Any]) -> list[str]:
-    """Warn of a pair whose motion could not be followed."""
-    motion = pair.get("motion")
-    if motion is None or motion["followed"]:
-        return []
-    shares = motion["valid_fraction"]
-    return [f"pair {pair['pair']}, motion pass {len(shares)}: {100 * shares[-1]:.0f} % valid; {motion['verdict']}"]
 
 
 def _spread(values: xr.DataArray, valid: np.ndarray) -> dict[str, float | None]:

@@ -24,6 +24,8 @@ LEAST_FRACTION = 0.02
 
 PAIRS_TOLD = 20
 """Pairs named one by one at the end."""
+WARNINGS_TOLD = 20
+"""Warnings told at the end; `summary.json` holds all."""
 
 Progress = Callable[[str, float], None]
 
@@ -137,8 +139,11 @@ def tell_run(summary: dict[str, Any], out: Path) -> None:
     """Say what came of a run."""
     tell_calibration(summary)
     tell_vectors(summary, out)
-    for text in summary["warnings"]:
+    warnings = summary["warnings"]
+    for text in warnings[:WARNINGS_TOLD]:
         print(f"warning: {text}")
+    if len(warnings) > WARNINGS_TOLD:
+        print(f"{len(warnings) - WARNINGS_TOLD:,} more warnings are in {out / 'summary.json'}")
     print(f"{summary['timings_s']['total']:.0f} s, peak memory {summary['peak_memory_mib']:.0f} MiB")
     print(f"report: {out / 'report.html'}")
 
@@ -186,9 +191,17 @@ def tell_vectors(summary: dict[str, Any], out: Path) -> None:
 
 
 def tell_failed(summary: dict[str, Any], where: TextIO) -> None:
-    """Name the pairs that failed."""
-    failed = summary["failed"]
+    """Name the pairs that failed, and count those that failed earlier and were not tried now."""
+    failed = failed_now(summary)
     for item in failed[:PAIRS_TOLD]:
         print(f"failed: pair {item['pair']}: {item['reason']}", file=where)
-    total = summary["experiment"]["pairs"]
-    print(f"{len(failed)} of {total} pairs failed; the same command tries them again", file=where)
+    total, earlier = summary["experiment"]["pairs"], len(summary["failed"]) - len(failed)
+    if failed:
+        print(f"{len(failed)} of {total} pairs failed; the same command tries them again", file=where)
+    if earlier:
+        print(f"{earlier} of {total} pairs failed in earlier runs and were not tried in this one", file=where)
+
+
+def failed_now(summary: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the entries of the pairs that failed in the invocation which a summary is of."""
+    return [item for item in summary["failed"] if not item.get("earlier")]

@@ -32,6 +32,10 @@ CLEAR_RATIO = 2.0
 MIN_NEIGHBOURS = 3
 """A vector with fewer good neighbours cannot be judged and is rejected, unless the grid itself has no more."""
 
+LEAST_SEEN = 0.75
+"""Least part of a window that two cameras see. What one camera sees has hardly any depth, and pulls the displacement
+along it towards the mean of all depths, by as much as it is part of the window."""
+
 _ROUNDS = 5
 _CUBE = np.ones((3, 3, 3), bool)
 
@@ -42,6 +46,7 @@ def validate(
     measured: np.ndarray,
     search: tuple[float, float, float],
     *,
+    seen: np.ndarray | None = None,
     predicted: np.ndarray | None = None,
     peak_ratio: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -55,6 +60,8 @@ def validate(
         Where `first` may be trusted at all.
     search : tuple of float
         Largest lag at which peaks were searched, order (z, y, x) [voxel].
+    seen : ndarray of bool, shape (z, y, x), optional
+        Where there is anything to measure; all else is no part of the grid. Default: everywhere.
     predicted : ndarray, shape (z, y, x, 3), optional
         Displacement known before, around which peaks were searched [voxel].
     peak_ratio : ndarray, shape (z, y, x), optional
@@ -67,7 +74,9 @@ def validate(
     valid : ndarray of bool, shape (z, y, x)
         True where `field` is a measured peak that passed the test.
     """
-    possible = scipy.ndimage.convolve(np.ones(measured.shape, int), _CUBE.astype(int), mode="constant") - 1
+    seen = np.ones(measured.shape, bool) if seen is None else seen
+    measured = measured & seen
+    possible = scipy.ndimage.convolve(seen.astype(int), _CUBE.astype(int), mode="constant") - seen
     needed = np.minimum(MIN_NEIGHBOURS, possible)
     valid, judged = measured.copy(), np.zeros(measured.shape, bool)
     second_agrees = np.zeros(measured.shape, bool)
@@ -87,8 +96,36 @@ def validate(
             break
         valid = passed
         todo = scipy.ndimage.binary_dilation(changed, _CUBE)
-    rescued = ~valid & second_agrees
+    rescued = ~valid & second_agrees & seen
     return fill(np.where(rescued[..., None], second, first), valid | rescued), valid | rescued
+
+
+def seen_windows(
+    seen: np.ndarray,
+    window: tuple[int, int, int],
+    origin: tuple[int, int, int],
+    step: tuple[int, int, int],
+    count: tuple[int, int, int],
+) -> np.ndarray:
+    """Whether at least `LEAST_SEEN` of a window's voxels are seen.
+
+    Parameters
+    ----------
+    seen : ndarray of bool, shape (z, y, x)
+        Voxels that enough cameras see.
+    window, origin, step, count : tuple of int
+        Edges of the windows, first voxel of the first one, distance and number of them along z, y, x.
+
+    Returns
+    -------
+    ndarray of bool, shape `count`
+    """
+    share = seen.astype(float)
+    for axis, (edge, first, distance, number) in enumerate(zip(window, origin, step, count, strict=True)):
+        below = np.insert(share.cumsum(axis), 0, 0, axis)
+        start = first + distance * np.arange(number)
+        share = (below.take(start + edge, axis) - below.take(start, axis)) / edge
+    return share >= LEAST_SEEN * (1 - 1e-9)  # sums of shares are rounded
 
 
 def _agrees(field: np.ndarray, prediction: Prediction, search: tuple[float, float, float]) -> np.ndarray:

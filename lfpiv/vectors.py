@@ -10,10 +10,9 @@ import enum
 import json
 import logging
 import math
-import numbers
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import scipy.ndimage
@@ -21,6 +20,7 @@ import xarray as xr
 
 from lfpiv import validation
 from lfpiv.predictor import Predictor
+from lfpiv.volumepair import is_finite, moves_beyond, prepared, seen, voxel_axes
 from lfpiv_kernels import correlate as kernel
 from lfpiv_kernels import deform
 from lfpiv_kernels.uncertainty import displacement_deviation
@@ -39,17 +39,22 @@ FIRST_SEARCH = 0.25
 LOWEST_RIVAL = 0.01
 """Coefficient that stands for lower ones in the peak ratio, which is then finite."""
 
-_BACKGROUND_SAMPLES = 100_000  # voxels whose median is taken for the background
 _AXES = ("z", "y", "x")
-_SPACING_TOLERANCE = 1e-3  # coordinates written as decimal numbers of float32 are that even, relative to the spacing
 
 
 class Verdict(enum.Enum):
     """What the valid part of the last pass says about the measurement; the text is the advice."""
 
     GOOD = "most vectors are valid"
-    POOR = "many vectors were replaced: use larger windows, or look at the seeding and at the volumes"
+    POOR = (
+        "many vectors were replaced: use larger windows, or look at the seeding, at the volumes, and whether particles "
+        "move as far as is searched (correlation.max_displacement_voxel, by default a quarter of the first window)"
+    )
     FAILED = "hardly any vector is valid: check that both volumes show the same particles and that displacements fit"
+    TOO_FAR = (
+        "particles move farther than is searched, so that valid vectors may be chance: raise "
+        "correlation.max_displacement_voxel, use a larger first window, or a shorter dt_s"
+    )
 
 
 def correlate(
@@ -75,7 +80,8 @@ def correlate(
     Parameters
     ----------
     volume_a, volume_b : DataArray or ndarray, shape (z, y, x)
-        Intensities at the first and the second instant; finite, of any sign. DataArrays carry coordinates z, y, x [mm].
+        Intensities at the first and the second instant; finite, of any sign. Either two DataArrays, which
+        carry coordinates z, y, x [mm], or two arrays.
     dt_s : float
         Time between the two [s].
     windows : sequence, optional
@@ -103,42 +109,44 @@ def correlate(
     Dataset
         Dims z, y, x: window centres [mm]. ``u``, ``v``, ``w`` [m/s] and ``displacement_x``, ``_y``, ``_z`` [voxel]:
         means over the window, finite unless no vector at all is valid; ``valid``: true where the vector was measured
-        and passed validation, false where it was replaced; ``peak_ratio``: highest correlation over the highest
-        more than two lags away from it;
+        and passed validation, false where it was replaced, as it is where two cameras see less than three quarters of
+        the window, if volumes say so by their coordinate ``views``; ``peak_ratio``: highest correlation over the
+        highest more than two lags away from it;
         ``correlation``: coefficient at the peak; ``uncertainty`` [voxel]: standard deviation of the displacement
         vector (root of the summed variances of its components ``uncertainty_x``, ``_y``, ``_z``), from the correlation
-        statistics of [1]_, NaN where the vector was replaced and after a single pass. Attributes: a verdict, and as
-        JSON the settings and what each pass did.
+        statistics of [1]_, NaN where the vector was replaced and after a single pass. Attributes: a verdict,
+        ``valid_fraction`` and ``seen_fraction``, the parts of the vectors that are valid and where two cameras see
+        enough, and as JSON the settings and what each pass did.
 
     Raises
     ------
     ValueError
-        If the volumes differ in shape or coordinates, are not finite, or an argument is out of range.
+        If the volumes differ in kind, shape or coordinates, are not finite, or an argument is out of range.
 
     References
     ----------
     .. [1] B. Wieneke, "PIV uncertainty quantification from correlation statistics", Meas. Sci. Technol. 26 (2015)
        074002, doi:10.1088/0957-0233/26/7/074002.
     """
-    first, second = _check_volume(volume_a, "volume_a"), _check_volume(volume_b, "volume_b")
-    axes_mm, spacing_mm = _check_axes(volume_a, volume_b, voxel_mm)
-    if not (_is_finite(dt_s) and dt_s > 0):
+    first, second = prepared(volume_a, "volume_a"), prepared(volume_b, "volume_b")
+    axes_mm, spacing_mm = voxel_axes(volume_a, volume_b, voxel_mm)
+    if not (is_finite(dt_s) and dt_s > 0):
         raise ValueError(f"dt_s: expected a positive time [s], got {dt_s!r}.")
-    if not (_is_finite(overlap) and 0 <= overlap < 1):
+    if not (is_finite(overlap) and 0 <= overlap < 1):
         raise ValueError(f"overlap: expected 0 <= overlap < 1, got {overlap!r}.")
-    if not (_is_finite(smoothing_voxel) and smoothing_voxel >= 0):
+    if not (is_finite(smoothing_voxel) and smoothing_voxel >= 0):
         raise ValueError(f"smoothing_voxel: expected a value >= 0, got {smoothing_voxel!r}.")
-    if not (_is_finite(intensity_power) and intensity_power > 0):
+    if not (is_finite(intensity_power) and intensity_power > 0):
         raise ValueError(f"intensity_power: expected a value > 0, got {intensity_power!r}.")
     schedule = _check_windows(windows, first.shape)
-    search = _first_search(max_displacement_voxel, schedule[0], first.shape)
+    search = first_search = _first_search(max_displacement_voxel, schedule[0], first.shape)
     missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
     first, second = (emphasise(volume, missing, intensity_power) for volume in (first, second))
     multi_pass = _MultiPass(first, second, symmetric=len(schedule) > 1)
-    for number, window in enumerate(schedule):
-        shared = overlap if number == len(schedule) - 1 else max(overlap, COARSE_OVERLAP)
-        multi_pass.run(window, shared, search)
+    for window in schedule[:-1]:
+        multi_pass.run(window, max(overlap, COARSE_OVERLAP), search)
         search = (REFINE_SEARCH,) * 3
+    multi_pass.run(schedule[-1], overlap, search, seen=seen(volume_a, volume_b))
     settings = {
         "windows": [list(window) for window in schedule],
         "overlap": overlap,
@@ -146,7 +154,13 @@ def correlate(
         "smoothing_voxel": smoothing_voxel,
         "intensity_power": intensity_power,
     }
-    return _dataset(multi_pass, axes_mm, spacing_mm, dt_s, settings)
+    share = float(multi_pass.valid[multi_pass.seen].mean()) if multi_pass.seen.any() else 0.0
+    verdict = Verdict.GOOD if share >= 0.8 else Verdict.POOR if share >= 0.3 else Verdict.FAILED
+    if verdict is not Verdict.GOOD:
+        if moves_beyond(first, second, first_search):
+            verdict = Verdict.TOO_FAR
+        log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
+    return _dataset(multi_pass, axes_mm, spacing_mm, dt_s, verdict, settings)
 
 
 class _MultiPass:
@@ -160,6 +174,8 @@ class _MultiPass:
     """What the next pass starts from."""
     peaks: kernel.WindowPeaks
     """Correlation peaks of the last pass."""
+    seen: np.ndarray
+    """Which of its windows enough cameras see, shape (z, y, x)."""
 
     def __init__(self, first: np.ndarray, second: np.ndarray, *, symmetric: bool):
         self.volumes, self.symmetric = (first, second), symmetric
@@ -172,8 +188,14 @@ class _MultiPass:
         first, second = self.volumes
         return deform.spline_coefficients(first), deform.spline_coefficients(second)
 
-    def run(self, window: tuple[int, int, int], overlap: float, search: tuple[int, int, int]) -> None:
-        """Deform by the field so far, correlate, validate."""
+    def run(
+        self,
+        window: tuple[int, int, int],
+        overlap: float,
+        search: tuple[int, int, int],
+        seen: np.ndarray | None = None,
+    ) -> None:
+        """Deform by the field so far, correlate, validate; windows that hold too little of what is `seen` fail."""
         shape = self.volumes[0].shape
         step = _triple(max(1, round(edge * (1 - overlap))) for edge in window)
         origin, count = kernel.window_grid(shape, window, step)
@@ -187,11 +209,15 @@ class _MultiPass:
         self.peaks = kernel.correlate_windows(
             first, second, window=window, step=step, search=search, symmetric=self.symmetric
         )
+        self.seen = np.ones(count, bool)
+        if seen is not None:
+            self.seen = validation.seen_windows(seen, window, origin, step, count)
         self.field, self.valid = validation.validate(
             self.peaks.displacement + predicted,
             self.peaks.second_displacement + predicted,
             self.peaks.measured,
             search,
+            seen=self.seen,
             predicted=predicted if self.passes and overlap < COARSE_OVERLAP else None,
             peak_ratio=self.peaks.correlation / np.maximum(self.peaks.rival, LOWEST_RIVAL),
         )
@@ -217,9 +243,10 @@ def _dataset(
     axes_mm: list[np.ndarray],
     spacing_mm: tuple[float, float, float],
     dt_s: float,
+    verdict: Verdict,
     settings: dict[str, Any],
 ) -> xr.Dataset:
-    """Put the last pass into the form of the product, with units and a verdict."""
+    """Put the last pass into the form of the product, with units and its verdict."""
     deviation = np.full(result.field.shape, np.nan)
     if len(result.passes) > 1:  # the statistics need volumes that were deformed onto each other
         window, origin, step, count = result.layout
@@ -254,19 +281,16 @@ def _dataset(
         distance = (positions[-1] - positions[0]) / max(len(positions) - 1, 1)
         attributes = {"units": "mm", "long_name": "centre of the window"}
         places[axis] = (axis, positions[0] + distance * centres, attributes)
-    share = float(result.valid.mean())
-    verdict = Verdict.GOOD if share >= 0.8 else Verdict.POOR if share >= 0.3 else Verdict.FAILED
     summary = {
         "title": "displacement and velocity of particles between two volumes",
         "dt_s": float(dt_s),
         "voxel_mm": [float(s) for s in spacing_mm],
-        "valid_fraction": share,
+        "valid_fraction": float(result.valid.mean()),
+        "seen_fraction": float(result.seen.mean()),
         "verdict": verdict.value,
         "settings": json.dumps(settings),
         "passes": json.dumps(result.passes),
     }
-    if verdict is not Verdict.GOOD:
-        log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
     return xr.Dataset(variables, places, summary)
 
 
@@ -285,68 +309,6 @@ def emphasise(volume: np.ndarray, smoothing_voxel: float, intensity_power: float
     return volume if intensity_power == 1 else np.maximum(volume, 0) ** np.float32(intensity_power)
 
 
-def _is_finite(value: object) -> TypeGuard[float]:
-    """Whether a value is a finite real number."""
-    return isinstance(value, numbers.Real) and math.isfinite(value)
-
-
-def _check_volume(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
-    """Background-free copy of a volume as float32, scaled to a largest magnitude of 1."""
-    try:
-        values = np.asarray(volume)
-    except ValueError:  # rows of unequal length
-        raise ValueError(
-            f"{name}: expected a volume of numbers (z, y, x), got nested sequences of other form."
-        ) from None
-    if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fiub":
-        raise ValueError(f"{name}: expected a volume of numbers (z, y, x), got {values.dtype} of shape {values.shape}.")
-    with np.errstate(over="ignore"):
-        values = values.astype(np.float32, copy=isinstance(volume, np.ma.MaskedArray))
-    if isinstance(volume, np.ma.MaskedArray):
-        values[np.ma.getmaskarray(volume)] = np.nan
-    lowest, highest = float(values.min()), float(values.max())
-    if not (math.isfinite(lowest) and math.isfinite(highest)):
-        bad = values.size - int(np.isfinite(values).sum())
-        raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
-    background = np.median(values.ravel()[:: 1 + values.size // _BACKGROUND_SAMPLES])
-    values = values - background  # a copy
-    values /= max(highest - float(background), float(background) - lowest, float(np.finfo(np.float32).tiny))
-    checked: np.ndarray = values
-    return checked
-
-
-def _check_axes(
-    volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np.ndarray, voxel_mm: float | None
-) -> tuple[list[np.ndarray], tuple[float, float, float]]:
-    """Voxel centres [mm] along z, y, x and their spacing [mm]."""
-    if np.shape(volume_a) != np.shape(volume_b):
-        raise ValueError(f"volume_b: expected the shape of volume_a, {np.shape(volume_a)}, got {np.shape(volume_b)}.")
-    if not (isinstance(volume_a, xr.DataArray) and isinstance(volume_b, xr.DataArray)):
-        if not (_is_finite(voxel_mm) and voxel_mm > 0):
-            raise ValueError(f"voxel_mm: expected the voxel edge [mm] > 0, which arrays need, got {voxel_mm!r}.")
-        return [voxel_mm * np.arange(n) for n in np.shape(volume_a)], (voxel_mm, voxel_mm, voxel_mm)
-    if voxel_mm is not None:
-        raise ValueError("voxel_mm: expected no value with DataArrays, whose coordinates tell it. Leave it out.")
-    axes, spacing = [], []
-    for axis in _AXES:
-        for name, volume in (("volume_a", volume_a), ("volume_b", volume_b)):
-            if volume.dims != _AXES or axis not in volume.coords or volume.sizes[axis] < 2:
-                raise ValueError(
-                    f"{name}: expected dims (z, y, x) with coordinates [mm] and at least 2 voxels each, got "
-                    f"{dict(volume.sizes)} with coordinates {list(volume.coords)}."
-                )
-        centres = np.asarray(volume_a[axis], float)
-        distance = (centres[-1] - centres[0]) / (len(centres) - 1)
-        if not distance > 0 or np.abs(np.diff(centres) - distance).max() > _SPACING_TOLERANCE * distance:
-            raise ValueError(f"volume_a: expected increasing, evenly spaced coordinates {axis} [mm], got {centres}.")
-        if np.abs(np.asarray(volume_b[axis], float) - centres).max() > _SPACING_TOLERANCE * distance:
-            raise ValueError(f"volume_b: expected the coordinates {axis} of volume_a, got others.")
-        axes.append(centres)
-        spacing.append(float(distance))
-    z, y, x = spacing
-    return axes, (z, y, x)
-
-
 def _check_windows(windows: Sequence[Any] | None, shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:
     """Window of each pass as (z, y, x)."""
     if windows is None:
@@ -356,7 +318,7 @@ def _check_windows(windows: Sequence[Any] | None, shape: tuple[int, int, int]) -
     schedule = []
     for window in windows:
         given = tuple(window) if np.ndim(window) else (window,) * 3
-        if len(given) != 3 or not all(_is_finite(edge) and int(edge) == edge and edge >= 4 for edge in given):
+        if len(given) != 3 or not all(is_finite(edge) and int(edge) == edge and edge >= 4 for edge in given):
             raise ValueError(f"windows: expected edges of whole voxels >= 4, one or (z, y, x) per pass, got {window}.")
         edges = _triple(int(edge) for edge in given)
         too_large = [(axis, edge, n) for axis, edge, n in zip(_AXES, edges, shape, strict=True) if edge > n]
@@ -381,7 +343,7 @@ def _first_search(
     """Largest lag of the first pass: a peak needs one lag beyond it."""
     if max_displacement_voxel is None:
         return _triple(max(REFINE_SEARCH, math.ceil(FIRST_SEARCH * edge) + 1) for edge in window)
-    if not (_is_finite(max_displacement_voxel) and 0 < max_displacement_voxel < max(shape)):
+    if not (is_finite(max_displacement_voxel) and 0 < max_displacement_voxel < max(shape)):
         raise ValueError(
             f"max_displacement_voxel: expected a value > 0 and within the volume {shape}, got {max_displacement_voxel}."
         )

@@ -90,6 +90,15 @@ def test_bad_input_is_status_2_with_one_line_and_nothing_left(tiny_experiment, t
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_many_warnings_are_counted(capfd, tmp_path):
+    texts = [f"camera {number} sleeps" for number in range(terminal.WARNINGS_TOLD + 1234)]
+    summary = {"calibration": {}, "pairs": [], "warnings": texts, "timings_s": {"total": 1.0}, "peak_memory_mib": 1.0}
+    terminal.tell_run(summary, tmp_path)
+    said = capfd.readouterr().out.splitlines()
+    assert sum(line.startswith("warning: camera") for line in said) == terminal.WARNINGS_TOLD
+    assert f"1,234 more warnings are in {tmp_path / 'summary.json'}" in said
+
+
 @pytest.mark.parametrize("command", ["run", "calibrate", "reconstruct", "correlate", "report"])
 def test_every_step_refuses_a_folder_it_cannot_write(tiny_experiment, tmp_path, capfd, command):
     (tmp_path / "file").write_text("not a folder")

@@ -242,6 +242,30 @@ def test_the_standard_error_is_the_scatter_of_means_of_correlated_pairs(memory):
         assert errors.attrs["pairs_per_independent"] < 1.1
 
 
+SHORT = 0.12
+"""Part of the true error by which that of a short series may be off: what is left of the estimated mean's part."""
+
+
+@pytest.mark.parametrize(("memory", "pairs"), [(0.0, 3), (0.0, 10), (0.5, 10), (0.5, 20), (0.8, 50)])
+@pytest.mark.parametrize("complete", [True, False])
+def test_the_standard_error_of_short_series_knows_that_their_mean_is_estimated(memory, pairs, complete):
+    rng = np.random.default_rng(6)
+    places = 4000  # independent of one another
+    series = np.empty((pairs, places))
+    series[0] = rng.normal(size=places)
+    for step in range(1, pairs):
+        series[step] = memory * series[step - 1] + np.sqrt(1 - memory**2) * rng.normal(size=places)
+    valid = rng.random(series.shape) >= (0.0 if complete else 0.15)
+    errors = statistics.standard_error(ensemble(series, valid=valid)).standard_error_u.values.ravel()
+    counted = valid.astype(float)
+    apart = np.abs(np.subtract.outer(np.arange(pairs), np.arange(pairs)))
+    total = np.einsum("ip,ij,jp->p", counted, memory**apart, counted)
+    known = counted.sum(0) > 1
+    true = np.sqrt(total[known]) / counted.sum(0)[known]
+    assert np.isnan(errors[~known]).all()
+    assert abs(np.sqrt((errors[known] ** 2).mean() / (true**2).mean()) - 1) < SHORT
+
+
 def test_modules_are_reached_from_the_package():
     assert lfpiv.derived is derived and lfpiv.statistics is statistics
     assert {"derived", "statistics"} <= set(dir(lfpiv))

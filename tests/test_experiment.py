@@ -296,9 +296,13 @@ def vectors(seed=0, shape=(2, 3, 4)):
     }
     variables["valid"] = (("z", "y", "x"), rng.random(shape) > 0.2)
     variables["uncertainty"][1][0, 0, 0] = np.nan
+    for name, axis in zip("uvw", "xyz", strict=True):  # 0.1 mm per voxel in 1 ms
+        variables[name] = (("z", "y", "x"), 0.1 * variables[f"displacement_{axis}"][1], {"units": "m/s"})
     coordinates = {name: (name, np.arange(n) * 0.4, {"units": "mm"}) for name, n in zip("zyx", shape, strict=True)}
     return xr.Dataset(
-        variables, coordinates, {"dt_s": 1e-3, "verdict": "most vectors are valid", "passes": [{"window": [8, 8, 8]}]}
+        variables,
+        coordinates,
+        {"dt_s": 1e-3, "voxel_mm": [0.1] * 3, "verdict": "most vectors are valid", "passes": [{"window": [8, 8, 8]}]},
     )
 
 
@@ -346,13 +350,16 @@ def test_files_of_earlier_versions_are_read(tmp_path, version):
     xr.testing.assert_equal(dataset.read_reconstruction(path), older)
 
 
-def test_the_structure_of_the_images_travels_with_the_volumes(tmp_path):
+def test_what_is_known_of_the_images_travels_with_the_volumes(tmp_path):
     pair = {"a": volume(1, [0.9, 0.5]), "b": volume(2, [0.8, 0.6])}
     for frame, values in (("a", [0.5, 0.01]), ("b", [0.4, 0.6])):
         pair[frame].attrs |= {"cameras": ["left", "right"], "structure": values}
+        pair[frame].attrs |= {"camera_gain": [1.0, 0.4], "light_outside": [0.25, values[1]]}
         dataset.write_volume(pair[frame], tmp_path / f"{frame}.nc", attributes={})
     condensed = dataset.build_reconstruction({frame: dataset.read_volume(tmp_path / f"{frame}.nc") for frame in "ab"})
     assert condensed["structure"].sel(frame="a", camera="right") == 0.01
+    assert condensed["camera_gain"].sel(frame="b", camera="right") == 0.4
+    assert condensed["light_outside"].sel(frame="b", camera="right") == 0.6
     xr.testing.assert_equal(condensed, dataset.build_reconstruction(pair))
 
 

@@ -2,6 +2,8 @@
 
 import csv
 import importlib.util
+import json
+import logging
 import sys
 import types
 from pathlib import Path
@@ -9,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from vector_sets import from_flow, random_vectors, write_run
+from vector_sets import DT_S, VOXEL_MM, from_flow, random_vectors, write_run
 
 import lfpiv
 from lfpiv import cli, dataset, davis, derived, export, images
@@ -79,6 +81,30 @@ def test_a_single_layer_of_vectors_is_an_image_too(tmp_path):
     np.testing.assert_array_equal(at_points(image, "valid"), written[0].valid)
 
 
+def test_volumes_of_other_settings_are_not_put_beside_vectors(tmp_path, caplog):
+    def depends_on(voxel_mm, images, **more):
+        return json.dumps({"volume": {"voxel_mm": voxel_mm}, "calibration": "cafe", "images": images, **more})
+
+    images = {0: [["a.tif", 7, 1]], 1: [["a.tif", 7, 2]], 2: [["a.tif", 7, 3]], 3: None}
+    for number, kept in images.items():  # vectors of one voxel size, of images that are gone by now for the last pair
+        write_run(tmp_path, (number,), depends_on=depends_on(0.08, kept, correlation={"overlap": 0.5}))
+    made = {0: (0.08, images[0]), 1: (0.1, images[1]), 2: (0.08, [["a.tif", 7, 9]]), 3: (0.08, [["a.tif", 7, 4]])}
+    places = {name: (name, np.arange(n) * 0.1) for name, n in zip("zyx", (3, 4, 5), strict=True)}
+    volume = xr.DataArray(np.ones((3, 4, 5), np.float32), places, ("z", "y", "x"))
+    for number, stamp in made.items():
+        for frame in "ab":
+            path = tmp_path / "volumes" / f"pair_{number:04d}_{frame}.nc"
+            dataset.write_volume(volume, path, attributes={"depends_on": depends_on(*stamp)})
+    with caplog.at_level(logging.WARNING):
+        lfpiv.export_results(tmp_path, "vti", out=tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").glob("volume_*.vti")} == {
+        f"volume_{number:04d}_{frame}.vti" for number in (0, 3) for frame in "ab"
+    }
+    listed = (tmp_path / "out" / "volumes_b.pvd").read_text()
+    assert "volume_0003_b.vti" in listed and "volume_0001_b.vti" not in listed
+    assert "pair_0001_a.nc and 3 other volumes: not exported" in caplog.text and "--keep-volumes" in caplog.text
+
+
 def test_one_netcdf_holds_all_pairs(run, tmp_path):
     folder, _ = run
     (path,) = lfpiv.export_results(folder, "netcdf", out=tmp_path, interval_s=INTERVAL_S)
@@ -129,7 +155,10 @@ def test_pivpy_computes_with_the_planes(tmp_path):
     rates = np.array([[1.0, 2.0, 0.0], [-3.0, 4.0, 0.0], [0.0, 0.0, 0.0]])  # velocity gradient [1/s]
     flow = from_flow(lambda x, y, z: np.tensordot(rates, np.stack([x, y, z]), 1))
     for number in range(3):
-        vectors = random_vectors(number).assign({name: flow[name].astype(np.float32) for name in "uvw"})
+        vectors = random_vectors(number)
+        for name, axis in zip("uvw", "xyz", strict=True):
+            vectors[name].values = flow[name]
+            vectors[f"displacement_{axis}"].values = flow[name] * DT_S / (1e-3 * VOXEL_MM)
         path = tmp_path / "vectors" / f"pair_{number:04d}.nc"
         dataset.write_vectors(vectors, path, attributes={})
     (path,) = lfpiv.export_results(tmp_path, "pivpy", depth_mm=float(flow.z[2]) + 0.1)

@@ -1,7 +1,9 @@
 """Images that are right in form and wrong otherwise: of another camera, misplaced, saturated, half exposed, copied."""
 
 import dataclasses
+import logging
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ import scenes
 import tifffile
 
 import lfpiv
-from lfpiv.exposure import GAP_LIGHT, NO_PLACE, SATURATED, dark_blocks, gap_light, pair_warnings, saturated_share
+from lfpiv import cautions, dataset, exposure, notices, pair, pipeline, statistics
+from lfpiv.exposure import GAP_LIGHT, NO_PLACE, SATURATED, dark_blocks, gap_light, saturated_share
 from lfpiv.simulate import simulate
 
 CLEAR = GAP_LIGHT / 5  # what belongs together keeps clear of the limit; real images gave 0.013, rendered ones 0.001
@@ -79,26 +82,131 @@ def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
     assert dark_blocks(first, half) >= 2 and dark_blocks(half, first) == dark_blocks(first, half)
 
 
-def write(experiment, name, frame, image):
-    tifffile.imwrite(experiment.particle_path(name, 0, frame), image.astype(np.uint16))
-
-
-def test_what_is_suspicious_about_a_pair_is_said(pair_of_cameras, tmp_path):
+def test_what_is_suspicious_about_images_is_found(pair_of_cameras):
     experiment, calibration = pair_of_cameras
-    assert pair_warnings(experiment, calibration, 0) == []
-    whole = {(name, frame): experiment.particle_image(name, 0, frame) for name in ("left", "right") for frame in "ab"}
-    copy = dataclasses.replace(experiment, path=tmp_path / "experiment.toml")
-    for name in ("left", "right"):
-        copy.particle_path(name, 0, "a").parent.mkdir(parents=True)
-    write(copy, "left", "a", whole["right", "a"][::-1])
-    write(copy, "left", "b", whole["left", "b"] * 0.05)
-    write(copy, "right", "a", np.minimum(whole["right", "a"] * 40, 4095))
-    write(copy, "right", "b", np.minimum(whole["right", "a"] * 40, 4095))
-    said = " ".join(pair_warnings(copy, calibration, 0))
-    assert "right, pair 0, frame b: the same image as right, pair 0, frame a" in said
-    assert "right, pair 0, frame a" in said and "saturated" in said and "left, pair 0: " in said
-    copy.particle_path("left", 0, "a").unlink()
-    assert pair_warnings(copy, calibration, 0) == []  # the pair itself will say what is missing
+    decoder = calibration.cameras["left"].decoder
+    first, second = (experiment.particle_image("left", 0, frame) for frame in "ab")
+
+    def found(image):
+        return [item["what"] for item in exposure.frame_findings(image, image - 40, decoder, "left", "a")]
+
+    assert found(first) == found(second) == exposure.camera_findings(first, second, "left") == []
+    assert found(np.roll(first, QUARTER_PITCH_PX, axis=1)) == ["misplaced"]
+    assert found(np.minimum(first * 40, 4095)) == ["saturated"]
+    assert [item["what"] for item in exposure.camera_findings(first, second * 0.05, "left")] == ["uneven"]
+    images = [(name, exposure.fingerprint(image)) for name, image in (("one", first), ("other", second))]
+    exposure.require_different(images)
+    with pytest.raises(lfpiv.InputError, match=r"a copy: .* found the same image as one\. Check particles\.images"):
+        exposure.require_different([*images, ("a copy", exposure.fingerprint(first.copy()))])
+
+
+@pytest.mark.parametrize(
+    ("cameras", "empty", "unmeasured"),
+    [
+        (1, ["a only"], True),
+        (2, [], False),
+        (2, ["b left"], True),
+        (3, ["a left", "b right"], False),  # two cameras saw each frame
+        (3, ["b left", "b right"], True),
+    ],
+)
+def test_vectors_count_where_two_cameras_saw_particles(cameras, empty, unmeasured):
+    findings = [{"what": "empty", "camera": name[2:], "frame": name[0], "value": 0.0} for name in empty]
+    findings.append({"what": "dim", "camera": "left", "frame": "a", "value": 0.04})
+    assert exposure.unmeasured(findings, cameras) == unmeasured
+
+
+@pytest.fixture(scope="module")
+def spoilt(small_run, tmp_path_factory):
+    """A run of which every pair has other bad images; the user has silenced the log. File, folder, exit status."""
+    folder = tmp_path_factory.mktemp("spoilt")
+    file, out = small_run.images(folder / "data"), small_run.calibrated(folder / "out")
+    rng = np.random.default_rng(0)
+    spoil(file, "particles/*/*0000*", lambda image: rng.normal(np.median(image), 4, image.shape).round())
+    for path in file.parent.glob("particles/*/*0001_a.tif"):
+        shutil.copy(path, path.with_name(path.name.replace("_a", "_b")))
+    spoil(file, "particles/*/*0002*", lambda image: np.minimum(image * 40.0, 4095))
+    spoil(file, "particles/left/*0003_b*", lambda image: np.where(np.arange(400)[:, None] < 200, image, 40))
+    logger = logging.getLogger("lfpiv")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("lfpiv.report.write_report", lambda *arguments: None)
+            summary = pipeline.run(file, out, keep_volumes=True)
+    finally:
+        logger.setLevel(before)
+    return file, out, summary
+
+
+def test_the_images_of_every_pair_are_looked_at(spoilt):
+    """What cannot be is no result, what is doubtful is said once with its pairs, whatever the log shows."""
+    _, out, summary = spoilt
+    ((failed),) = summary["failed"]
+    assert failed["pair"] == 1 and "frame b: expected an image of its own, found the same image as" in failed["reason"]
+    assert [pair["pair"] for pair in summary["pairs"]] == [0, 2, 3] == lfpiv.open_results(out).pair.values.tolist()
+    said = summary["warnings"]
+    saturated = [text for text in said if "saturated" in text]
+    assert [text.split(": ")[0] for text in saturated] == [
+        f"{name}, frame {frame}, pair 2" for frame in "ab" for name in ("left", "right")
+    ]
+    (uneven,) = [text for text in said if "of 9 parts" in text]
+    assert uneven.startswith("left, pair 3: ")
+    assert all(
+        f"{name}, frame {frame}, pair 0: no particles" in " ".join(said) for name in ("left", "right") for frame in "ab"
+    )
+
+
+def test_a_pair_of_noise_enters_no_mean(spoilt):
+    """Correlation calls its vectors valid; the images say that there is nothing to measure."""
+    file, out, summary = spoilt
+    vectors = dataset.read_vectors(out / "vectors" / "pair_0000.nc")
+    assert not vectors["valid"].any() and np.isnan(vectors["uncertainty"]).all()
+    assert vectors.attrs["verdict"] == summary["pairs"][0]["verdict"] == pair.NO_PARTICLES
+    assert summary["pairs"][0]["valid_fraction"] == 0 < summary["pairs"][1]["valid_fraction"]
+    results = lfpiv.open_results(out)
+    mean, good = statistics.mean(results), statistics.mean(results.sel(pair=[2, 3]))
+    assert int(mean["pairs_counted"].max()) == 2
+    np.testing.assert_array_equal(mean["u"], good["u"])
+    (out / "vectors" / "pair_0000.nc").unlink()  # and of volumes in files, the same
+    pipeline.correlate(file, out, pairs=(0, 1))
+    assert dataset.read_vectors(out / "vectors" / "pair_0000.nc").equals(vectors)
+
+
+def test_warnings_outlive_the_invocation(spoilt, tmp_path, monkeypatch):
+    """The same command again, and a report made anew, say what the first run said."""
+    file, out, first = spoilt
+    pages = []
+    monkeypatch.setattr("lfpiv.report.write_report", lambda *arguments: pages.append(arguments[2]["warnings"]))
+    for again in (pipeline.run(file, out, keep_volumes=True), pipeline.report(file, out)):
+        assert again["warnings"] == first["warnings"] and len(first["warnings"]) > len(first["pairs"])
+    assert pages == [first["warnings"]] * 2
+    alone = shutil.copytree(out, tmp_path / "out")
+    shutil.rmtree(alone / "vectors")  # volumes know it, too
+    assert [text for text in pipeline.report(file, alone)["warnings"] if "saturated" in text or "of 9" in text]
+
+
+def test_warnings_are_kept_whatever_the_log_shows():
+    log = logging.getLogger("lfpiv.silent")
+    log.setLevel(logging.CRITICAL)
+    notices.warn(log, "nobody collects")
+    with notices.collected() as outer:
+        notices.warn(log, "%d %s", 2, "lenses")
+        with notices.collected() as inner:
+            notices.warn(log, "100 % dark")
+            notices.warn(log, "100 % dark")
+        notices.warn(log, "the end")
+    assert outer == ["2 lenses", "the end"] and inner == ["100 % dark"]
+
+
+def test_many_pairs_with_the_same_trouble_are_one_line():
+    trouble = [
+        {"what": "saturated", "camera": "left", "frame": "a", "value": 0.1 + number / 1e4} for number in range(1000)
+    ]
+    (text,) = cautions.of_images({"pair": number, "findings": [found]} for number, found in enumerate(trouble))
+    assert text.startswith("left, frame a, pairs 0, 1, 2, 3, 4 and 995 more: 10 to 20 % of the bright pixels")
+    poor = [{"pair": number, "verdict": "look", "valid_fraction": 0.01 * number} for number in (3, 5)]
+    assert cautions.of_pairs(poor) == ["pairs 3, 5: 3 to 5 % of the vectors are valid; look"]
 
 
 def spoil(experiment, pattern, change):
@@ -129,11 +237,17 @@ def test_a_saturated_white_image_and_pictures_on_their_side_are_named(small_run,
     assert "white image's bright pixels are saturated" in saturated and "turned by 90 degrees" in turned
 
 
-def test_a_wrong_spacing_of_the_dots_shows_in_the_magnification(small_run, tmp_path):
+def test_wrong_spacing_and_size_of_the_dots_show(small_run, tmp_path, caplog):
+    """In the magnification, and in what the dots look like; kept with the calibration, whatever the log shows."""
     file = small_run.images(tmp_path / "data")
-    file.write_text(file.read_text("utf-8").replace("spacing_mm = 0.5", "spacing_mm = 0.45"), "utf-8")
-    report = calibrate_first(file).report
+    text = file.read_text("utf-8").replace("spacing_mm = 0.5", "spacing_mm = 0.45")
+    assert "dot_diameter_mm = 0.1\n" in text
+    file.write_text(text.replace("dot_diameter_mm = 0.1\n", "dot_diameter_mm = 0.15\n"), "utf-8")
+    with caplog.at_level(logging.CRITICAL, "lfpiv"):
+        report = calibrate_first(file).report
     assert report["sigma_nor_test"] < GOOD
-    assert len(report["warnings"]) == 1 and re.search(r"magnified 1\.(09\d|1\d\d) times, not 1", report["warnings"][0])
+    magnified, wide = report["warnings"]
+    assert re.search(r"magnified 1\.(09\d|1\d\d) times, not 1", magnified)
+    assert wide.startswith("left: the board's dots look 0.") and wide.endswith("mm wide, not 0.15 mm")
     right = small_run.summary["calibration"]["left"]
     assert right["magnification"] == pytest.approx(1, abs=MAGNIFICATION) and right["warnings"] == []

@@ -16,7 +16,7 @@ import psutil
 import pytest
 from small_run import PAIRS, damage, same_vectors, start
 
-from lfpiv import cli, pipeline
+from lfpiv import cli, open_results, pipeline
 from lfpiv.errors import InputError
 from lfpiv.folder import Folder
 from lfpiv.pair import PairWork
@@ -322,6 +322,52 @@ def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatc
     assert cli.call(["run", str(experiment), "--out", str(out), "--pairs", "1:"]) == 2
     assert images[1].name in capfd.readouterr().err.splitlines()[-1]
     assert not finished(out) and whole(out)
+
+
+def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(small_run, tmp_path, capfd, no_report):
+    """Each status tells of its own invocation; results of other images than there are now are put aside."""
+    experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+    spoilt = next((tmp_path / "data").rglob("*0002*"))
+    good, stated = spoilt.read_bytes(), experiment.read_text()
+    damage(spoilt)
+    (out / "vectors" / "pair_0003.nc").unlink()
+
+    def called(*arguments):
+        status = cli.call([arguments[0], str(experiment), "--out", str(out), *arguments[1:]])
+        summary = json.loads((out / "summary.json").read_text())
+        return status, [item["pair"] for item in summary["failed"]], [pair["pair"] for pair in summary["pairs"]]
+
+    assert called("run") == (3, [2], [0, 1, 3]), "the pair after it was not done"
+    assert open_results(out).pair.values.tolist() == [0, 1, 3], "vectors of images that are no more are in use"
+    aside = [path.name for path in out.rglob("*.outdated")]
+    assert sorted(aside) == ["pair_0002.outdated", "pair_0002_a.outdated", "pair_0002_b.outdated"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lfpiv.weights.build_weights", lambda *arguments, **more: pytest.fail("weights for no pair"))
+        assert called("run") == (3, [2], [0, 1, 3])
+        capfd.readouterr()
+        assert called("run", "--pairs", "0:1") == (0, [2], [0, 1, 3])
+        assert "1 of 4 pairs failed in earlier runs" in capfd.readouterr().out
+        experiment.write_text(stated.replace(f"pairs = {PAIRS}", "pairs = 2"))
+        assert called("run") == (0, [], [0, 1]), "a pair that is no more cannot fail"
+        experiment.write_text(stated)
+        assert called("run") == (3, [2], [0, 1, 3])
+    spoilt.write_bytes(good)
+    assert called("reconstruct", "--pairs", "2:") == (0, [], [0, 1, 3])
+    assert called("run", "--keep-volumes") == (0, [], [0, 1, 2, 3])
+    assert same_vectors(small_run.out, out) == PAIRS and not list(out.rglob("*.outdated"))
+
+
+def test_a_run_that_goes_on_does_not_end_at_the_first_damaged_pair(small_run, tmp_path, capfd, no_report):
+    """Stopped after pair 0; pair 1 is damaged, and its volumes are not needed where its images are gone."""
+    experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+    for pair in (1, 2, 3):
+        (out / "vectors" / f"pair_000{pair}.nc").unlink()
+    damage(next((tmp_path / "data").rglob("*0001*")))
+    next((tmp_path / "data").rglob("*0003*")).unlink()
+    assert cli.call(["run", str(experiment), "--out", str(out)]) == 3
+    said = capfd.readouterr().err
+    assert "pair 1" in said.split("The other pairs will be done")[0]
+    assert sorted(finished(out)) == [f"pair_000{pair}.nc" for pair in (0, 2, 3)]
 
 
 def test_a_bad_image_of_the_calibration_is_bad_input(small_run, tmp_path, capfd):

@@ -1,7 +1,10 @@
 """The whole job on a small simulated experiment: right vectors, complete files, and only what changed done anew."""
 
+import dataclasses
 import html
 import json
+import os
+import re
 import shutil
 
 import numpy as np
@@ -62,7 +65,9 @@ def test_every_file_of_the_contract_is_there_and_whole(finished):
         assert 0 < figures["dots_found"] <= figures["dots_expected"] <= 5 * 5 * 3
         assert 0 < figures["network_correction_pitch"] < 0.1  # rendered by an ideal lens: hardly anything is left
     assert [len(pair["residual"]["a"]) for pair in summary["pairs"]] == [9] * PAIRS and summary["failed"] == []
-    assert all(set(pair["structure"]["b"]) == {"left", "right"} for pair in summary["pairs"])
+    for figure in ("structure", "camera_gain", "light_outside"):
+        assert all(set(pair[figure]["b"]) == {"left", "right"} for pair in summary["pairs"])
+    assert all(max(pair["camera_gain"]["a"].values()) == 1 for pair in summary["pairs"])
     assert not any("noise" in text for text in summary["warnings"])
 
 
@@ -168,6 +173,30 @@ def test_a_new_image_concerns_its_pair_alone_and_a_lost_one_none(small_run, tmp_
     assert unfinished() == []
     shutil.copy(tmp_path / "elsewhere", images[-1])
     assert unfinished() == [2]
+
+
+def test_images_are_told_apart_by_their_whole_path(small_run, tmp_path):
+    """Frames in folders, files of one name, one length and one second: exchanging the frames concerns everything."""
+    file = small_run.images(tmp_path / "data")
+    for path in sorted((file.parent / "particles").rglob("*.tif")):
+        camera, (_, number, frame) = path.parent.name, path.stem.split("_")
+        moved = file.parent / "particles" / frame / camera / f"{number}.tif"
+        moved.parent.mkdir(parents=True, exist_ok=True)
+        moved.write_bytes(b"image")
+        os.utime(moved, (1.7e9, 1.7e9))
+    text = re.sub('images = "particles.*"', 'images = "particles/{frame}/{camera}/{pair:04d}.tif"', file.read_text())
+    file.write_text(text)
+    experiment = read_experiment(file)
+    made = stamp.of_vectors(experiment, "calibration", 0)
+    exchanged = dataclasses.replace(experiment, frames=("b", "a"))
+    assert stamp.of_vectors(exchanged, "calibration", 0).changes(made.attributes) == ["particles.frames", "images"]
+    file.parent.rename(tmp_path / "elsewhere")  # the images with their experiment: nothing has changed
+    there = read_experiment(tmp_path / "elsewhere" / file.name)
+    assert stamp.of_vectors(there, "calibration", 0).changes(made.attributes) == []
+    shutil.rmtree(tmp_path / "elsewhere" / "particles")  # gone, but stated to be others
+    exchanged = dataclasses.replace(there, frames=("b", "a"))
+    assert stamp.of_vectors(there, "calibration", 0).changes(made.attributes) == []
+    assert stamp.of_vectors(exchanged, "calibration", 0).changes(made.attributes) == ["particles.frames"]
 
 
 def test_figures_come_from_the_files_without_reading_them(finished, monkeypatch):

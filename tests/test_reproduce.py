@@ -196,6 +196,10 @@ def test_network_and_ray_tracing_reconstruct_alike(figures):
         runs["from_truth", "network", 0.5]["q"] > 0.9 > runs["blobs", "network", 0.5]["q"]
     )  # the truth is a fixed point
     assert runs["blobs", "network", 0.1]["q"] > 0.7  # sparse: hardly a ghost
+    for run in case["runs"]:  # the correlation smooths by what the sieve has not
+        as_it_is = run["q_as_correlated"] == pytest.approx(run["q"], abs=1e-12)
+        assert as_it_is == (run["sieve_voxel"] >= fig12.CORRELATED_VOXEL), run
+    assert runs["blobs", "network", 0.5]["sieve_voxel"] > 0 == runs["paper", "network", 0.5]["sieve_voxel"]
     assert all(runs["blobs", "network", ppm]["q"] > runs["no_sieve", "network", ppm]["q"] for ppm in (0.1, 0.5))
     assert (
         runs["points", "network", 0.1]["q"] < runs["blobs", "network", 0.1]["q"]

@@ -146,6 +146,32 @@ def test_what_is_no_finished_run_is_refused_in_one_sentence(tmp_path):
         lfpiv.open_results(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda v: v.u.values.__imul__(1000), r"'u' to be 'displacement_x' times voxel_mm / dt_s, found 119 of 120"),
+        (lambda v: v.w.values.__setitem__((0, 1, 2), 9), r"'w' to be 'displacement_z' .*found 1 of 120"),
+        (lambda v: v.displacement_y.values.__setitem__((3, 4, 5), np.nan), r"'v' to be 'displacement_y' .*found 1 of"),
+        (lambda v: v.attrs.update(voxel_mm=[0.2, 0.1, 0.1]), r"'w' to be 'displacement_z' "),
+        (lambda v: v.attrs.update(dt_s=1e-4), r"'[uvw]' to be 'displacement_[xyz]' "),
+        (lambda v: v.attrs.update(voxel_mm=0.1), r"voxel_mm, edges \(z, y, x\) > 0, found 0.1"),
+        (lambda v: v.attrs.pop("voxel_mm"), r"voxel_mm, edges \(z, y, x\) > 0, found None"),
+        (lambda v: v.x.attrs.update(units="m"), "coordinate x in mm, found it in m"),
+        (lambda v: v.z.attrs.pop("units"), "coordinate z in mm, found it in no unit"),
+    ],
+)
+def test_velocities_that_their_displacements_belie_are_refused(tmp_path, spoil, words):
+    vectors = random_vectors(0)
+    vectors["u"].values[0, 0, 0] = vectors["displacement_x"].values[0, 0, 0] = np.nan  # both unknown: that is fine
+    dataset.write_vectors(vectors, tmp_path / "good.nc", attributes={})
+    spoil(vectors)
+    with pytest.raises(ValueError, match=words):
+        dataset.write_vectors(vectors, tmp_path / "bad.nc", attributes={})
+    dataset.write_dataset(vectors, tmp_path / "bad.nc")
+    with pytest.raises(lfpiv.InputError, match=rf"bad\.nc.*{words}"):
+        dataset.read_vectors(tmp_path / "bad.nc")
+
+
 def volume(seed):
     rng = np.random.default_rng(seed)
     places = {name: (name, np.arange(n) * 0.1, {"units": "mm"}) for name, n in zip("zyx", (3, 4, 5), strict=True)}

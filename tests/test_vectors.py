@@ -531,6 +531,57 @@ def test_unrelated_and_empty_volumes_say_so():
     assert empty.attrs["verdict"] == vectors.Verdict.FAILED.value
 
 
+def test_windows_that_one_camera_sees_are_replaced():
+    shape, window = (20, 24, 28), (8, 12, 8)
+    first, second = volumes(shape)
+    views = np.full(shape, 2, np.uint8)
+    views[:, :12], views[3:9, 20:, :5] = 1, 0
+    options = {"windows": (16, window), "overlap": 0.75, "dt_s": 1.0}
+    anything = lfpiv.correlate(first, second, **options)
+    assert anything["valid"].mean() > 0.95 and anything.attrs["seen_fraction"] == 1
+    told = [volume.assign_coords(views=(("z", "y", "x"), views)) for volume in (first, second)]
+    result = lfpiv.correlate(*told, **options)
+    origin, count = kernel.window_grid(shape, window, (2, 3, 2))
+    share = np.zeros(count)
+    for cell in np.ndindex(*count):
+        corner = [o + k * s for o, k, s in zip(origin, cell, (2, 3, 2), strict=True)]
+        share[cell] = (views[tuple(slice(c, c + w) for c, w in zip(corner, window, strict=True))] >= 2).mean()
+    enough = share >= validation.LEAST_SEEN
+    assert {0.0, validation.LEAST_SEEN, 1.0} <= set(share.ravel())  # nothing, just enough, all
+    good = result["valid"].values
+    kept = good & anything["valid"].values
+    assert not good[~enough].any() and good[enough].mean() > 0.95
+    assert result.attrs["seen_fraction"] == enough.mean() and result.attrs["valid_fraction"] == good.mean() < 0.8
+    assert result.attrs["verdict"] == vectors.Verdict.GOOD.value  # of what can be measured nearly all is valid
+    assert np.isfinite(measured(result)).all() and np.isnan(result["uncertainty"].values[~enough]).all()
+    np.testing.assert_array_equal(measured(result)[kept], measured(anything)[kept])
+    one = lfpiv.correlate(first, told[1], **options)
+    np.testing.assert_array_equal(one["valid"], good)
+    nowhere = [volume.assign_coords(views=(("z", "y", "x"), 0 * views)) for volume in (first, second)]
+    assert lfpiv.correlate(*nowhere, **options).attrs["verdict"] == vectors.Verdict.FAILED.value
+    with pytest.raises(ValueError, match=r"views: expected a coordinate over \(z, y, x\)"):
+        lfpiv.correlate(first.assign_coords(views=("z", [2] * 20)), second, **options)
+
+
+def test_displacements_beyond_the_search_are_named():
+    """Chance makes some vectors valid; what the volumes are like as wholes tells that it was not looked far enough."""
+    shape, windows = (28, 40, 48), (24, 12)  # looked for up to 6 voxels along each axis
+    for seed, flow, verdict in (
+        (60, uniform(0.4, 0.2, 9.3), vectors.Verdict.TOO_FAR),
+        (61, uniform(-8.6, 7.7, 0.5), vectors.Verdict.TOO_FAR),
+        (62, uniform(0.4, 0.2, 5.3), vectors.Verdict.GOOD),
+    ):
+        result = correlate(particle_pair(shape, flow, seed=seed, ghosts=0.3), windows=windows)
+        assert result.attrs["verdict"] == verdict.value
+    seldom = [particle_pair(shape, uniform(0, 0, 0), seed=seed)[0] for seed in (63, 64)]  # nothing in common
+    for power in (0.5, 1.0):
+        lost = correlate(seldom, windows=windows, intensity_power=power).attrs["verdict"]
+        assert lost in (vectors.Verdict.FAILED.value, vectors.Verdict.POOR.value)
+        noisy = [np.random.default_rng(seed).random((40, 40, 40)) for seed in (65, 66)]
+        lost = correlate(noisy, windows=(12, 12), intensity_power=power).attrs["verdict"]
+        assert lost in (vectors.Verdict.FAILED.value, vectors.Verdict.POOR.value)
+
+
 def test_a_single_edge_is_cut_to_the_volume():
     first, second = volumes()
     whole, given = max(first.shape), tuple(first.shape)
@@ -604,3 +655,6 @@ def test_coordinates_must_agree():
         lfpiv.correlate(*(v.transpose("x", "y", "z").transpose("x", "z", "y") for v in (first, second)), dt_s=1.0)
     with pytest.raises(ValueError, match="voxel_mm: expected no value with DataArrays"):
         lfpiv.correlate(first, second, dt_s=1.0, voxel_mm=0.1)
+    for pair, other in (((first, second.values), "volume_b"), ((first.values, second), "volume_a")):
+        with pytest.raises(ValueError, match=f"{other}: expected a DataArray, as volume_. is"):
+            lfpiv.correlate(*pair, dt_s=1.0, voxel_mm=0.2)

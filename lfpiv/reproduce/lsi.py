@@ -29,7 +29,7 @@ from lfpiv.reproduce.lsitwin import (
     window_mm,
 )
 from lfpiv.reproduce.planarpiv import require_openpiv
-from lfpiv.reproduce.rigs import Rig, true_field
+from lfpiv.reproduce.rigs import VOXEL_MM, Rig, true_field
 
 TITLE = "Figs. 20 to 22: low-swirl injector, light-field PIV against planar PIV"
 
@@ -192,7 +192,7 @@ def _result(
         for number, name in enumerate("uv")
     }
     off = volume["displacement_mm"] - volume["truth_mm"]
-    voxel = [float(np.nanmean(np.abs(off[..., axis]))) / 0.1 for axis in range(3)]
+    voxel = [float(np.nanmean(np.abs(off[..., axis]))) / VOXEL_MM for axis in range(3)]
     _draw_profiles(twin, profiles, work / "fig22.png")
     _draw_planes(twin, volume, planar, work / "fig20_21.png")
     measured: dict[str, float] = {f"error_{name}": errors[name]["planar"] for name in "uv"}
