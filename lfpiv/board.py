@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -155,7 +156,23 @@ def few_pixels(optics: Optics) -> str:
     )
 
 
-class Planes(Sequence[np.ndarray]):
+class _OfPlanes(Sequence[np.ndarray], abc.ABC):
+    """Images of the board's planes, each made by `_image` when it is asked for."""
+
+    @overload
+    def __getitem__(self, plane: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, plane: slice) -> Sequence[np.ndarray]: ...
+    def __getitem__(self, plane: int | slice) -> np.ndarray | Sequence[np.ndarray]:
+        if isinstance(plane, slice):
+            return [self[n] for n in range(*plane.indices(len(self)))]
+        return self._image(plane)
+
+    @abc.abstractmethod
+    def _image(self, plane: int) -> np.ndarray: ...
+
+
+class Planes(_OfPlanes):
     """Images read when they are asked for; whole counts of the first ones are held, as many as `HELD_BYTES` allow."""
 
     def __init__(self, read: Callable[[int], np.ndarray], count: int):
@@ -165,13 +182,7 @@ class Planes(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return self._count
 
-    @overload
-    def __getitem__(self, plane: int) -> np.ndarray: ...
-    @overload
-    def __getitem__(self, plane: slice) -> Sequence[np.ndarray]: ...
-    def __getitem__(self, plane: int | slice) -> np.ndarray | Sequence[np.ndarray]:
-        if isinstance(plane, slice):
-            return [self[n] for n in range(*plane.indices(len(self)))]
+    def _image(self, plane: int) -> np.ndarray:
         if not 0 <= plane < self._count:
             raise IndexError(plane)
         if plane not in self._held:
@@ -185,7 +196,7 @@ class Planes(Sequence[np.ndarray]):
         return self._held[plane]
 
 
-class _Signals(Sequence[np.ndarray]):
+class _Signals(_OfPlanes):
     """The planes' images above their dark levels, nan where saturated; only the last one asked for is kept as float."""
 
     def __init__(self, images: Sequence[np.ndarray], decoder: LightFieldDecoder, dark: np.ndarray | None):
@@ -210,13 +221,7 @@ class _Signals(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return len(self._images)
 
-    @overload
-    def __getitem__(self, plane: int) -> np.ndarray: ...
-    @overload
-    def __getitem__(self, plane: slice) -> Sequence[np.ndarray]: ...
-    def __getitem__(self, plane: int | slice) -> np.ndarray | Sequence[np.ndarray]:
-        if isinstance(plane, slice):
-            return [self[n] for n in range(*plane.indices(len(self)))]
+    def _image(self, plane: int) -> np.ndarray:
         if plane != self._plane:
             image = np.asarray(self._images[plane])
             level, sigma = self._levels[plane]

@@ -252,7 +252,7 @@ class Job:
                     limit_bytes=memory.left_for_weights(self.experiment),
                     progress=self.step("weights"),
                 )
-                _ = weights.column_sum  # made once for all pairs, and warns of what fewer than two cameras see
+                _ = weights.camera_sums  # made once for all pairs and workers
             counted = compare_with_count(weights) if method == "footprint" else {}
         self.weights_report = {"method": method, "memory_mib": weights.memory_bytes / memory.MIB, "warnings": warnings}
         if method == "footprint":

@@ -207,8 +207,7 @@ def _project_even(weights: Weights) -> dict[str, _Even]:
     """Light of an evenly lit volume in each camera, in pixels that see what all do; nothing where too few do."""
     gains = {name: np.asarray(camera.gain, np.float32).reshape(-1) for name, camera in weights.cameras.items()}
     partly = np.zeros(weights.grid.size, bool)
-    for name, gain in gains.items():
-        seen = weights.projector(name).back_project(gain, np.zeros(weights.grid.size, np.float32))
+    for seen in weights.camera_sums:
         partly |= seen < WHOLLY_SEEN * seen.max()
     even = {}
     for name, gain in gains.items():

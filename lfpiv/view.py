@@ -18,7 +18,6 @@ from lfpiv.rig import Grid, Optics
 if TYPE_CHECKING:
     from lfpiv.calibration import CalibratedCamera, Calibration
     from lfpiv.settings import Board
-    from lfpiv.weights import Weights
 
 log = logging.getLogger(__name__)
 
@@ -165,28 +164,11 @@ def _sees(camera: CalibratedCamera, grid: Grid) -> np.ndarray:
     return seen.reshape(x.shape)
 
 
-def column_sums(weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """Sum the weights of every voxel and count the cameras that see it; warn where but one of several does.
-
-    Returns
-    -------
-    total : ndarray, shape (z, y, x), float32
-        Sum of a voxel's weights over all pixels of all cameras.
-    views : ndarray, shape (z, y, x), uint8
-        Number of cameras in which that sum is above `SEEN_SHARE` of its largest.
-    """
-    total = np.zeros(weights.grid.size, np.float32)
-    views = np.zeros(weights.grid.size, np.uint8)
-    for name, camera in weights.cameras.items():
-        before = total.copy()
-        weights.projector(name).back_project(np.asarray(camera.gain, np.float32).reshape(-1), total)
-        own = total - before
-        views += own > SEEN_SHARE * own.max()
-    views = weights.stored.restore(views)
-    if len(weights.cameras) > 1:
-        for text in _alone(views, [weights.grid.axis_mm(axis) for axis in range(3)]):
+def warn_alone(views: np.ndarray, grid: Grid, cameras: int) -> None:
+    """Log a warning where voxels of a grid are seen by but one of several cameras; `views` counts them, (z, y, x)."""
+    if cameras > 1:
+        for text in _alone(views, [grid.axis_mm(axis) for axis in range(3)]):
             log.warning("%s", text)
-    return weights.stored.restore(total), views
 
 
 def _alone(views: np.ndarray, axes_mm: Sequence[np.ndarray]) -> list[str]:

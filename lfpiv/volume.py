@@ -143,7 +143,8 @@ def reconstruct(
     views = [_view(weights, name, recording) for name, recording in recordings.items()]
 
     sieve = gaussian(sieve_voxel, weights.stored.shape)
-    column_sum = _column_sum(weights, views, recordings)
+    gains = (np.float32(recording.camera_gain) for recording in recordings.values())
+    column_sum = sum(gain * own for gain, own in zip(gains, weights.camera_sums, strict=True))
     lit = column_sum > 1e-6 * column_sum.max()
     if normalisation == "column":
         step, unblurred = (
@@ -229,16 +230,6 @@ def reconstruct(
             "active_share": active_share,
         },
     )
-
-
-def _column_sum(weights: Weights, views: list[View], recordings: Mapping[str, Recording]) -> np.ndarray:
-    """Sum of each voxel's weights over all pixels, each camera's by its gain, shape (voxel,), float32."""
-    if all(recording.camera_gain == 1 for recording in recordings.values()):
-        return weights.stored.store(weights.column_sum)
-    total = np.zeros(weights.grid.size, np.float32)
-    for view in views:
-        view.projector.back_project(view.gain, total)
-    return total
 
 
 def _view(weights: Weights, name: str, recording: Recording) -> View:

@@ -17,7 +17,7 @@ import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.rig import Grid
-from lfpiv.view import column_sums
+from lfpiv.view import SEEN_SHARE, warn_alone
 from lfpiv.voxelgrid import in_order
 from lfpiv.weightblocks import (
     BLOCK_BYTES,
@@ -56,7 +56,7 @@ class Weights:
     Made by `build_weights`. ``weights(volume)`` returns a dict camera -> image, ``weights.T(images)`` a volume.
     """
 
-    _views: np.ndarray | None = None
+    _camera_sums: np.ndarray | None = None
     _largest: float | None = None
 
     def __init__(
@@ -81,7 +81,6 @@ class Weights:
         self._asked, self._limit_bytes = form, limit_bytes
         self._counted: dict[str, CountedVoxels] = {}
         self._projectors: dict[str, Projector] = {}
-        self._column_sum: np.ndarray | None = None
         if method == "footprint":  # counting a whole grid takes long: it waits until the operator is applied
             self._build(progress)
 
@@ -92,11 +91,11 @@ class Weights:
         stored: StoredGrid,
         method: str,
         blocks: Mapping[str, Blocks],
-        column_sum: np.ndarray | None = None,
+        camera_sums: np.ndarray | None = None,
     ) -> Weights:
         """Weights of blocks that were built before, one per camera: see `lfpiv.weightstore`."""
         weights = cls(cameras, stored.grid, "count")  # builds nothing yet
-        weights.stored, weights.method, weights._column_sum = stored, method, column_sum
+        weights.stored, weights.method, weights._camera_sums = stored, method, camera_sums
         weights.forms = {name: part.form for name, part in blocks.items()}
         weights._projectors = {name: Projector(part) for name, part in blocks.items()}
         return weights
@@ -168,19 +167,30 @@ class Weights:
         return weights
 
     @property
+    def camera_sums(self) -> np.ndarray:
+        """Sum of each voxel's weights over all pixels of each camera, stored order, shape (camera, voxel), float32.
+
+        Where they are made, voxels that but one of several cameras sees are warned of.
+        """
+        if self._camera_sums is None:
+            self._camera_sums = np.zeros((len(self.cameras), self.grid.size), np.float32)
+            for own, (name, camera) in zip(self._camera_sums, self.cameras.items(), strict=True):
+                self.projector(name).back_project(np.asarray(camera.gain, np.float32).reshape(-1), own)
+            warn_alone(self.views, self.grid, len(self.cameras))
+        return self._camera_sums
+
+    @property
     def column_sum(self) -> np.ndarray:
         """Sum of each voxel's weights over all pixels of all cameras, shape (z, y, x), float32."""
-        if self._column_sum is None:
-            self._column_sum, self._views = column_sums(self)
-        return self._column_sum
+        total: np.ndarray = sum(self.camera_sums)
+        return self.stored.restore(total)
 
     @property
     def views(self) -> np.ndarray:
         """Number of cameras that see each voxel, shape (z, y, x), uint8."""
-        if self._views is None:
-            total, self._views = column_sums(self)
-            self._column_sum = total if self._column_sum is None else self._column_sum
-        return self._views
+        sums = self.camera_sums
+        seen = sums > SEEN_SHARE * sums.max(axis=1, keepdims=True)
+        return self.stored.restore(seen.sum(axis=0, dtype=np.uint8))
 
     @property
     def affected_pixels(self) -> np.ndarray:

@@ -79,7 +79,7 @@ def save_weights(weights: Weights, folder: Path) -> str:
             "grid": dataclasses.asdict(weights.grid),
             "order": weights.stored.order,
             "method": weights.method,
-            "column_sum": put("column_sum", weights.column_sum),
+            "camera_sums": put("camera_sums", weights.camera_sums),
             "cameras": {
                 name: put(f"camera{number}", weights.projector(name).blocks)
                 for number, name in enumerate(weights.cameras)
@@ -122,10 +122,12 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
             raise ValueError(f"cameras {', '.join(header['cameras'])}")
         grid = Grid(**{name: _tuple(value) for name, value in header["grid"].items()})
         blocks = {name: _take(Blocks, folder, entry) for name, entry in header["cameras"].items()}
-        column_sum = np.load(folder / header["column_sum"])
+        camera_sums = np.load(folder / header["camera_sums"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
-    return Weights.from_blocks(cameras, StoredGrid(grid, _tuple(header["order"])), header["method"], blocks, column_sum)
+    return Weights.from_blocks(
+        cameras, StoredGrid(grid, _tuple(header["order"])), header["method"], blocks, camera_sums
+    )
 
 
 _PARTS = {"microimages": Microimages}

@@ -35,7 +35,7 @@ def random_system(seed, voxels=(3, 4, 5), rows=4, lit=0.4):
     rng = np.random.default_rng(seed)
     grid = lfpiv.Grid(shape=voxels, voxel_mm=1.0, first_centre_mm=(0.0, 0.0, 0.0))
     weights = Weights.__new__(Weights)
-    weights.grid, weights.method, weights._column_sum = grid, "footprint", None
+    weights.grid, weights.method = grid, "footprint"
     weights.stored, weights.cameras, weights._projectors = StoredGrid(grid, (1, 0, 2)), {}, {}
     for name in ("one", "two"):
         value = rng.integers(1, 256, (grid.size * rows, 8)) * (rng.random((grid.size * rows, 8)) < lit)
