@@ -31,6 +31,8 @@ PERCENTILE = 10
 SECONDS, FEWEST, MOST, ENOUGH = 4.0, 3, 30, 20.0
 """Time spent on a case's samples, and how many there are at least and at most; a run that takes longer than
 `ENOUGH` is timed once, without a warm-up [s]."""
+TURNS, SHARE = 8, 0.5
+"""Turns at least of a peer and us, and how long ours runs in each, as a part of the peer's time."""
 ROUNDS, BLOCKS, LEAST_BAND = 30, 5, 0.03
 """Samples per side of a comparison, the blocks they are cut into, and the narrowest band of a verdict."""
 COMPARED = ("mapping", "count", "footprint", "project", "back_project", "smart", "correlate_8", "deform", "train")
@@ -52,6 +54,36 @@ def low(run) -> tuple[object, float, float, int]:
         if len(times) >= FEWEST and sum(wall for wall, _ in times) > SECONDS:
             break
     return result, *np.percentile(times, PERCENTILE, axis=0), len(times)
+
+
+def interleaved(run, peer) -> tuple[object, np.ndarray, list[float]]:
+    """Result of a peer's first run; low percentiles of the peer's and our times [s], and the range of their ratio.
+
+    The machine's speed drifts by a third within minutes, so both take turns: after each run of the peer ours runs for
+    `SHARE` of its time. Shape (peer and ours, wall and CPU); the range is from the 10th to the 90th percentile of the
+    ratio of wall times, turn by turn.
+    """
+    result, first, cpu = sample(peer)
+    theirs, ours, ratios = [(first, cpu)] if first > ENOUGH else [], [], []
+    while first <= ENOUGH and len(theirs) < MOST:
+        theirs.append(sample(peer)[1:])
+        ours += (turn := _for_seconds(run, SHARE * theirs[-1][0]))
+        ratios.append(theirs[-1][0] / np.percentile(turn, PERCENTILE, axis=0)[0])
+        if len(theirs) >= TURNS and sum(wall for wall, _ in theirs) > SECONDS:
+            break
+    if not ours:
+        ours = _for_seconds(run, SHARE * first)
+        ratios = [first / np.percentile(ours, PERCENTILE, axis=0)[0]]
+    low_times = np.array([np.percentile(times, PERCENTILE, axis=0) for times in (theirs, ours)])
+    return result, low_times, list(np.percentile(ratios, [PERCENTILE, 100 - PERCENTILE]))
+
+
+def _for_seconds(run, seconds: float) -> list[tuple[float, float]]:
+    """Wall and CPU times of runs until they took so long altogether, `MOST` at most."""
+    times: list[tuple[float, float]] = []
+    while len(times) < MOST and sum(wall for wall, _ in times) < seconds:
+        times.append(sample(run)[1:])
+    return times
 
 
 def limits() -> dict[str, float]:
@@ -98,13 +130,15 @@ def measure(name: str) -> bool:
         emit("times_hardware_limit", wall / seconds[by], by=by, limit_s=seconds[by], machine_per_second=machine[by])
     for peer, run in work.peers.items():
         try:
-            done, peer_wall, peer_cpu, _ = low(run)
+            done, ((peer_wall, peer_cpu), (wall, cpu)), ratios = interleaved(work.run, run)
             quality = (work.peer_check or work.check)(done)
         except cases.WrongResult as wrong:
             emit("peer_wrong", str(wrong), peer=peer)
             continue
         share = work.peer_share
-        emit("faster_than_peer", peer_wall / share / wall, peer=peer, peer_s=peer_wall / share, **quality)
+        between = [ratio / share for ratio in ratios]
+        seconds = {"peer_s": peer_wall / share, "ours_s": wall}
+        emit("faster_than_peer", peer_wall / share / wall, peer=peer, turns=between, **seconds, **quality)
         emit("less_cpu_than_peer", peer_cpu / share / cpu, peer=peer)
     return True
 
