@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # what the names below stand for
     from lfpiv.report import write_report
     from lfpiv.results import open_results
     from lfpiv.rig import Grid, LensLattice, Optics
+    from lfpiv.selfcalibration import self_calibrate
     from lfpiv.vectors import correlate
     from lfpiv.volume import reconstruct
     from lfpiv.weights import build_weights
@@ -47,6 +48,7 @@ _MODULES = {
     "reconstruct": "lfpiv.volume",
     "reconstruct_pair": "lfpiv.motion",
     "run": "lfpiv.pipeline",
+    "self_calibrate": "lfpiv.selfcalibration",
     "thin_lens": "lfpiv.calibration",
     "write_report": "lfpiv.report",
 }
@@ -73,6 +75,7 @@ __all__ = [
     "reconstruct",
     "reconstruct_pair",
     "run",
+    "self_calibrate",
     "thin_lens",
     "write_report",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,29 @@ class CalibratedCamera:
         arrays = self.network.to_arrays() | ({} if self.baseline is None else self.baseline.to_arrays())
         points, pupil = (np.ascontiguousarray(array, np.float32) for array in (points_mm, pupil_mm))
         return mapping.evaluate(arrays, points, pupil)
+
+    def moved(self, rotation: np.ndarray, shift_mm: np.ndarray) -> CalibratedCamera:
+        """Return the camera after a rigid movement: its rays of x are this one's of ``rotation x + shift``.
+
+        Exact: the movement becomes part of the network's first layer and of the thin lens's pose.
+
+        Parameters
+        ----------
+        rotation : ndarray, shape (3, 3)
+            Orthonormal.
+        shift_mm : ndarray, shape (3,)
+            Along x, y, z [mm].
+        """
+        network, baseline = self.network, self.baseline
+        if network is not None:
+            matrix, shift = np.eye(5), np.append(shift_mm, [0.0, 0.0])
+            matrix[:3, :3] = rotation
+            network = network.of_affine_inputs(matrix, shift)
+        if baseline is not None:
+            baseline = replace(
+                baseline, rotation=baseline.rotation @ rotation, offset_mm=rotation.T @ (baseline.offset_mm - shift_mm)
+            )
+        return replace(self, network=network, baseline=baseline)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from lfpiv.settings import (
     Correlation,
     ExperimentTable,
     Network,
+    SelfCalibration,
     Smart,
     Volume,
 )
@@ -68,6 +69,7 @@ class Experiment:
     smart: Smart
     correlation: Correlation
     network: Network
+    self_calibration: SelfCalibration
     compute: Compute
     particle_images: str
     """Path pattern of the particle images, relative to the experiment file."""
@@ -114,6 +116,12 @@ class Experiment:
         """All images the calibration reads, in a fixed order."""
         paths = [path for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
         return paths + [self.board_path(c.name, p) for c in self.cameras for p in range(len(self.board.planes_mm))]
+
+    @property
+    def self_calibration_pairs(self) -> list[int]:
+        """Pairs whose particles tell how the cameras stand: as many as asked for, evenly spread."""
+        count = min(self.self_calibration.pairs, self.pairs)
+        return [(2 * number + 1) * self.pairs // (2 * count) for number in range(count)]
 
     def pair_paths(self, pair: int) -> list[Path]:
         """All images of one pair, in a fixed order."""
@@ -177,6 +185,7 @@ def read_experiment(path: str | Path) -> Experiment:
         pairs=table.particles.pairs,
         frames=table.particles.frames,
         smart=table.smart,
+        self_calibration=table.self_calibration,
         correlation=table.correlation,
         network=table.network,
         compute=table.compute,

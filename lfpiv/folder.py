@@ -40,6 +40,11 @@ class Folder:
         return self.path / "calibration.h5"
 
     @property
+    def self_calibration(self) -> Path:
+        """The calibration corrected for movements of the cameras."""
+        return self.path / "self_calibration.h5"
+
+    @property
     def summary(self) -> Path:
         """Machine-readable figures of the run."""
         return self.path / "summary.json"

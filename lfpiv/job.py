@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -112,6 +113,7 @@ class Job:
         self.failed: dict[int, str] = {}
         """Pair -> why this invocation has no result of it."""
         self.tried: set[int] = set()
+        self.self_calibration_report: dict[str, Any] = {}
         self.weights_report: dict[str, Any] = {}
         self.workers_report: dict[str, Any] = {"count": 1, "threads": device.threads, "peak_memory_mib": None}
         self.calibration: Calibration | None = None
@@ -231,8 +233,35 @@ class Job:
             dataset.write_bytes(content.getbuffer(), path)
         return self.calibration
 
-    def build_weights(self, calibration: Calibration) -> Weights:
-        """Build the weights of the grid."""
+    def self_calibrate(self, calibration: Calibration) -> Calibration:
+        """Correct the calibration by the particles where the experiment asks for it; what is in the folder is kept."""
+        mark = stamp.of_self_calibration(self.experiment, self.calibration_stamp.hash)
+        if mark is None:
+            return calibration
+        from lfpiv import movedcameras
+        from lfpiv.camera import load_calibration
+
+        path = self.folder.self_calibration
+        found = stamp.marks(path)
+        if found is not None and not mark.changes(found):
+            log.info("self-calibration: finished before with the same settings, kept")
+            self.self_calibration_report = movedcameras.figures(found)
+            return load_calibration(path)
+        try:
+            with self.timed("self_calibration"):
+                corrected, self.self_calibration_report = movedcameras.correct(self.experiment, calibration)
+        except ValueError as error:
+            raise InputError(f"{self.experiment.path}: self_calibration.pairs: {error}") from None
+        content = io.BytesIO()
+        corrected.calibration.save(content)  # type: ignore[arg-type]  # HDF5 takes files too
+        _mark(content, **mark.attributes, figures=json.dumps(self.self_calibration_report))
+        with writing(path):
+            dataset.write_bytes(content.getbuffer(), path)
+        return corrected.calibration
+
+    def build_weights(self, calibration: Calibration, todo: Sequence[int]) -> Weights:
+        """Build the weights of the grid, for some pairs of which the first tells whether cameras moved."""
+        from lfpiv import movedcameras
         from lfpiv.calibration import warn_outside
         from lfpiv.view import require_seen
         from lfpiv.weights import build_weights, compare_with_count
@@ -254,7 +283,11 @@ class Job:
                 )
                 _ = weights.camera_sums  # made once for all pairs and workers
             counted = compare_with_count(weights) if method == "footprint" else {}
+            disparity = movedcameras.check(self.experiment, weights, todo)
         self.weights_report = {"method": method, "memory_mib": weights.memory_bytes / memory.MIB, "warnings": warnings}
+        self.weights_report |= disparity
+        if self.self_calibration_report:
+            self.weights_report["self_calibration"] = self.self_calibration_report
         if method == "footprint":
             self.weights_report |= {"form": dict(weights.forms), "cuts": dict(weights.cuts)}
             self.weights_report["profiles_check_l2"] = {

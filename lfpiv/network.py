@@ -96,6 +96,12 @@ class Network:
         """Each layer as one matrix (inputs + 1, nodes) whose last row is the bias."""
         return [np.vstack([weight, bias]) for weight, bias in zip(self.weights, self.biases, strict=True)]
 
+    def of_affine_inputs(self, matrix: np.ndarray, shift: np.ndarray) -> Network:
+        """Return the network whose value at x is this one's at ``matrix x + shift``: the first layer holds both."""
+        first = (matrix * self.input_scale / self.input_scale[:, None]).T @ self.weights[0]
+        bias = (matrix @ self.input_centre + shift - self.input_centre) / self.input_scale @ self.weights[0]
+        return replace(self, weights=(first, *self.weights[1:]), biases=(self.biases[0] + bias, *self.biases[1:]))
+
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the network as named arrays, for files and kernels; `from_arrays` is the inverse."""
         arrays = {name: getattr(self, name) for name in _SCALING}

@@ -25,6 +25,7 @@ from lfpiv.settings import Correlation
 from lfpiv.structure import seen_structure
 
 if TYPE_CHECKING:
+    from lfpiv.camera import CalibratedCamera
     from lfpiv.weights import Weights
 
 log = logging.getLogger(__name__)
@@ -178,18 +179,7 @@ class PairWork:
     def read_light(self, pair: int, frame: str) -> FrameLight:
         """Read the images of one frame and look at each by itself."""
         assert self.weights is not None
-        start = time.perf_counter()
-        light, noise, fingerprints, findings = {}, {}, {}, list[Finding]()
-        for name in (camera.name for camera in self.experiment.cameras):
-            raw, dark = self.experiment.particle_image(name, pair, frame), self.darks[name]
-            decoder = self.weights.cameras[name].decoder
-            image = raw if dark is None else raw - dark
-            level, noise[name] = decoder.background(image)
-            light[name] = image - np.float32(level)
-            fingerprints[name] = exposure.fingerprint(raw)
-            findings += exposure.frame_findings(raw, light[name], decoder, name, frame)
-        seconds = time.perf_counter() - start
-        return FrameLight(light=light, noise=noise, fingerprints=fingerprints, findings=findings, seconds=seconds)
+        return read_light(self.experiment, self.weights.cameras, self.darks, pair, frame)
 
     def _write_volumes(self, pair: int, volumes: Sequence[xr.DataArray]) -> None:
         mark = stamp.of_volumes(self.experiment, self.calibration_hash, pair).attributes
@@ -223,6 +213,27 @@ class PairWork:
             dataset.write_vectors(vectors, path, attributes=attributes, reconstruction=condensed)
             path.with_suffix(RETIRED).unlink(missing_ok=True)
         log.info("pair %d: %.0f %% of the vectors valid", pair, 100 * float(vectors["valid"].mean()))
+
+
+def read_light(
+    experiment: Experiment,
+    cameras: Mapping[str, CalibratedCamera],
+    darks: Mapping[str, np.ndarray | None],
+    pair: int,
+    frame: str,
+) -> FrameLight:
+    """Read the images of one frame, given the dark image of every camera, and look at each by itself."""
+    start = time.perf_counter()
+    light, noise, fingerprints, findings = {}, {}, {}, list[Finding]()
+    for name, camera in cameras.items():
+        raw, dark = experiment.particle_image(name, pair, frame), darks[name]
+        image = raw if dark is None else raw - dark
+        level, noise[name] = camera.decoder.background(image)
+        light[name] = image - np.float32(level)
+        fingerprints[name] = exposure.fingerprint(raw)
+        findings += exposure.frame_findings(raw, light[name], camera.decoder, name, frame)
+    seconds = time.perf_counter() - start
+    return FrameLight(light=light, noise=noise, fingerprints=fingerprints, findings=findings, seconds=seconds)
 
 
 def _volumes(

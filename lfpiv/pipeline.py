@@ -104,7 +104,8 @@ def reconstruct(
         todo, _ = _plan(job, todo, 1, None)
         calibration = job.calibrate()
         if todo:
-            work = job.work(job.build_weights(calibration), keep_volumes=True, vectors=False)
+            weights = job.build_weights(job.self_calibrate(calibration), todo)
+            work = job.work(weights, keep_volumes=True, vectors=False)
             _do(job, batch.alone(work, todo, job.step("image pairs")))
         return job.finish(report=False)
 
@@ -182,7 +183,9 @@ def _outcomes(
     keep_volumes: bool,
 ) -> Generator[Outcome, None, None]:
     """Do the pairs here or in several processes; the weights are built once, for all of them."""
-    weights = None if all(map(job.has_volumes, todo)) else job.build_weights(calibration)
+    weights = None
+    if not all(map(job.has_volumes, todo)):
+        weights = job.build_weights(job.self_calibrate(calibration), todo)
     work = job.work(weights, keep_volumes=keep_volumes)
     if planned is not None and weights is not None:
         planned = batch.lowered(planned, job.experiment, weights.memory_bytes, job.device)

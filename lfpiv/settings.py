@@ -106,6 +106,14 @@ class Compute(Table):
     """Memory the run may take [GiB]; absent: what the machine has available."""
 
 
+class SelfCalibration(Table):
+    """Table ``[self_calibration]``: correction of the calibration for cameras that moved since the board."""
+
+    pairs: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Pairs whose first frames tell by their particles how the cameras stand, evenly spread over all; 0: nothing is
+    corrected, and a warning says where it should be."""
+
+
 class NominalCamera(Table):
     """Keys of ``[[camera]]`` that a data sheet and the plan of the rig give; scenes of the simulator have them too."""
 
@@ -218,4 +226,5 @@ class ExperimentTable(Table):
     smart: Smart = Smart()
     correlation: Correlation = Correlation()
     network: Network = Network()
+    self_calibration: SelfCalibration = SelfCalibration()
     compute: Compute = Compute()

@@ -91,13 +91,30 @@ def of_calibration(experiment: Experiment) -> Stamp:
     )
 
 
+def of_self_calibration(experiment: Experiment, calibration: str) -> Stamp | None:
+    """Stamp of the self-calibration; None where none is asked for. `calibration` is the calibration's hash."""
+    if not experiment.self_calibration.pairs:
+        return None
+    images = [path for pair in experiment.self_calibration_pairs for path in experiment.pair_paths(pair)]
+    return Stamp(
+        {
+            "calibration": calibration,
+            "volume": dataclasses.asdict(experiment.grid),
+            "self_calibration": experiment.self_calibration.model_dump(),
+            "images": _identity(images, experiment.path.parent),
+        }
+    )
+
+
 def of_volumes(experiment: Experiment, calibration: str, pair: int) -> Stamp:
     """Stamp of both volumes of a pair; `calibration` is the calibration's hash."""
     compute = experiment.compute
+    corrected = of_self_calibration(experiment, calibration)
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
     return Stamp(
         {
             "calibration": calibration,
+            "self_calibration": None if corrected is None else corrected.hash,
             "volume": dataclasses.asdict(experiment.grid),
             "smart": experiment.smart.model_dump(),
             "motion": reach if experiment.smart.motion_passes else None,

@@ -100,6 +100,15 @@ class Weights:
         weights._projectors = {name: Projector(part) for name, part in blocks.items()}
         return weights
 
+    def of_camera(self, name: str) -> Weights:
+        """Weights of one of the cameras; its blocks are shared."""
+        one = Weights({name: self.cameras[name]}, self.grid, "count")  # builds nothing
+        one.stored, one.method = self.stored, self.method
+        one._projectors = {name: self.projector(name)}
+        if name in self.forms:
+            one.forms = {name: self.forms[name]}
+        return one
+
     # -- the operator ----------------------------------------------------------------------------------------------
 
     def __call__(self, volume: np.ndarray, out: Images | None = None) -> Images:

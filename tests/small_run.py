@@ -46,12 +46,18 @@ class SmallRun:
         return folder
 
 
-def make_small_run(folder: Path, device: str) -> SmallRun:
+def small_scene(**moved):
+    """Scene of two cameras; `moved` has more keys of a camera by its name."""
     cameras = [
-        scenes.camera(name, angle, (400, 400), true_yaw_deg=angle + TRUE_ANGLE_DEG, true_array_roll_deg=0.05)
+        scenes.camera(
+            name,
+            angle,
+            (400, 400),
+            **{"true_yaw_deg": angle + TRUE_ANGLE_DEG, "true_array_roll_deg": 0.05} | moved.get(name, {}),
+        )
         for name, angle in (("left", 40.0), ("right", -40.0))
     ]
-    scene = scenes.scene(
+    return scenes.scene(
         "small",
         cameras,
         planes_mm=(-0.7, 0.0, 0.7),
@@ -61,6 +67,10 @@ def make_small_run(folder: Path, device: str) -> SmallRun:
         smart={"iterations": 8},
         network={"hidden": (12,), "epochs": 60},
     )
+
+
+def make_small_run(folder: Path, device: str) -> SmallRun:
+    scene = small_scene()
     experiment = simulate(scene, folder / "data")
     summary = pipeline.run(experiment, folder / "out", device=device, keep_volumes=True)
     return SmallRun(experiment, folder / "out", summary)

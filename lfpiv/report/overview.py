@@ -110,6 +110,7 @@ def what_was_run(experiment: Experiment, summary: Mapping[str, Any]) -> str:
         ("Image pairs", f"{len(summary['pairs']):,} of {experiment.pairs:,} finished"),
         ("Motion passes", _motion(summary)),
         ("Weights", _weights(summary.get("weights") or {})),
+        ("Cameras against each other", _agreement(summary.get("weights") or {})),
         ("Computed on", f"{device['kind']}, {device['threads']} threads"),
     ]
     return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
@@ -150,6 +151,25 @@ def _weights(report: Mapping[str, Any]) -> str:
         text += (
             f"; {percent(float(np.mean(errors)), 1)} (mean of {len(errors)} voxels), at most "
             f"{percent(max(errors), 1)}, from counted rays"
+        )
+    return text
+
+
+def _agreement(report: Mapping[str, Any]) -> str:
+    """How far apart the cameras show the same particles, and what self-calibration did about it."""
+    text = ""
+    if "disparity_voxel" in report:
+        text = f"particles of pair {report['disparity_pair']} within {report['disparity_voxel']:.2f} voxel"
+    corrected = report.get("self_calibration")
+    if corrected:
+        moved = ", ".join(
+            f"{name} by {1000 * float(np.linalg.norm(move['shift_mm'])):.0f} µm and "
+            f"{float(np.linalg.norm(move['rotation_deg'])):.2f}°"
+            for name, move in corrected["movements"].items()
+        )
+        text += (
+            f"{'; ' if text else ''}self-calibrated by {markup.count(len(corrected['pairs']), 'pair')}: "
+            f"{corrected['disparity_before_voxel']:.2f} voxel before, {corrected['disparity_voxel']:.2f} after; {moved}"
         )
     return text
 

@@ -1,0 +1,115 @@
+"""What a run does about cameras that moved since the board was recorded: it says so, or corrects the calibration."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable, Mapping
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lfpiv import notices
+from lfpiv.pair import read_light
+from lfpiv.selfcalibration import SelfCalibration, disparities, explained_mm, fit_movements, self_calibrate
+
+if TYPE_CHECKING:
+    from lfpiv.camera import CalibratedCamera, Calibration
+    from lfpiv.experiment import Experiment
+    from lfpiv.weights import Weights
+
+log = logging.getLogger(__name__)
+
+LARGE_VOXEL = 0.5
+"""Disparity above which a warning is due [voxel]: at one voxel vectors are half as far off again."""
+
+TRIED = 3
+"""Pairs that are tried where the first ones cannot tell."""
+
+
+def correct(experiment: Experiment, calibration: Calibration) -> tuple[SelfCalibration, dict[str, Any]]:
+    """Correct a calibration by the pairs that the experiment names; also its figures for the summary.
+
+    Raises
+    ------
+    ValueError
+        If images cannot be used, or do not tell how the cameras stand.
+    """
+    pairs = experiment.self_calibration_pairs
+    images = list(_light(experiment, calibration.cameras, pairs))
+    found = self_calibrate(calibration, experiment.grid, images)
+    voxel = experiment.grid.voxel_mm
+    movements = {
+        name: {
+            "shift_mm": np.round(move.shift_mm, 5).tolist(),
+            "shift_std_mm": np.round(move.std[:3], 5).tolist(),
+            "rotation_deg": np.round(np.degrees(move.rotation_rad), 4).tolist(),
+            "rotation_std_deg": np.round(np.degrees(move.std[3:]), 4).tolist(),
+        }
+        for name, move in found.movements.items()
+    }
+    names = list(movements)
+    before, after = (
+        explained_mm(some, fit_movements(some, names, experiment.grid), experiment.grid) / voxel
+        for some in (found.before, found.after)
+    )
+    log.info("self-calibration: cameras were %.2f voxel apart, now %.2f (%d corrections)", before, after, found.rounds)
+    return found, {
+        "pairs": pairs,
+        "corrections": found.rounds,
+        "disparity_before_voxel": round(before, 3),
+        "disparity_voxel": round(after, 3),
+        "movements": movements,
+    }
+
+
+def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> dict[str, Any]:
+    """Measure by the first usable pair how far cameras stand apart; warn where it is much, return figures.
+
+    Empty where that cannot be told: one camera, too few particles, no pair whose images can be used.
+    """
+    if len(weights.cameras) < 2 or weights.method != "footprint":
+        return {}
+    for pair in islice(pairs, TRIED):
+        try:
+            images = list(_light(experiment, weights.cameras, [pair]))
+            found = disparities(weights, images)
+        except ValueError as error:
+            log.debug("disparity of the cameras in pair %d: %s", pair, error)
+            continue
+        movements = fit_movements(found, list(weights.cameras), experiment.grid)
+        disparity = explained_mm(found, movements, experiment.grid) / experiment.grid.voxel_mm
+        log.info("cameras show the particles of pair %d within %.2f voxel of each other", pair, disparity)
+        if disparity > LARGE_VOXEL:
+            notices.warn(log, "%s", _warning(disparity, experiment, weights.cameras))
+        return {"disparity_voxel": round(disparity, 3), "disparity_pair": pair}
+    return {}
+
+
+def _warning(disparity: float, experiment: Experiment, cameras: Mapping[str, CalibratedCamera]) -> str:
+    names = " and ".join(cameras) if len(cameras) == 2 else "the cameras"
+    mend = (
+        "record the board again"
+        if experiment.self_calibration.pairs
+        else f"set self_calibration.pairs = {min(5, experiment.pairs)}, or record the board again"
+    )
+    return (
+        f"{names} show the same particles {disparity:.1f} voxel ({disparity * experiment.grid.voxel_mm:.3f} mm) apart: "
+        f"a camera moved since the board was recorded; {mend}."
+    )
+
+
+def _light(
+    experiment: Experiment, cameras: Mapping[str, CalibratedCamera], pairs: Iterable[int]
+) -> Iterable[dict[str, np.ndarray]]:
+    """Images of the first frames of some pairs, without dark and background."""
+    darks = {name: experiment.dark(name) for name in cameras}
+    for pair in pairs:
+        yield read_light(experiment, cameras, darks, pair, experiment.frames[0]).light
+
+
+def figures(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Figures of a self-calibration from the attributes of its file."""
+    stored: dict[str, Any] = json.loads(attributes["figures"])
+    return stored
