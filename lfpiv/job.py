@@ -249,7 +249,9 @@ class Job:
             return load_calibration(path)
         try:
             with self.timed("self_calibration"):
-                corrected, self.self_calibration_report = movedcameras.correct(self.experiment, calibration)
+                corrected, self.self_calibration_report = movedcameras.correct(
+                    self.experiment, calibration, self.step("self-calibration")
+                )
         except ValueError as error:
             raise InputError(f"{self.experiment.path}: self_calibration.pairs: {error}") from None
         content = io.BytesIO()

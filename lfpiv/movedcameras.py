@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lfpiv import notices
+from lfpiv.disparity import disparities
 from lfpiv.pair import read_light
-from lfpiv.selfcalibration import SelfCalibration, disparities, explained_mm, fit_movements, self_calibrate
+from lfpiv.selfcalibration import SelfCalibration, explained_mm, fit_movements, self_calibrate
 
 if TYPE_CHECKING:
     from lfpiv.camera import CalibratedCamera, Calibration
@@ -28,7 +29,9 @@ TRIED = 3
 """Pairs that are tried where the first ones cannot tell."""
 
 
-def correct(experiment: Experiment, calibration: Calibration) -> tuple[SelfCalibration, dict[str, Any]]:
+def correct(
+    experiment: Experiment, calibration: Calibration, progress: Callable[[float], None]
+) -> tuple[SelfCalibration, dict[str, Any]]:
     """Correct a calibration by the pairs that the experiment names; also its figures for the summary.
 
     Raises
@@ -38,7 +41,7 @@ def correct(experiment: Experiment, calibration: Calibration) -> tuple[SelfCalib
     """
     pairs = experiment.self_calibration_pairs
     images = list(_light(experiment, calibration.cameras, pairs))
-    found = self_calibrate(calibration, experiment.grid, images)
+    found = self_calibrate(calibration, experiment.grid, images, progress=progress)
     voxel = experiment.grid.voxel_mm
     movements = {
         name: {

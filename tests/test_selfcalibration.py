@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from small_run import small_scene
 
 import lfpiv
-from lfpiv import pipeline, selfcalibration
+from lfpiv import disparity, pipeline, selfcalibration
 from lfpiv.camera import Calibration
+from lfpiv.disparity import Disparity
 from lfpiv.rig import Grid
-from lfpiv.selfcalibration import Disparity, Movement
+from lfpiv.selfcalibration import Movement
 from lfpiv.simulate import simulate
 
 ROUNDING = 1e-12
@@ -60,7 +61,7 @@ def naive_coefficients(first, second, window, reach):
     for place in np.ndindex(*out.shape):
         to = at + np.array(place) - reach
         inside = ((to >= 0) & (to < second[0].shape)).all(1)
-        if inside.sum() < selfcalibration.LEAST_OVERLAP * len(at):
+        if inside.sum() < disparity.LEAST_OVERLAP * len(at):
             continue
         products = spread = other = 0.0
         for one, two in zip(first, second, strict=True):
@@ -81,11 +82,11 @@ def naive_coefficients(first, second, window, reach):
 
 
 def test_coefficients_are_those_of_the_overlap(monkeypatch):
-    monkeypatch.setattr(selfcalibration, "SEARCH_VOXEL", 2)
+    monkeypatch.setattr(disparity, "SEARCH_VOXEL", 2)
     rng = np.random.default_rng(3)
     first, second = ([rng.gamma(0.3, size=(5, 7, 6)) for _ in range(2)] for _ in range(2))
     window = slice(0, 4), slice(3, 7), slice(1, 5)
-    found = selfcalibration._coefficients(first, second, window)
+    found = disparity._coefficients(first, second, window)
     assert np.abs(found - naive_coefficients(first, second, window, 2)).max() < SUMS
     assert (found == 0).any() and (np.abs(found) > 0.1).any()
 
