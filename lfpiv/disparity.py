@@ -6,7 +6,7 @@ disparity.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -86,10 +86,10 @@ def disparities(
     progress : callable, optional
         Called with the finished fraction.
 
-    Raises
-    ------
-    ValueError
-        If no part of the volume shows the same particles in any two cameras.
+    Returns
+    -------
+    tuple of Disparity
+        Empty where no part of the volume shows the same particles in any two cameras.
     """
     names, grid = list(weights.cameras), weights.grid
     alone: dict[str, list[np.ndarray]] = {}
@@ -106,13 +106,13 @@ def disparities(
             disparity = _disparity(alone[first], alone[second], window, grid, (first, second))
             if disparity is not None:
                 found.append(disparity)
-    if not found:
-        raise ValueError(
-            "images: expected particles that two cameras show within "
-            f"{SEARCH_VOXEL} voxels of each other, found none: the cameras moved by more, the images are not of the "
-            "same instant, or hold too few particles."
-        )
     return tuple(found)
+
+
+def unlinked(found: Sequence[Disparity], cameras: Iterable[str]) -> list[str]:
+    """Name the cameras that show no particles of any other one."""
+    linked = {name for one in found for name in one.cameras}
+    return [name for name in cameras if name not in linked]
 
 
 def _windows(grid: Grid) -> list[tuple[slice, ...]]:

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lfpiv import notices
-from lfpiv.disparity import disparities
+from lfpiv.cautions import named
+from lfpiv.disparity import SEARCH_VOXEL, disparities, unlinked
 from lfpiv.pair import read_light
 from lfpiv.selfcalibration import SelfCalibration, explained_mm, fit_movements, self_calibrate
+from lfpiv.structure import NOISE, seen_structure
 
 if TYPE_CHECKING:
     from lfpiv.camera import CalibratedCamera, Calibration
@@ -70,16 +72,23 @@ def correct(
 def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> dict[str, Any]:
     """Measure by the first usable pair how far cameras stand apart; warn where it is much, return figures.
 
-    Empty where that cannot be told: one camera, too few particles, no pair whose images can be used.
+    Empty where that cannot be told: one camera, no pair whose images show particles, or cameras that show none in
+    common, of which it warns.
     """
     if len(weights.cameras) < 2 or weights.method != "footprint":
         return {}
+    alone: dict[int, list[str]] = {}
     for pair in islice(pairs, TRIED):
         try:
             images = list(_light(experiment, weights.cameras, [pair]))
+            if any(seen_structure(image, weights.cameras[name].decoder) < NOISE for name, image in images[0].items()):
+                continue
             found = disparities(weights, images)
-        except ValueError as error:
+        except ValueError as error:  # the pair's own turn will tell
             log.debug("disparity of the cameras in pair %d: %s", pair, error)
+            continue
+        alone[pair] = unlinked(found, weights.cameras)
+        if alone[pair]:
             continue
         movements = fit_movements(found, list(weights.cameras), experiment.grid)
         disparity = explained_mm(found, movements, experiment.grid) / experiment.grid.voxel_mm
@@ -87,6 +96,15 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> dic
         if disparity > LARGE_VOXEL:
             notices.warn(log, "%s", _warning(disparity, experiment, weights.cameras))
         return {"disparity_voxel": round(disparity, 3), "disparity_pair": pair}
+    if alone:
+        lost = dict.fromkeys(name for some in alone.values() for name in some)
+        others = "" if len(lost) == len(weights.cameras) else " and the other cameras"
+        notices.warn(
+            log,
+            "%s",
+            f"{named(list(alone))}: {' and '.join(lost)}{others} show no particles in common within {SEARCH_VOXEL} "
+            "voxels: a camera moved by more, their images are of different instants, or show very few particles.",
+        )
     return {}
 
 

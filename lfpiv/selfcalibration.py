@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lfpiv.camera import Calibration
-from lfpiv.disparity import Disparity, disparities
+from lfpiv.disparity import SEARCH_VOXEL, Disparity, disparities, unlinked
 from lfpiv.rig import Grid
 from lfpiv.weights import build_weights
 
@@ -115,7 +115,7 @@ def self_calibrate(
     Raises
     ------
     ValueError
-        If there are fewer than two cameras, no images, or no disparity can be told from them.
+        If there are fewer than two cameras, no images, or a camera shows nothing that another one shows.
     """
     if len(calibration.cameras) < 2 or not images:
         raise ValueError(
@@ -132,6 +132,12 @@ def self_calibrate(
                 progress((number + fraction) / (ROUNDS + 1))
 
         found.append(disparities(build_weights(corrected, grid), images, step))
+        alone = unlinked(found[-1], movements)
+        if alone:
+            raise ValueError(
+                f"images: expected particles that {' and '.join(alone)} and another camera show within {SEARCH_VOXEL} "
+                "voxels of each other, found none: it moved by more, its images are of other instants, or show too few."
+            )
         steps = fit_movements(found[-1], list(movements), grid)
         if len(found) > ROUNDS or explained_mm(found[-1], steps, grid) < CONVERGED_VOXEL * grid.voxel_mm:
             break

@@ -47,6 +47,14 @@ def test_moved_camera_has_the_rays_of_moved_points(small_run):
     assert np.abs(camera.map(points, pupil) - expected).max() > 0.05
 
 
+def test_weights_of_one_camera_are_those_of_all(small_run):
+    experiment = lfpiv.open_experiment(small_run.experiment)
+    weights = lfpiv.build_weights(lfpiv.load_calibration(small_run.out / "calibration.h5"), experiment.grid)
+    volume = np.random.default_rng(7).random(experiment.grid.shape, np.float32)
+    one = weights.of_camera("right")
+    assert list(one(volume)) == ["right"] and np.array_equal(one(volume)["right"], weights(volume)["right"])
+
+
 def test_movements_follow_each_other():
     first, step = movement([0.1, 0.2, -0.1], [0.01, 0.02, -0.03]), movement([-0.3, 0.1, 0.2], [0.02, -0.01, 0.04])
     points = np.random.default_rng(2).uniform(-1, 1, (20, 3))
@@ -211,3 +219,21 @@ def test_what_cannot_be_told_is_refused(small_run, knocked, tmp_path):
     noise = {name: rng.normal(0, 5, shape).astype(np.float32) for name in calibration.cameras}
     with pytest.raises(ValueError, match="found none"):
         lfpiv.self_calibrate(calibration, experiment.grid, [noise])
+
+
+def test_cameras_of_different_instants_are_named(small_run, tmp_path):
+    file = small_run.images(tmp_path / "data")
+    images = sorted((file.parent / "particles" / "right").iterdir())
+    for path in images:
+        path.rename(path.with_name(f"old_{path.name}"))
+    for old, new in zip(images, images[2:] + images[:2], strict=True):  # each pair's are another's
+        old.with_name(f"old_{old.name}").rename(new)
+    summary = pipeline.run(file, small_run.calibrated(tmp_path / "out"), pairs=(0, 3))
+    said = [text for text in summary["warnings"] if "no particles in common" in text]
+    assert len(said) == 1 and said[0].startswith("pairs 0, 1, 2: left and right show")
+    assert "disparity_voxel" not in summary["weights"]
+    file.write_text(file.read_text("utf-8") + "\n[self_calibration]\npairs = 1\n", "utf-8")
+    with pytest.raises(
+        lfpiv.InputError, match=r"self_calibration\.pairs: images: expected particles that left and right"
+    ):
+        pipeline.run(file, tmp_path / "out", pairs=(0, 1))
