@@ -28,6 +28,9 @@ SMOOTHING_VOXEL = 1.0
 """Standard deviation of the Gaussian that volumes are smoothed by before they are correlated [voxel]."""
 SEARCH_VOXEL = 16
 """Largest disparity searched for along each axis [voxel]."""
+NEAR_VOXEL = 4
+"""Largest distance of a window's disparity from that of the whole volume along each axis: a chance peak elsewhere is no
+match [voxel]."""
 WINDOW_VOXEL, MOST_WINDOWS = 12, 3
 """Least edge of the windows into which the volume is cut, and how many there are along an axis at most: a rigid
 movement needs no more."""
@@ -101,11 +104,13 @@ def disparities(
             volume = reconstruct(one, {name: instant[name]}, ITERATIONS).values
             alone[name].append(gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant"))
     found = []
-    for first, second in combinations(names, 2):
-        for window in _windows(grid):
-            disparity = _disparity(alone[first], alone[second], window, grid, (first, second))
-            if disparity is not None:
-                found.append(disparity)
+    whole = tuple(slice(0, edge) for edge in grid.shape)
+    for pair in combinations(names, 2):
+        volumes = alone[pair[0]], alone[pair[1]]
+        of_all = _disparity(volumes, whole, grid, pair)
+        if of_all is not None:
+            parts = [_disparity(volumes, window, grid, pair, near_mm=of_all.shift_mm) for window in _windows(grid)]
+            found += [part for part in parts if part is not None] or [of_all]
     return tuple(found)
 
 
@@ -126,18 +131,24 @@ def _windows(grid: Grid) -> list[tuple[slice, ...]]:
 
 
 def _disparity(
-    first: Sequence[np.ndarray],
-    second: Sequence[np.ndarray],
+    volumes: tuple[Sequence[np.ndarray], Sequence[np.ndarray]],
     window: tuple[slice, ...],
     grid: Grid,
     cameras: tuple[str, str],
+    near_mm: np.ndarray | None = None,
 ) -> Disparity | None:
-    """Disparity of two cameras' volumes in a window; None where no peak tells it."""
+    """Disparity of two cameras' volumes in a window, near another one where given; None where no peak tells it."""
+    first, second = volumes
     coefficient = _coefficients(first, second, window)
     mirrored = _coefficients(first, [volume[:, ::-1] for volume in second], _mirror(window, grid.shape[1]))
-    place = np.unravel_index(int(np.nanargmax(coefficient)), coefficient.shape)
-    peak, rival = float(coefficient[place]), float(np.nanmax(mirrored))
-    if not peak >= SIGNIFICANT * rival or any(not 0 < i < 2 * SEARCH_VOXEL for i in place):
+    low, high = np.zeros(3, int), np.full(3, 2 * SEARCH_VOXEL)
+    if near_mm is not None:
+        centre = np.rint(near_mm[::-1] / grid.voxel_mm).astype(int) + SEARCH_VOXEL
+        low, high = np.maximum(centre - NEAR_VOXEL, low), np.minimum(centre + NEAR_VOXEL, high)
+    searched = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
+    place = low + np.unravel_index(int(coefficient[searched].argmax()), coefficient[searched].shape)
+    peak, rival = float(coefficient[tuple(place)]), float(mirrored[searched].max())
+    if not peak >= SIGNIFICANT * rival or not ((place > low) & (place < high)).all():
         return None
     middle = np.clip(place, FIT_REACH, 2 * SEARCH_VOXEL - FIT_REACH)
     around = coefficient[tuple(slice(i - FIT_REACH, i + FIT_REACH + 1) for i in middle)]

@@ -30,6 +30,8 @@ LEAST_STD_VOXEL, ASSUMED_STD_VOXEL = 0.02, 0.1
 CONVERGED_VOXEL = 0.05
 """A round that moves cameras against each other by less, as far as their views tell, ends the self-calibration."""
 ROUNDS = 4
+FITS, OUTLIER = 10, 2.0
+"""Solutions of a fit, and how many times as far off as most a disparity counts a quarter."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,19 +164,22 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
     are held near none by `PRIOR_MM` and `PRIOR_RAD`; so the mean of all cameras, which none tells, is none.
     """
     rows = [_row(one, cameras, grid) for one in found]
-    count = len(cameras)
-    information, pull = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
-    for one, row in zip(found, rows, strict=True):
-        information += row.T @ one.weight @ row
-        pull += row.T @ one.weight @ one.shift_mm
+    count, least = len(cameras), LEAST_STD_VOXEL * grid.voxel_mm
     prior = np.diag(np.tile(np.repeat([PRIOR_MM**-2.0, PRIOR_RAD**-2.0], 3), count))
-    free = 3 * len(found) - 6 * (count - 1)
-    variance = ((LEAST_STD_VOXEL if free > 0 else ASSUMED_STD_VOXEL) * grid.voxel_mm) ** 2
-    for _ in range(2):  # the first solution tells the variance
-        covariance = np.linalg.inv(information / variance + prior)
-        values = covariance @ pull / variance
-        left = [one.told_mm(one.shift_mm - row @ values) ** 2 for one, row in zip(found, rows, strict=True)]
-        variance = max(variance, sum(left) / max(free, 1))
+    variance, trust = (ASSUMED_STD_VOXEL * grid.voxel_mm) ** 2, np.ones(len(found))
+    for _ in range(FITS):  # each solution tells the variance, and which disparities are chance peaks
+        information, pull = prior.copy(), np.zeros(6 * count)
+        for one, row, part in zip(found, rows, trust / variance, strict=True):
+            information += part * row.T @ one.weight @ row
+            pull += part * row.T @ one.weight @ one.shift_mm
+        covariance = np.linalg.inv(information)
+        values = covariance @ pull
+        left = np.array([one.told_mm(one.shift_mm - row @ values) for one, row in zip(found, rows, strict=True)])
+        scale = max(1.5 * float(np.median(left)), least)
+        trust = (1 + (left / (OUTLIER * scale)) ** 2) ** -2.0  # Geman and McClure
+        free = 3 * trust.sum() - 6 * (count - 1)
+        if free > 0:
+            variance = max(float(trust @ left**2) / free, least**2)
     apart = np.kron(np.eye(count) - 1 / count, np.eye(6))  # errors of what all cameras share: none, by definition
     std = np.sqrt(np.diag(apart @ covariance @ apart.T)).reshape(-1, 6)
     centre = _centre_mm(grid)

@@ -237,3 +237,19 @@ def test_cameras_of_different_instants_are_named(small_run, tmp_path):
         lfpiv.InputError, match=r"self_calibration\.pairs: images: expected particles that left and right"
     ):
         pipeline.run(file, tmp_path / "out", pairs=(0, 1))
+
+
+def test_chance_peaks_do_not_move_cameras():
+    rng = np.random.default_rng(8)
+    found = []
+    for number in range(18):
+        at = rng.uniform(-1, 1, 3)
+        shift = rng.uniform(-0.4, 0.4, 3) if number % 6 == 0 else 0.01 * rng.standard_normal(3)
+        pair = Disparity(
+            cameras=("left", "right"), centre_mm=at, shift_mm=shift, sharpness=np.eye(3), peak=0.5, rival=0.1
+        )
+        found.append(pair)
+    fitted = selfcalibration.fit_movements(found, ["left", "right"], GRID)
+    assert all(np.abs(move.shift_mm).max() < LATERAL_MM for move in fitted.values())
+    plain = np.mean([one.shift_mm for one in found], axis=0)
+    assert np.abs(plain).max() / 2 > LATERAL_MM  # what least squares alone would make of it
