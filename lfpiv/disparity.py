@@ -28,9 +28,11 @@ SMOOTHING_VOXEL = 1.0
 """Standard deviation of the Gaussian that volumes are smoothed by before they are correlated [voxel]."""
 SEARCH_VOXEL = 16
 """Largest disparity searched for along each axis [voxel]."""
+MIDDLE_VOXEL = 128
+"""Largest edge of the middle of the volume, which is asked first, all of it where it is smaller."""
 NEAR_VOXEL = 4
-"""Largest distance of a window's disparity from that of the whole volume along each axis: a chance peak elsewhere is no
-match [voxel]."""
+"""Largest distance of a window's disparity from that of the middle along each axis: a chance peak elsewhere is no match
+[voxel]."""
 WINDOW_VOXEL, MOST_WINDOWS = 12, 3
 """Least edge of the windows into which the volume is cut, and how many there are along an axis at most: a rigid
 movement needs no more."""
@@ -104,10 +106,10 @@ def disparities(
             volume = reconstruct(one, {name: instant[name]}, ITERATIONS).values
             alone[name].append(gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant"))
     found = []
-    whole = tuple(slice(0, edge) for edge in grid.shape)
+    middle = tuple(slice((n - m) // 2, (n + m) // 2) for n in grid.shape for m in [min(n, MIDDLE_VOXEL)])
     for pair in combinations(names, 2):
         volumes = alone[pair[0]], alone[pair[1]]
-        of_all = _disparity(volumes, whole, grid, pair)
+        of_all = _disparity(volumes, middle, grid, pair)
         if of_all is not None:
             parts = [_disparity(volumes, window, grid, pair, near_mm=of_all.shift_mm) for window in _windows(grid)]
             found += [part for part in parts if part is not None] or [of_all]

@@ -228,7 +228,11 @@ def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
 @pytest.mark.parametrize(("number", "options"), [(signal.SIGINT, ["--workers", "2"]), (signal.SIGTERM, [])])
 def test_an_interrupted_run_ends_cleanly_and_says_how_to_go_on(small_run, tmp_path, number, options):
     out = small_run.calibrated(tmp_path / "out")
-    run = start("run", small_run.experiment, "--out", out, *options)
+    file = small_run.images(tmp_path / "data")
+    slow = file.read_text("utf-8").replace("iterations = 8", "iterations = 400\ntolerance = 0.0")
+    assert slow.count("iterations = 400") == 1
+    file.write_text(slow, "utf-8")  # seconds for each pair: none may be done before the signal comes
+    run = start("run", file, "--out", out, *options)
     wait_for(lambda: workers_of(run) if options else (out / ".lock").exists(), run, "work")
     children = psutil.Process(run.pid).children(recursive=True)
     run.send_signal(number)
