@@ -1,6 +1,7 @@
 """A small simulated experiment that everything runs on in seconds once it is calibrated."""
 
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -77,8 +78,12 @@ def make_small_run(folder: Path, device: str) -> SmallRun:
 
 
 def start(*arguments, **options) -> subprocess.Popen:
-    """Start the command line as a process of its own; its standard error is a pipe of text."""
+    """Start the command line as a process of its own; its standard error is a pipe of text.
+
+    A shell's background jobs ignore interrupts, and so would what they start.
+    """
     command = [sys.executable, "-m", "lfpiv", *map(str, arguments)]
+    options["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
