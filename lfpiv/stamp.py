@@ -53,7 +53,8 @@ class Stamp:
             if old == new or (name == "images" and new is None):
                 continue
             if isinstance(old, dict) and isinstance(new, dict):
-                found += [f"{name}.{key}" for key in {**old, **new} if old.get(key) != new.get(key)]
+                gone = {"images"} if new.get("images", ()) is None else set()
+                found += [f"{name}.{key}" for key in {**old, **new} if old.get(key) != new.get(key) and key not in gone]
             else:
                 found.append(name)
         return found
@@ -95,26 +96,30 @@ def of_self_calibration(experiment: Experiment, calibration: str) -> Stamp | Non
     """Stamp of the self-calibration; None where none is asked for. `calibration` is the calibration's hash."""
     if not experiment.self_calibration.pairs:
         return None
-    images = [path for pair in experiment.self_calibration_pairs for path in experiment.pair_paths(pair)]
-    return Stamp(
-        {
-            "calibration": calibration,
-            "volume": dataclasses.asdict(experiment.grid),
-            "self_calibration": experiment.self_calibration.model_dump(),
-            "images": _identity(images, experiment.path.parent),
-        }
-    )
+    volume = dataclasses.asdict(experiment.grid)
+    return Stamp({"calibration": calibration, "volume": volume, "self_calibration": _self_calibration(experiment)})
+
+
+def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
+    """Settings and images of the self-calibration; None where none is asked for."""
+    if not experiment.self_calibration.pairs:
+        return None
+    images = [
+        experiment.particle_path(camera.name, pair, experiment.frames[0])
+        for pair in experiment.self_calibration_pairs
+        for camera in experiment.cameras
+    ]
+    return {**experiment.self_calibration.model_dump(), "images": _identity(images, experiment.path.parent)}
 
 
 def of_volumes(experiment: Experiment, calibration: str, pair: int) -> Stamp:
     """Stamp of both volumes of a pair; `calibration` is the calibration's hash."""
     compute = experiment.compute
-    corrected = of_self_calibration(experiment, calibration)
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
     return Stamp(
         {
             "calibration": calibration,
-            "self_calibration": None if corrected is None else corrected.hash,
+            "self_calibration": _self_calibration(experiment),
             "volume": dataclasses.asdict(experiment.grid),
             "smart": experiment.smart.model_dump(),
             "motion": reach if experiment.smart.motion_passes else None,

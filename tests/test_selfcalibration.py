@@ -185,6 +185,9 @@ def test_run_tells_that_a_camera_moved_and_corrects_it_where_asked(small_run, kn
     again = pipeline.run(file, out, pairs=(0, 2))
     assert "vectors of pair 0" in again["reused"] and again["weights"]["self_calibration"] == figures
     assert "Cameras against each other" in (out / "report.html").read_text("utf-8")
+    for path in (file.parent / "particles").glob("*/*"):
+        path.unlink()
+    assert [pair["pair"] for pair in pipeline.report(file, out)["pairs"]] == [0, 1]  # results outlive their images
 
 
 def small_grid(file):
