@@ -113,7 +113,6 @@ class Job:
         self.failed: dict[int, str] = {}
         """Pair -> why this invocation has no result of it."""
         self.tried: set[int] = set()
-        self.self_calibration_report: dict[str, Any] = {}
         self.weights_report: dict[str, Any] = {}
         self.workers_report: dict[str, Any] = {"count": 1, "threads": device.threads, "peak_memory_mib": None}
         self.calibration: Calibration | None = None
@@ -226,11 +225,8 @@ class Job:
 
         with self.timed("calibration"):
             self.calibration = calibrate_cameras(self.experiment, progress=self.step("calibration"))
-        content = io.BytesIO()  # not straight to disk: see `dataset.write_bytes`
-        self.calibration.save(content)  # type: ignore[arg-type]  # HDF5 takes files too
-        _mark(content, **self.calibration_stamp.attributes, seconds=self.seconds["calibration"])
-        with writing(path):
-            dataset.write_bytes(content.getbuffer(), path)
+        attributes = {**self.calibration_stamp.attributes, "seconds": self.seconds["calibration"]}
+        _write_calibration(self.calibration, path, **attributes)
         return self.calibration
 
     def self_calibrate(self, calibration: Calibration) -> Calibration:
@@ -245,20 +241,17 @@ class Job:
         found = stamp.marks(path)
         if found is not None and not mark.changes(found):
             log.info("self-calibration: finished before with the same settings, kept")
-            self.self_calibration_report = movedcameras.figures(found)
+            self.weights_report["self_calibration"] = json.loads(found["figures"])
             return load_calibration(path)
         try:
             with self.timed("self_calibration"):
-                corrected, self.self_calibration_report = movedcameras.correct(
+                corrected, self.weights_report["self_calibration"] = movedcameras.correct(
                     self.experiment, calibration, self.step("self-calibration")
                 )
         except ValueError as error:
             raise InputError(f"{self.experiment.path}: self_calibration.pairs: {error}") from None
-        content = io.BytesIO()
-        corrected.calibration.save(content)  # type: ignore[arg-type]  # HDF5 takes files too
-        _mark(content, **mark.attributes, figures=json.dumps(self.self_calibration_report))
-        with writing(path):
-            dataset.write_bytes(content.getbuffer(), path)
+        figures = self.weights_report["self_calibration"]
+        _write_calibration(corrected.calibration, path, **mark.attributes, figures=json.dumps(figures))
         return corrected.calibration
 
     def build_weights(self, calibration: Calibration, todo: Sequence[int]) -> Weights:
@@ -286,10 +279,8 @@ class Job:
                 _ = weights.camera_sums  # made once for all pairs and workers
             counted = compare_with_count(weights) if method == "footprint" else {}
             disparity = movedcameras.check(self.experiment, weights, todo)
-        self.weights_report = {"method": method, "memory_mib": weights.memory_bytes / memory.MIB, "warnings": warnings}
-        self.weights_report |= disparity
-        if self.self_calibration_report:
-            self.weights_report["self_calibration"] = self.self_calibration_report
+        memory_mib = weights.memory_bytes / memory.MIB
+        self.weights_report |= {"method": method, "memory_mib": memory_mib, "warnings": warnings, **disparity}
         if method == "footprint":
             self.weights_report |= {"form": dict(weights.forms), "cuts": dict(weights.cuts)}
             self.weights_report["profiles_check_l2"] = {
@@ -390,8 +381,13 @@ class Job:
         result["peak_memory_mib"] = max(peak or 0.0 for peak in peaks)
 
 
-def _mark(file: io.BytesIO, **attributes: Any) -> None:
+def _write_calibration(calibration: Calibration, path: Path, **attributes: Any) -> None:
+    """Write a calibration and what its file is marked with, whole or not at all."""
     import h5py
 
-    with h5py.File(file, "a") as opened:
+    content = io.BytesIO()  # not straight to disk: see `dataset.write_bytes`
+    calibration.save(content)  # type: ignore[arg-type]  # HDF5 takes files too
+    with h5py.File(content, "a") as opened:
         opened.attrs.update(attributes)
+    with writing(path):
+        dataset.write_bytes(content.getbuffer(), path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from itertools import islice
@@ -42,9 +41,9 @@ def correct(
         If images cannot be used, or do not tell how the cameras stand.
     """
     pairs = experiment.self_calibration_pairs
-    images = list(_light(experiment, calibration.cameras, pairs))
+    darks = _darks(experiment)
+    images = [_light(experiment, calibration.cameras, darks, pair) for pair in pairs]
     found = self_calibrate(calibration, experiment.grid, images, progress=progress)
-    voxel = experiment.grid.voxel_mm
     movements = {
         name: {
             "shift_mm": np.round(move.shift_mm, 5).tolist(),
@@ -54,15 +53,12 @@ def correct(
         }
         for name, move in found.movements.items()
     }
-    names = list(movements)
-    before, after = (
-        explained_mm(some, fit_movements(some, names, experiment.grid), experiment.grid) / voxel
-        for some in (found.before, found.after)
-    )
-    log.info("self-calibration: cameras were %.2f voxel apart, now %.2f (%d corrections)", before, after, found.rounds)
+    before, after = (apart / experiment.grid.voxel_mm for apart in (found.apart_mm[0], found.apart_mm[-1]))
+    corrections = len(found.apart_mm) - 1
+    log.info("self-calibration: cameras were %.2f voxel apart, now %.2f (%d corrections)", before, after, corrections)
     return found, {
         "pairs": pairs,
-        "corrections": found.rounds,
+        "corrections": corrections,
         "disparity_before_voxel": round(before, 3),
         "disparity_voxel": round(after, 3),
         "movements": movements,
@@ -77,10 +73,10 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> dic
     """
     if len(weights.cameras) < 2 or weights.method != "footprint":
         return {}
-    alone: dict[int, list[str]] = {}
+    darks, alone = _darks(experiment), dict[int, list[str]]()
     for pair in islice(pairs, TRIED):
         try:
-            images = list(_light(experiment, weights.cameras, [pair]))
+            images = [_light(experiment, weights.cameras, darks, pair)]
             if any(seen_structure(image, weights.cameras[name].decoder) < NOISE for name, image in images[0].items()):
                 continue
             found = disparities(weights, images)
@@ -121,16 +117,16 @@ def _warning(disparity: float, experiment: Experiment, cameras: Mapping[str, Cal
     )
 
 
+def _darks(experiment: Experiment) -> dict[str, np.ndarray | None]:
+    """Dark image of every camera [counts], None where there is none."""
+    return {camera.name: experiment.dark(camera.name) for camera in experiment.cameras}
+
+
 def _light(
-    experiment: Experiment, cameras: Mapping[str, CalibratedCamera], pairs: Iterable[int]
-) -> Iterable[dict[str, np.ndarray]]:
-    """Images of the first frames of some pairs, without dark and background."""
-    darks = {name: experiment.dark(name) for name in cameras}
-    for pair in pairs:
-        yield read_light(experiment, cameras, darks, pair, experiment.frames[0]).light
-
-
-def figures(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures of a self-calibration from the attributes of its file."""
-    stored: dict[str, Any] = json.loads(attributes["figures"])
-    return stored
+    experiment: Experiment,
+    cameras: Mapping[str, CalibratedCamera],
+    darks: Mapping[str, np.ndarray | None],
+    pair: int,
+) -> dict[str, np.ndarray]:
+    """Images of the first frame of a pair, without dark and background."""
+    return read_light(experiment, cameras, darks, pair, experiment.frames[0]).light

@@ -86,8 +86,8 @@ class SelfCalibration:
     """Disparities with the calibration as it was."""
     after: tuple[Disparity, ...]
     """Disparities with the corrected one."""
-    rounds: int
-    """Corrections made one after the other."""
+    apart_mm: tuple[float, ...]
+    """How far apart the cameras were, as `explained_mm` has it: before, and after each correction."""
 
 
 def self_calibrate(
@@ -126,14 +126,14 @@ def self_calibrate(
         )
     corrected = calibration
     movements = {name: Movement.none(grid) for name in calibration.cameras}
-    found = []
+    found, apart = [], list[float]()
     for number in range(ROUNDS + 1):
 
-        def step(fraction: float, number: int = number) -> None:
+        def tell(fraction: float, number: int = number) -> None:
             if progress is not None:
                 progress((number + fraction) / (ROUNDS + 1))
 
-        found.append(disparities(build_weights(corrected, grid), images, step))
+        found.append(disparities(build_weights(corrected, grid), images, tell))
         alone = unlinked(found[-1], movements)
         if alone:
             raise ValueError(
@@ -141,7 +141,8 @@ def self_calibrate(
                 "voxels of each other, found none: it moved by more, its images are of other instants, or show too few."
             )
         steps = fit_movements(found[-1], list(movements), grid)
-        if len(found) > ROUNDS or explained_mm(found[-1], steps, grid) < CONVERGED_VOXEL * grid.voxel_mm:
+        apart.append(explained_mm(found[-1], steps, grid))
+        if len(found) > ROUNDS or apart[-1] < CONVERGED_VOXEL * grid.voxel_mm:
             break
         movements = {name: movements[name].after(step) for name, step in steps.items()}
         corrected = Calibration(
@@ -152,7 +153,7 @@ def self_calibrate(
         movements={name: replace(move, std=steps[name].std) for name, move in movements.items()},
         before=found[0],
         after=found[-1],
-        rounds=len(found) - 1,
+        apart_mm=tuple(apart),
     )
 
 

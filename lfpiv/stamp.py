@@ -101,7 +101,7 @@ def of_self_calibration(experiment: Experiment, calibration: str) -> Stamp | Non
 
 
 def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
-    """Settings and images of the self-calibration; None where none is asked for."""
+    """Return settings and images of the self-calibration; None where none is asked for."""
     if not experiment.self_calibration.pairs:
         return None
     images = [
