@@ -8,48 +8,48 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # what the names below stand for
-    from lfpiv import derived as derived
-    from lfpiv import metrics as metrics
-    from lfpiv import statistics as statistics
-    from lfpiv.calibration import Calibration, calibrate, load_calibration, thin_lens
-    from lfpiv.errors import InputError
-    from lfpiv.experiment import Experiment, open_experiment
-    from lfpiv.export import export_results
-    from lfpiv.lensarray import LensArray, find_lens_array
-    from lfpiv.motion import reconstruct_pair
-    from lfpiv.pipeline import run
-    from lfpiv.report import write_report
-    from lfpiv.results import open_results
-    from lfpiv.rig import Grid, LensLattice, Optics
-    from lfpiv.selfcalibration import self_calibrate
-    from lfpiv.vectors import correlate
-    from lfpiv.volume import reconstruct
-    from lfpiv.weights import build_weights
+from lfpiv.version import __version__ as __version__
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:  # what the names below stand for
+    from lfpiv import metrics as metrics
+    from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
+    from lfpiv.errors import InputError
+    from lfpiv.experiment.experiment import Experiment, open_experiment
+    from lfpiv.geometry.optics import Grid, LensLattice, Optics
+    from lfpiv.lightfield.lens_array import LensArray, find_lens_array
+    from lfpiv.reconstruction.motion import reconstruct_pair
+    from lfpiv.reconstruction.volume import reconstruct
+    from lfpiv.report import write_report
+    from lfpiv.results.export import export_results
+    from lfpiv.results.reader import open_results
+    from lfpiv.runs.pipeline import run
+    from lfpiv.selfcalibration.movements import self_calibrate
+    from lfpiv.velocity import derived as derived
+    from lfpiv.velocity import statistics as statistics
+    from lfpiv.velocity.cross_correlation import correlate
+    from lfpiv.weights.operator import build_weights
 
 _MODULES = {
-    "Calibration": "lfpiv.calibration",
-    "Experiment": "lfpiv.experiment",
-    "Grid": "lfpiv.rig",
+    "Calibration": "lfpiv.calibration.cameras",
+    "Experiment": "lfpiv.experiment.experiment",
+    "Grid": "lfpiv.geometry.optics",
     "InputError": "lfpiv.errors",
-    "LensArray": "lfpiv.lensarray",
-    "LensLattice": "lfpiv.rig",
-    "Optics": "lfpiv.rig",
-    "build_weights": "lfpiv.weights",
-    "calibrate": "lfpiv.calibration",
-    "correlate": "lfpiv.vectors",
-    "export_results": "lfpiv.export",
-    "find_lens_array": "lfpiv.lensarray",
-    "load_calibration": "lfpiv.calibration",
-    "open_experiment": "lfpiv.experiment",
-    "open_results": "lfpiv.results",
-    "reconstruct": "lfpiv.volume",
-    "reconstruct_pair": "lfpiv.motion",
-    "run": "lfpiv.pipeline",
-    "self_calibrate": "lfpiv.selfcalibration",
-    "thin_lens": "lfpiv.calibration",
+    "LensArray": "lfpiv.lightfield.lens_array",
+    "LensLattice": "lfpiv.geometry.optics",
+    "Optics": "lfpiv.geometry.optics",
+    "build_weights": "lfpiv.weights.operator",
+    "calibrate": "lfpiv.calibration.cameras",
+    "correlate": "lfpiv.velocity.cross_correlation",
+    "export_results": "lfpiv.results.export",
+    "find_lens_array": "lfpiv.lightfield.lens_array",
+    "load_calibration": "lfpiv.calibration.cameras",
+    "open_experiment": "lfpiv.experiment.experiment",
+    "open_results": "lfpiv.results.reader",
+    "reconstruct": "lfpiv.reconstruction.volume",
+    "reconstruct_pair": "lfpiv.reconstruction.motion",
+    "run": "lfpiv.runs.pipeline",
+    "self_calibrate": "lfpiv.selfcalibration.movements",
+    "thin_lens": "lfpiv.calibration.cameras",
     "write_report": "lfpiv.report",
 }
 

@@ -1,6 +1,6 @@
 """``python -m lfpiv``: the command line."""
 
-from lfpiv.cli import main
+from lfpiv.cli.commands import main
 
 if __name__ == "__main__":
     main()

@@ -38,14 +38,14 @@ def two_widths(smears):
 
 
 def footprint(model, *, optics, lattice, frame, rectangles, local=False):
-    """Sensor image of one voxel's weights, the formulas of ``lfpiv_kernels.footprint`` pixel by pixel.
+    """Sensor image of one voxel's weights, the formulas of ``lfpiv_kernels.weights.footprint`` pixel by pixel.
 
     Parameters
     ----------
     model : ndarray, shape (30,)
         Ray model.
     optics, lattice
-        Values with the attributes of ``lfpiv.rig.Optics`` and ``LensLattice``.
+        Values with the attributes of ``lfpiv.geometry.optics.Optics`` and ``LensLattice``.
     frame, rectangles
         From ``lattice.cell_frame`` and ``lattice.cell_rectangles``.
     local : bool

@@ -12,11 +12,13 @@ from scipy import ndimage, optimize
 from threadpoolctl import threadpool_limits
 
 import lfpiv
-from lfpiv.network import train
-from lfpiv.rig import Grid
-from lfpiv.weightblocks import COUNT_POINTS
-from lfpiv.weights import COUNT_SAMPLES_ONE, compare_with_count
-from lfpiv_kernels import correlate, deform, mapping, runtime
+from lfpiv.calibration.network import train
+from lfpiv.geometry.optics import Grid
+from lfpiv.weights.blocks import COUNT_POINTS
+from lfpiv.weights.operator import COUNT_SAMPLES_ONE, compare_with_count
+from lfpiv_kernels import runtime
+from lfpiv_kernels.correlation import correlate, deform
+from lfpiv_kernels.rays import mapping
 
 SCALES = {
     "small": {"voxels": 32, "sensor": (720, 1000), "rays": 4_000_000, "volume": (48, 64, 64), "samples": 8_000},
@@ -345,7 +347,7 @@ def _train(scale, epochs) -> Work:
 
 
 def _demo(_) -> Work:
-    from lfpiv import demo
+    from lfpiv.cli import demo
 
     def run():
         with tempfile.TemporaryDirectory() as folder:

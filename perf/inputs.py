@@ -11,10 +11,10 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from lfpiv.calibration import CalibratedCamera, Calibration
-from lfpiv.network import Network
-from lfpiv.rig import Grid, LensLattice, Optics
-from lfpiv.thinlens import thin_lens_model
+from lfpiv.calibration.cameras import CalibratedCamera, Calibration
+from lfpiv.calibration.network import Network
+from lfpiv.calibration.thin_lens_model import thin_lens_model
+from lfpiv.geometry.optics import Grid, LensLattice, Optics
 
 
 class _Camera(CalibratedCamera):

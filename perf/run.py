@@ -100,7 +100,7 @@ def measure(name: str) -> bool:
     """Print the metrics of one case; false if its result is wrong."""
     import cases
 
-    from lfpiv.memory import peak_mib
+    from lfpiv.runs.memory import peak_mib
 
     def emit(metric, value, unit="1", **more):
         line = {"case": name, "metric": metric, "value": value, "unit": unit, **more}

@@ -30,7 +30,7 @@ def device(request):
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory, device):
     """Return a small simulated experiment, run from images to vectors: see `small_run.SmallRun`."""
-    from small_run import make_small_run
+    from support.small_run import make_small_run
 
     return make_small_run(tmp_path_factory.mktemp("small"), device.kind)
 
@@ -38,7 +38,7 @@ def small_run(tmp_path_factory, device):
 @pytest.fixture(scope="session")
 def reported(tmp_path_factory, device):
     """Return a small finished run, and its report under `page`."""
-    from report_run import make_run
+    from support.report_run import make_run
 
     return make_run(tmp_path_factory.mktemp("reported"))
 

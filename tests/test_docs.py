@@ -21,10 +21,11 @@ import typer
 from pydantic import BaseModel
 
 import lfpiv
-from lfpiv import cli, pipeline
-from lfpiv.scene import Scene, open_scene
-from lfpiv.settings import ExperimentTable
-from lfpiv.toml import tomllib
+from lfpiv.cli import commands
+from lfpiv.experiment.settings import ExperimentTable
+from lfpiv.experiment.toml import tomllib
+from lfpiv.runs import pipeline
+from lfpiv.simulation.scene import Scene, open_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -96,17 +97,17 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(reader, name):
 
 @pytest.mark.parametrize("name", [n for n, page in PAGES.items() if any(commands_of(page))])
 def test_commands_are_understood_and_quick_ones_succeed(reader, name, capfd):
-    known = typer.main.get_command(cli.app).commands
+    known = typer.main.get_command(commands.app).commands
     for words in commands_of(PAGES[name]):
         if words[0] in known:
             known[words[0]].make_context(words[0], list(words[1:]))  # raises on what it does not understand
         run = words[0].startswith("-") or (words[0] not in LONG and not {"--workers", "--scheduler"} & set(words))
-        assert not run or cli.call(words) == 0, (words, capfd.readouterr().err)
+        assert not run or commands.call(words) == 0, (words, capfd.readouterr().err)
 
 
 @pytest.mark.parametrize("name", PAGES)
 def test_named_commands_and_options_exist(name):
-    known = typer.main.get_command(cli.app).commands
+    known = typer.main.get_command(commands.app).commands
     for spoken in re.findall(r"`lfpiv ([a-z][^`]*)`", PAGES[name].read_text("utf-8")):
         command, *rest = spoken.split()
         assert command in known, spoken

@@ -10,11 +10,13 @@ from collections import Counter
 import numpy as np
 import pytest
 import warp as wp
-from ideal_rig import two_cameras
+from support.ideal_rig import two_cameras
 
 import lfpiv
-from lfpiv.network import train
-from lfpiv_kernels import correlate, deform, footprint, raymodel, runtime
+from lfpiv.calibration.network import train
+from lfpiv_kernels import runtime
+from lfpiv_kernels.correlation import correlate, deform
+from lfpiv_kernels.weights import footprint, ray_model
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.2, 1.0, 0.8), voxel_mm=0.1)
 CAMERAS = 2
@@ -110,13 +112,13 @@ def test_blocks_lie_gap_free_inside_the_rays_and_end_where_they_are_lit(form, de
     for name in weights.cameras:
         blocks = weights.projector(name).blocks
         height, width = blocks.height.astype(np.int64), blocks.width.astype(np.int64)
-        assert height.min() > 0 and width.min() > 0 and width.max() <= raymodel.LANES
+        assert height.min() > 0 and width.min() > 0 and width.max() <= ray_model.LANES
         size = width + height if form == "profiles" else width * height
         start = np.concatenate([[0], np.cumsum(size)])
         assert (start[blocks.first_block] == blocks.first_value).all()
-        assert len(blocks.value) == start[-1] + raymodel.LANES
+        assert len(blocks.value) == start[-1] + ray_model.LANES
         assert blocks.ray.min() >= 0
-        assert (blocks.ray + (height - 1) * blocks.microimages.edge + raymodel.LANES <= blocks.microimages.size).all()
+        assert (blocks.ray + (height - 1) * blocks.microimages.edge + ray_model.LANES <= blocks.microimages.size).all()
         for block in range(0, len(height), 7):
             value = blocks.value[start[block] : start[block + 1]]
             if form == "pixels":

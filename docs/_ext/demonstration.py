@@ -17,7 +17,7 @@ EXTRA = DOCS / "generated" / "extra"
 
 def prepare(app):
     """Run the demonstration where it is not finished, and copy its report beside the pages."""
-    from lfpiv import demo
+    from lfpiv.cli import demo
 
     if not (DEMO / "report.html").exists():
         here = os.getcwd()
@@ -35,8 +35,8 @@ def _compare_with_the_tutorial():
     import quoted
     from sphinx.util import logging as sphinx_logging
 
-    from lfpiv import demo
-    from lfpiv.scene import open_scene
+    from lfpiv.cli import demo
+    from lfpiv.simulation.scene import open_scene
 
     with importlib.resources.as_file(importlib.resources.files("lfpiv") / "demo_scene.toml") as path:
         scene = open_scene(path)

@@ -107,20 +107,20 @@ def commands() -> dict[str, Any]:
     """Return the commands of the command line by name."""
     import typer
 
-    from lfpiv.cli import app
+    from lfpiv.cli.commands import app
 
     return {name: command for name, command in typer.main.get_command(app).commands.items() if not command.hidden}
 
 
 def help_text(name: str) -> str:
     """Return what ``lfpiv NAME --help`` prints, in lines of 100 characters."""
-    from lfpiv import cli
+    from lfpiv.cli import commands
 
     shown, width = io.StringIO(), os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "100"
     try:
         with contextlib.redirect_stdout(shown):
-            cli.call([name, "--help"])
+            commands.call([name, "--help"])
     finally:
         os.environ.pop("COLUMNS")
         if width is not None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 import lfpiv
-from lfpiv import demo
+from lfpiv.cli import demo
 
 folder = Path("lfpiv-demo")
 if not (folder / "report.html").exists():

@@ -14,8 +14,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import lfpiv
-from lfpiv import demo
-from lfpiv.scene import true_mapping
+from lfpiv.cli import demo
+from lfpiv.simulation.scene import true_mapping
 
 folder = Path("lfpiv-demo")
 if not (folder / "report.html").exists():

@@ -13,7 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import lfpiv
-from lfpiv import demo, metrics
+from lfpiv import metrics
+from lfpiv.cli import demo
 
 folder = Path("lfpiv-demo")
 if not (folder / "report.html").exists():

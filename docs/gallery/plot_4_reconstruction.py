@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import lfpiv
-from lfpiv import demo
+from lfpiv.cli import demo
 
 folder = Path("lfpiv-demo")
 if not (folder / "report.html").exists():

@@ -11,7 +11,7 @@ import numpy as np
 
 import lfpiv
 from lfpiv import metrics
-from lfpiv.flows import Swirl, window_mean
+from lfpiv.simulation.flows import Swirl, window_mean
 
 grid = lfpiv.Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=(6.4, 6.4, 3.2), voxel_mm=0.1)
 flow = Swirl(peak_mm=0.4, core_mm=1.6, axis="z")

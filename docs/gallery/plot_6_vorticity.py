@@ -11,7 +11,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 import lfpiv
-from lfpiv import demo, derived
+from lfpiv import derived
+from lfpiv.cli import demo
 
 folder = Path("lfpiv-demo")
 if not (folder / "report.html").exists():

@@ -14,8 +14,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import lfpiv
-from lfpiv.scene import Scene, true_mapping
-from lfpiv.simulate import simulate
+from lfpiv.simulation.scene import Scene, true_mapping
+from lfpiv.simulation.simulator import simulate
 
 camera = {
     "name": "left",

@@ -14,14 +14,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lfpiv import dataset
-from lfpiv.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment
 from lfpiv.report import calibration as calibration_section
 from lfpiv.report import markup, overview, pairs, volumes
 from lfpiv.report import vectors as vector_section
+from lfpiv.results import netcdf
 
 if TYPE_CHECKING:
-    from lfpiv.calibration import Calibration
+    from lfpiv.calibration.cameras import Calibration
 
 __all__ = ["write_report"]
 
@@ -71,7 +71,7 @@ def write_report(
         *sections.values(),
     ]
     scripts = "\n".join(_asset(name) for name in _SCRIPTS)
-    dataset.write_text(
+    netcdf.write_text(
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f"<title>{markup.escape(experiment.name)}: light-field PIV</title>"
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -85,7 +85,7 @@ def write_report(
 
 def _asset(name: str) -> str:
     """Text of a file beside this module."""
-    return (importlib.resources.files("lfpiv.report") / name).read_text("utf-8")
+    return (importlib.resources.files("lfpiv.report") / "static" / name).read_text("utf-8")
 
 
 def _plotly() -> str:

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.camera import CalibratedCamera, Calibration
-from lfpiv.experiment import CameraSetup, Experiment
-from lfpiv.report import calibrationpanels as panels
+from lfpiv.calibration.camera import CalibratedCamera, Calibration
+from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.report import calibration_panels as panels
 from lfpiv.report import markup
-from lfpiv.report.dotmap import DotMap, dot_map, dot_outlines_px
-from lfpiv.report.lensmap import LensMap, lens_map
+from lfpiv.report.dot_map import DotMap, dot_map, dot_outlines_px
+from lfpiv.report.lens_map import LensMap, lens_map
 from lfpiv.report.markup import number
 
 PERCENTILES = (50, 75, 90, 95, 99)

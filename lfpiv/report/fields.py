@@ -20,8 +20,9 @@ import matplotlib
 import numpy as np
 import xarray as xr
 
-from lfpiv import dataset, derived
 from lfpiv.errors import InputError
+from lfpiv.results import netcdf
+from lfpiv.velocity import derived
 
 log = logging.getLogger(__name__)
 
@@ -72,9 +73,9 @@ def survey(vectors: Mapping[int, Path]) -> Survey:
         If a file that is read cannot be read or holds no vectors.
     """
     chosen = evenly(list(vectors), MOST_READ)
-    first = dataset.read_vectors(vectors[chosen[0]])
+    first = netcdf.read_vectors(vectors[chosen[0]])
     most = max(min(MOST_VECTORS // min(first["u"].size, MOST_IN_FIELD) - 2, MOST_SHOWN), 1)
-    shown = {pair: dataset.read_vectors(vectors[pair]) for pair in evenly(chosen, most)}
+    shown = {pair: netcdf.read_vectors(vectors[pair]) for pair in evenly(chosen, most)}
     total = np.zeros((3, *first["u"].shape))
     square, count, read = np.zeros_like(total), np.zeros(first["u"].shape, int), 0
     for pair in chosen:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment
 from lfpiv.report import markup
 from lfpiv.report.markup import number, percent
 

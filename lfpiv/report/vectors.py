@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lfpiv.report import flowpanels, markup
+from lfpiv.report import flow_panels, markup
 from lfpiv.report.fields import Survey, embed, survey
 from lfpiv.report.markup import number, percent, significant
 
@@ -56,7 +56,7 @@ def _what_is_here(found: Survey, pairs: int, thinning: int, first: xr.Dataset) -
 
 def _slices(pair: int, first: xr.Dataset) -> str:
     still = markup.figure(
-        [*flowpanels.slices(first), *flowpanels.slices(first, normal="y", most=1)],
+        [*flow_panels.slices(first), *flow_panels.slices(first, normal="y", most=1)],
         f"Pair {pair}: velocity at several depths, and in the middle from the side. Arrows show the components in the "
         "slice, colour the one across it; pale arrows were replaced after validation.",
     )
@@ -102,7 +102,7 @@ def _depth_rows(vectors: xr.Dataset) -> list[list[str]]:
 
 def _space(pair: int, first: xr.Dataset) -> str:
     still = markup.figure(
-        [flowpanels.in_space(first)], f"Pair {pair}: the valid vectors, coloured by speed, seen from obliquely above."
+        [flow_panels.in_space(first)], f"Pair {pair}: the valid vectors, coloured by speed, seen from obliquely above."
     )
     return f"""<h3>In space</h3>
 <div class="view" id="space">
@@ -127,7 +127,7 @@ to zoom once the view is chosen by a click, a tap or the Tab key; arrow keys tur
 def _displacements(pair: int, first: xr.Dataset) -> str:
     shown, tables = [], []
     for axis in "xyz":
-        panel, counts, edges = flowpanels.displacement_histogram(first, axis)
+        panel, counts, edges = flow_panels.displacement_histogram(first, axis)
         shown.append(panel)
         rows = [
             [f"{number(low, 3)} to {number(high, 3)}", str(count)]

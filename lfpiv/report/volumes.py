@@ -10,11 +10,11 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import Normalize
 
-from lfpiv import dataset
 from lfpiv.report import markup
-from lfpiv.report.lightsheet import ENOUGH, LightSheet, find_sheet
+from lfpiv.report.light_sheet import ENOUGH, LightSheet, find_sheet
 from lfpiv.report.markup import number, percent
 from lfpiv.report.svg import INK, SERIES, colour_bar, new_panel, spread_ticks, style, to_svg
+from lfpiv.results import netcdf
 
 FEW_VOLUMES = 6
 """So many volumes have a line of their own; of more, the median and the range are drawn."""
@@ -39,7 +39,7 @@ def section(summary: Mapping[str, Any], vectors: Mapping[int, Path]) -> str:
         if len(residual)
     }
     pair = next(iter(vectors))
-    first = dataset.read_reconstruction(vectors[pair])
+    first = netcdf.read_reconstruction(vectors[pair])
     if first is None:
         return ""
     parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(pair, first)]
@@ -224,7 +224,7 @@ def _images(summary: Mapping[str, Any]) -> str:
     """Medians over all images of each camera: its structure, its brightness and its light beside the volume."""
     found: dict[str, dict[str, list[float]]] = {}
     for item in summary["pairs"]:
-        for name in dataset.OF_IMAGES:
+        for name in netcdf.OF_IMAGES:
             for cameras in item.get(name, {}).values():
                 for camera, value in cameras.items():
                     found.setdefault(camera, {}).setdefault(name, []).append(value)
@@ -233,7 +233,7 @@ def _images(summary: Mapping[str, Any]) -> str:
     rows = []
     for camera, values in found.items():
         structure, gain, outside = (
-            float(np.median(values[name])) if name in values else None for name in dataset.OF_IMAGES
+            float(np.median(values[name])) if name in values else None for name in netcdf.OF_IMAGES
         )
         rows.append([camera, number(structure, 2), number(gain, 2), percent(outside)])
     text = (

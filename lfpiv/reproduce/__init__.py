@@ -26,8 +26,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import lfpiv
 from lfpiv.errors import InputError
+from lfpiv.version import __version__
 
 __all__ = ["BEYOND", "CASES", "PAPER", "SCALES", "reproduce"]
 
@@ -90,7 +90,7 @@ def reproduce(
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise InputError(f"seed: expected a whole number >= 0, got {seed!r}.")
     report = progress or (lambda step, fraction: None)
-    settings = {"scale": scale, "seed": seed, "version": lfpiv.__version__}
+    settings = {"scale": scale, "seed": seed, "version": __version__}
     out = Path(out)
     store.open_folder(out, settings)
     for key in keys:

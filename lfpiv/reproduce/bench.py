@@ -15,16 +15,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-import lfpiv
 from lfpiv import metrics
-from lfpiv.calibration import Calibration
-from lfpiv.camera import CalibratedCamera
+from lfpiv.calibration.camera import CalibratedCamera
+from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration
+from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.reproduce import Progress, rigs, store
-from lfpiv.scene import Scene
-from lfpiv.settings import Correlation, Smart
-from lfpiv.simulate import FULL_SCALE, render_camera
-from lfpiv.weights import Weights
-from lfpiv_kernels import render
+from lfpiv.simulation.scene import Scene
+from lfpiv.simulation.simulator import FULL_SCALE, render_camera
+from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.weights.operator import Weights, build_weights
+from lfpiv_kernels.rendering import render
 
 SIZE_MM = {"small": (4.8, 4.8, 2.4), "paper": (10.0, 10.0, 5.0)}
 """Size of the volume (x, y, z)."""
@@ -158,7 +158,7 @@ class Bench:
         last, weights = self._weights
         if weights is None or len(key) != len(last) or any(a is not b for a, b in zip(key, last, strict=True)):
             self._weights, weights = ((), None), None  # one set at a time: memory
-            weights = lfpiv.build_weights(chosen, self.grid)
+            weights = build_weights(chosen, self.grid)
             self._weights = (key, weights)
         return weights
 
@@ -238,7 +238,7 @@ class Bench:
         correlation: Correlation | None = None,
     ) -> Judged:
         """Correlate the volumes of `volumes` and compare everything with the truth."""
-        vectors = lfpiv.correlate(*volumes, dt_s=rigs.DT_S, **(correlation or Correlation()).model_dump())
+        vectors = correlate(*volumes, dt_s=rigs.DT_S, **(correlation or Correlation()).model_dump())
         field = np.stack([vectors[f"displacement_{axis}"].values for axis in "xyz"], axis=-1)
         edge = json.loads(vectors.attrs["settings"])["windows"][-1]
         axes = [vectors[axis].values for axis in "zyx"]
@@ -375,6 +375,6 @@ def recalibrated(bench: Bench, name: str, **network: Any) -> Calibration:
     if not stored.exists():
         scratch = stored.with_name(f".{stored.name}")
         stored.parent.mkdir(parents=True, exist_ok=True)
-        lfpiv.calibrate(asked).save(scratch)
+        calibrate(asked).save(scratch)
         scratch.replace(stored)
-    return lfpiv.load_calibration(stored)
+    return load_calibration(stored)

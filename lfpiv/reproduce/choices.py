@@ -11,12 +11,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-import lfpiv
-from lfpiv.calibration import Calibration
+from lfpiv.calibration.cameras import Calibration, thin_lens
+from lfpiv.calibration.thin_lens_model import thin_lens_model
+from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.reconstruction.motion import reconstruct_pair
 from lfpiv.reproduce import Progress, bench, page, plots, rigs, store
 from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
-from lfpiv.settings import Correlation, Smart
-from lfpiv.thinlens import thin_lens_model
 
 TITLE = "What each choice is worth"
 
@@ -213,7 +213,7 @@ def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray
             levels = {camera: weights.cameras[camera].decoder.background(images[camera]) for camera in bench.TWO}
             light.append({camera: images[camera] - np.float32(level) for camera, (level, _) in levels.items()})
             noise.append({camera: deviation for camera, (_, deviation) in levels.items()})
-        found = lfpiv.reconstruct_pair(weights, light, floor=noise, **smart.model_dump())
+        found = reconstruct_pair(weights, light, floor=noise, **smart.model_dump())
         return {
             "volumes": np.stack([volume.values for volume in found]),
             "iterations": np.mean([volume.attrs["iterations"] for volume in found]),
@@ -230,7 +230,7 @@ def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray
 def _traced(own: Bench, choice: Choice) -> Calibration:
     """Thin lenses at the nominal angles, as wrong about their height as the choice says."""
     experiment, cameras = own.rig.experiment, {}
-    nominal = lfpiv.thin_lens(experiment).cameras
+    nominal = thin_lens(experiment).cameras
     for sign, name in zip((0.5, -0.5), bench.TWO, strict=True):
         camera = nominal[name]
         lens = thin_lens_model(camera.optics, experiment.camera(name).nominal_angle_deg)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from lfpiv import metrics
-from lfpiv.camera import CalibratedCamera
+from lfpiv.calibration.camera import CalibratedCamera
+from lfpiv.geometry.optics import Grid
 from lfpiv.reproduce import Progress, page, plots
 from lfpiv.reproduce.rigs import VOXEL_MM, numerical_rig
-from lfpiv.rig import Grid
-from lfpiv.weightblocks import count_voxels
-from lfpiv.weights import COUNT_SAMPLES_ONE
+from lfpiv.weights.blocks import count_voxels
+from lfpiv.weights.operator import COUNT_SAMPLES_ONE
 
 TITLE = "Fig. 10: weights of one voxel"
 

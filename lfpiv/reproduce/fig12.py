@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-import lfpiv
 from lfpiv import metrics
-from lfpiv.ghosts import PEAK_SHARE
+from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.metrics.particles import PEAK_SHARE
+from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import Progress, page, plots, rigs, store
-from lfpiv.settings import Correlation, Smart
-from lfpiv.vectors import emphasise, missing_smoothing
-from lfpiv.weights import Weights
+from lfpiv.velocity.cross_correlation import emphasise, missing_smoothing
+from lfpiv.weights.operator import Weights
 
 TITLE = "Fig. 12: reconstructed particles; Fig. 11: at 0.1 particles per microlens"
 
@@ -194,7 +194,7 @@ def _judge(
     if from_truth:  # dark voxels are not quite dark: ghosts may grow
         light = sum(float(image.sum(dtype=np.float64)) for image in images.values()) / len(images)
         first = (truth.values + DARK_SHARE * float(truth.max())) * np.float32(light / float(truth.sum()))
-    result = lfpiv.reconstruct(weights, images, first=first, progress=step, **smart.of_one_frame())
+    result = reconstruct(weights, images, first=first, progress=step, **smart.of_one_frame())
     quality = metrics.particle_quality(result, positions_mm)
     found = metrics.find_particles(result, quality.threshold)
     return {

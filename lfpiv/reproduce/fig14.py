@@ -11,14 +11,15 @@ import xarray as xr
 from matplotlib.ticker import MaxNLocator
 from skimage.measure import marching_cubes
 
-import lfpiv
-from lfpiv import derived, metrics
-from lfpiv.flows import Ring
+from lfpiv import metrics
+from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.metrics.vector_fields import BELOW_VOXEL
+from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import Progress, angles, page, plots, rigs, store
-from lfpiv.settings import Correlation, Smart
-from lfpiv.vectorfields import BELOW_VOXEL
-from lfpiv.vectors import DEFAULT_WINDOWS
-from lfpiv.weights import Weights
+from lfpiv.simulation.flows import Ring
+from lfpiv.velocity import derived
+from lfpiv.velocity.cross_correlation import DEFAULT_WINDOWS, correlate
+from lfpiv.weights.operator import Weights
 
 TITLE = "Fig. 14: displacement of a ring vortex; Fig. 13: its vorticity at 0.5 particles per microlens"
 
@@ -66,7 +67,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
     def correlated(volumes: Sequence[xr.DataArray]) -> dict[str, np.ndarray]:
         fields: dict[str, np.ndarray] = {}
         for name, windows in SCHEDULES.items():
-            vectors = lfpiv.correlate(*volumes, dt_s=rigs.DT_S, windows=windows, **correlation)
+            vectors = correlate(*volumes, dt_s=rigs.DT_S, windows=windows, **correlation)
             fields |= _pack(vectors, name)
         return fields
 
@@ -87,7 +88,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
                 volumes, quality = [], []
                 for number, positions in enumerate(frames(ppm)):
                     images = _images(rig, work, settings, ppm, number, positions)
-                    volumes.append(lfpiv.reconstruct(built, images, **smart.of_one_frame()))
+                    volumes.append(reconstruct(built, images, **smart.of_one_frame()))
                     quality.append(metrics.reconstruction_quality(volumes[-1], rigs.truth(positions, grid)))
                     progress("volumes and vectors", (done + 0.4 * (number + 1)) / total)
                 return {**correlated(volumes), "q": np.array(quality)}

@@ -12,11 +12,11 @@ from matplotlib.ticker import MaxNLocator
 from scipy import ndimage
 
 from lfpiv import metrics
+from lfpiv.experiment.settings import Smart
+from lfpiv.geometry.optics import Grid
 from lfpiv.reproduce import Progress, page, plots, store
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.rigs import Rig, reconstruct_images
-from lfpiv.rig import Grid
-from lfpiv.settings import Smart
 
 TITLE = "Figs. 18 and 19: board dots reconstructed at every plane"
 

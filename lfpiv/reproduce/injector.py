@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lfpiv.reproduce.rigs import OPTICS, VOXEL_MM, Rig, calibrated_rig
-from lfpiv.scene import Scene
+from lfpiv.simulation.scene import Scene
 
 SENSOR_PX = {"small": (1728, 2208), "paper": (2208, 2752)}
 """Rows and columns; at "small" the sensor is cut to what sees the smaller volume."""

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
 from lfpiv.reproduce import Progress, page, plots
 from lfpiv.reproduce.injector import experimental_rig
-from lfpiv.reproduce.lsitwin import (
+from lfpiv.reproduce.lsi_twin import (
     DEPTHS_D,
     DIAMETER_MM,
     ITERATIONS,
@@ -28,7 +28,7 @@ from lfpiv.reproduce.lsitwin import (
     planar_mean,
     window_mm,
 )
-from lfpiv.reproduce.planarpiv import require_openpiv
+from lfpiv.reproduce.planar_piv import require_openpiv
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, true_field
 
 TITLE = "Figs. 20 to 22: low-swirl injector, light-field PIV against planar PIV"

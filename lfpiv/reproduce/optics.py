@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-import lfpiv
-from lfpiv.calibration import Calibration
+from lfpiv.calibration.cameras import Calibration, thin_lens
 from lfpiv.reproduce import Progress, bench, page, plots, rigs
 from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
-from lfpiv.scene import Scene, true_mapping
+from lfpiv.simulation.scene import Scene, true_mapping
 
 TITLE = "Real optics: where ray tracing fails and the network does not"
 
@@ -142,7 +141,7 @@ def optics_scene(scale: str, seed: int, optics: Optics) -> Scene:
 def ways(rig: rigs.Rig) -> dict[str, Calibration]:
     """Map by a rig's network, by the thin lens fitted to the same dots, and by DRT at the true angles."""
     fitted = {name: replace(camera, network=None) for name, camera in rig.calibration.cameras.items()}
-    return dict(zip(MAPPINGS, (rig.calibration, Calibration(fitted), lfpiv.thin_lens(rig.experiment)), strict=True))
+    return dict(zip(MAPPINGS, (rig.calibration, Calibration(fitted), thin_lens(rig.experiment)), strict=True))
 
 
 def _ray_errors(own: Bench, mapping: Calibration, seed: int) -> dict[str, float]:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lfpiv import dataset
+from lfpiv.results import netcdf
 
 log = logging.getLogger(__name__)
 
@@ -103,14 +103,14 @@ def write(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
         if not path.exists():
             continue
         stored = json.loads(path.read_text("utf-8"))
-        if stored["settings"] != dataset.plain(settings):
+        if stored["settings"] != netcdf.plain(settings):
             continue
         content[key] = stored["value"]
         for figure in content[key]["figures"]:
             shutil.copyfile(path.parent / figure["file"], out / f".{figure['file']}")
             (out / f".{figure['file']}").replace(out / figure["file"])
-    dataset.write_json(content, out / "reproduce.json")
-    dataset.write_text(_page(out, content), out / "index.html")
+    netcdf.write_json(content, out / "reproduce.json")
+    netcdf.write_text(_page(out, content), out / "index.html")
     return content
 
 

@@ -14,19 +14,21 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-import lfpiv
-from lfpiv import dataset, metrics
-from lfpiv.board import BoardDots
-from lfpiv.calibration import Calibration
-from lfpiv.experiment import Experiment
-from lfpiv.flows import Ring, window_mean
-from lfpiv.rig import Grid
-from lfpiv.scene import Scene, true_mapping
-from lfpiv.settings import Smart
-from lfpiv.simulate import expose, render_camera, simulate
-from lfpiv.thinlens import thin_lens_model
-from lfpiv.weights import Weights
-from lfpiv_kernels import render, runtime
+from lfpiv import metrics
+from lfpiv.calibration.board.board import BoardDots
+from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
+from lfpiv.calibration.thin_lens_model import thin_lens_model
+from lfpiv.experiment.experiment import Experiment, open_experiment
+from lfpiv.experiment.settings import Smart
+from lfpiv.geometry.optics import Grid
+from lfpiv.reconstruction.volume import reconstruct
+from lfpiv.results import netcdf
+from lfpiv.simulation.flows import Ring, window_mean
+from lfpiv.simulation.scene import Scene, true_mapping
+from lfpiv.simulation.simulator import expose, render_camera, simulate
+from lfpiv.weights.operator import Weights, build_weights
+from lfpiv_kernels import runtime
+from lfpiv_kernels.rendering import render
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +104,7 @@ class Rig:
     def weights(self, grid: Grid, mapping: str, progress: Callable[[float], None] | None = None) -> Weights:
         """Weights of a grid by "network", or by direct ray tracing with a key of `TURNED_DEG`."""
         calibration = self.calibration if mapping == "network" else self.ray_tracing(mapping)
-        return lfpiv.build_weights(calibration, grid, progress=progress)
+        return build_weights(calibration, grid, progress=progress)
 
     def ray_tracing(self, mapping: str) -> Calibration:
         """Thin lenses at the nominal angles, turned by the errors of `TURNED_DEG`."""
@@ -118,7 +120,7 @@ class Rig:
     @cached_property
     def _nominal(self) -> Calibration:
         """Thin lenses behind the microlens arrays that the white images show."""
-        return lfpiv.thin_lens(self.experiment)
+        return thin_lens(self.experiment)
 
 
 def numerical_scene(scale: str, seed: int) -> Scene:
@@ -168,21 +170,21 @@ def calibrated_rig(scene: Scene, folder: Path, progress: Callable[[str, float], 
     """Simulate the board of a scene and calibrate from it; both are kept in `folder` while the scene stays the same."""
     runtime.device()
     path, marker = folder / "experiment" / "experiment.toml", folder / "scene.json"
-    content = dataset.plain(scene.model_dump(mode="json"))
+    content = netcdf.plain(scene.model_dump(mode="json"))
     if not marker.exists() or json.loads(marker.read_text("utf-8")) != content:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
-        dataset.write_json(content, marker)
+        netcdf.write_json(content, marker)
     if not path.exists():
         simulate(scene, path.parent, progress=lambda what, done, total: progress(what, done / total))
-    experiment = lfpiv.open_experiment(path)
+    experiment = open_experiment(path)
     stored = folder / "calibration.h5"
     if not stored.exists():
         scratch = folder / ".calibration.h5"
-        calibration = lfpiv.calibrate(experiment, progress=lambda fraction: progress("calibration", fraction))
+        calibration = calibrate(experiment, progress=lambda fraction: progress("calibration", fraction))
         calibration.save(scratch)
         scratch.replace(stored)
-    return Rig(scene, experiment, lfpiv.load_calibration(stored))
+    return Rig(scene, experiment, load_calibration(stored))
 
 
 def volume_grid(size_mm: tuple[float, float, float]) -> Grid:
@@ -290,9 +292,7 @@ def reconstruct_images(
     for name, camera in weights.cameras.items():
         level, noise[name] = camera.decoder.background(images[name])
         light[name] = images[name] - np.float32(level)
-    return lfpiv.reconstruct(
-        weights, light, floor=noise if floor is None else floor, first=first, **smart.of_one_frame()
-    )
+    return reconstruct(weights, light, floor=noise if floor is None else floor, first=first, **smart.of_one_frame())
 
 
 def truth(positions_mm: np.ndarray, grid: Grid) -> xr.DataArray:

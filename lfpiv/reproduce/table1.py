@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.board import BoardDots, DotBoard, measure_board
-from lfpiv.calibration import MODEL_ERROR_PITCH
-from lfpiv.guide import guide_between
-from lfpiv.network import sigma_nor, train
+from lfpiv.calibration.board.board import BoardDots, DotBoard, measure_board
+from lfpiv.calibration.cameras import MODEL_ERROR_PITCH
+from lfpiv.calibration.levenberg_marquardt import levenberg_marquardt
+from lfpiv.calibration.network import sigma_nor, train
+from lfpiv.calibration.thin_lens_model import fit_thin_lens
+from lfpiv.calibration.virtual_samples import guide_between
 from lfpiv.reproduce import Progress, page, plots, store
 from lfpiv.reproduce.rigs import Rig, numerical_rig
 from lfpiv.reproduce.trainers import bayesian_regularisation, gradient_descent
-from lfpiv.scene import true_mapping
-from lfpiv.thinlens import fit_thin_lens
-from lfpiv.trainers import levenberg_marquardt
+from lfpiv.simulation.scene import true_mapping
 
 TITLE = "Table 1: error of the mapping by trainer and depth of the network"
 

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-import lfpiv
-from lfpiv.board import BoardDots
-from lfpiv.network import train
+from lfpiv.calibration.board.board import BoardDots
+from lfpiv.calibration.network import train
 from lfpiv.reproduce import Progress, page
 from lfpiv.reproduce.rigs import Rig, numerical_rig, volume_grid
-from lfpiv.weights import compare_with_count
+from lfpiv.weights.operator import build_weights, compare_with_count
 from lfpiv_kernels import runtime
 
 TITLE = "Table 3: data and computing time"
@@ -71,9 +70,9 @@ def compute(rig: Rig, scale: str, *, seed: int, progress: Progress) -> dict[str,
     for number, mapping in enumerate(("network", "drt")):
         progress(f"weights, {mapping}", 0.5 + number / 4)
         calibration = rig.calibration if mapping == "network" else rig.ray_tracing(mapping)
-        lfpiv.build_weights(calibration, volume_grid((0.8, 0.8, 0.8)))  # compiles the kernels
+        build_weights(calibration, volume_grid((0.8, 0.8, 0.8)))  # compiles the kernels
         wall, cpu = time.perf_counter(), time.process_time()
-        weights = lfpiv.build_weights(calibration, grid)
+        weights = build_weights(calibration, grid)
         spent = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
         errors = [error for camera in compare_with_count(weights).values() for error in camera]
         built[mapping] = spent | {

@@ -1,6 +1,6 @@
 """The trainers of Table 1 that this software does not use itself: Bayesian regularisation, and descent with momentum.
 
-Both have the form of `lfpiv.trainers`, so that `lfpiv.network.train` takes them as its `trainer`.
+Both have the form of `lfpiv.calibration.levenberg_marquardt`, so that `lfpiv.calibration.network.train` takes them as its `trainer`.
 
 References
 ----------
@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
 
-from lfpiv.trainers import Fit, Samples, Stop, forward, normal_equations
+from lfpiv.calibration.levenberg_marquardt import Fit, Samples, Stop, forward, normal_equations
 
 FIRST_DAMPING, LEAST_DAMPING, LAST_DAMPING = 5e-3, 1e-20, 1e10
 """Damping of the first step, the smallest, and where a step is too short to matter: the values customary for [1]_."""
@@ -113,7 +113,7 @@ def gradient_descent(
 
     Parameters
     ----------
-    layers, training, validation : as for `lfpiv.trainers.levenberg_marquardt`
+    layers, training, validation : as for `lfpiv.calibration.levenberg_marquardt.levenberg_marquardt`
         The epoch with the lowest validation error is kept.
     epochs : int
         Passes over the samples at most.

@@ -1,0 +1,1 @@
+"""Dots of a calibration board: found, named, and located in every microimage."""

@@ -1,0 +1,235 @@
+"""A calibrated camera, the calibration of a rig, and their file."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lfpiv.calibration.board.board import BoardDots
+from lfpiv.calibration.network import Network
+from lfpiv.calibration.thin_lens_model import ThinLensModel
+from lfpiv.errors import InputError
+from lfpiv.geometry.optics import LensLattice, Optics, pair
+from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.microimage_layout import lay_out
+from lfpiv_kernels.rays import mapping
+from lfpiv_kernels.weights.microimages import Microimages
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibratedCamera:
+    """One camera: its microlens array, its light-field decoder, and the mapping of its rays."""
+
+    name: str
+    optics: Optics
+    lattice: LensLattice
+    decoder: LightFieldDecoder
+    """Pupil points, coverage, gain and background of the sensor's pixels."""
+    network: Network | None = None
+    """BP-NN of Eqs. 6-7, (x, y, z, u, v) -> (s, t) [mm], or its correction to `baseline`; None for DRT."""
+    baseline: ThinLensModel | None = None
+    """Thin lens under the network, or None."""
+    region_mm: np.ndarray | None = None
+    """Corners (x, y, z) of the box that the board's dots spanned [mm], shape (2, 3); None for DRT."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """Figures of quality, JSON-able: sigma_nor_test, dots_found, dots_expected, lens_array_rms_px, ..."""
+    dots: BoardDots | None = None
+    """The labels the network was trained on."""
+    test_errors: np.ndarray | None = None
+    """Error of each held-out label [microlens pitch], shape (n,)."""
+
+    @cached_property
+    def gain(self) -> np.ndarray:
+        """White-image gain of every pixel, shape (rows, columns), float32.
+
+        The board's dots tell how much of the white image's scatter from pixel to pixel is response and how much is
+        noise; without them, or where the estimator of the dots does not measure it, it is taken as noise.
+        """
+        share = 0.0 if self.dots is None else self.dots.response_share
+        return self.decoder.shrunk_gain(0.0 if math.isnan(share) else share)
+
+    @cached_property
+    def microimages(self) -> Microimages:
+        """How the rays of the microlenses lie in memory; it is the same for every grid."""
+        return lay_out(self.optics, self.lattice)
+
+    def map(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+        """Trace rays to the microlens array (Eqs. 6-7).
+
+        Parameters
+        ----------
+        points_mm : array_like, shape (n, 3)
+            Object points (x, y, z) [mm].
+        pupil_mm : array_like, shape (n, 2)
+            Where the rays cross the main lens pupil, (u, v) [mm].
+
+        Returns
+        -------
+        ndarray, shape (n, 2), float64
+            Where they meet the microlens array, (s, t) [mm].
+
+        Raises
+        ------
+        ValueError
+            If the shapes are not (n, 3) and (n, 2).
+        """
+        points, pupil = np.asarray(points_mm, float), np.asarray(pupil_mm, float)
+        if points.ndim != 2 or points.shape[1] != 3 or pupil.shape != (len(points), 2):
+            raise ValueError(
+                f"points_mm, pupil_mm: expected shapes (n, 3) and (n, 2), got {points.shape} and {pupil.shape}."
+            )
+        rays = np.zeros((len(points), 2)) if self.baseline is None else self.baseline(points, pupil)
+        return rays if self.network is None else rays + self.network(np.hstack([points, pupil]))
+
+    def map_fan(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+        """Trace a fan of rays from every point, in single precision on the running device.
+
+        Parameters
+        ----------
+        points_mm : ndarray, shape (n, 3)
+            Object points (x, y, z) [mm].
+        pupil_mm : ndarray, shape (k, 2)
+            Pupil points (u, v) [mm], the same for every object point.
+
+        Returns
+        -------
+        ndarray, shape (n, k, 2), float32
+            Where the rays meet the microlens array, (s, t) [mm].
+        """
+        if self.network is None:
+            every = np.repeat(points_mm, len(pupil_mm), axis=0), np.tile(pupil_mm, (len(points_mm), 1))
+            return self.map(*every).astype(np.float32).reshape(len(points_mm), len(pupil_mm), 2)
+        arrays = self.network.to_arrays() | ({} if self.baseline is None else self.baseline.to_arrays())
+        points, pupil = (np.ascontiguousarray(array, np.float32) for array in (points_mm, pupil_mm))
+        return mapping.evaluate(arrays, points, pupil)
+
+    def moved(self, rotation: np.ndarray, shift_mm: np.ndarray) -> CalibratedCamera:
+        """Return the camera after a rigid movement: its rays of x are this one's of ``rotation x + shift``.
+
+        Exact: the movement becomes part of the network's first layer and of the thin lens's pose.
+
+        Parameters
+        ----------
+        rotation : ndarray, shape (3, 3)
+            Orthonormal.
+        shift_mm : ndarray, shape (3,)
+            Along x, y, z [mm].
+        """
+        network, baseline = self.network, self.baseline
+        if network is not None:
+            matrix, shift = np.eye(5), np.append(shift_mm, [0.0, 0.0])
+            matrix[:3, :3] = rotation
+            network = network.of_affine_inputs(matrix, shift)
+        if baseline is not None:
+            baseline = replace(
+                baseline, rotation=baseline.rotation @ rotation, offset_mm=rotation.T @ (baseline.offset_mm - shift_mm)
+            )
+        return replace(self, network=network, baseline=baseline)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The calibrated cameras of a rig. Made by `calibrate`, `load_calibration` or `thin_lens`."""
+
+    cameras: dict[str, CalibratedCamera]
+    """Camera name -> camera."""
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration to an HDF5 file, overwriting it."""
+        with h5py.File(path, "w") as file:
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            file.attrs["cameras"] = list(self.cameras)
+            for name, camera in self.cameras.items():
+                _write_camera(file.create_group(f"camera/{name}"), camera)
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a calibration that `Calibration.save` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or of another schema version.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            version = file.attrs.get("schema_version")
+            if version != SCHEMA_VERSION:
+                raise InputError(
+                    f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {version}; "
+                    "calibrate anew."
+                )
+            return Calibration({name: _read_camera(file[f"camera/{name}"], name) for name in file.attrs["cameras"]})
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: expected a calibration file, could not read it ({error}); calibrate anew.") from None
+
+
+def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:
+    for name, value in vars(camera.optics).items():
+        group.attrs[f"optics.{name}"] = value
+    for name, value in vars(camera.lattice).items():
+        group.attrs[f"lattice.{name}"] = value
+    group.attrs["report"] = json.dumps(camera.report)
+    if camera.region_mm is not None:
+        group["region_mm"] = camera.region_mm
+    if camera.test_errors is not None:
+        group["test_errors"] = camera.test_errors
+    for label, part in (("decoder", camera.decoder), ("dots", camera.dots)):
+        if part is not None:
+            for item in fields(part):
+                value = getattr(part, item.name)
+                if isinstance(value, np.ndarray):
+                    group.create_dataset(f"{label}/{item.name}", data=value, compression="gzip", compression_opts=1)
+                elif isinstance(value, int | float):
+                    group.require_group(label).attrs[item.name] = value
+    if camera.network is not None:
+        for name, value in camera.network.to_arrays().items():
+            group[f"network/{name}"] = value
+    if camera.baseline is not None:
+        for name, value in camera.baseline.to_arrays().items():
+            group[f"baseline/{name}"] = value
+
+
+def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
+    def values(prefix: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for key, value in group.attrs.items():
+            if key.startswith(prefix):
+                found[key[len(prefix) :]] = value.item() if isinstance(value, np.generic) else value
+        return found
+
+    nominal = values("optics.")
+    nominal["sensor_shape"] = tuple(int(n) for n in nominal["sensor_shape"])
+    cell = values("lattice.")
+    cell["origin_mm"], cell["basis_mm"] = pair(cell["origin_mm"]), tuple(pair(row) for row in cell["basis_mm"])
+    optics, lattice = Optics(**nominal), LensLattice(**cell)
+
+    def arrays(label: str) -> dict[str, Any]:
+        part = group[label]
+        return {key: value[()] for key, value in part.items()} | {
+            key: value.item() for key, value in part.attrs.items()
+        }
+
+    return CalibratedCamera(
+        name=name,
+        optics=optics,
+        lattice=lattice,
+        decoder=LightFieldDecoder(optics=optics, lattice=lattice, **arrays("decoder")),
+        network=Network.from_arrays(arrays("network")) if "network" in group else None,
+        baseline=ThinLensModel.from_arrays(arrays("baseline")) if "baseline" in group else None,
+        region_mm=group["region_mm"][()] if "region_mm" in group else None,
+        report=json.loads(group.attrs["report"]),
+        dots=BoardDots(**arrays("dots")) if "dots" in group else None,
+        test_errors=group["test_errors"][()] if "test_errors" in group else None,
+    )

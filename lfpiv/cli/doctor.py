@@ -1,0 +1,107 @@
+"""What a bug report needs: versions, devices, memory, and a self-test of the kernels on this machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from lfpiv.results import netcdf
+from lfpiv.runs import memory
+from lfpiv_kernels import runtime
+
+TOLERANCE_MAPPING = 1e-4
+"""Single precision through sums of 20 terms of size 1, with room for a device's own exp."""
+
+TOLERANCE_SHIFT_VOXEL = 0.05
+"""The self-test's blobs are noise-free; a correct sub-voxel peak is well within this."""
+
+SHIFT_VOXEL = (0.7, -0.4, 1.3)
+"""Displacement (z, y, x) of the self-test [voxel]."""
+
+
+def examine(device: str = "auto") -> Iterator[tuple[str, str, bool]]:
+    """Yield (item, finding, good) one after the other; the last items test the kernels and take some seconds.
+
+    Parameters
+    ----------
+    device : {"auto", "cpu", "cuda"}
+        Device to test.
+    """
+    yield "system", f"{platform.system()} {platform.release()}, {platform.machine()}", True
+    for name, version in netcdf.versions().items():
+        yield name, version, True
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    yield "CPU cores", str(cores), True
+    yield "memory available", f"{memory.available_bytes() / memory.GIB:.1f} GiB", True
+    try:
+        running = runtime.start(device)
+    except (RuntimeError, ValueError) as error:
+        yield "kernels", str(error), False
+        return
+    yield from _cuda()
+    reason = f" ({running.reason})" if running.reason else ""
+    yield "kernels run on", f"{running.kind}, {running.threads} threads{reason}", True
+    for name, test in (("ray mapping (Taichi)", _test_mapping), ("correlation (Warp)", _test_correlation)):
+        start = time.perf_counter()
+        try:
+            finding, good = test()
+        except Exception as error:  # whatever breaks a kernel is the finding
+            finding, good = f"{type(error).__name__}: {error}", False
+        yield name, f"{finding}, {time.perf_counter() - start:.1f} s with compilation", good
+
+
+def _cuda() -> Iterator[tuple[str, str, bool]]:
+    import warp as wp
+
+    devices = wp.get_cuda_devices()
+    if not devices:
+        yield "CUDA", "no device visible", True
+    for device in devices:
+        free, total = device.free_memory / memory.GIB, device.total_memory / memory.GIB
+        yield f"CUDA {device.alias}", f"{device.name}, {free:.1f} of {total:.1f} GiB free", True
+
+
+def _blobs(shape: tuple[int, int, int], centres: np.ndarray) -> np.ndarray:
+    axes = np.ogrid[tuple(slice(n) for n in shape)]
+    volume = np.zeros(shape, np.float32)
+    for centre in centres:
+        volume += np.exp(-sum((axis - at) ** 2 for axis, at in zip(axes, centre, strict=True)) / 2)
+    return volume
+
+
+def _test_mapping() -> tuple[str, bool]:
+    """Evaluate a random network on the device and in NumPy."""
+    from lfpiv.calibration.network import Network
+    from lfpiv_kernels.rays import mapping
+
+    rng = np.random.default_rng(0)
+    network = Network(
+        weights=(rng.normal(size=(5, 20)), rng.normal(size=(20, 2))),
+        biases=(rng.normal(size=20), rng.normal(size=2)),
+        input_centre=np.zeros(5),
+        input_scale=np.ones(5),
+        output_centre=np.zeros(2),
+        output_scale=np.ones(2),
+    )
+    points = rng.uniform(-1, 1, (10_000, 5)).astype(np.float32)
+    miss = float(np.abs(mapping.evaluate(network.to_arrays(), points) - network(points)).max())
+    return f"network evaluated to {miss:.1e}", miss < TOLERANCE_MAPPING
+
+
+def _test_correlation() -> tuple[str, bool]:
+    """Recover a known uniform shift of Gaussian blobs."""
+    from lfpiv.velocity.cross_correlation import correlate
+
+    rng, shape = np.random.default_rng(0), (24, 32, 32)
+    centres = rng.uniform(-3, np.add(shape, 3), (400, 3))
+    half = np.asarray(SHIFT_VOXEL) / 2
+    first, second = _blobs(shape, centres - half), _blobs(shape, centres + half)
+    vectors = correlate(first, second, windows=(16, 16), voxel_mm=1.0, dt_s=1.0)
+    names = [f"displacement_{axis}" for axis in "zyx"]
+    middle = tuple(slice(1, -1) if n > 2 else slice(None) for n in vectors["u"].shape)
+    miss = max(abs(float(np.median(vectors[n].values[middle])) - d) for n, d in zip(names, SHIFT_VOXEL, strict=True))
+    return f"known shift recovered to {miss:.3f} voxel", miss < TOLERANCE_SHIFT_VOXEL

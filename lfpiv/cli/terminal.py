@@ -1,0 +1,207 @@
+"""How the command line talks: log lines or bars on standard error, results or JSON on standard output."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+log = logging.getLogger("lfpiv")
+
+LOG_EVERY_S = 10.0
+"""Without a terminal a long step writes a log line at most this often [s]."""
+LEAST_FRACTION = 0.02
+"""Finished part of a step from which its time left is foretold."""
+
+PAIRS_TOLD = 20
+"""Pairs named one by one at the end."""
+WARNINGS_TOLD = 20
+"""Warnings told at the end; `summary.json` holds all."""
+
+Progress = Callable[[str, float], None]
+
+
+class Interrupted(Exception):
+    """Ctrl-C or a request to terminate, in a form the command line parser leaves alone."""
+
+
+@dataclass
+class Voice:
+    """What a command says."""
+
+    debug: bool = False
+    """Debug messages and tracebacks."""
+    quiet: bool = False
+    """Warnings and errors only."""
+    json: bool = False
+    """The result as JSON in place of text."""
+
+    def answer(self, result: Any, tell: Callable[[], None]) -> None:
+        """Give a command's result: as JSON, as text by `tell`, or not at all."""
+        if self.json:
+            from lfpiv.results.netcdf import plain
+
+            print(json.dumps(plain(result), indent=2, allow_nan=False))
+        elif not self.quiet:
+            tell()
+
+    @contextlib.contextmanager
+    def speaking(self) -> Iterator[Progress]:
+        """Configure logging and give the progress callback: bars on an interactive terminal, log lines otherwise."""
+        from rich.console import Console
+
+        console = Console(stderr=True)
+        interactive = console.is_terminal and not self.quiet
+        handler = _handler(console) if interactive else _plain_handler()
+        loggers = [logging.getLogger(name) for name in ("lfpiv", "lfpiv_kernels")]
+        level = logging.DEBUG if self.debug else logging.WARNING if self.quiet else logging.INFO
+        for logger in loggers:
+            logger.addHandler(handler)
+            logger.setLevel(level)
+        try:
+            if interactive:
+                with _bars(console) as update:
+                    yield update
+            else:
+                yield _log_lines()
+        except KeyboardInterrupt as error:
+            raise Interrupted from error
+        finally:
+            for logger in loggers:
+                logger.removeHandler(handler)
+
+
+def _handler(console: Console) -> logging.Handler:
+    from rich.logging import RichHandler
+
+    handler = RichHandler(console=console, show_path=False, markup=False, highlighter=None)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    return handler
+
+
+def _plain_handler() -> logging.Handler:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
+    return handler
+
+
+@contextlib.contextmanager
+def _bars(console: Console) -> Iterator[Progress]:
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"))
+    with Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as bars:
+        tasks: dict[str, Any] = {}
+
+        def update(step: str, fraction: float) -> None:
+            if step not in tasks:
+                tasks[step] = bars.add_task(step, total=1.0)
+            bars.update(tasks[step], completed=fraction)
+
+        yield update
+
+
+def _log_lines() -> Progress:
+    began: dict[str, tuple[float, float]] = {}  # step -> time and fraction of its first report
+    last: dict[str, float] = {}
+
+    def update(step: str, fraction: float) -> None:
+        now = time.monotonic()
+        if step not in last or (fraction < 1 and now - last[step] >= LOG_EVERY_S):
+            start, done = began.setdefault(step, (now, fraction))
+            part = fraction - done
+            left = f", about {duration((now - start) / part * (1 - fraction))} left" if part >= LEAST_FRACTION else ""
+            log.info("%s: %.0f %%%s", step, 100 * fraction, left)
+            last[step] = now
+
+    return update
+
+
+def duration(seconds: float) -> str:
+    """Return a time in words: 40 s, 5 min, 2 h 10 min."""
+    minutes = round(seconds / 60)
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def tell_run(summary: dict[str, Any], out: Path) -> None:
+    """Say what came of a run."""
+    tell_calibration(summary)
+    tell_vectors(summary, out)
+    warnings = summary["warnings"]
+    for text in warnings[:WARNINGS_TOLD]:
+        print(f"warning: {text}")
+    if len(warnings) > WARNINGS_TOLD:
+        print(f"{len(warnings) - WARNINGS_TOLD:,} more warnings are in {out / 'summary.json'}")
+    print(f"{summary['timings_s']['total']:.0f} s, peak memory {summary['peak_memory_mib']:.0f} MiB")
+    print(f"report: {out / 'report.html'}")
+
+
+def tell_demo(summary: dict[str, Any], out: Path) -> None:
+    """Say what came of the demonstration."""
+    truth = summary["demo"]
+    print(
+        f"against the simulated flow: mean error {truth['mean_error_voxel']:.2f} voxel, "
+        f"where displacements reach {truth['largest_displacement_voxel']:.2f} voxel"
+    )
+    tell_run(summary, out)
+
+
+def tell_case(key: str, result: dict[str, Any]) -> None:
+    """Say what a case of `lfpiv reproduce` found: ours, the paper's, the goal."""
+    print(f"{key}: {result['title']}")
+    for row in result["comparison"]:
+        ours, paper = (
+            "-" if row[name] is None else f"{row[name]:.4g}" if isinstance(row[name], float) else row[name]
+            for name in ("ours", "paper")
+        )
+        unit = f" {row['unit']}" if row["unit"] else ""
+        goal = "" if row["goal"] is None else f", goal {row['goal']}: {'reached' if row['reached'] else 'NOT reached'}"
+        print(f"  {row['what']}: {ours}{unit}, paper {paper}{goal}", flush=True)
+
+
+def tell_calibration(summary: dict[str, Any]) -> None:
+    """Say one line per camera."""
+    for name, figures in summary["calibration"].items():
+        print(
+            f"{name}: {figures['dots_found']} of {figures['dots_expected']} dots, "
+            f"sigma_nor {figures['sigma_nor_test']:.4f} pitch on held-out dots, "
+            f"lens array fitted to {figures['lens_array_rms_px']:.3f} px"
+        )
+
+
+def tell_vectors(summary: dict[str, Any], out: Path) -> None:
+    """Say one line per pair, of the first ones."""
+    pairs = summary["pairs"]
+    for pair in pairs[:PAIRS_TOLD]:
+        print(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.0f} % valid vectors")
+    if len(pairs) > PAIRS_TOLD:
+        print(f"{len(pairs)} pairs in all, {100 * summary['valid_fraction']:.0f} % valid vectors on average")
+
+
+def tell_failed(summary: dict[str, Any], where: TextIO) -> None:
+    """Name the pairs that failed, and count those that failed earlier and were not tried now."""
+    failed = failed_now(summary)
+    for item in failed[:PAIRS_TOLD]:
+        print(f"failed: pair {item['pair']}: {item['reason']}", file=where)
+    total, earlier = summary["experiment"]["pairs"], len(summary["failed"]) - len(failed)
+    if failed:
+        print(f"{len(failed)} of {total} pairs failed; the same command tries them again", file=where)
+    if earlier:
+        print(f"{earlier} of {total} pairs failed in earlier runs and were not tried in this one", file=where)
+
+
+def failed_now(summary: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the entries of the pairs that failed in the invocation which a summary is of."""
+    return [item for item in summary["failed"] if not item.get("earlier")]

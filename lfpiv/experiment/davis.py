@@ -1,0 +1,154 @@
+"""Images of LaVision's DaVis (.im7, .imx), read by LaVision's own library, which the extra ``davis`` installs.
+
+A DaVis buffer may hold several frames: both exposures of a pair, and several cameras. Which one is meant is said behind
+the file's name: ``B00001.im7#0`` is the first frame, ``B00001.im7#1.0`` the first exposure of the second camera in a
+buffer of double frames (frame 2 * 1 + 0). A buffer of a single frame needs no number.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv.errors import InputError
+
+SUFFIXES = (".im7", ".imx")
+"""Files of images."""
+VECTOR_SUFFIXES = (".vc7", ".vec")
+"""Files of vectors, which hold no image."""
+
+_FRAME = re.compile(r"(?:(?P<camera>\d+)\.)?(?P<frame>\d+)")
+
+
+class NotOneImage(Exception):
+    """The file holds something else than one single-channel image; the text says what."""
+
+
+def split_frame(path: Path) -> tuple[Path, str]:
+    """Split what names an image into its file and the frame in it, "" where none is named.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from lfpiv.experiment.davis import split_frame
+    >>> [str(part) for part in split_frame(Path("left/B00001.im7#1"))]
+    ['left/B00001.im7', '1']
+    >>> [str(part) for part in split_frame(Path("left#1.tif"))]  # a name like any other
+    ['left#1.tif', '']
+    """
+    name, mark, frame = path.name.rpartition("#")
+    if mark and Path(name).suffix.lower() in SUFFIXES:
+        return path.with_name(name), frame
+    return path, ""
+
+
+def check(path: Path, place: str) -> None:
+    """Check what can be known of a DaVis image without decoding the buffer, all frames of which are decoded together.
+
+    Raises
+    ------
+    InputError
+        If the extra ``davis`` is missing.
+    NotOneImage
+        If what is named behind ``#`` can be no frame.
+    ValueError
+        If the file is empty.
+    """
+    file, fragment = split_frame(path)
+    _library(place)
+    _named_frame(fragment)
+    if file.stat().st_size == 0:
+        raise ValueError("the file is empty")
+
+
+def read(path: Path, place: str) -> np.ndarray:
+    """Read one frame of a DaVis image buffer.
+
+    Parameters
+    ----------
+    path : Path
+        The file, with the frame behind ``#`` where it holds several.
+    place : str
+        What the image is, for messages.
+
+    Returns
+    -------
+    ndarray, shape (rows, columns)
+        Grey values [counts], of the type they are stored in unless the buffer scales them.
+
+    Raises
+    ------
+    InputError
+        If the extra ``davis`` is missing.
+    NotOneImage
+        If there is no such frame, or it is no single image of grey values.
+    """
+    file, fragment = split_frame(path)
+    library = _library(place)
+    status = file.stat()
+    buffer = _buffer(library, str(file), status.st_mtime_ns, status.st_size)
+    number = _frame_number(fragment, len(buffer))
+    frame = buffer[number]
+    if "PIXEL" not in frame.components:
+        raise NotOneImage(f"frame {number} without pixels, such as a vector field")
+    if str(frame.attributes.get("RGBFrame", "0")) != "0":
+        raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
+    masked = [int(np.size(mask) - np.count_nonzero(mask)) for mask in frame.masks]  # 1: a pixel that counts
+    if any(masked):
+        raise NotOneImage(f"an image with {sum(masked)} masked pixels; save it as it was recorded")
+    planes = frame.components["PIXEL"].planes
+    if len(planes) != 1 or np.ndim(planes[0]) != 2:
+        raise NotOneImage(f"{len(planes)} planes of shape {np.shape(planes[0])}, such as a volume")
+    pixels: np.ndarray = np.asarray(planes[0])
+    scale = frame.scales.i
+    if (scale.slope, scale.offset) == (1.0, 0.0):
+        return pixels
+    return float(scale.offset) + float(scale.slope) * pixels.astype(float)
+
+
+def _library(place: str) -> Any:
+    try:
+        import lvpyio
+    except ImportError as error:
+        found = "found none" if isinstance(error, ModuleNotFoundError) else f"found one that does not load ({error})"
+        raise InputError(
+            f"{place}: LaVision images are read by the package lvpyio, {found}. Install the extra davis with "
+            "pip install 'lfpiv[davis]', or save the images as TIFF in DaVis."
+        ) from None
+    return lvpyio
+
+
+@functools.lru_cache(maxsize=1)
+def _buffer(library: Any, file: str, changed_ns: int, size: int) -> Any:
+    """Read a buffer; the frames of one file are asked for one after the other, so the last one is kept."""
+    return library.read_buffer(file)
+
+
+def _named_frame(fragment: str) -> int | None:
+    """Turn what is named behind ``#`` into the number of a frame; None where nothing is."""
+    if not fragment:
+        return None
+    match = _FRAME.fullmatch(fragment)
+    if match is None:
+        raise NotOneImage(f"a frame called {fragment!r}; name it by number (#0) or #CAMERA.EXPOSURE (#1.0)")
+    if match["camera"] is None:
+        return int(match["frame"])
+    if int(match["frame"]) > 1:
+        raise NotOneImage(f"exposure {match['frame']} in #{fragment}; a double frame has the exposures 0 and 1")
+    return 2 * int(match["camera"]) + int(match["frame"])
+
+
+def _frame_number(fragment: str, count: int) -> int:
+    """Return the number of the frame that is named behind ``#`` in a buffer of `count` frames."""
+    number = _named_frame(fragment)
+    if number is None:
+        if count == 1:
+            return 0
+        raise NotOneImage(f"{count} frames; name one behind the file: #0 to #{count - 1}, or #CAMERA.EXPOSURE")
+    if number >= count:
+        raise NotOneImage(f"{count} frame{'' if count == 1 else 's'}, none of them #{fragment}; they count from 0")
+    return number

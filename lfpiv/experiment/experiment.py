@@ -1,0 +1,371 @@
+"""The experiment file: TOML to a frozen value, everything it names checked before any work."""
+
+from __future__ import annotations
+
+import math
+import string
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv.errors import InputError
+from lfpiv.experiment import images, nominal_checks
+from lfpiv.experiment.settings import (
+    SMALLEST_WINDOW,
+    Board,
+    CameraTable,
+    Compute,
+    Correlation,
+    ExperimentTable,
+    Network,
+    SelfCalibration,
+    Smart,
+    Volume,
+)
+from lfpiv.experiment.toml import read_toml
+from lfpiv.geometry.optics import Grid, Optics
+
+DECODED_PIXELS = 100_000_000
+"""Particle images decoded before the work starts [pixel], in order; the others are checked by header and length."""
+
+MICROLENS_SHARE = 0.2
+"""Largest focal length of the microlenses over the main lens's image distance; more is a slip in a unit."""
+
+FEWEST_LENSES = 3
+"""Microlenses a sensor must hold along each axis; fewer are a slip in the pitch or the pixel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSetup:
+    """One camera: its name, nominal optics and white and dark image."""
+
+    name: str
+    optics: Optics
+    """Nominal optics; ``sensor_shape`` is that of the white image."""
+    nominal_angle_deg: float
+    """Angle about y [degree]; names the board's dots and serves the thin-lens mapping, never the network."""
+    image_flip: str
+    """How the camera's images are mirrored; undone on reading."""
+    white_path: Path
+    dark_path: Path | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """An experiment whose files exist and fit each other. Made by `open_experiment`."""
+
+    path: Path
+    name: str
+    dt_s: float
+    """Time between the two frames of a pair [s]."""
+    cameras: tuple[CameraSetup, ...]
+    board: Board
+    grid: Grid
+    pairs: int
+    frames: tuple[str, str]
+    smart: Smart
+    correlation: Correlation
+    network: Network
+    self_calibration: SelfCalibration
+    compute: Compute
+    particle_images: str
+    """Path pattern of the particle images, relative to the experiment file."""
+
+    def camera(self, name: str) -> CameraSetup:
+        """Return the camera called `name`; ValueError names the known ones."""
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        raise ValueError(f"camera: expected one of {', '.join(c.name for c in self.cameras)}, got {name!r}.")
+
+    def white(self, name: str) -> np.ndarray:
+        """White image of a camera, float32 (rows, columns), dark not subtracted."""
+        camera = self.camera(name)
+        return _read(camera.white_path, f"white_image of camera {name!r}", camera)
+
+    def dark(self, name: str) -> np.ndarray | None:
+        """Dark image of a camera, float32 (rows, columns), or None where the file names none."""
+        camera = self.camera(name)
+        if camera.dark_path is None:
+            return None
+        return _read(camera.dark_path, f"dark_image of camera {name!r}", camera)
+
+    def board_image(self, name: str, plane: int) -> np.ndarray:
+        """Board image of a camera at plane number `plane`, float32 (rows, columns)."""
+        return _read(self.board_path(name, plane), _board_label(name, plane), self.camera(name))
+
+    def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
+        """Particle image of a camera, float32 (rows, columns); InputError where it is no such image, or even."""
+        label, path = _particle_label(name, pair, frame), self.particle_path(name, pair, frame)
+        image = _read(path, label, self.camera(name))
+        images.require_contrast(image, path, label)
+        return image
+
+    def board_path(self, name: str, plane: int) -> Path:
+        """Path of a board image."""
+        return self.path.parent / self.board.images.format(camera=name, plane=plane)
+
+    def particle_path(self, name: str, pair: int, frame: str) -> Path:
+        """Path of a particle image."""
+        return self.path.parent / self.particle_images.format(camera=name, pair=pair, frame=frame)
+
+    def calibration_paths(self) -> list[Path]:
+        """All images the calibration reads, in a fixed order."""
+        paths = [path for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
+        return paths + [self.board_path(c.name, p) for c in self.cameras for p in range(len(self.board.planes_mm))]
+
+    @property
+    def self_calibration_pairs(self) -> list[int]:
+        """Pairs whose particles tell how the cameras stand: as many as asked for, evenly spread."""
+        count = min(self.self_calibration.pairs, self.pairs)
+        return [(2 * number + 1) * self.pairs // (2 * count) for number in range(count)]
+
+    def pair_paths(self, pair: int) -> list[Path]:
+        """All images of one pair, in a fixed order."""
+        return [self.particle_path(camera.name, pair, frame) for frame in self.frames for camera in self.cameras]
+
+
+def open_experiment(path: str | Path) -> Experiment:
+    """Read an experiment file and check everything it says and names, before any work.
+
+    White, dark and board images are decoded, and particle images up to `DECODED_PIXELS`; of the others the header and
+    the length are checked, of DaVis images only that they are there. `lfpiv.run` asks less: there only the first pair
+    must be whole, see `check_pairs`.
+
+    Parameters
+    ----------
+    path : str or Path
+        TOML file in the form described in the README.
+
+    Returns
+    -------
+    Experiment
+
+    Raises
+    ------
+    InputError
+        If a key is unknown, missing or out of range, an image is missing, damaged, or does not fit the others, or the
+        nominal cameras certainly see nothing of the volume.
+    """
+    experiment = read_experiment(path)
+    for _, reason in check_pairs(experiment, range(experiment.pairs)):
+        raise InputError(reason)
+    return experiment
+
+
+def read_experiment(path: str | Path) -> Experiment:
+    """Read and check an experiment as `open_experiment` does, all but its particle images."""
+    path = Path(path)
+    table = read_toml(path, ExperimentTable)
+    names = [camera.name for camera in table.camera]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
+    _check_pattern(
+        path, "board.images", table.board.images, {"camera": names, "plane": range(len(table.board.planes_mm))}
+    )
+    _check_pattern(
+        path,
+        "particles.images",
+        table.particles.images,
+        {"camera": names, "pair": range(table.particles.pairs), "frame": table.particles.frames},
+    )
+    grid = _grid(path, table.volume)
+    _check_windows(path, table.correlation, grid)
+    experiment = Experiment(
+        path=path,
+        name=table.name,
+        dt_s=table.dt_s,
+        cameras=tuple(_camera(path, camera) for camera in table.camera),
+        board=table.board,
+        grid=grid,
+        pairs=table.particles.pairs,
+        frames=table.particles.frames,
+        smart=table.smart,
+        self_calibration=table.self_calibration,
+        correlation=table.correlation,
+        network=table.network,
+        compute=table.compute,
+        particle_images=table.particles.images,
+    )
+    for camera in experiment.cameras:
+        nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)
+        nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.nominal_angle_deg)
+    _check_calibration_images(experiment)
+    return experiment
+
+
+def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:
+    """Check the particle images of some pairs; yield each pair that cannot be used, and why.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        From `read_experiment`.
+    pairs : sequence of int
+        Pairs to check: decoded up to `DECODED_PIXELS`, the first one at any rate; the others by header and length (a
+        DaVis image must be there).
+
+    Yields
+    ------
+    pair : int
+    reason : str
+        Names the file, what was expected, what was found.
+    """
+    decoded = 0
+    for number, pair in enumerate(pairs):
+        try:
+            for camera in experiment.cameras:
+                for frame in experiment.frames:
+                    label = _particle_label(camera.name, pair, frame)
+                    _check_shape(experiment.particle_path(camera.name, pair, frame), label, camera)
+            decoded += 2 * sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
+            if number == 0 or decoded <= DECODED_PIXELS:
+                for camera in experiment.cameras:
+                    for frame in experiment.frames:
+                        experiment.particle_image(camera.name, pair, frame)
+        except InputError as error:
+            yield pair, str(error)
+
+
+def _check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any]) -> None:
+    """Refuse a path pattern that cannot be filled in, or that names one file for several images."""
+    known = ", ".join("{" + name + "}" for name in fields)
+    try:
+        used = {name for _, name, _, _ in string.Formatter().parse(pattern) if name is not None}
+        if used <= set(fields):
+            pattern.format(**{name: values[0] for name, values in fields.items()})
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{path}: {key}: expected a path with {known}, found {pattern!r} ({error}).") from None
+    if used - set(fields):
+        raise InputError(f"{path}: {key}: expected only {known}, found {{{min(used - set(fields))}}} in {pattern!r}.")
+    for name, values in fields.items():
+        if len(values) > 1 and name not in used:
+            raise InputError(
+                f"{path}: {key}: expected {{{name}}} in the path, since there are {len(values)}, found {pattern!r}."
+            )
+
+
+def _grid(path: Path, volume: Volume) -> Grid:
+    for axis, size in zip("xyz", volume.size_mm, strict=True):
+        if not SMALLEST_WINDOW <= size / volume.voxel_mm + 0.5 < 2**31:
+            raise InputError(
+                f"{path}: volume.size_mm: expected {SMALLEST_WINDOW} voxels or more along {axis}, at most 2^31, "
+                f"found {size:g} mm with voxel_mm = {volume.voxel_mm:g}."
+            )
+    return Grid.from_extent(centre_mm=volume.centre_mm, size_mm=volume.size_mm, voxel_mm=volume.voxel_mm)
+
+
+def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
+    for window in correlation.windows or ():
+        if not isinstance(window, tuple):
+            continue  # a single edge is cut to the volume
+        for axis, edge, n in zip("zyx", window, grid.shape, strict=True):
+            if edge > n:
+                raise InputError(
+                    f"{path}: correlation.windows: expected windows inside the volume, found {edge} voxels "
+                    f"along {axis} where the volume has {n}. Use a smaller window, or a single edge, which is cut to "
+                    "the volume."
+                )
+
+
+def _camera(path: Path, table: CameraTable) -> CameraSetup:
+    white_path = path.parent / table.white_image
+    shape = _white_shape(white_path, f"white_image of camera {table.name!r}")
+    optics = Optics(
+        focal_length_mm=table.focal_length_mm,
+        magnification=table.magnification,
+        f_number=table.f_number,
+        microlens_pitch_mm=table.microlens_pitch_mm,
+        microlens_focal_length_mm=table.microlens_focal_length_mm,
+        pixel_mm=table.pixel_um / 1000,
+        sensor_shape=shape,
+        layout=table.microlens_layout,
+    )
+    if table.microlens_focal_length_mm > MICROLENS_SHARE * optics.image_distance_mm:
+        raise InputError(
+            f"{path}: camera {table.name!r}, microlens_focal_length_mm: expected far less than the image distance "
+            f"f (1 + |M|) = {optics.image_distance_mm:g} mm, found {table.microlens_focal_length_mm:g}. Are it and "
+            "focal_length_mm in mm?"
+        )
+    pitch_px = optics.microimage_pitch_px
+    if not (math.isfinite(pitch_px) and 2 <= pitch_px <= min(shape) / FEWEST_LENSES):
+        raise InputError(
+            f"{path}: camera {table.name!r}, microlens_pitch_mm: expected microimages of at least 2 pixels, and "
+            f"at least {FEWEST_LENSES} of them across the sensor of {shape} pixels, found {pitch_px:.4g}. "
+            "Check microlens_pitch_mm and pixel_um."
+        )
+    return CameraSetup(
+        name=table.name,
+        optics=optics,
+        nominal_angle_deg=table.nominal_angle_deg,
+        image_flip=table.image_flip,
+        white_path=white_path,
+        dark_path=None if table.dark_image is None else path.parent / table.dark_image,
+    )
+
+
+def _white_shape(path: Path, label: str) -> tuple[int, int]:
+    header = images.read_header(path, label)
+    if header is not None:
+        return header.shape
+    rows, columns = images.read_image(path, label).shape
+    return rows, columns
+
+
+def _check_calibration_images(experiment: Experiment) -> None:
+    """Check that every image of the calibration is there, fits its camera's white image and can be decoded."""
+    for camera in experiment.cameras:
+        if camera.dark_path is not None:
+            _check_shape(camera.dark_path, f"dark_image of camera {camera.name!r}", camera)
+        for plane in range(len(experiment.board.planes_mm)):
+            _check_shape(experiment.board_path(camera.name, plane), _board_label(camera.name, plane), camera)
+    for camera in experiment.cameras:
+        white, dark = experiment.white(camera.name), experiment.dark(camera.name)
+        label = f"white_image of camera {camera.name!r}"
+        images.require_contrast(white, camera.white_path, label)
+        if dark is not None and float((white - dark).max()) <= 0:
+            raise InputError(
+                f"{camera.white_path} ({label}): expected a white image brighter than the dark image, found none of "
+                f"its pixels above {camera.dark_path}. Are the two files exchanged?"
+            )
+        for plane in range(len(experiment.board.planes_mm)):
+            board = experiment.board_image(camera.name, plane)
+            path, label = experiment.board_path(camera.name, plane), _board_label(camera.name, plane)
+            images.require_contrast(board, path, label)
+
+
+def _read(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
+    """Read an image of a camera, its mirroring undone; refused where it is of another shape than the white image."""
+    image = images.read_image(path, label, flip=camera.image_flip)
+    _require_shape(image.shape, path, label, camera)
+    return image
+
+
+def _check_shape(path: Path, label: str, camera: CameraSetup) -> None:
+    """Refuse an image that is missing, damaged, or of another shape than its camera's white image.
+
+    A DaVis image must be there; what is in it is checked where it is decoded.
+    """
+    header = images.read_header(path, label)
+    if header is not None:
+        _require_shape(header.shape, path, label, camera)
+
+
+def _require_shape(shape: tuple[int, ...], path: Path, label: str, camera: CameraSetup) -> None:
+    if shape != camera.optics.sensor_shape:
+        raise InputError(
+            f"{path} ({label}): expected {camera.optics.sensor_shape} pixels (rows, columns) as in the white image "
+            f"{camera.white_path}, found {shape}. All images of a camera have one size."
+        )
+
+
+def _board_label(camera: str, plane: int) -> str:
+    return f"board.images, camera {camera!r}, plane {plane}"
+
+
+def _particle_label(camera: str, pair: int, frame: str) -> str:
+    return f"particles.images, camera {camera!r}, pair {pair}, frame {frame!r}"

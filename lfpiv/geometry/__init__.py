@@ -1,0 +1,1 @@
+"""Optics of a camera, grid of voxels, lattice of lenses: frozen values in millimetres, arrays ordered (z, y, x)."""

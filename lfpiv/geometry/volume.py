@@ -1,0 +1,73 @@
+"""Points and volumes as a caller hands them to a measure: checked, and with the grid of their voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.geometry.optics import Grid
+
+_DIMS = ("z", "y", "x")
+_SPACING_TOLERANCE = 1e-3  # unevenness of coordinates written as float32 decimals, relative to the spacing
+
+
+def checked_points(points: np.ndarray, name: str) -> np.ndarray:
+    """Return points as float64 of shape (n, 3), or raise ValueError."""
+    points = np.asarray(points, float)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        fault = "" if np.isfinite(points).all() else " with NaN or infinity"
+        raise ValueError(f"{name}: expected finite points (x, y, z) of shape (n, 3), got shape {points.shape}{fault}.")
+    return points
+
+
+def checked_volume(volume: xr.DataArray | np.ndarray, grid: Grid | None, name: str) -> tuple[np.ndarray, Grid]:
+    """Return a volume's finite values (z, y, x) and its grid, or raise ValueError."""
+    values = np.asarray(volume)
+    if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fiub":
+        raise ValueError(f"{name}: expected a volume of numbers (z, y, x), got {values.dtype} of shape {values.shape}.")
+    values = values.astype(np.float32 if values.dtype == np.float32 else np.float64, copy=False)
+    bad = values.size - int(np.isfinite(values).sum())
+    if bad:
+        raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
+    if isinstance(volume, xr.DataArray):
+        if grid is not None:
+            raise ValueError("grid: expected no value with a DataArray, whose coordinates tell it. Leave it out.")
+        return values, _grid_of(volume, name)
+    if grid is None or values.shape != tuple(grid.shape):
+        fault = "no grid" if grid is None else f"a grid of shape {grid.shape}"
+        raise ValueError(f"{name}: an array of shape {values.shape} needs the grid of its voxels, got {fault}.")
+    return values, grid
+
+
+def in_order(volume: xr.DataArray | np.ndarray, name: str) -> xr.DataArray | np.ndarray:
+    """Return a volume as it is, or raise ValueError where its named dimensions are in another order than (z, y, x)."""
+    if isinstance(volume, xr.DataArray) and volume.dims != _DIMS:
+        raise ValueError(
+            f"{name}: expected dims (z, y, x), got ({', '.join(map(str, volume.dims))}). Use .transpose('z', 'y', 'x')."
+        )
+    return volume
+
+
+def _grid_of(volume: xr.DataArray, name: str) -> Grid:
+    """Grid of a DataArray with coordinates in mm."""
+    if volume.dims != _DIMS or any(axis not in volume.coords for axis in _DIMS):
+        raise ValueError(
+            f"{name}: expected dims (z, y, x) with coordinates [mm], got {dict(volume.sizes)} with coordinates "
+            f"{list(volume.coords)}."
+        )
+    axes = [np.asarray(volume[axis], float) for axis in _DIMS]
+    steps = np.concatenate([np.diff(axis) for axis in axes])
+    voxel_mm = float(np.median(steps)) if len(steps) else float(volume.attrs.get("voxel_mm", 1.0))
+    if not voxel_mm > 0 or (np.abs(steps - voxel_mm) > _SPACING_TOLERANCE * voxel_mm).any():
+        raise ValueError(
+            f"{name}: expected evenly spaced cubic voxels, got steps of {steps.min()} to {steps.max()} mm."
+        )
+    nz, ny, nx = volume.shape
+    z, y, x = (float(axis[0]) for axis in axes)
+    return Grid(shape=(nz, ny, nx), voxel_mm=voxel_mm, first_centre_mm=(z, y, x))
+
+
+def voxel_place(points_mm: np.ndarray, grid: Grid) -> np.ndarray:
+    """Points (x, y, z) [mm] as fractional voxel indices (z, y, x)."""
+    place: np.ndarray = (points_mm[:, ::-1] - np.asarray(grid.first_centre_mm)) / grid.voxel_mm
+    return place

@@ -1,0 +1,267 @@
+"""Lattice vectors and phase of a microlens array, found in its white image without knowing anything of it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import fft, ndimage
+
+from lfpiv.errors import InputError
+from lfpiv.geometry.optics import LAYOUTS
+
+TILE_PX = 1024
+"""Side of the part of the image that the autocorrelation sees [pixel]; lags reach half of it."""
+PEAK_FRACTION = 0.7
+"""A lag is a lattice vector if its correlation is above this part of the best; between lattice vectors it is lower."""
+SIGNIFICANCE = 8
+"""Correlation that is no chance [standard deviations of that of unrelated pixels, one in the root of their number]."""
+NOMINAL_TOLERANCE = 0.2
+"""Largest relative error of a nominal pitch: twice what a data sheet may be off."""
+CELL_TOLERANCE = 0.03
+"""Largest misfit of a neighbour to the layout [pitch]; real arrays stay within 1 %."""
+CANDIDATES = 200
+"""Shortest lags tried as lattice vector."""
+DISC_RADII = np.arange(0.2, 0.81, 0.02)
+"""Radii of microimages tried [pitch]; of the largest, four overlap in the middle between their lenses."""
+
+
+# Lattice vectors from the autocorrelation ----------------------------------------------------------------------------
+
+
+def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndarray:
+    """Lattice vectors, rows (column, row) [pixel], in the standard order of `LensArray.basis_px`."""
+    tile = _middle(image)
+    width, best = nominal or min(tile.shape) / 4, -1.0
+    while width >= 3:  # a narrow mean hides unequal lenses, a wide one keeps more signal: the lattice itself decides
+        correlation = _autocorrelation(_evened(tile, width))
+        peaks = _correlation_peaks(correlation)
+        trial = {name: _best_lag(correlation, *peaks, name) for name in LAYOUTS}
+        score = max(score for score, _ in trial.values())
+        if score > best:
+            chosen, chosen_peaks, found, best = correlation, peaks, trial, score
+        width /= 2
+    if best * math.sqrt(tile.size) < SIGNIFICANCE:
+        raise InputError(
+            "white: no regular array of microimages found. Expected a sharp white image with at least four lenses "
+            "across; check file, exposure and dark frame."
+        )
+    fits = [name for name in LAYOUTS if found[name][0] >= PEAK_FRACTION * best]
+    shown = min(fits, key=lambda name: np.hypot(*found[name][1]))  # far lags of one layout resemble the other
+    if shown != layout:
+        raise InputError(
+            f"layout: expected the layout of the white image, {shown} with a pitch of about "
+            f"{np.hypot(*found[shown][1]):.1f} px, got {layout!r}. Check the microlens layout."
+        )
+    lag = found[layout][1]
+    if nominal and abs(np.hypot(*lag) / nominal - 1) > NOMINAL_TOLERANCE:
+        raise InputError(
+            f"nominal_pitch_px: expected the pitch of the white image, about {np.hypot(*lag):.1f} px, got {nominal:g}. "
+            "Check microlens pitch and pixel size."
+        )
+    return _refine_basis(chosen, _standard_basis(lag, layout), chosen_peaks[1])
+
+
+def _middle(image: np.ndarray) -> np.ndarray:
+    start = [max(0, (n - TILE_PX) // 2) for n in image.shape]
+    return image[start[0] : start[0] + TILE_PX, start[1] : start[1] + TILE_PX]
+
+
+def _evened(tile: np.ndarray, width: float) -> np.ndarray:
+    """Tile less its local mean in units of its local contrast: unequal and dead lenses must not outweigh the gaps."""
+    size = 2 * round(width / 2) + 1
+    mean = ndimage.uniform_filter(tile, size)
+    even: np.ndarray = tile / np.maximum(mean, 0.1 * max(mean.max(), 1e-30)) - 1
+    contrast = np.sqrt(np.maximum(ndimage.uniform_filter(even**2, 2 * size + 1), 0))
+    even /= np.maximum(contrast, max(np.median(contrast), 1e-30))
+    even -= even.mean()
+    return even
+
+
+def _autocorrelation(tile: np.ndarray) -> np.ndarray:
+    """Correlation coefficient of the tile with itself over the overlap at each lag up to half of it.
+
+    Lag zero lies in the middle and holds the mean of its neighbours, so pixel noise leaves no spike.
+    """
+    rows, columns = tile.shape
+    reach = rows // 2, columns // 2
+    padded = [fft.next_fast_len(size + lag, real=True) for size, lag in zip((rows, columns), reach, strict=True)]
+    lag_row, lag_column = np.arange(reach[0] + 1), np.arange(-reach[1], reach[1] + 1)
+    pairs = np.multiply.outer(rows - lag_row, columns - np.abs(lag_column))
+    power = np.abs(fft.rfft2(tile, padded, workers=-1)) ** 2
+    product = fft.irfft2(power, padded, workers=-1)[np.ix_(lag_row, lag_column)]
+    (sum_a, sum_b), (square_a, square_b) = _overlap_sums(tile, reach), _overlap_sums(tile**2, reach)
+    variances = (square_a - sum_a**2 / pairs) * (square_b - sum_b**2 / pairs)
+    half = (product - sum_a * sum_b / pairs) / np.sqrt(np.maximum(variances, 1e-12 * max(variances.max(), 1e-30)))
+    correlation = np.vstack([half[:0:-1, ::-1], half])
+    correlation[reach] = correlation[reach[0] - 1 : reach[0] + 2, reach[1]][::2].mean()
+    return correlation
+
+
+def _overlap_sums(tile: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Sum over the tile's part that meets itself at each lag (row >= 0): of the one copy and of the other."""
+    total = np.zeros(np.add(tile.shape, 1))
+    total[1:, 1:] = tile.cumsum(0, dtype=float).cumsum(1)
+    r = np.arange(reach[0] + 1)[:, None]
+    c = np.arange(-reach[1], reach[1] + 1)[None]
+    rows, columns = tile.shape
+    left, right = np.maximum(-c, 0), columns - np.maximum(c, 0)  # columns that have a partner at column + c
+
+    def box(top: np.ndarray, bottom: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+        inside: np.ndarray = total[bottom, last] - total[top, last] - total[bottom, first] + total[top, first]
+        return inside
+
+    return box(0 * r, rows - r, left, right), box(r, rows + 0 * r, left + c, right + c)
+
+
+def _correlation_peaks(correlation: np.ndarray) -> tuple[np.ndarray, float]:
+    """Local maxima of a half plane, lags (n, 2) as (column, row), and the radius of the lobe about lag zero [pixel]."""
+    middle = np.array(correlation.shape) // 2
+    row, column = np.ogrid[-middle[0] : middle[0] + 1, -middle[1] : middle[1] + 1]
+    radius = np.hypot(row, column)
+    ring = np.rint(radius).astype(int).ravel()
+    profile = (np.bincount(ring, correlation.ravel()) / np.bincount(ring))[: middle.min() // 2]
+    rises = np.flatnonzero(np.diff(profile[1:]) > 0)
+    lobe = 1 + int(rises[0]) if len(rises) else len(profile)
+    top = ndimage.maximum_filter(correlation, 2 * math.ceil(0.4 * lobe) + 1) == correlation
+    top &= ((row > 0) | ((row == 0) & (column > 0))) & (radius > lobe) & (radius < 0.9 * middle.min())
+    return (np.argwhere(top) - middle)[:, ::-1], lobe
+
+
+def _best_lag(correlation: np.ndarray, lags: np.ndarray, lobe: float, layout: str) -> tuple[float, np.ndarray]:
+    """Shortest lag (column, row) that spans a lattice of high correlation, with the lattice's score.
+
+    The score is the lowest correlation at the neighbours of lag zero. Multiples of the lattice score as high as the
+    true one, so the shortest of the best is taken.
+    """
+    middle = np.array(correlation.shape) // 2
+    height = correlation[tuple((lags[:, ::-1] + middle).T)]
+    lags = lags[height > 0.5 * PEAK_FRACTION * height.max(initial=0)]
+    best = [(0.0, np.zeros(2))]
+    for lag in lags[np.argsort(np.hypot(*lags.T), kind="stable")[:CANDIDATES]]:
+        first, second = _standard_basis(lag, layout)
+        nodes = np.array([first, second, second - first] if layout == "hexagonal" else [first, second])
+        slack = math.ceil(min(CELL_TOLERANCE * np.hypot(*lag), lobe / 2))
+        around = [
+            correlation[r - slack : r + slack + 1, c - slack : c + slack + 1]
+            for c, r in np.rint(nodes).astype(int) + middle[::-1]
+        ]
+        best.append((min((float(part.max()) for part in around if part.size), default=0.0), lag))
+    highest = max(score for score, _ in best)
+    return next((score, lag) for score, lag in best if score >= PEAK_FRACTION * highest)
+
+
+def cell_angle_deg(layout: str) -> float:
+    """Angle between the two lattice vectors [degree]."""
+    return 60.0 if layout == "hexagonal" else 90.0
+
+
+def lattice_pitch(basis: np.ndarray, layout: str) -> float:
+    """Distance of neighbouring lenses [pixel], from the area of the lattice's cell."""
+    return math.sqrt(abs(np.linalg.det(basis)) / math.sin(math.radians(cell_angle_deg(layout))))
+
+
+def _standard_basis(lag: np.ndarray, layout: str) -> np.ndarray:
+    """Lattice vectors, ordered and signed as `LensArray.basis_px` says, of the lattice that one of them spans."""
+    turn, lowest = (60.0, -15.0) if layout == "hexagonal" else (90.0, -45.0)
+    angle = math.degrees(math.atan2(lag[1], lag[0]))
+    angles = np.radians(lowest + (angle - lowest) % turn + np.array([0, turn]))
+    basis: np.ndarray = np.hypot(*lag) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return basis
+
+
+def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np.ndarray:
+    """Lattice vectors through the correlation's peaks at lags of doubling length, each predicted by the last fit."""
+    middle = np.array(correlation.shape)[::-1] // 2
+    half = max(1, int(lobe / 4))
+    offset = np.arange(-half, half + 1)
+    row, column = (a.ravel() for a in np.meshgrid(offset, offset, indexing="ij"))
+    paraboloid = np.linalg.pinv(np.stack([np.ones_like(row), column, row, column**2, row * column, row**2], 1) + 0.0)
+    limit = middle - half - 1
+    reach = 1.5 * np.hypot(*basis[0])
+    while True:
+        index = indices_inside(np.zeros(2), basis, -limit, limit)
+        near = np.hypot(*(index @ basis).T) <= reach
+        index = index[near & (index != 0).any(1)]
+        lag = np.rint(index @ basis).astype(int)
+        patch = correlation[middle[1] + lag[:, 1, None] + row, middle[0] + lag[:, 0, None] + column]
+        _, dx, dy, xx, xy, yy = (patch @ paraboloid.T).T
+        hessian = 4 * xx * yy - xy**2
+        peak = (xx < 0) & (hessian > 0)
+        shift = np.stack([xy * dy - 2 * yy * dx, xy * dx - 2 * xx * dy], 1)[peak] / hessian[peak, None]
+        kept = (np.abs(shift) <= half + 1).all(1)
+        if np.linalg.matrix_rank(index[peak][kept]) == 2:
+            basis = np.linalg.lstsq(index[peak][kept], lag[peak][kept] + shift[kept], rcond=None)[0]
+        if reach > np.hypot(*limit):
+            return basis
+        reach *= 2
+
+
+def indices_inside(origin: np.ndarray, basis: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
+    """List the indices (i, j) of all lattice nodes with low <= node < high, row after row, shape (node, 2)."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
+    reach = (corners - origin) @ np.linalg.inv(basis)
+    first, last = np.floor(reach.min(0)).astype(int), np.ceil(reach.max(0)).astype(int)
+    j, i = (a.ravel() for a in np.mgrid[first[1] : last[1] + 1, first[0] : last[0] + 1])
+    index: np.ndarray = np.stack([i, j], axis=1)
+    node = origin + index @ basis
+    inside: np.ndarray = index[((node >= low) & (node < high)).all(1)]
+    return inside
+
+
+# Phase from the symmetry of the mean cell ----------------------------------------------------------------------------
+
+
+def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
+    """Place of a lens centre (column, row) [pixel] near the image's middle, good to about a pixel.
+
+    The mean cell looks the same after a quarter (sixth) turn about a lens centre. In a square array also about the
+    gaps between four lenses. Discs of some size about the lens centres explain it better than discs about the gaps,
+    even where microimages overlap so far that a gap, between four bright overlaps, is brighter than a centre.
+    """
+    pitch = lattice_pitch(basis, layout)
+    crop = _evened(_middle(image), pitch)
+    bins = 2 * int(np.clip(pitch / 2, 3, 16))
+    cell = _mean_cell(crop, basis, bins)
+
+    turn = np.array([[0, -1], [1, 1]]) if layout == "hexagonal" else np.array([[0, -1], [1, 0]])
+    place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 2)
+    offset = place[:, None] - place[None]  # (point, centre, 2): lattice coordinates about every possible centre
+    turned = (place[None] + offset @ turn.T) % bins
+    symmetry = (cell.reshape(-1, 1) * cell[turned[..., 0], turned[..., 1]]).sum(0)
+    centre = place[np.argmax(symmetry)]
+    if layout == "square":
+        centre = max(centre, (centre + bins // 2) % bins, key=lambda middle: _disc_likeness(cell, basis, middle))
+    start = [max(0, (n - TILE_PX) // 2) for n in image.shape[::-1]]
+    phase: np.ndarray = centre / bins @ basis + start
+    return phase
+
+
+def _disc_likeness(cell: np.ndarray, basis: np.ndarray, centre: np.ndarray) -> float:
+    """Correlation of a cell with equal discs about the lattice nodes that `centre` belongs to, of the best radius."""
+    bins = len(cell)
+    place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 1, 2) - centre
+    around = bins * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1), indexing="ij"), -1).reshape(1, -1, 2)
+    inner = (place + bins // 2) % bins - bins // 2
+    pitch = np.hypot(*basis[0])
+    away = np.linalg.norm((inner - around) @ basis / bins, axis=-1)
+    found = [np.clip((radius * pitch - away) * bins / pitch + 0.5, 0, 1).sum(1) for radius in DISC_RADII]
+    even = cell.ravel() - cell.mean()
+    return max(float(even @ (disc - disc.mean())) / max(float(disc.std()), 1e-9) for disc in found)
+
+
+def _mean_cell(crop: np.ndarray, basis: np.ndarray, bins: int) -> np.ndarray:
+    """Crop folded into one lattice cell of bins x bins (i, j), each pixel shared by the four nearest bins."""
+    inverse = np.linalg.inv(basis) * bins
+    row, column = np.ogrid[: crop.shape[0], : crop.shape[1]]
+    i, j = (column * inverse[0, k] + row * inverse[1, k] for k in (0, 1))
+    i0, j0 = np.floor(i).astype(int), np.floor(j).astype(int)
+    fi, fj = i - i0, j - j0
+    total, weight = np.zeros(bins * bins), np.zeros(bins * bins)
+    for di, dj, share in ((0, 0, (1 - fi) * (1 - fj)), (1, 0, fi * (1 - fj)), (0, 1, (1 - fi) * fj), (1, 1, fi * fj)):
+        bin_number = ((i0 + di) % bins * bins + (j0 + dj) % bins).ravel()
+        total += np.bincount(bin_number, (share * crop).ravel(), bins * bins)
+        weight += np.bincount(bin_number, share.ravel(), bins * bins)
+    return (total / np.maximum(weight, 1e-12)).reshape(bins, bins)

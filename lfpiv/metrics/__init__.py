@@ -1,0 +1,37 @@
+"""Figures of merit of weights, volumes, particles, dots and vectors, against the truth or against one another.
+
+Equation numbers are the paper's.
+"""
+
+from lfpiv.metrics.images_and_volumes import DotError, dot_error, reconstruction_quality, relative_l2, weight_ssim
+from lfpiv.metrics.particles import (
+    ParticleQuality,
+    Particles,
+    elongation,
+    find_particles,
+    match_particles,
+    particle_quality,
+    reconstruction_accuracy,
+    truth_volume,
+)
+from lfpiv.metrics.vector_fields import DisplacementError, displacement_difference, displacement_error, empirical_cdf
+
+__all__ = [
+    "DisplacementError",
+    "DotError",
+    "ParticleQuality",
+    "Particles",
+    "displacement_difference",
+    "displacement_error",
+    "dot_error",
+    "elongation",
+    "empirical_cdf",
+    "find_particles",
+    "match_particles",
+    "particle_quality",
+    "reconstruction_accuracy",
+    "reconstruction_quality",
+    "relative_l2",
+    "truth_volume",
+    "weight_ssim",
+]

@@ -1,0 +1,102 @@
+"""How far the microimages of a white image lie off the lattice of a calibration, over the sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.lightfield.lens_basis import indices_inside
+from lfpiv.lightfield.microimage_fit import BLUR_REACH_PX, cut_patches, measure, robust_fit
+
+MOST_LENSES = 6000
+"""Microimages measured, drawn evenly by chance: 60 and more in each cell of the map."""
+CELLS = 10
+"""Cells of the map along the longer side of the sensor."""
+LEAST_IN_CELL = 3
+"""Fewest microimages whose scatter a cell shows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensMap:
+    """Distance of measured microimage centres from the lattice in cells of the sensor, in pixels (column, row)."""
+
+    column_px: np.ndarray
+    """Middles of the cells along the columns [pixel], shape (columns,)."""
+    row_px: np.ndarray
+    """Middles of the cells along the rows [pixel], shape (rows,)."""
+    count: np.ndarray
+    """Microimages in each cell, shape (rows, columns)."""
+    mean_px: np.ndarray
+    """Mean of measured minus lattice [pixel], nan where a cell is empty, shape (rows, columns, 2)."""
+    rms_px: np.ndarray
+    """Root mean square distance [pixel], shape (rows, columns)."""
+    total_rms_px: float
+    """The same over all cells [pixel]."""
+    left_out: int
+    """Microimages left out: dark, dead or far off."""
+    measured: int
+    """Microimages that count."""
+
+
+def lens_map(white: np.ndarray, dark: np.ndarray | None, optics: Optics, lattice: LensLattice) -> LensMap:
+    """Measure microimages as `find_lens_array` does and compare them with a lattice.
+
+    Parameters
+    ----------
+    white : ndarray, shape (rows, columns)
+        White image [counts].
+    dark : ndarray, shape (rows, columns), or None
+        Dark frame [counts].
+    optics : Optics
+        Nominal optics.
+    lattice : LensLattice
+        Lattice of the microlenses in their plane [mm].
+    """
+    image = np.asarray(white, np.float32) - (0 if dark is None else np.asarray(dark, np.float32))
+    origin, basis = lattice_px(optics, lattice)
+    pitch = lattice.pitch_mm * (1 + optics.sensor_per_pupil) / optics.pixel_mm
+    half = math.ceil(pitch * min(0.5 * np.abs(basis).sum(0).max() / pitch, 0.71))  # of a square that holds a cell
+    margin = half + BLUR_REACH_PX + 1
+    rows, columns = image.shape
+    index = indices_inside(origin, basis, (margin, margin), (columns - 1 - margin, rows - 1 - margin))
+    if len(index) > MOST_LENSES:
+        index = index[np.sort(np.random.default_rng(0).choice(len(index), MOST_LENSES, replace=False))]
+    nodes = origin + index @ basis
+    shift, lit, microimage = measure(cut_patches(image, nodes, half), nodes, basis)
+    more, lit, _ = measure(cut_patches(image, nodes + shift, half), nodes + shift, basis, microimage)
+    shift = shift + more  # the second time from its own centre, where the linear fit is exact
+    nodes, shift = nodes[lit], shift[lit]
+    kept = robust_fit(np.column_stack([np.ones(len(nodes)), nodes / max(rows, columns)]), shift)[1]
+    return _in_cells(nodes[kept], shift[kept], image.shape, int(len(lit) - kept.sum()))
+
+
+def lattice_px(optics: Optics, lattice: LensLattice) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of microimage (0, 0) and lattice vectors on the sensor as (column, row) [pixel], X = s_l (1 + f_m/s_i)."""
+    widening = 1 + optics.sensor_per_pupil
+    origin = optics.sensor_px(np.asarray(lattice.origin_mm) * widening)
+    return origin, np.asarray(lattice.basis_mm) * widening / optics.pixel_mm
+
+
+def _in_cells(nodes: np.ndarray, shift: np.ndarray, shape: tuple[int, int], left_out: int) -> LensMap:
+    rows, columns = shape
+    edge = max(rows, columns) / CELLS
+    size = max(round(rows / edge), 1), max(round(columns / edge), 1)
+    at = np.clip(((nodes[:, ::-1] + 0.5) / (np.array(shape) / size)).astype(int), 0, np.array(size) - 1)
+    cell, cells = at[:, 0] * size[1] + at[:, 1], size[0] * size[1]
+    count = np.bincount(cell, minlength=cells)
+    few = count < LEAST_IN_CELL
+    sums = [np.bincount(cell, values, cells) for values in (shift[:, 0], shift[:, 1], (shift**2).sum(1))]
+    mean_x, mean_y, square = (np.where(few, np.nan, total / np.maximum(count, 1)) for total in sums)
+    return LensMap(
+        column_px=(np.arange(size[1]) + 0.5) * columns / size[1] - 0.5,
+        row_px=(np.arange(size[0]) + 0.5) * rows / size[0] - 0.5,
+        count=count.reshape(size),
+        mean_px=np.stack([mean_x, mean_y], axis=1).reshape(*size, 2),
+        rms_px=np.sqrt(square).reshape(size),
+        total_rms_px=float(np.sqrt((shift**2).sum(1).mean())),
+        left_out=left_out,
+        measured=len(nodes),
+    )

@@ -1,0 +1,194 @@
+"""The output folder of a run: where its files lie, that they can be written, and that one run at a time writes them."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import logging
+import os
+import shutil
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from lfpiv import warn
+from lfpiv.errors import InputError, StorageError
+
+log = logging.getLogger(__name__)
+
+FRAME_NAMES = "ab"
+"""Names of the two frames in output files, whatever the images call them."""
+
+RETIRED = ".outdated"
+"""Suffix, in place of ``.nc``, of results of a pair that failed since its images changed."""
+
+MIB = 1 << 20
+
+
+@dataclass(frozen=True)
+class Folder:
+    """Where a run keeps its files."""
+
+    path: Path
+
+    @property
+    def calibration(self) -> Path:
+        """The calibration of all cameras."""
+        return self.path / "calibration.h5"
+
+    @property
+    def self_calibration(self) -> Path:
+        """The calibration corrected for movements of the cameras."""
+        return self.path / "self_calibration.h5"
+
+    @property
+    def summary(self) -> Path:
+        """Machine-readable figures of the run."""
+        return self.path / "summary.json"
+
+    @property
+    def report(self) -> Path:
+        """The page for people."""
+        return self.path / "report.html"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the run that writes here; names it."""
+        return self.path / ".lock"
+
+    @property
+    def shared(self) -> Path:
+        """What the workers of a run share while it lasts."""
+        return self.path / ".shared"
+
+    def vectors(self, pair: int) -> Path:
+        """Vectors of one pair."""
+        return self.path / "vectors" / f"pair_{pair:04d}.nc"
+
+    def volume(self, pair: int, frame: int) -> Path:
+        """Volume of one frame (0 or 1) of a pair."""
+        return self.path / "volumes" / f"pair_{pair:04d}_{FRAME_NAMES[frame]}.nc"
+
+    def sweep(self) -> None:
+        """Remove what a killed run left: half-written files and what its workers shared. Only under the lock."""
+        for place in (self.path, self.vectors(0).parent, self.volume(0, 0).parent):
+            for path in place.glob(".*.tmp"):
+                path.unlink(missing_ok=True)
+        shutil.rmtree(self.shared, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep every other run from writing here; the lock ends with the process, however that ends.
+
+        Raises
+        ------
+        InputError
+            If another run holds the folder; names its process.
+        """
+        file = _locked(self.lock)
+        try:
+            yield
+        finally:
+            if file is not None:
+                with contextlib.suppress(OSError):  # while it is held: nobody else can have it open and locked
+                    self.lock.unlink()
+                os.close(file)
+
+
+def _locked(path: Path) -> int | None:
+    """Open and lock a file; None where the file system knows no locks."""
+    import fcntl
+
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = os.pread(file, 1000, 0)
+            os.close(file)
+            if error.errno not in (errno.EAGAIN, errno.EACCES):
+                warn.warn(log, "%s: this file system knows no locks: start no second run on this folder", path.parent)
+                return None
+            raise InputError(
+                f"{path.parent}: expected a folder that no other run writes to, found it held by {_named(holder)}. "
+                "Wait for its end, stop it, or choose another --out. `lfpiv report` may look at it meanwhile."
+            ) from None
+        try:
+            same = os.path.samestat(os.fstat(file), os.stat(path))
+        except FileNotFoundError:
+            same = False
+        if same:
+            break
+        os.close(file)  # its holder removed it between our opening and locking it
+    os.ftruncate(file, 0)
+    since = time.strftime("%Y-%m-%d %H:%M:%S")
+    os.pwrite(file, json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": since}).encode(), 0)
+    return file
+
+
+def _named(holder: bytes) -> str:
+    try:
+        found = json.loads(holder)
+        return f"process {found['process']} on {found['host']} since {found['since']}"
+    except (ValueError, KeyError, TypeError):  # it is about to write its name
+        return "another process"
+
+
+def retire(path: Path) -> Path:
+    """Rename a result so that nobody takes it for one, and return its new path; the next success removes it."""
+    return path.replace(path.with_suffix(RETIRED))
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what goes wrong while a result is written into a StorageError that says how to go on."""
+    try:
+        yield
+    except StorageError:
+        raise
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        free = ""
+        with contextlib.suppress(OSError):
+            free = f", {shutil.disk_usage(path.parent).free / MIB:,.0f} MiB free there"
+        raise StorageError(
+            f"{path}: cannot be written: {reason}{free}. What is finished is kept and whole; mend that, and the same "
+            "command goes on from there."
+        ) from error
+
+
+def make_writable(path: Path) -> list[Path]:
+    """Make a folder and check that it can be written; return the folders made, innermost first."""
+    made = []
+    try:
+        for parent in (path, *path.parents):
+            if parent.exists():
+                break
+            made.append(parent)
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / f".write-test-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        for parent in made:
+            with contextlib.suppress(OSError):
+                parent.rmdir()
+        raise InputError(
+            f"{path}: expected an output folder that can be written, found: {(error.strerror or str(error)).lower()}. "
+            "Choose another one with --out."
+        ) from None
+    folder = Folder(path)
+    for place in (folder.vectors(0).parent, folder.volume(0, 0).parent):
+        if place.exists() and not place.is_dir():
+            raise InputError(
+                f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
+            )
+    for place in (folder.calibration, folder.summary, folder.report):
+        if place.is_dir():
+            raise InputError(
+                f"{place}: expected a place for a file, found a folder. Remove it or choose another --out."
+            )
+    return made

@@ -1,0 +1,367 @@
+"""Files of a run: one writer, reader and validator of vectors and volumes. A finished name is the resume marker."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import importlib.metadata
+import io
+import json
+import math
+import os
+import platform
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.errors import InputError
+from lfpiv.experiment.davis import split_frame
+from lfpiv.version import __version__
+
+SCHEMA_VERSION = 3
+"""Version of the form of the files; readers refuse newer ones. 2: the group has dimensions of its own; 3: it holds
+``profile_z``, which older ones lack."""
+
+VECTOR_UNITS = {
+    "u": "m/s",
+    "v": "m/s",
+    "w": "m/s",
+    "displacement_x": "voxel",
+    "displacement_y": "voxel",
+    "displacement_z": "voxel",
+    "valid": "1",
+    "peak_ratio": "1",
+    "uncertainty": "voxel",
+}
+"""Variables of a vector dataset and their units."""
+
+ROUNDING = 1e-5
+"""Largest difference of a velocity from what its displacement tells, relative or in voxels: both are rounded to single
+precision, and so may be what a user computes from them."""
+
+RECONSTRUCTION = "reconstruction"
+"""NetCDF group beside the vectors of a pair: projections, profiles and residuals of its two volumes."""
+
+_AXES = ("z", "y", "x")
+_GROUP_AXES = {axis: f"voxel_{axis}" for axis in _AXES}  # the group's axes in the file, where z, y, x are the vectors'
+_DESCRIPTIONS: dict[str, dict[str, Any]] = {
+    "z": {"axis": "Z"},
+    "y": {"axis": "Y"},
+    "x": {"axis": "X"},
+    "valid": {
+        "standard_name": "quality_flag",
+        "flag_values": np.array([0, 1], np.int8),
+        "flag_meanings": "replaced measured",
+    },
+}  # attributes of the CF conventions, which plotting and geometry tools look for
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a scratch path in the folder of `path`; renamed to `path` at the end, removed on any failure.
+
+    The path is new each time, so that two processes may write one file; what a killed one leaves ends in ``.tmp``.
+    """
+    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield scratch
+        with scratch.open("rb") as file:
+            os.fsync(file.fileno())  # the name must not outlive a power failure without its bytes
+        os.replace(scratch, path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def write_bytes(content: bytes | memoryview, path: Path) -> None:
+    """Write a file, whole or not at all; HDF5 files too: HDF5's own writing crashes the process on a full disk."""
+    with replacing(path) as scratch:
+        scratch.write_bytes(content)
+
+
+def write_text(text: str, path: Path) -> None:
+    """Write a text file, whole or not at all."""
+    with replacing(path) as scratch:
+        scratch.write_text(text, "utf-8")
+
+
+def write_json(value: Any, path: Path) -> None:
+    """Write a JSON file, whole or not at all; NaN and infinity become null."""
+    write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n", path)
+
+
+def plain(value: Any) -> Any:
+    """Turn arrays, NumPy numbers, tuples, paths and non-finite numbers into what JSON knows."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def settings_hash(**parts: Any) -> str:
+    """Short hash of everything a result depends on; the order of keys does not matter."""
+    text = json.dumps(plain(parts), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def content_hash(paths: Iterable[Path]) -> str:
+    """Hash of the bytes of several images, in order; a frame of a file that holds several counts, too."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in paths:
+        image, frame = split_frame(path)
+        with image.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+        digest.update(b"end of file" + frame.encode())
+    return digest.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package, of Python and of the libraries its numbers depend on."""
+    names = ("numpy", "scipy", "taichi", "warp-lang", "xarray", "opencv-python-headless", "scikit-learn")
+    found = {"lfpiv": __version__, "python": platform.python_version()}
+    for name in names:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
+
+
+OF_IMAGES = ("structure", "camera_gain", "light_outside")
+"""What is known of each camera's image: how far light of near pixels correlates, the camera's brightness relative to
+the brightest one, and the part of its light in pixels that no voxel lights."""
+
+
+def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
+    """Condense the volumes of a pair to what a report shows: maximum projections, brightness and residual history.
+
+    Parameters
+    ----------
+    volumes : dict
+        Frame name -> volume (z, y, x) with ``residual`` (one number per iteration) and ``stop`` in its attributes, and
+        ``cameras`` with what is known of their images by the names of `OF_IMAGES`.
+
+    Returns
+    -------
+    Dataset
+        ``projection_z`` (frame, y, x), ``projection_y`` (frame, z, x), ``projection_x`` (frame, z, y) [counts],
+        ``profile_z`` (frame, z), the mean brightness of each plane of voxels [counts],
+        ``residual`` (frame, iteration), ``stop`` (frame) and those of `OF_IMAGES` that are known (frame, camera).
+    """
+    frames = list(volumes)
+    first = volumes[frames[0]]
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray | list[str]]] = {}
+    for axis in _AXES:
+        kept = tuple(name for name in _AXES if name != axis)
+        stack = np.stack([volume.max(axis).transpose(*kept).values for volume in volumes.values()])
+        variables[f"projection_{axis}"] = (("frame", *kept), stack.astype(np.float32))
+    profiles = np.stack([volume.mean(["y", "x"], dtype=float).values for volume in volumes.values()])
+    variables["profile_z"] = (("frame", "z"), profiles.astype(np.float32))
+    histories = [np.atleast_1d(np.asarray(volume.attrs["residual"], float)) for volume in volumes.values()]
+    residual = np.full((len(frames), max(map(len, histories))), np.nan)
+    for row, history in zip(residual, histories, strict=True):
+        row[: len(history)] = history
+    variables["residual"] = (("frame", "iteration"), residual)
+    variables["stop"] = (("frame",), [str(volume.attrs["stop"]) for volume in volumes.values()])
+    coordinates: dict[str, Any] = {"frame": frames}
+    if "cameras" in first.attrs:
+        cameras = first.attrs["cameras"]
+        coordinates["camera"] = json.loads(cameras) if isinstance(cameras, str) else list(cameras)
+        for name in OF_IMAGES:
+            if name in first.attrs:
+                rows = [np.atleast_1d(np.asarray(volume.attrs[name], float)) for volume in volumes.values()]
+                variables[name] = (("frame", "camera"), np.stack(rows))
+    coordinates |= {axis: (axis, first[axis].values, {"units": "mm"}) for axis in _AXES}
+    return xr.Dataset(variables, coordinates)
+
+
+def check_vectors(vectors: xr.Dataset) -> None:
+    """Check the form of a vector dataset.
+
+    Raises
+    ------
+    ValueError
+        If a variable, a coordinate, a unit or the attribute ``dt_s`` or ``voxel_mm`` is missing or wrong, or u, v, w do
+        not follow from the displacements.
+    """
+    for axis in _AXES:
+        if axis not in vectors.coords or vectors[axis].dims != (axis,):
+            raise ValueError(f"vectors: expected the coordinate {axis} in mm, found {list(vectors.coords)}.")
+        if (unit := vectors[axis].attrs.get("units")) != "mm":
+            raise ValueError(f"vectors: expected the coordinate {axis} in mm, found it in {unit or 'no unit'}.")
+    for name, unit in VECTOR_UNITS.items():
+        if name not in vectors:
+            raise ValueError(f"vectors: expected the variable {name!r}, found {list(vectors.data_vars)}.")
+        if vectors[name].dims[-3:] != _AXES:
+            raise ValueError(f"vectors: expected {name!r} over (z, y, x), found {vectors[name].dims}.")
+        if vectors[name].attrs.get("units", "1") != unit:
+            raise ValueError(f"vectors: expected {name!r} in {unit}, found {vectors[name].attrs.get('units')}.")
+    if vectors["valid"].dtype != bool:
+        raise ValueError(f"vectors: expected 'valid' to be boolean, found {vectors['valid'].dtype}.")
+    if not vectors.attrs.get("dt_s", 0) > 0:
+        raise ValueError(f"vectors: expected the attribute dt_s > 0, found {vectors.attrs.get('dt_s')}.")
+    voxel_mm = np.asarray(vectors.attrs.get("voxel_mm", ()))
+    if voxel_mm.shape != (3,) or voxel_mm.dtype.kind not in "fiu" or not (voxel_mm > 0).all():
+        found = vectors.attrs.get("voxel_mm")
+        raise ValueError(f"vectors: expected the attribute voxel_mm, edges (z, y, x) > 0, found {found}.")
+    for name, axis, edge_mm in zip("wvu", _AXES, voxel_mm, strict=True):
+        displacement = vectors[f"displacement_{axis}"].values
+        moved = vectors[name].values / (1e-3 * edge_mm / vectors.attrs["dt_s"])
+        wrong = ~np.isclose(moved, displacement, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
+        if wrong.any():
+            raise ValueError(
+                f"vectors: expected {name!r} to be 'displacement_{axis}' times voxel_mm / dt_s, found {wrong.sum()} of "
+                f"{wrong.size} that are not. Change both, or keep what you derive under another name."
+            )
+
+
+def write_vectors(
+    vectors: xr.Dataset, path: Path, *, attributes: Mapping[str, Any], reconstruction: xr.Dataset | None = None
+) -> None:
+    """Write the vectors of one pair as NetCDF4, whole or not at all.
+
+    Parameters
+    ----------
+    vectors : Dataset
+        Dims z, y, x [mm]; the variables of `VECTOR_UNITS`.
+    path : Path
+        Target; an existing file is replaced.
+    attributes : dict
+        Added to the dataset's attributes: settings, their hash, seconds.
+    reconstruction : Dataset, optional
+        From `build_reconstruction`; stored as the group "reconstruction".
+
+    Raises
+    ------
+    ValueError
+        If the dataset does not have the form `check_vectors` asks for.
+    """
+    check_vectors(vectors)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    groups = {"": _packed(vectors, {**attributes, "versions": versions()})}
+    if reconstruction is not None:
+        groups[RECONSTRUCTION] = _packed(reconstruction.rename(_GROUP_AXES), {})
+    _write(groups, path)
+
+
+def read_vectors(path: Path) -> xr.Dataset:
+    """Read the vectors of one pair into memory.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, unreadable, of a newer schema, or no vector dataset.
+    """
+    vectors = _read(path, None)
+    try:
+        check_vectors(vectors)
+    except ValueError as error:
+        raise InputError(f"{path}: {error} Remove the file and run again.") from None
+    return vectors
+
+
+def read_reconstruction(path: Path) -> xr.Dataset | None:
+    """Read what `build_reconstruction` left beside the vectors of a pair; None where there is nothing."""
+    try:
+        stored = _read(path, RECONSTRUCTION)
+    except InputError:
+        return None
+    return stored.rename({name: axis for axis, name in _GROUP_AXES.items() if name in stored.dims})
+
+
+def write_volume(volume: xr.DataArray, path: Path, *, attributes: Mapping[str, Any]) -> None:
+    """Write one volume (z, y, x) [counts] as NetCDF4, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write({"": _packed(volume.rename("intensity").to_dataset(), {**attributes, "versions": versions()})}, path)
+
+
+def read_volume(path: Path) -> xr.DataArray:
+    """Read one volume into memory; raises InputError as `read_vectors` does."""
+    dataset = _read(path, None)
+    if "intensity" not in dataset or dataset["intensity"].dims != _AXES:
+        raise InputError(f"{path}: expected a volume 'intensity' over (z, y, x), found {list(dataset.data_vars)}.")
+    return dataset["intensity"]
+
+
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Read the attributes of a finished NetCDF or HDF5 file."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        found = dict(file.attrs)
+    return {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in found.items()}
+
+
+def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, Any] | None = None) -> None:
+    """Write a dataset of any form as NetCDF4, whole or not at all; attributes that NetCDF does not know become JSON.
+
+    Raises
+    ------
+    OSError
+        If the disk has less space than the dataset takes uncompressed: HDF5 does not survive a disk that fills up.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if dataset.nbytes > shutil.disk_usage(path.parent).free:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    with replacing(path) as scratch:  # straight to disk: it may be larger than the memory
+        _packed(dataset, attributes or {}).to_netcdf(scratch, engine="h5netcdf")
+
+
+def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
+    """Give a dataset the attributes and the compression it has in a file."""
+    dataset = dataset.copy()
+    own = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
+    dataset.attrs = {key: _attribute(value) for key, value in own.items()}
+    packed = {"zlib": True, "complevel": 1, "shuffle": True}
+    for name, item in dataset.variables.items():
+        described = {**item.attrs, **_DESCRIPTIONS.get(str(name), {})}
+        item.attrs = {key: _attribute(value) for key, value in described.items()}
+        item.encoding = packed if item.ndim >= 2 and item.dtype.kind in "fiub" else {}
+    return dataset
+
+
+def _write(groups: Mapping[str, xr.Dataset], path: Path) -> None:
+    """Write datasets as the groups of a NetCDF4 file; "" is its root. Put together in memory: see `write_bytes`."""
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    content = io.BytesIO()
+    with h5netcdf.File(content, "w") as file:
+        for group, dataset in groups.items():
+            dataset.dump_to_store(H5NetCDFStore(file.create_group(group) if group else file))
+    write_bytes(content.getbuffer(), path)
+
+
+def _attribute(value: Any) -> Any:
+    """Put a value into the form of a NetCDF attribute: numbers, their lists and text as they are, else JSON."""
+    if isinstance(value, (str, int, float, np.number)) and not isinstance(value, bool):
+        return value
+    if isinstance(value, (list, tuple, np.ndarray)) and len(value) > 0:
+        numbers = value if isinstance(value, np.ndarray) else list(value)
+        if all(isinstance(item, (int, float, np.number)) and not isinstance(item, bool) for item in numbers):
+            return np.asarray(numbers)
+    return json.dumps(plain(value))
+
+
+def _read(path: Path, group: str | None) -> xr.Dataset:
+    if not path.is_file():
+        raise InputError(f"{path}: expected a NetCDF file of a run, found no such file. Run the step that writes it.")
+    try:
+        dataset = xr.load_dataset(path, engine="h5netcdf", group=group)
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: expected a NetCDF4 file, found {error}. Remove it and run again.") from None
+    version = dataset.attrs.get("schema_version", 0)
+    if not 1 <= version <= SCHEMA_VERSION:
+        raise InputError(f"{path}: expected schema version 1 to {SCHEMA_VERSION}, found {version}. Update lfpiv.")
+    return dataset

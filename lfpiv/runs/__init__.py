@@ -1,0 +1,1 @@
+"""One run of an experiment: its steps in order, pair by pair, in one process or in several."""

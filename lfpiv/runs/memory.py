@@ -1,0 +1,198 @@
+"""How much memory a run needs and how much there is."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Experiment
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.cameras import Calibration
+
+log = logging.getLogger(__name__)
+
+MIB = 1 << 20
+GIB = 1 << 30
+
+BYTES_PER_VOXEL = 64
+"""Volume-sized float32 arrays held at once at the least: two frames, and SMART's or the correlation's work on them."""
+
+BYTES_PER_VOXEL_AND_CAMERA = 64
+"""Ray model of a voxel in one camera: chief ray, slopes, second-order terms, widths."""
+
+BYTES_PER_PIXEL = 64
+"""Per sensor pixel: images, their light-field blocks, the decoder's arrays."""
+
+BASE_BYTES = GIB // 2
+"""Python, its libraries and compiled kernels."""
+
+GROUPS = Path("/sys/fs/cgroup")
+"""Control groups of the machine, or of the container."""
+
+OWN_GROUPS = Path("/proc/self/cgroup")
+"""Names those that this process belongs to."""
+
+
+def least_bytes(experiment: Experiment) -> int:
+    """Estimate the least memory a run of the experiment takes [byte], from the volume and the sensors alone."""
+    cameras = len(experiment.cameras)
+    pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
+    voxel_bytes = BYTES_PER_VOXEL + BYTES_PER_VOXEL_AND_CAMERA * cameras
+    return BASE_BYTES + voxel_bytes * experiment.grid.size + BYTES_PER_PIXEL * pixels
+
+
+def weights_bytes(experiment: Experiment) -> int:
+    """Estimate the memory of the weights [byte] from the nominal rig, before any image is read; logs the upper end."""
+    from lfpiv.weights.operator import estimate_memory
+
+    cameras, grid, form = _nominal_cameras(experiment), experiment.grid, experiment.compute.weights_form
+    weights = estimate_memory(cameras, grid, form)
+    if form == "auto" and (most := estimate_memory(cameras, grid, "pixels")) > weights:
+        log.info("memory: %.1f GiB for weights, up to %.1f GiB where rays bend", weights / GIB, most / GIB)
+    return weights
+
+
+def worker_bytes(experiment: Experiment) -> int:
+    """Estimate what one worker process takes beside the weights, which all share [byte]."""
+    pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
+    return BASE_BYTES + BYTES_PER_VOXEL * experiment.grid.size + BYTES_PER_PIXEL * pixels
+
+
+def run_bytes(experiment: Experiment, weights: int, workers: int) -> int:
+    """Estimate what a run takes [byte]: alone, or the larger of building the weights and working with them together."""
+    build = least_bytes(experiment) + weights
+    if workers == 1:
+        return build
+    return max(build, BASE_BYTES + weights + workers * worker_bytes(experiment))
+
+
+def fitting_workers(experiment: Experiment, weights: int, workers: int) -> int:
+    """Return how many of so many workers fit into the memory, at least 1."""
+    limit = allowed_bytes(experiment)
+    while workers > 1 and run_bytes(experiment, weights, workers) > limit:
+        workers -= 1
+    return workers
+
+
+def allowed_bytes(experiment: Experiment) -> int:
+    """Return the memory a run may take [byte]: what is available, and what ``compute.memory_gib`` allows."""
+    allowed = experiment.compute.memory_gib
+    return available_bytes() if allowed is None else min(int(allowed * GIB), available_bytes())
+
+
+def available_bytes() -> int:
+    """Return the memory this process may take [byte]: what the machine has free or its control groups allow."""
+    free = _meminfo("MemAvailable")
+    if free is None:
+        free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
+    return max(0, min([free, *_left_in_groups()]))
+
+
+def left_for_weights(experiment: Experiment) -> int:
+    """Return the memory that the weights may take [byte], beside volumes that are still to come."""
+    left = available_bytes() - BYTES_PER_VOXEL * experiment.grid.size
+    if experiment.compute.memory_gib is not None:
+        left = min(left, int(experiment.compute.memory_gib * GIB) - least_bytes(experiment))
+    return left
+
+
+def require(needed: int, experiment: Experiment, what: str) -> None:
+    """Refuse work that needs more memory than there is, or than ``compute.memory_gib`` allows.
+
+    Raises
+    ------
+    InputError
+        With both numbers and the volume's size.
+    """
+    allowed, limit = experiment.compute.memory_gib, allowed_bytes(experiment)
+    if needed <= limit:
+        return
+    origin = "compute.memory_gib allows" if allowed is not None and limit == int(allowed * GIB) else "are available"
+    shape = " x ".join(map(str, experiment.grid.shape))
+    raise InputError(
+        f"{experiment.path}: volume: {what} {shape} voxels (z, y, x) and {len(experiment.cameras)} camera(s) need at "
+        f"least {needed / GIB:,.1f} GiB of memory, {limit / GIB:,.1f} GiB {origin}. Raise volume.voxel_mm or shrink "
+        "volume.size_mm."
+    )
+
+
+def peak_mib() -> float:
+    """Return the largest memory this process has held so far [MiB]."""
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / MIB if sys.platform == "darwin" else peak / 1024
+
+
+def _meminfo(key: str) -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(key + ":")), None)
+
+
+def _left_in_groups() -> Iterator[int]:
+    """Memory that each control group of this process with a limit, its own one or one above, leaves it [byte].
+
+    Files in the page cache count as used there, but the kernel drops them when memory is asked for.
+    """
+    names = ("memory.max", "memory.current", "inactive_file", "active_file")
+    older = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file", "total_active_file")
+    for controller, place, files in (("", GROUPS, names), ("memory", GROUPS / "memory", older)):
+        for group in _groups(controller, place):
+            yield _left_in(group, files)
+
+
+def _groups(controller: str, place: Path) -> list[Path]:
+    """Folders of this process's group and of those above it up to `place`; controllers of version 2 have no name."""
+    try:
+        lines = [line.split(":", 2) for line in OWN_GROUPS.read_text().splitlines()]
+    except OSError:
+        lines = []
+    own = next((group for _, names, group in lines if controller in names.split(",")), "/")
+    if ".." in own:  # outside of what a container sees
+        own = "/"
+    path = place / own.strip("/")
+    return [path, *(parent for parent in path.parents if parent.is_relative_to(place))]
+
+
+def _left_in(group: Path, names: tuple[str, str, str, str]) -> int:
+    """Memory that one group leaves its processes [byte]; no end of it where there is no such group, or no limit."""
+    limit, used, *dropped = names
+    try:
+        left = int((group / limit).read_text()) - int((group / used).read_text())
+    except (OSError, ValueError):  # not there, or "max"
+        return sys.maxsize
+    with contextlib.suppress(OSError):
+        lines = (line.split() for line in (group / "memory.stat").read_text().splitlines())
+        left += sum(int(value) for name, value in lines if name in dropped)
+    return left
+
+
+def _nominal_cameras(experiment: Experiment) -> Calibration:
+    """Return the rig as the data sheets have it: no image is read, nothing found."""
+    from lfpiv.calibration.cameras import CalibratedCamera, Calibration
+    from lfpiv.calibration.thin_lens_model import thin_lens_model
+    from lfpiv.geometry.optics import LensLattice
+
+    cameras = {}
+    for setup in experiment.cameras:
+        pitch, half = setup.optics.microlens_pitch_mm, setup.optics.microlens_pitch_mm / 2
+        second = (half, half * 3**0.5) if setup.optics.layout == "hexagonal" else (0.0, pitch)
+        cameras[setup.name] = CalibratedCamera(
+            name=setup.name,
+            optics=setup.optics,
+            lattice=LensLattice(origin_mm=(0.0, 0.0), basis_mm=((pitch, 0.0), second), layout=setup.optics.layout),
+            decoder=None,  # type: ignore[arg-type]  # there is no image yet
+            baseline=thin_lens_model(setup.optics, setup.nominal_angle_deg),
+        )
+    return Calibration(cameras)

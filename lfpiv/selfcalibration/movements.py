@@ -1,0 +1,212 @@
+"""Volume self-calibration: the particles tell whether the cameras still stand as they did before the board.
+
+Each camera alone shows every particle, drawn out along its own view. Where two cameras' volumes match best is their
+disparity [1]. A camera that was knocked has moved as a rigid body, so six numbers per camera explain the disparities of
+the whole volume; what all cameras share cannot be told from a moved volume and stays as the board had it.
+Triangulation, which does this for focused images, does not work for light-field images; correlating volumes does.
+
+References
+----------
+[1] Wieneke, Volume self-calibration for 3D particle image velocimetry, Exp. Fluids 45, 549 (2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lfpiv.calibration.camera import Calibration
+from lfpiv.geometry.optics import Grid
+from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, Disparity, disparities, unlinked
+from lfpiv.weights.operator import build_weights
+
+PRIOR_MM, PRIOR_RAD = 0.3, 0.02
+"""Movements that count as one standard deviation: what the particles do not tell stays near none."""
+LEAST_STD_VOXEL, ASSUMED_STD_VOXEL = 0.02, 0.1
+"""Least standard deviation of a disparity in its sharpest direction, and the one assumed where too few tell it."""
+CONVERGED_VOXEL = 0.05
+"""A round that moves cameras against each other by less, as far as their views tell, ends the self-calibration."""
+ROUNDS = 4
+FITS, OUTLIER = 10, 2.0
+"""Solutions of a fit, and how many times as far off as most a disparity counts a quarter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Movement:
+    """How a camera moved since its calibration, as a rigid movement of the points that it sees.
+
+    What lies at x it sees where its mapping has ``rotation (x - centre) + centre + shift``.
+    """
+
+    shift_mm: np.ndarray
+    """Along x, y, z, shape (3,) [mm]."""
+    rotation_rad: np.ndarray
+    """Rotation vector about `centre_mm`, shape (3,) [rad]."""
+    centre_mm: np.ndarray
+    """Centre of the volume, shape (3,) [mm]."""
+    std: np.ndarray
+    """Standard errors of shift [mm] and rotation [rad], shape (6,)."""
+
+    @property
+    def affine(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation matrix R and shift t [mm] of the same movement as ``R x + t``."""
+        rotation = Rotation.from_rotvec(self.rotation_rad).as_matrix()
+        return rotation, self.centre_mm + self.shift_mm - rotation @ self.centre_mm
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        """Move points (n, 3) [mm]."""
+        rotation, shift = self.affine
+        moved: np.ndarray = points_mm @ rotation.T + shift
+        return moved
+
+    @classmethod
+    def none(cls, grid: Grid) -> Movement:
+        """Return that of a camera that stands still."""
+        return cls(shift_mm=np.zeros(3), rotation_rad=np.zeros(3), centre_mm=_centre_mm(grid), std=np.zeros(6))
+
+    def after(self, step: Movement) -> Movement:
+        """Return the movement that begins with a step and goes on with this one."""
+        outer, inner = (Rotation.from_rotvec(one.rotation_rad) for one in (self, step))
+        shift = self(step(self.centre_mm[None]))[0] - self.centre_mm
+        return replace(self, shift_mm=shift, rotation_rad=(outer * inner).as_rotvec())
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfCalibration:
+    """What particles tell of a calibration, and the calibration that explains them."""
+
+    calibration: Calibration
+    """Corrected."""
+    movements: dict[str, Movement]
+    """Camera name -> how it moved; the mean of all cameras is none."""
+    before: tuple[Disparity, ...]
+    """Disparities with the calibration as it was."""
+    after: tuple[Disparity, ...]
+    """Disparities with the corrected one."""
+    apart_mm: tuple[float, ...]
+    """How far apart the cameras were, as `explained_mm` has it: before, and after each correction."""
+
+
+def self_calibrate(
+    calibration: Calibration,
+    grid: Grid,
+    images: Sequence[Mapping[str, np.ndarray]],
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> SelfCalibration:
+    """Correct a calibration for movements of its cameras, by images of particles.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of two cameras or more.
+    grid : Grid
+        The volume.
+    images : sequence of dict
+        Particle images of some instants, camera name -> image (rows, columns), background removed.
+    progress : callable, optional
+        Called with the finished fraction of the most rounds that there may be.
+
+    Returns
+    -------
+    SelfCalibration
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two cameras, no images, or a camera shows nothing that another one shows.
+    """
+    if len(calibration.cameras) < 2 or not images:
+        raise ValueError(
+            f"calibration, images: expected two cameras or more and images, got {len(calibration.cameras)} cameras and "
+            f"images of {len(images)} instants."
+        )
+    corrected = calibration
+    movements = {name: Movement.none(grid) for name in calibration.cameras}
+    found, apart = [], list[float]()
+    for number in range(ROUNDS + 1):
+
+        def tell(fraction: float, number: int = number) -> None:
+            if progress is not None:
+                progress((number + fraction) / (ROUNDS + 1))
+
+        found.append(disparities(build_weights(corrected, grid), images, tell))
+        alone = unlinked(found[-1], movements)
+        if alone:
+            raise ValueError(
+                f"images: expected particles that {' and '.join(alone)} and another camera show within {SEARCH_VOXEL} "
+                "voxels of each other, found none: it moved by more, its images are of other instants, or show too few."
+            )
+        steps = fit_movements(found[-1], list(movements), grid)
+        apart.append(explained_mm(found[-1], steps, grid))
+        if len(found) > ROUNDS or apart[-1] < CONVERGED_VOXEL * grid.voxel_mm:
+            break
+        movements = {name: movements[name].after(step) for name, step in steps.items()}
+        corrected = Calibration(
+            {name: calibration.cameras[name].moved(*move.affine) for name, move in movements.items()}
+        )
+    return SelfCalibration(
+        calibration=corrected,
+        movements={name: replace(move, std=steps[name].std) for name, move in movements.items()},
+        before=found[0],
+        after=found[-1],
+        apart_mm=tuple(apart),
+    )
+
+
+def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid) -> dict[str, Movement]:
+    """Find the rigid movements of cameras that explain disparities, by weighted least squares.
+
+    A disparity is the difference of two cameras' movements; its weight is its peak's sharpness, so directions that the
+    views do not tell hardly count, and its scale is what the fit leaves over. Where no disparity tells movements, they
+    are held near none by `PRIOR_MM` and `PRIOR_RAD`; so the mean of all cameras, which none tells, is none.
+    """
+    rows = [_row(one, cameras, grid) for one in found]
+    count, least = len(cameras), LEAST_STD_VOXEL * grid.voxel_mm
+    prior = np.diag(np.tile(np.repeat([PRIOR_MM**-2.0, PRIOR_RAD**-2.0], 3), count))
+    variance, trust = (ASSUMED_STD_VOXEL * grid.voxel_mm) ** 2, np.ones(len(found))
+    for _ in range(FITS):  # each solution tells the variance, and which disparities are chance peaks
+        information, pull = prior.copy(), np.zeros(6 * count)
+        for one, row, part in zip(found, rows, trust / variance, strict=True):
+            information += part * row.T @ one.weight @ row
+            pull += part * row.T @ one.weight @ one.shift_mm
+        covariance = np.linalg.inv(information)
+        values = covariance @ pull
+        left = np.array([one.told_mm(one.shift_mm - row @ values) for one, row in zip(found, rows, strict=True)])
+        scale = max(1.5 * float(np.median(left)), least)
+        trust = (1 + (left / (OUTLIER * scale)) ** 2) ** -2.0  # Geman and McClure
+        free = 3 * trust.sum() - 6 * (count - 1)
+        if free > 0:
+            variance = max(float(trust @ left**2) / free, least**2)
+    apart = np.kron(np.eye(count) - 1 / count, np.eye(6))  # errors of what all cameras share: none, by definition
+    std = np.sqrt(np.diag(apart @ covariance @ apart.T)).reshape(-1, 6)
+    centre = _centre_mm(grid)
+    return {
+        name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=centre, std=std[number])
+        for number, (name, value) in enumerate(zip(cameras, values.reshape(-1, 6), strict=True))
+    }
+
+
+def explained_mm(found: Sequence[Disparity], movements: Mapping[str, Movement], grid: Grid) -> float:
+    """Return the root mean square of the disparities that movements explain, as far as the views tell [mm]."""
+    values = np.concatenate([np.append(move.shift_mm, move.rotation_rad) for move in movements.values()])
+    told = [one.told_mm(_row(one, list(movements), grid) @ values) for one in found]
+    return float(np.sqrt(np.mean(np.square(told))))
+
+
+def _row(disparity: Disparity, cameras: Sequence[str], grid: Grid) -> np.ndarray:
+    """Disparity as a linear function of all cameras' shifts and rotations, shape (3, 6 cameras)."""
+    x, y, z = disparity.centre_mm - _centre_mm(grid)
+    movement = np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
+    row = np.zeros((3, 6 * len(cameras)))
+    for name, sign in zip(disparity.cameras, (-1, 1), strict=True):
+        at = 6 * cameras.index(name)
+        row[:, at : at + 6] = sign * movement
+    return row
+
+
+def _centre_mm(grid: Grid) -> np.ndarray:
+    return np.array([grid.axis_mm(axis)[[0, -1]].mean() for axis in (2, 1, 0)])

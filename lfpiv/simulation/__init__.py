@@ -1,0 +1,1 @@
+"""Simulated experiments with known truth: particles, flows, cameras and their images."""

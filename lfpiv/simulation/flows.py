@@ -1,0 +1,348 @@
+"""Flows with known displacement: what a simulated pair of frames moves by, and its mean over interrogation windows.
+
+A flow is a frozen value called with points (n, 3) [mm]; it returns the displacement (n, 3) [mm] from the first frame to
+the second of a particle that passes the point midway in time. Frames at point -+ displacement/2 are therefore
+consistent with the flow to second order. Points and displacements are ordered (x, y, z).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.spatial import cKDTree
+
+from lfpiv.experiment.settings import Flag, Number, Positive, Table
+from lfpiv.simulation.swirl import injector_profiles
+from lfpiv.simulation.tracers import TracerMap, interpolate, load_tracers
+from lfpiv.simulation.turbulence import TurbulentFlow
+
+Point = tuple[Number, Number, Number]
+Axis = Literal["x", "y", "z"]
+
+LAMB_OSEEN = 1.2564312086261697
+"""Root a of exp(a) = 1 + 2 a: with it the tangential displacement of a Lamb-Oseen vortex peaks at the core radius."""
+
+CHUNK = 20_000
+"""Points evaluated at once, which bounds the memory of quadratures."""
+
+
+class Uniform(Table):
+    """The same displacement everywhere."""
+
+    kind: Literal["uniform"] = "uniform"
+    displacement_mm: Point
+    """Displacement (x, y, z) [mm]."""
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) at points (n, 3) [mm]."""
+        return np.broadcast_to(np.asarray(self.displacement_mm, float), _points(points_mm).shape).copy()
+
+
+class Shear(Table):
+    """Displacement along one axis, proportional to the distance along another."""
+
+    kind: Literal["shear"] = "shear"
+    along: Axis
+    """Axis of the displacement."""
+    across: Axis
+    """Axis along which it grows."""
+    rate: Number
+    """Displacement per distance [mm/mm]."""
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    """Point at rest (x, y, z) [mm]."""
+
+    @model_validator(mode="after")
+    def _two_axes(self) -> Shear:
+        if self.along == self.across:
+            raise ValueError("two different axes in `along` and `across`")
+        return self
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) at points (n, 3) [mm]."""
+        points_mm = _points(points_mm)
+        across, along = "xyz".index(self.across), "xyz".index(self.along)
+        displacement = np.zeros(points_mm.shape)
+        displacement[:, along] = self.rate * (points_mm[:, across] - self.centre_mm[across])
+        return displacement
+
+
+class Ring(Table):
+    """Ring vortex whose core line is a circle parallel to the x-y plane; the fluid inside the ring moves along -z.
+
+    The magnitude is peak (r/core) exp(1 - r/core), r the distance from the core line; a negative peak turns it round.
+    """
+
+    kind: Literal["ring"] = "ring"
+    radius_mm: Positive
+    """Radius of the core line [mm]."""
+    core_mm: Positive
+    """Distance from the core line where the displacement is largest [mm]."""
+    peak_mm: Number
+    """Largest displacement [mm]."""
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    """Centre of the ring (x, y, z) [mm]."""
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) at points (n, 3) [mm]."""
+        x, y, z = (_points(points_mm) - self.centre_mm).T
+        from_axis = np.hypot(x, y)
+        outward = from_axis - self.radius_mm
+        r = np.hypot(outward, z)
+        per_distance = self.peak_mm / self.core_mm * np.exp(1 - r / self.core_mm)
+        radial = -per_distance * z / np.where(from_axis > 0, from_axis, 1)  # on the axis x = y = 0 anyway
+        return np.stack([radial * x, radial * y, per_distance * outward], axis=1)
+
+
+class Swirl(Table):
+    """Rotation about an axis, right-handed for a positive peak, with a Gaussian jet along it."""
+
+    kind: Literal["swirl"] = "swirl"
+    peak_mm: Number
+    """Tangential displacement at the core radius [mm]."""
+    core_mm: Positive
+    """Core radius [mm]."""
+    profile: Literal["lamb_oseen", "solid"] = "lamb_oseen"
+    """Lamb-Oseen vortex, which peaks at the core radius and decays; or solid-body rotation, which grows everywhere."""
+    axis: Axis = "y"
+    """Direction of the axis of rotation."""
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    """A point on the axis (x, y, z) [mm]."""
+    axial_mm: Number = 0.0
+    """Displacement of the jet along the axis, on the axis [mm]."""
+    axial_core_mm: Positive | None = None
+    """Distance from the axis at which the jet has fallen to 1/e [mm]; absent: the core radius."""
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) at points (n, 3) [mm]."""
+        arm = _points(points_mm) - self.centre_mm
+        axis = "xyz".index(self.axis)
+        arm[:, axis] = 0
+        square = (arm**2).sum(1) / self.core_mm**2
+        rate = np.full(len(arm), self.peak_mm / self.core_mm)  # tangential displacement / distance from the axis
+        if self.profile == "lamb_oseen":
+            small = square < 1e-12
+            decay = np.where(small, LAMB_OSEEN, -np.expm1(-LAMB_OSEEN * square) / np.where(small, 1, square))
+            rate = rate * (1 + 1 / (2 * LAMB_OSEEN)) * decay
+        displacement = rate[:, None] * np.cross(np.eye(3)[axis], arm)
+        width = self.axial_core_mm or self.core_mm
+        displacement[:, axis] = self.axial_mm * np.exp(-square * (self.core_mm / width) ** 2)
+        return displacement
+
+
+class SwirlingJet(Table):
+    """Mean flow of a low-swirl injector: a jet that turns and spreads, free of divergence.
+
+    At the outlet it has the profiles of `lfpiv.simulation.swirl.injector_profiles`. Stream surfaces are r / delta = constant with
+    delta^2 = 1 + (spreading y / R)^2, y the distance from the outlet; along them the axial velocity falls as
+    1 / delta^2, volume flow and circulation are kept, and the radial velocity is r delta' / delta times the axial one.
+    The defaults are the paper's injector: S = 0.55, D = 34 mm, central channel of 12 mm radius; 37 degree vanes give
+    that swirl number with a mass ratio of 0.42 (Eq. 17).
+    """
+
+    kind: Literal["swirling_jet"] = "swirling_jet"
+    bulk_mm: Number
+    """Displacement at the bulk velocity, volume flow over the nozzle's area [mm]; negative: against the axis."""
+    swirl_number: Number = 0.55
+    """Swirl number S at the outlet; positive: right-handed about the axis."""
+    nozzle_radius_mm: Positive = 17.0
+    """Radius R of the nozzle [mm]."""
+    radius_ratio: Annotated[float, Field(strict=True, gt=0.05, lt=0.95)] = 12 / 17
+    """Radius of the central channel over the nozzle's."""
+    mass_ratio: Annotated[float, Field(strict=True, ge=0, le=20)] = 0.42
+    """Mass flow of the central channel over that of the swirled annulus."""
+    shear_layer_mm: Positive = 1.7
+    """Half thickness of the tanh-shaped shear layers [mm]."""
+    spreading: Annotated[float, Field(strict=True, ge=0, le=2)] = 0.5
+    """Tangent of the half angle at which the jet's edge spreads, far from the outlet."""
+    axis: Axis = "y"
+    """Direction of the jet's axis."""
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    """Centre of the outlet (x, y, z) [mm]."""
+
+    @model_validator(mode="after")
+    def _layers_thin(self) -> SwirlingJet:
+        if not 0.01 <= self.shear_layer_mm / self.nozzle_radius_mm <= 0.5:
+            raise ValueError("shear_layer_mm between 1 and 50 % of nozzle_radius_mm")
+        return self
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) at points (n, 3) [mm]."""
+        radius, axis = self.nozzle_radius_mm, "xyz".index(self.axis)
+        arm = (_points(points_mm) - self.centre_mm) / radius
+        along = np.eye(3)[axis]
+        height = arm[:, axis].copy()
+        arm[:, axis] = 0
+        spread = 1 + (self.spreading * height) ** 2  # delta squared
+        axial, spin = injector_profiles(
+            (arm**2).sum(1) / spread,
+            self.radius_ratio,
+            self.mass_ratio,
+            self.shear_layer_mm / radius,
+            self.swirl_number,
+        )
+        outward = axial / spread * self.spreading**2 * height / spread  # radial velocity over radius
+        turning = spin / spread  # azimuthal velocity over radius: circulation is kept
+        displacement = outward[:, None] * arm + turning[:, None] * np.cross(along, arm)
+        displacement[:, axis] = axial / spread
+        return self.bulk_mm * displacement
+
+
+class Tracers(Table):
+    """Flow given by tracers followed from one instant to another, mapped into a box of the volume.
+
+    Between the tracers the displacement is a weighted linear fit to the nearest ones; outside their bounding box it is
+    that of the box's nearest point. Axes may be stretched differently; displacements are stretched with them.
+    """
+
+    kind: Literal["tracers"] = "tracers"
+    file: Annotated[str, Field(min_length=1)]
+    """A .npz file; relative to the scene file."""
+    first: str = "t0"
+    """Array (tracer, >= 3) in the file whose first columns are x, y, z at the first instant, in any unit."""
+    second: str = "t1"
+    """Array of the same tracers, in the same order, at the second instant."""
+    size_mm: tuple[Positive, Positive, Positive]
+    """Size (x, y, z) of the box the tracers fill [mm]."""
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    """Centre of that box (x, y, z) [mm]."""
+    box: tuple[Point, Point] | None = None
+    """The same box in the file's unit, two opposite corners; absent: the tracers' own extent."""
+    peak_mm: Positive | None = None
+    """Scale the displacement so that its largest magnitude is this [mm]; absent: as in the file."""
+    as_given: Flag = False
+    """Render the file's own tracers as particles; else place particles at random and interpolate."""
+
+    @model_validator(mode="after")
+    def _box_open(self) -> Tracers:
+        if self.box is not None and not all(low < high for low, high in zip(*self.box, strict=True)):
+            raise ValueError("a box whose second corner lies above the first along every axis")
+        return self
+
+    def tracers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the tracers' positions midway in time and their displacements, each (n, 3) [mm].
+
+        Raises
+        ------
+        InputError
+            If the file is missing or does not hold the two arrays.
+        """
+        position, displacement, _ = load_tracers(self.file, self.first, self.second, self._map())
+        return position, displacement
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) at points (n, 3) [mm]."""
+        points_mm = _points(points_mm)
+        position, displacement, tree = load_tracers(self.file, self.first, self.second, self._map())
+        return interpolate(tree, displacement, np.clip(points_mm, position.min(0), position.max(0)))
+
+    def _map(self) -> TracerMap:
+        return self.size_mm, self.centre_mm, self.box, self.peak_mm
+
+
+Flow = Uniform | Shear | Ring | Swirl | SwirlingJet | Tracers
+KINDS = {model.model_fields["kind"].default: model for model in (Uniform, Shear, Ring, Swirl, SwirlingJet, Tracers)}
+"""The flows by the ``kind`` a scene file names."""
+
+
+def _points(points_mm: np.ndarray) -> np.ndarray:
+    points_mm = np.asarray(points_mm, float)
+    if points_mm.ndim != 2 or points_mm.shape[1] != 3:
+        raise ValueError(f"points_mm: expected shape (n, 3), got {points_mm.shape}. Columns are x, y, z.")
+    return points_mm
+
+
+def _window(window_mm: float | tuple[float, float, float]) -> np.ndarray:
+    window = np.broadcast_to(np.asarray(window_mm, float), 3)
+    if not (np.isfinite(window).all() and (window >= 0).all()):
+        raise ValueError(f"window_mm: expected sizes (x, y, z) of 0 or more, got {window_mm}.")
+    return window
+
+
+def window_mean(
+    flow: Callable[[np.ndarray], np.ndarray],
+    centres_mm: np.ndarray,
+    window_mm: float | tuple[float, float, float],
+    *,
+    order: int = 6,
+) -> np.ndarray:
+    """Mean displacement of a flow over interrogation windows: what an ideal correlation would measure.
+
+    Parameters
+    ----------
+    flow : callable
+        Points (n, 3) to displacements (n, 3) [mm]. The fluctuating part of a `TurbulentFlow` is averaged exactly.
+    centres_mm : ndarray, shape (n, 3)
+        Window centres (x, y, z) [mm].
+    window_mm : float or tuple of float
+        Edges of the windows, one or (x, y, z) [mm].
+    order : int
+        Gauss-Legendre nodes per axis; exact for polynomials of degree 2 order - 1.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Mean displacement (x, y, z) [mm].
+
+    Examples
+    --------
+    A window of 1 mm rounds off the peak of a vortex with a core of 0.5 mm:
+
+    >>> from lfpiv.simulation.flows import Swirl, window_mean
+    >>> vortex = Swirl(peak_mm=0.2, core_mm=0.5, axis="z")
+    >>> vortex([(0.5, 0, 0)]).round(3).tolist()
+    [[0.0, 0.2, 0.0]]
+    >>> (window_mean(vortex, [(0.5, 0, 0)], 1.0) + 0).round(3).tolist()
+    [[0.0, 0.134, 0.0]]
+    """
+    centres_mm, window = _points(centres_mm), _window(window_mm)
+    if isinstance(flow, TurbulentFlow):
+        turbulent = flow.fluctuation.window_mean(centres_mm, tuple(window))
+        mean: np.ndarray = window_mean(flow.mean, centres_mm, tuple(window), order=order) + turbulent
+        return mean
+    node, weight = np.polynomial.legendre.leggauss(order)
+    nodes = np.stack(np.meshgrid(node, node, node, indexing="ij"), -1).reshape(-1, 3) * window / 2
+    weights = np.einsum("i,j,k->ijk", weight, weight, weight).ravel() / 8
+    mean = np.empty((len(centres_mm), 3))
+    step = max(1, CHUNK // len(nodes))
+    for first in range(0, len(mean), step):
+        part = centres_mm[first : first + step]
+        value = flow((part[:, None] + nodes).reshape(-1, 3)).reshape(len(part), len(nodes), 3)
+        mean[first : first + step] = np.einsum("n,cnk->ck", weights, value)
+    return mean
+
+
+def average_truth(
+    points_mm: np.ndarray,
+    displacement_mm: np.ndarray,
+    centres_mm: np.ndarray,
+    window_mm: float | tuple[float, float, float],
+) -> np.ndarray:
+    """Mean displacement of the particles in each interrogation window, for flows known at particles only.
+
+    Parameters
+    ----------
+    points_mm, displacement_mm : ndarray, shape (particle, 3)
+        Positions midway in time and displacements (x, y, z) [mm].
+    centres_mm : ndarray, shape (n, 3)
+        Window centres (x, y, z) [mm].
+    window_mm : float or tuple of float
+        Edges of the windows, one or (x, y, z) [mm].
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Mean displacement [mm]; NaN where a window holds no particle.
+    """
+    points_mm, displacement_mm, centres_mm = _points(points_mm), _points(displacement_mm), _points(centres_mm)
+    if points_mm.shape != displacement_mm.shape:
+        raise ValueError(f"displacement_mm: expected one per point, {points_mm.shape}, got {displacement_mm.shape}.")
+    half = np.maximum(_window(window_mm) / 2, 1e-12)
+    members = cKDTree(points_mm / half).query_ball_point(centres_mm / half, 1.0, p=np.inf)
+    mean = np.full((len(centres_mm), 3), np.nan)
+    for row, inside in zip(mean, members, strict=True):
+        if inside:
+            row[:] = displacement_mm[inside].mean(0)
+    return mean

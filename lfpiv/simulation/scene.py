@@ -1,0 +1,222 @@
+"""Scene files of the simulator: what cameras, board, particles and flow truly are, as frozen models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
+
+from lfpiv.experiment.settings import Compute, Correlation, Count, Flag, Network, Number, Positive, Smart, Table
+from lfpiv.experiment.toml import read_toml
+from lfpiv.simulation.flows import KINDS, Flow, Tracers
+from lfpiv.simulation.scene_camera import Aberrations, NonNegative, Point, SceneCamera, Windows, true_mapping
+from lfpiv.simulation.turbulence import Turbulence, TurbulentFlow
+
+__all__ = ["Aberrations", "Scene", "SceneCamera", "Windows", "open_scene", "true_mapping"]
+
+
+class SceneBoard(Table):
+    """Table ``[board]``: the calibration board and its depths."""
+
+    dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
+    """Dots along x and y."""
+    spacing_mm: Positive
+    """Distance of neighbouring dots [mm]."""
+    dot_diameter_mm: Positive
+    """Diameter of a dot [mm]."""
+    planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
+    """Depth z of each plane [mm]."""
+    inverted: Flag = False
+    """Dark dots on a bright board."""
+
+    @model_validator(mode="after")
+    def _dots_apart(self) -> SceneBoard:
+        if self.dot_diameter_mm >= self.spacing_mm:
+            raise ValueError("dot_diameter_mm smaller than spacing_mm")
+        return self
+
+    def dots_mm(self, plane_mm: float) -> np.ndarray:
+        """Dot centres (x, y, z) at one depth, x fastest, shape (dot, 3) [mm]."""
+        x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing_mm for n in self.dots)
+        y, x = np.meshgrid(y, x, indexing="ij")
+        return np.stack([x.ravel(), y.ravel(), np.full(x.size, float(plane_mm))], axis=1)
+
+
+class SceneVolume(Table):
+    """Table ``[volume]``: the volume to reconstruct, (x, y, z) order."""
+
+    centre_mm: Point = (0.0, 0.0, 0.0)
+    """Centre (x, y, z) of the volume [mm]."""
+    size_mm: tuple[Positive, Positive, Positive]
+    """Size (x, y, z) of the volume [mm]."""
+    voxel_mm: Positive
+    """Edge of a voxel [mm]."""
+
+
+class SceneParticles(Table):
+    """Table ``[particles]``: how many, how bright, how large."""
+
+    per_microlens: Positive | None = None
+    """Particles per microlens of the seeded region's x-y face (the paper's ppm); give this or `count`."""
+    count: Count | None = None
+    """Particles of each pair."""
+    pairs: Count = 1
+    """Number of image pairs, each with particles of its own."""
+    fill: Positive = 1.0
+    """Edges of the seeded region relative to the volume's; above 1 there are particles outside the volume too."""
+    intensity_sd: NonNegative = 0.0
+    """Standard deviation of the particles' intensity about 1."""
+    sigma_mm: Positive | None = None
+    """Standard deviation of Gaussian particles [mm]."""
+    radius_mm: Positive | None = None
+    """Radius of spheres that shine evenly from their volume [mm]; without either, particles are points."""
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> SceneParticles:
+        if (self.per_microlens is None) == (self.count is None):
+            raise ValueError("either per_microlens or count")
+        if self.sigma_mm is not None and self.radius_mm is not None:
+            raise ValueError("at most one of sigma_mm and radius_mm")
+        return self
+
+
+class Exposure(Table):
+    """Table ``[exposure]``: brightness as the level of a pixel above the background [count]."""
+
+    white_counts: Positive = 2700.0
+    """A pixel wholly inside a microimage of the white image."""
+    dot_counts: Positive = 3500.0
+    """A pixel of a microlens that sees nothing but the bright part of the board."""
+    particle_counts: Positive = 600.0
+    """A pixel lit by one point-like particle of intensity 1 (its light fills as many pixels as one microimage)."""
+
+
+class Noise(Table):
+    """Table ``[noise]``: the camera's noise."""
+
+    background: NonNegative = 40.0
+    """Level without light [count]."""
+    read_noise: NonNegative = 3.0
+    """Standard deviation of the read-out [count]."""
+    full_well_e: NonNegative = 10_000.0
+    """Electrons at full scale, which set the shot noise; 0 switches it off."""
+
+
+class Quality(Table):
+    """Table ``[quality]``: rays of the renderer, rounded up to powers of two."""
+
+    particle_rays: Count = 32_768
+    """Rays of each particle."""
+    dot_rays: Count = 131_072
+    """Rays of each board dot."""
+    pixel_rays: Count = 256
+    """Rays of each pixel of white images and of boards with dark dots."""
+
+
+class Scene(Table):
+    """The whole scene file. `smart`, `correlation`, `network`, `compute` are copied into the experiment file."""
+
+    name: Annotated[str, Field(min_length=1)]
+    """Name of the experiment."""
+    seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Whole number that every random draw derives from."""
+    dt_s: Positive
+    """Time between the two frames of a pair [s]."""
+    camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1)]
+    window: Windows = ()
+    """Windows of the cameras that name none of their own."""
+    aberrations: Aberrations | None = None
+    """Aberrations of the cameras that name none of their own."""
+    board: SceneBoard
+    volume: SceneVolume
+    particles: SceneParticles
+    flow: Annotated[Flow, Field(discriminator="kind")]
+    """Displacement between the two frames, the same for every pair: with turbulence, its mean."""
+    turbulence: Turbulence | None = None
+    """Fluctuation added to the flow, another one for every pair."""
+    exposure: Exposure = Exposure()
+    noise: Noise = Noise()
+    quality: Quality = Quality()
+    smart: Smart = Smart()
+    correlation: Correlation = Correlation()
+    network: Network = Network()
+    compute: Compute = Compute()
+
+    @field_validator("camera")
+    @classmethod
+    def _names_differ(cls, cameras: tuple[SceneCamera, ...]) -> tuple[SceneCamera, ...]:
+        if len({camera.name for camera in cameras}) != len(cameras):
+            raise ValueError("a different name for each camera")
+        return cameras
+
+    @field_validator("window", "aberrations")
+    @classmethod
+    def _suit_every_camera(cls, value: Any, info: ValidationInfo) -> Any:
+        optics: dict[str, Any] = {"window": (), "aberrations": None} | {str(info.field_name): value}
+        try:
+            for camera in info.data.get("camera", ()):
+                camera.with_optics(**optics)
+        except ValidationError as error:
+            raise error.errors()[0]["ctx"]["error"] from None
+        return value
+
+    @field_validator("turbulence")
+    @classmethod
+    def _not_on_given_tracers(cls, turbulence: Turbulence | None, info: ValidationInfo) -> Turbulence | None:
+        if turbulence is not None and getattr(info.data.get("flow"), "as_given", False):
+            raise ValueError("no turbulence on top of tracers that move as_given")
+        return turbulence
+
+    @model_validator(mode="after")
+    def _hand_optics_to_cameras(self) -> Scene:
+        cameras = tuple(camera.with_optics(self.window, self.aberrations) for camera in self.camera)
+        object.__setattr__(self, "camera", cameras)
+        return self
+
+    @field_validator("flow", mode="before")
+    @classmethod
+    def _known_flow(cls, table: Any) -> Any:
+        if isinstance(table, Mapping):
+            kind = table.get("kind")
+            if kind not in KINDS:
+                raise ValueError(f"a flow with kind = {' or '.join(map(repr, KINDS))}")
+            known = KINDS[kind].model_fields
+            unknown = [key for key in table if key not in known]
+            if unknown:
+                raise ValueError(f"for kind {kind!r} only the keys {', '.join(known)} (not {unknown[0]!r})")
+        return table
+
+    def flow_of(self, pair: int) -> Flow | TurbulentFlow:
+        """Return the flow of one pair, mean and turbulence: points (n, 3) to displacements (n, 3) [mm]."""
+        if self.turbulence is None:
+            return self.flow
+        return TurbulentFlow(self.flow, self.turbulence.realisation(seed=(self.seed, 7, pair)))
+
+
+def open_scene(path: str | Path) -> Scene:
+    """Read a scene file.
+
+    Parameters
+    ----------
+    path : str or Path
+        TOML file with the tables of `Scene`; a tracer file is looked up relative to it.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a key is unknown, missing or out of range.
+    """
+    path = Path(path)
+    scene = read_toml(path, Scene)
+    if isinstance(scene.flow, Tracers):
+        flow = scene.flow.model_copy(update={"file": str((path.parent / scene.flow.file).absolute())})
+        flow.tracers()  # a missing or unsuitable file is refused here, before any work
+        scene = scene.model_copy(update={"flow": flow})
+    return scene

@@ -1,0 +1,270 @@
+"""Cameras of a simulated scene: nominal optics, true pose, windows, aberrations, and the true rays they see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+
+from lfpiv.experiment.settings import Count, Flag, NominalCamera, Number, Positive, Table
+from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv_kernels.rendering import real_optics
+
+NonNegative = Annotated[float, Field(strict=True, ge=0)]
+Pair = tuple[Number, Number]
+Point = tuple[Number, Number, Number]
+
+
+Pitches = Annotated[float, Field(strict=True, ge=-10, le=10)]
+Index = Annotated[float, Field(strict=True, ge=1, le=4)]
+
+
+FOCUS_STEPS, FOCUS_MM = 200, 1e-11
+"""Steps at most that move a camera until it is in focus through its windows, and the last one's length [mm]."""
+
+
+class Window(Table):
+    """Table ``[window]`` or ``[camera.window]``: a plane-parallel plate between particles and lens; several in a row.
+
+    Rays are refracted exactly (Snell's law); losses by reflection are left out.
+    """
+
+    point_mm: Point
+    """A point of the surface on the particles' side (x, y, z) [mm]."""
+    normal: Point
+    """Normal of the surfaces (x, y, z), of any length and either sense."""
+    thickness_mm: NonNegative
+    """Thickness [mm]; 0 is a bare interface, such as a liquid's free surface."""
+    index: Index
+    """Refractive index of the plate (about 1.46 fused silica, 1.52 crown glass, 1.49 acrylic)."""
+    medium_index: Index = 1.0
+    """Refractive index of what surrounds the particles (1.333 water); only in the window next to them."""
+
+    @field_validator("normal")
+    @classmethod
+    def _has_length(cls, value: Point) -> Point:
+        if not any(value):
+            raise ValueError("a direction other than (0, 0, 0)")
+        return value
+
+
+def _as_list(value: Any) -> Any:
+    return (value,) if isinstance(value, (Mapping, Window)) else value
+
+
+def _next_to_particles_first(windows: tuple[Window, ...]) -> tuple[Window, ...]:
+    if any(window.medium_index != 1 for window in windows[1:]):
+        raise ValueError("medium_index only in the first window, the one next to the particles")
+    return windows
+
+
+Windows = Annotated[tuple[Window, ...], BeforeValidator(_as_list), AfterValidator(_next_to_particles_first)]
+
+
+class Aberrations(Table):
+    """Table ``[aberrations]`` or ``[camera.aberrations]``: third-order (Seidel) aberrations of the main lens.
+
+    Each is the transverse ray aberration on the microlens array at the edge of the pupil, the edge of the field being
+    the sensor's corner: see `lfpiv_kernels.rendering.real_optics.aberration_mm` for the polynomial. One pitch is one microlens.
+    """
+
+    spherical_pitch: Pitches = 0.0
+    """Spherical aberration, the same over the field; grows with the cube of the pupil radius [pitch]."""
+    coma_pitch: Pitches = 0.0
+    """Tangential coma at the edge of the field, three times the sagittal one [pitch]."""
+    astigmatism_pitch: Pitches = 0.0
+    """Astigmatism at the edge of the field: tangential minus sagittal [pitch]."""
+    field_curvature_pitch: Pitches = 0.0
+    """Field curvature (sagittal) at the edge of the field [pitch]."""
+    distortion_percent: Annotated[float, Field(strict=True, ge=-10, le=10)] = 0.0
+    """Radial displacement of the chief ray at the edge of the field; positive: pincushion [% of the field's radius]."""
+    centre_mm: Pair = (0.0, 0.0)
+    """Where on the array (s, t) the field's aberrations vanish: off the sensor's centre for a decentred lens, which
+    then has coma on its axis [mm]."""
+
+
+class SceneCamera(NominalCamera):
+    """Table ``[[camera]]``: nominal optics, which the user is told, and what is true, which the user is not."""
+
+    sensor_width_px: Count
+    """Columns of the sensor."""
+    sensor_height_px: Count
+    """Rows of the sensor."""
+    true_yaw_deg: Number | None = None
+    """True camera angle about y [degree]; absent: the nominal one."""
+    true_pitch_deg: Number = 0.0
+    """Right-handed rotation about the camera's x axis, after the yaw [degree]."""
+    true_roll_deg: Number = 0.0
+    """Right-handed rotation about the camera's z axis, after the pitch [degree]."""
+    true_offset_mm: Point = (0.0, 0.0, 0.0)
+    """World point imaged in focus at the sensor's centre (x, y, z) [mm], as if the camera had been set up through its
+    windows."""
+    true_array_roll_deg: Number = 0.0
+    """Rotation of the microlens array on the sensor [degree]."""
+    true_array_offset_mm: Pair = (0.0, 0.0)
+    """Centre (s, t) of a lens, relative to the sensor's centre [mm]."""
+    true_microlens_pitch_mm: Positive | None = None
+    """True pitch of the array [mm]; absent: the nominal one."""
+    blur_px: NonNegative = 0.4
+    """Standard deviation of the sensor's Gaussian point spread [pixel]."""
+    vignetting: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
+    """Fraction of the light lost in the sensor's corners; the loss grows with the square of the distance."""
+    lens_gain_sd: Annotated[float, Field(strict=True, ge=0, lt=0.5)] = 0.0
+    """Standard deviation of the microlenses' transmission."""
+    dark_image: Flag = False
+    """Whether a dark image is recorded."""
+    window: Windows | None = None
+    """Windows this camera looks through, from the particles outwards; absent: the scene's."""
+    aberrations: Aberrations | None = None
+    """Aberrations of this camera's main lens; absent: the scene's."""
+
+    @model_validator(mode="after")
+    def _windows_face_the_camera(self) -> SceneCamera:
+        for window in self.window or ():
+            cosine = abs(self.rotation[2] @ window.normal) / np.linalg.norm(window.normal)
+            if cosine < real_optics.STEEPEST:
+                raise ValueError(
+                    f"a window whose normal is turned towards the camera (camera {self.name!r} meets it at "
+                    f"{np.degrees(np.arccos(cosine)):.0f} degrees)"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _rays_do_not_cross(self) -> SceneCamera:
+        steepest = real_optics.steepest_aberration(self.seidel)
+        if steepest > real_optics.STRONGEST:
+            raise ValueError(
+                f"aberrations that change by less than {real_optics.STRONGEST:g} mm per mm across the sensor (camera "
+                f"{self.name!r} has {steepest:.2g}; lower them, or move centre_mm to the sensor)"
+            )
+        return self
+
+    def with_optics(self, window: tuple[Window, ...], aberrations: Aberrations | None) -> SceneCamera:
+        """Return this camera with a scene's windows and aberrations where it has none of its own."""
+        own = {name: getattr(self, name) for name in type(self).model_fields}
+        for name, shared in (("window", window), ("aberrations", aberrations)):
+            own[name] = shared if own[name] is None else own[name]
+        return type(self)(**own)
+
+    @property
+    def optics(self) -> Optics:
+        """Nominal optics."""
+        return Optics(
+            focal_length_mm=self.focal_length_mm,
+            magnification=self.magnification,
+            f_number=self.f_number,
+            microlens_pitch_mm=self.microlens_pitch_mm,
+            microlens_focal_length_mm=self.microlens_focal_length_mm,
+            pixel_mm=self.pixel_um / 1000,
+            sensor_shape=(self.sensor_height_px, self.sensor_width_px),
+            layout=self.microlens_layout,
+        )
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """World to camera, Rz Rx Ry with Ry the rotation of Eqs. 1-3, shape (3, 3)."""
+        yaw = self.nominal_angle_deg if self.true_yaw_deg is None else self.true_yaw_deg
+        (cy, sy), (cx, sx), (cz, sz) = (
+            (np.cos(angle), np.sin(angle)) for angle in np.radians([yaw, self.true_pitch_deg, self.true_roll_deg])
+        )
+        about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+        about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+        about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+        rotation: np.ndarray = about_z @ about_x @ about_y
+        return rotation
+
+    @property
+    def axis_point_mm(self) -> np.ndarray:
+        """World point at the object distance on the camera's axis (x, y, z) [mm]: origin of the camera's frame.
+
+        Without windows it is the point in focus; with windows the camera stands where it sees that point in focus.
+        """
+        focused = np.asarray(self.true_offset_mm, float)
+        if not self.window:
+            return focused
+        optics, axis_point = self.optics, focused.copy()
+        radius, so = optics.pupil_radius_mm / np.sqrt(2), optics.object_distance_mm
+        pupil = radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+        for _ in range(FOCUS_STEPS):
+            seen = np.broadcast_to((focused - axis_point) @ self.rotation.T, (5, 3))
+            seen = real_optics.apparent_points(seen, pupil, so, self._plates(axis_point))
+            # where the five rays cross the focal plane: at the chief ray's place, and spread by the mean defocus
+            crossing = (seen[:, :2] * so - pupil * seen[:, 2:]) / (so - seen[:, 2:])
+            defocus = so * (crossing * pupil).sum() / (pupil**2).sum()
+            step = np.array([*crossing[0], -defocus])
+            axis_point += step @ self.rotation
+            if np.abs(step).max() < FOCUS_MM:
+                return axis_point
+        raise ValueError(f"camera {self.name!r}: window: no place found from which true_offset_mm is in focus.")
+
+    def _plates(self, axis_point_mm: np.ndarray) -> np.ndarray:
+        windows = self.window or ()
+        return real_optics.pack_plates(
+            np.array([window.normal for window in windows]).reshape(-1, 3) @ self.rotation.T,
+            (np.array([window.point_mm for window in windows]).reshape(-1, 3) - axis_point_mm) @ self.rotation.T,
+            np.array([window.thickness_mm for window in windows]),
+            np.array([window.index for window in windows]),
+            np.array([window.medium_index for window in windows]),
+            object_distance_mm=self.optics.object_distance_mm,
+        )
+
+    @property
+    def plates(self) -> np.ndarray:
+        """The windows in the camera's frame, as `raytrace.pack_plates` gives them, shape (window, 7)."""
+        return self._plates(self.axis_point_mm)
+
+    @property
+    def seidel(self) -> np.ndarray:
+        """The aberrations as `raytrace.Aberrations` lists them, shape (9,)."""
+        optics, lens = self.optics, self.aberrations or Aberrations()
+        field = float(np.hypot(*optics.sensor_shape)) * optics.pixel_mm / 2
+        edge = (lens.spherical_pitch, lens.coma_pitch, lens.astigmatism_pitch, lens.field_curvature_pitch)
+        transverse = [value * optics.microlens_pitch_mm for value in edge]
+        transverse.append(lens.distortion_percent / 100 * field)
+        return np.array([*lens.centre_mm, 1 / optics.pupil_radius_mm, 1 / field, *transverse])
+
+    @property
+    def lattice(self) -> LensLattice:
+        """The true microlens array in its own plane."""
+        pitch = self.true_microlens_pitch_mm or self.microlens_pitch_mm
+        roll = np.radians(self.true_array_roll_deg)
+        second = np.radians(60 if self.microlens_layout == "hexagonal" else 90)
+        basis = [(pitch * np.cos(angle + roll), pitch * np.sin(angle + roll)) for angle in (0.0, second)]
+        return LensLattice(
+            origin_mm=self.true_array_offset_mm, basis_mm=(basis[0], basis[1]), layout=self.microlens_layout
+        )
+
+
+def true_mapping(camera: SceneCamera | Mapping[str, Any]) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return the true mapping of a simulated camera from points and pupil coordinates to the microlens array.
+
+    Parameters
+    ----------
+    camera : SceneCamera or mapping
+        A camera of a scene, or its table in ``truth/spec.json``.
+
+    Returns
+    -------
+    callable
+        ``(points_mm (n, 3), pupil_mm (n, 2)) -> (s, t) (n, 2)`` [mm], origin at the sensor's centre: s = k u - m x_c of
+        the point's apparent place behind the windows, plus the lens's aberrations.
+    """
+    if not isinstance(camera, SceneCamera):
+        camera = SceneCamera.model_validate(camera)
+    optics, rotation, axis_point = camera.optics, camera.rotation, camera.axis_point_mm
+    plates, seidel = camera.plates, camera.seidel
+
+    def mapping(points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+        seen = (np.asarray(points_mm, float) - axis_point) @ rotation.T
+        if len(plates):
+            seen = real_optics.apparent_points(seen, pupil_mm, optics.object_distance_mm, plates)
+        m = optics.image_distance_mm / (optics.object_distance_mm - seen[..., 2:])
+        k = m * seen[..., 2:] / optics.object_distance_mm
+        array: np.ndarray = k * np.asarray(pupil_mm, float) - m * seen[..., :2]
+        if np.any(seidel[4:]):
+            array += real_optics.aberration_mm(array, pupil_mm, seidel)
+        return array
+
+    return mapping

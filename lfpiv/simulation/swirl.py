@@ -1,0 +1,130 @@
+"""Swirling jets: the swirl number of measured or stated profiles, that of a low-swirl injector, and its mean profiles.
+
+The swirl number is S = G_theta / (R G_x), the axial flux of angular momentum over the axial flux of axial momentum and
+the nozzle's radius, both without pressure and turbulence: integrals of U W r^2 and of U^2 r over the radius.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+QUADRATURE = 400
+"""Gauss-Legendre nodes over the jet's radius; its shear layers are resolved down to a hundredth of the radius."""
+
+
+def swirl_number(radius: np.ndarray, axial: np.ndarray, azimuthal: np.ndarray, *, nozzle_radius: float) -> float:
+    """Swirl number of profiles given at some radii, by the trapezoidal rule.
+
+    Parameters
+    ----------
+    radius : array_like, shape (n,)
+        Radii, rising, from the axis outwards; any unit of length.
+    axial, azimuthal : array_like, shape (n,)
+        Axial and azimuthal velocity (or displacement) there, both in one unit.
+    nozzle_radius : float
+        Radius R of the nozzle, in the unit of `radius`.
+
+    Returns
+    -------
+    float
+        S = int U W r^2 dr / (R int U^2 r dr).
+
+    Raises
+    ------
+    ValueError
+        If the profiles do not fit together, radii do not rise from 0 or more, or there is no axial flow.
+    """
+    radius, axial, azimuthal = (np.asarray(value, float) for value in (radius, axial, azimuthal))
+    if radius.ndim != 1 or len(radius) < 2 or axial.shape != radius.shape or azimuthal.shape != radius.shape:
+        raise ValueError(
+            "radius, axial, azimuthal: expected three profiles of one length of at least 2, got shapes "
+            f"{radius.shape}, {axial.shape} and {azimuthal.shape}."
+        )
+    if not (np.isfinite([radius, axial, azimuthal]).all() and radius[0] >= 0 and (np.diff(radius) >= 0).all()):
+        raise ValueError("radius, axial, azimuthal: expected finite values at radii that rise from 0 or more.")
+    if not (np.isfinite(nozzle_radius) and nozzle_radius > 0):
+        raise ValueError(f"nozzle_radius: expected a length above 0, got {nozzle_radius}.")
+    momentum = np.trapezoid(axial**2 * radius, radius)
+    if momentum == 0:
+        raise ValueError("axial: expected a flow along the axis, got none: the swirl number is not defined.")
+    return float(np.trapezoid(axial * azimuthal * radius**2, radius) / (nozzle_radius * momentum))
+
+
+def injector_swirl_number(vane_angle_deg: float, radius_ratio: float, mass_ratio: float) -> float:
+    """Swirl number of a low-swirl injector with flat profiles, Eq. 17.
+
+    Parameters
+    ----------
+    vane_angle_deg : float
+        Angle of the flow in the swirled annulus to the axis [degree].
+    radius_ratio : float
+        Radius of the central channel over that of the injector, r.
+    mass_ratio : float
+        Mass flow of the central channel over that of the annulus, m.
+
+    Examples
+    --------
+    >>> from lfpiv.simulation.swirl import injector_swirl_number
+    >>> round(injector_swirl_number(vane_angle_deg=37, radius_ratio=12 / 17, mass_ratio=0.42), 2)
+    0.55
+    """
+    if not (0 < radius_ratio < 1 and mass_ratio >= 0 and abs(vane_angle_deg) < 90):
+        raise ValueError(
+            "vane_angle_deg, radius_ratio, mass_ratio: expected -90 to 90, 0 to 1 and 0 or more, got "
+            f"{vane_angle_deg}, {radius_ratio} and {mass_ratio}."
+        )
+    square = radius_ratio**2
+    axial_momentum = 1 - square + mass_ratio**2 * square * (1 / square - 1) ** 2
+    return float(2 / 3 * np.tan(np.radians(vane_angle_deg)) * (1 - radius_ratio**3) / axial_momentum)
+
+
+def injector_profiles(
+    square: np.ndarray, radius_ratio: float, mass_ratio: float, shear_layer: float, swirl: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean profiles at the outlet of a low-swirl injector: Eq. 17's two streams with smooth shear layers between.
+
+    A slow, straight stream from the central channel, a fast, swirled one from the annulus at a nearly constant flow
+    angle, rest outside; layers of tanh shape. Smooth on the axis, because they are functions of the radius squared.
+
+    Parameters
+    ----------
+    square : ndarray
+        Squared radius over the nozzle's radius.
+    radius_ratio, mass_ratio : float
+        As for `injector_swirl_number`.
+    shear_layer : float
+        Half thickness of the shear layers over the nozzle's radius.
+    swirl : float
+        Swirl number of the profiles.
+
+    Returns
+    -------
+    axial, spin : ndarray
+        Axial velocity over the bulk velocity (volume flow over the nozzle's area), and azimuthal velocity over bulk
+        velocity and relative radius.
+    """
+    axial, spin = _raw_profiles(np.asarray(square, float), radius_ratio, mass_ratio, shear_layer)
+    bulk, raw_swirl = _profile_scales(radius_ratio, mass_ratio, shear_layer)
+    return axial / bulk, spin * swirl / (raw_swirl * bulk)
+
+
+def _raw_profiles(
+    square: np.ndarray, radius_ratio: float, mass_ratio: float, shear_layer: float
+) -> tuple[np.ndarray, np.ndarray]:
+    channel = mass_ratio * (1 / radius_ratio**2 - 1)  # velocity of the channel over that of the annulus
+    swirled = (1 + np.tanh((square - radius_ratio**2) / (2 * radius_ratio * shear_layer))) / 2
+    inside = (1 - np.tanh((square - 1) / (2 * shear_layer))) / 2
+    return (channel + (1 - channel) * swirled) * inside, swirled * inside / np.sqrt(square + shear_layer**2)
+
+
+@functools.lru_cache(maxsize=16)
+def _profile_scales(radius_ratio: float, mass_ratio: float, shear_layer: float) -> tuple[float, float]:
+    """Bulk velocity and swirl number of the raw profiles."""
+    node, weight = np.polynomial.legendre.leggauss(QUADRATURE)
+    outer = 1 + 12 * shear_layer  # where the jet has faded below 1e-10
+    radius, weight = outer * (node + 1) / 2, outer * weight / 2
+    axial, spin = _raw_profiles(radius**2, radius_ratio, mass_ratio, shear_layer)
+    momentum = (weight * axial**2 * radius).sum()
+    return 2 * float((weight * axial * radius).sum()), float((weight * axial * spin * radius**3).sum() / momentum)

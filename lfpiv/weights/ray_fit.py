@@ -1,0 +1,180 @@
+"""Local polynomials of a calibrated mapping in the pupil point: what the weight kernels take instead of the mapping."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from lfpiv_kernels.rays.count import POWERS
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
+
+RINGS = ((0.0, 1), (0.5, 6), (0.97, 12))
+"""Pupil points at which the mapping is evaluated: (radius / pupil radius, points on the ring)."""
+CHUNK_POINTS = 100_000
+"""Object points per evaluation: bounds the scratch memory."""
+STEPS = (8, 4, 2, 1)
+"""Voxels from one fit to the next on a grid, the widest that serves first."""
+PROBES = 256
+"""Random voxels in which interpolated fits are compared with their own."""
+NEAR_PITCH = 3e-4
+"""Largest difference of rays there [microlens pitch]; the mapping in single precision is known to 2e-4."""
+
+
+def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
+    """Fit polynomials of the pupil point to the rays of object points.
+
+    Parameters
+    ----------
+    camera : CalibratedCamera
+        Its ``map_fan(points, pupil)`` is evaluated at the points of `RINGS`.
+    points_mm : ndarray, shape (point, 3)
+        Object points (x, y, z) [mm].
+    degree : {2, 3}
+        Degree of the polynomial.
+
+    Returns
+    -------
+    ndarray, shape (point, 2, 6 or 10), float32
+        Coefficients of s and t [mm] in the pupil point [mm], terms as in `POWERS`.
+    """
+    radius = camera.optics.pupil_radius_mm
+    unit = np.array([(r * np.cos(a), r * np.sin(a)) for r, n in RINGS for a in 2 * np.pi * (np.arange(n) + 0.25) / n])
+    powers = [power for power in POWERS if sum(power) <= degree]
+    terms = np.stack([unit[:, 0] ** a * unit[:, 1] ** b for a, b in powers], axis=1)
+    solve = np.linalg.pinv(terms) / np.array([radius ** (a + b) for a, b in powers])[:, None]
+    pupil = (unit * radius).astype(np.float32)
+    both = np.zeros((len(unit), 2, 2, len(powers)), np.float32)  # one product for s and t: their rays lie side by side
+    both[:, 0, 0], both[:, 1, 1] = solve.T, solve.T
+    product = both.reshape(2 * len(unit), -1)
+    out = np.empty((len(points_mm), 2, len(powers)), np.float32)
+    for first in range(0, len(points_mm), CHUNK_POINTS):
+        part = points_mm[first : first + CHUNK_POINTS]
+        rays = camera.map_fan(part, pupil).reshape(len(part), -1)  # s and t by turns
+        middle = rays[:, :2].copy()
+        for axis in range(2):  # differences keep single precision where it matters
+            rays[:, axis::2] -= middle[:, axis, None]
+        out[first : first + len(part)] = (rays @ product).reshape(-1, 2, len(powers))
+        out[first : first + len(part), :, 0] += middle
+    return out
+
+
+def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
+    """Ray models of voxels for the footprint kernels, see ``lfpiv_kernels.weights.ray_model.MODEL_SIZE``.
+
+    The projected edges are differences of the mapping between opposite faces of the voxel.
+
+    Returns
+    -------
+    ndarray, shape (voxel, 30), float32
+    """
+    model = np.empty((len(centres_mm), 30), np.float32)
+    model[:, :12] = fit_rays(camera, centres_mm, degree=2).reshape(-1, 12)
+    for axis in range(3):
+        face = np.zeros(3)
+        face[axis] = voxel_mm / 2
+        edge = fit_rays(camera, centres_mm + face, degree=2) - fit_rays(camera, centres_mm - face, degree=2)
+        model[:, 12 + 2 * axis : 14 + 2 * axis] = edge[:, :, 0]
+        model[:, 18 + 4 * axis : 22 + 4 * axis] = edge[:, :, 1:3].reshape(-1, 4)
+    return _finite(model)
+
+
+def grid_models(
+    camera: CalibratedCamera,
+    shape: tuple[int, int, int],
+    centres_mm: Callable[[np.ndarray], np.ndarray],
+    axes: tuple[int, int, int],
+) -> Iterator[np.ndarray]:
+    """Ray models of a grid's voxels, plane by plane of its outermost axis.
+
+    The mapping is far smoother than a voxel is small: fits at every `STEPS`-th voxel, the widest step that serves, are
+    interpolated by cubic splines. The projected edges are half the differences between a voxel's neighbours.
+
+    Parameters
+    ----------
+    camera : CalibratedCamera
+        As for `fit_rays`.
+    shape : tuple of int
+        Voxels along the three axes, outermost first.
+    centres_mm : callable
+        Takes indices along the three axes, shape (point, 3), whole or not, also one outside the grid; returns
+        (x, y, z) [mm].
+    axes : tuple of int
+        Which of x, y, z (0, 1, 2) each axis of the grid is.
+
+    Yields
+    ------
+    ndarray, shape (voxels of a plane, 30), float32
+        See ``lfpiv_kernels.weights.ray_model.MODEL_SIZE``.
+    """
+    outer, rows, columns = shape
+    fits, along = _interpolated(camera, shape, centres_mm)
+
+    def plane_fits(plane: int) -> np.ndarray:
+        plane_nodes = along[0][plane + 1] @ fits.reshape(len(fits), -1)
+        row_fits = along[1] @ plane_nodes.reshape(fits.shape[1], -1)
+        every: np.ndarray = along[2] @ row_fits.reshape(rows + 2, fits.shape[2], -1)
+        return every.reshape(rows + 2, columns + 2, 2, 6)
+
+    before, here = plane_fits(-1), plane_fits(0)
+    for plane in range(outer):
+        after = plane_fits(plane + 1)
+        model = np.empty((rows, columns, 30), np.float32)
+        model[..., :12] = here[1:-1, 1:-1].reshape(rows, columns, 12)
+        differences = (
+            after[1:-1, 1:-1] - before[1:-1, 1:-1],
+            here[2:, 1:-1] - here[:-2, 1:-1],
+            here[1:-1, 2:] - here[1:-1, :-2],
+        )
+        for axis, difference in zip(axes, differences, strict=True):
+            model[..., 12 + 2 * axis : 14 + 2 * axis] = 0.5 * difference[..., 0]
+            model[..., 18 + 4 * axis : 22 + 4 * axis] = 0.5 * difference[..., 1:3].reshape(rows, columns, 4)
+        yield model.reshape(-1, 30)
+        before, here = here, after
+
+
+def _interpolated(
+    camera: CalibratedCamera, shape: tuple[int, int, int], centres_mm: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Fits at the nodes of a coarser grid, shape (nodes, nodes, nodes, 12), and what interpolates them.
+
+    That is one matrix per axis, shape (voxels + 2, nodes), float32: a voxel before the grid, its own, one behind.
+    """
+    rng = np.random.default_rng(0)
+    probes = np.column_stack([rng.integers(0, n, PROBES) for n in shape])
+    scale = camera.optics.pupil_radius_mm ** np.array([sum(power) for power in POWERS if sum(power) <= 2])
+    expected = _finite(fit_rays(camera, centres_mm(probes), degree=2)) * scale
+    for step in STEPS:
+        counts = [math.ceil((n + 1) / step) + 1 for n in shape]
+        nodes = [np.linspace(-1, n, count) for n, count in zip(shape, counts, strict=True)]
+        points = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+        fits = _finite(fit_rays(camera, centres_mm(points), degree=2)).reshape(*counts, 12)
+        along = [_spline_matrix(at, n) for at, n in zip(nodes, shape, strict=True)]
+        if step == 1:
+            break
+        weights = [matrix[probe + 1] for matrix, probe in zip(along, probes.T, strict=True)]
+        found = np.einsum("pa,pb,pc,abcf->pf", *weights, fits, optimize=True).reshape(PROBES, 2, 6) * scale
+        error = np.abs(found - expected).sum(-1).max() / camera.lattice.pitch_mm
+        if error < NEAR_PITCH:
+            break
+    return fits, along
+
+
+def _spline_matrix(nodes: np.ndarray, voxels: int) -> np.ndarray:
+    """Matrix that takes values at nodes to those at -1, 0, ..., `voxels`."""
+    wanted = np.arange(-1, voxels + 1)
+    if len(nodes) == len(wanted):
+        return np.eye(len(nodes), dtype=np.float32)
+    matrix: np.ndarray = CubicSpline(nodes, np.eye(len(nodes)))(wanted).astype(np.float32)
+    return matrix
+
+
+def _finite(model: np.ndarray) -> np.ndarray:
+    """Send a voxel in the lens's own plane far off the sensor."""
+    finite: np.ndarray = np.nan_to_num(model, copy=False, nan=1e9, posinf=1e9, neginf=-1e9)
+    return finite

@@ -1,0 +1,160 @@
+"""Weights as files that several processes map into their memory: built once, kept in memory once.
+
+A folder with one ``.npy`` file per array and ``weights.json``, which is written last. The files are read where and when
+a kernel reads them; processes of one machine share the pages.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lfpiv.errors import InputError
+from lfpiv.geometry.optics import Grid
+from lfpiv.results import netcdf
+from lfpiv.results.folder import writing
+from lfpiv.weights.blocks import StoredGrid
+from lfpiv.weights.operator import Weights
+from lfpiv_kernels.reconstruction.projector import Blocks
+from lfpiv_kernels.weights.microimages import Microimages
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
+
+SCHEMA_VERSION = 1
+_HEADER = "weights.json"
+_HASHED_BYTES = 1 << 24  # hashed at once
+
+
+def save_weights(weights: Weights, folder: Path) -> str:
+    """Write weights, built where they are not yet, into a folder that is made or replaced file by file.
+
+    Parameters
+    ----------
+    weights : Weights
+        From `build_weights`.
+    folder : Path
+        Target.
+
+    Returns
+    -------
+    str
+        Hash of the content, for `open_weights`.
+
+    Raises
+    ------
+    StorageError
+        If the folder cannot be written or the disk is full.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+
+    def put(name: str, value: Any) -> Any:
+        """Write an array, or the arrays in a dataclass; return what the header says of it."""
+        if dataclasses.is_dataclass(value):
+            return {
+                field.name: put(f"{name}.{field.name}", getattr(value, field.name))
+                for field in dataclasses.fields(value)
+            }
+        if not isinstance(value, np.ndarray):
+            return value
+        array = np.ascontiguousarray(value)
+        np.save(folder / f"{name}.npy", array)
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        content = array.reshape(-1).view(np.uint8)
+        for first in range(0, len(content), _HASHED_BYTES):
+            digest.update(content[first : first + _HASHED_BYTES].tobytes())
+        return f"{name}.npy"
+
+    with writing(folder / _HEADER):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _HEADER).unlink(missing_ok=True)
+        header = {
+            "schema_version": SCHEMA_VERSION,
+            "grid": dataclasses.asdict(weights.grid),
+            "order": weights.stored.order,
+            "method": weights.method,
+            "camera_sums": put("camera_sums", weights.camera_sums),
+            "cameras": {
+                name: put(f"camera{number}", weights.projector(name).blocks)
+                for number, name in enumerate(weights.cameras)
+            },
+        }
+        content = digest.hexdigest()
+        netcdf.write_json(header | {"content": content}, folder / _HEADER)
+    return content
+
+
+def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content: str | None = None) -> Weights:
+    """Map weights that `save_weights` wrote into memory, for reading only.
+
+    Parameters
+    ----------
+    folder : Path
+        Where they lie.
+    cameras : mapping of str to CalibratedCamera
+        The cameras they were built for.
+    content : str, optional
+        What `save_weights` returned; weights of another content are refused.
+
+    Returns
+    -------
+    Weights
+
+    Raises
+    ------
+    InputError
+        If the folder holds no complete weights, or those of other cameras or of another content.
+    """
+    path = folder / _HEADER
+    try:
+        header = json.loads(path.read_text("utf-8"))
+        if header["schema_version"] != SCHEMA_VERSION:
+            raise ValueError(f"schema version {header['schema_version']}")
+        if content not in (None, header["content"]):
+            raise ValueError("weights of another run")
+        if list(header["cameras"]) != list(cameras):
+            raise ValueError(f"cameras {', '.join(header['cameras'])}")
+        grid = Grid(**{name: _tuple(value) for name, value in header["grid"].items()})
+        blocks = {name: _take(Blocks, folder, entry) for name, entry in header["cameras"].items()}
+        camera_sums = np.load(folder / header["camera_sums"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
+    return Weights.from_blocks(
+        cameras, StoredGrid(grid, _tuple(header["order"])), header["method"], blocks, camera_sums
+    )
+
+
+_PARTS = {"microimages": Microimages}
+"""Fields that are dataclasses of arrays themselves."""
+
+
+def _take(kind: type, folder: Path, entry: Mapping[str, Any]) -> Any:
+    """Make a dataclass of what the header says of it; its arrays stay in their files."""
+    values = {}
+    for field in dataclasses.fields(kind):
+        value = entry[field.name]
+        if isinstance(value, dict):
+            values[field.name] = _take(_PARTS[field.name], folder, value)
+        elif isinstance(value, str) and value.endswith(".npy"):
+            values[field.name] = _map(folder / value)
+        else:
+            values[field.name] = _tuple(value)
+    return kind(**values)
+
+
+def _map(path: Path) -> np.ndarray:
+    try:
+        array: np.ndarray = np.load(path, mmap_mode="r")
+    except ValueError:  # nothing in it: there is nothing to map
+        array = np.load(path)
+    return np.asarray(array)
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

@@ -1,0 +1,1 @@
+"""Rays through the calibrated mapping, and rays counted per pixel (Taichi)."""

@@ -1,0 +1,96 @@
+"""Taichi: trace rays from points in voxels through the pupil and the microlens array, count them per pixel (Eq. 10).
+
+Per point the mapping is a third-order polynomial of the pupil point, fitted to the calibrated mapping: it is smooth, so
+that evaluating the network per ray would buy nothing. Twin: ``reference.count``.
+"""
+
+import numpy as np
+import taichi as ti
+
+from lfpiv_kernels import runtime
+from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
+from lfpiv_kernels.weights.footprint import Camera
+
+POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Exponents of u and v in the polynomial's terms."""
+
+
+@ti.kernel
+def _count_rays(
+    # in
+    rays: ti.types.ndarray(dtype=ti.f32, ndim=3),
+    shift: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    window: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    first_pixel: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    camera: Camera,
+    lattice: Lattice,
+    hexagonal: ti.template(),
+    samples: ti.i32,
+    # out
+    count_out: ti.types.ndarray(dtype=ti.i32, ndim=3),
+    total_out: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    step = 2.0 * camera[4] / samples
+    for point in range(rays.shape[0]):
+        w = window[point]
+        traced = 0
+        for a in range(samples):
+            for b in range(samples):
+                u = (a + shift[point, 0]) * step - camera[4]
+                v = (b + shift[point, 1]) * step - camera[4]
+                if u * u + v * v <= camera[4] * camera[4]:
+                    traced += 1
+                    st = ti.Vector([0.0, 0.0])
+                    for k in ti.static(range(2)):
+                        st[k] = (
+                            rays[point, k, 0]
+                            + u * (rays[point, k, 1] + u * (rays[point, k, 3] + u * rays[point, k, 6]))
+                            + v * (rays[point, k, 2] + v * (rays[point, k, 5] + v * rays[point, k, 9]))
+                            + u * v * (rays[point, k, 4] + u * rays[point, k, 7] + v * rays[point, k, 8])
+                        )
+                    lens = nearest_lens(lattice, st[0], st[1], hexagonal)
+                    centre = lens_centre(lattice, lens[0], lens[1])
+                    x = (centre[0] + camera[0] * (st[0] - u)) / camera[1] + camera[2]
+                    y = (centre[1] + camera[0] * (st[1] - v)) / camera[1] + camera[3]
+                    column = ti.cast(ti.floor(x), ti.i32) - first_pixel[w, 0]
+                    row = ti.cast(ti.floor(y), ti.i32) - first_pixel[w, 1]
+                    if 0 <= column < count_out.shape[2] and 0 <= row < count_out.shape[1]:
+                        count_out[w, row, column] += 1
+        ti.atomic_add(total_out[w], traced)
+
+
+def count_rays(rays, shift, window, first_pixel, camera, lattice, *, hexagonal, samples, shape):
+    """Trace a grid of `samples` x `samples` pupil points from every object point and count the rays per pixel.
+
+    Parameters
+    ----------
+    rays : ndarray, shape (point, 2, 10), float32
+        Polynomial of s and of t [mm] in the pupil point [mm], terms as in `POWERS`.
+    shift : ndarray, shape (point, 2), float32
+        Offset of each point's pupil grid, in [0, 1) of its step.
+    window : ndarray, shape (point,), int32
+        Window (voxel) that a point's rays are counted in.
+    first_pixel : ndarray, shape (window, 2), int32
+        (column, row) of each window's first pixel on the sensor. Rays outside a window are traced but not counted.
+    camera, lattice
+        From `footprint.pack_camera` and `lattice.pack_lattice`.
+    hexagonal : bool
+        Layout of the array.
+    samples : int
+        Pupil points per axis; those outside the pupil's disc are not traced.
+    shape : tuple of int
+        Rows and columns of a window.
+
+    Returns
+    -------
+    count : ndarray, shape (window, *shape), int32
+        Rays per pixel.
+    total : ndarray, shape (window,), int32
+        Rays traced.
+    """
+    runtime.device()
+    count = np.zeros((len(first_pixel), *shape), np.int32)
+    total = np.zeros(len(first_pixel), np.int32)
+    _count_rays(rays, shift, window, first_pixel, camera, lattice, bool(hexagonal), int(samples), count, total)
+    ti.sync()
+    return count, total

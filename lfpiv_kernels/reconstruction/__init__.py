@@ -1,0 +1,1 @@
+"""Projection, back projection and SMART's update (Warp)."""

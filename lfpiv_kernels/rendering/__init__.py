@@ -1,0 +1,1 @@
+"""Images of particles through real optics, for the simulator (Taichi)."""

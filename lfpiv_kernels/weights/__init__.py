@@ -1,0 +1,1 @@
+"""Weights integrated over voxel, pixel and microlens (Warp)."""

@@ -1,0 +1,172 @@
+"""Warp: the light of a sensor's pixels as rays, block by block of microimages; ``raymap`` maps the two to each other.
+
+The layout is C++: NumPy took ten times as long. Twin of the shares: ``lfpiv.lightfield.decoder.disc_fraction``.
+"""
+
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import runtime
+from lfpiv_kernels.weights.footprint_source import LAYER_FALL, LAYERS, SIDE_LAYERS
+from lfpiv_kernels.weights.ray_model import LANES
+
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        "max_unroll": 0,
+        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=off",  # rounds as NumPy does
+    }
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Microimages:
+    """How the rays of a camera's lenses lie in memory: blocks of edge x edge pixels, row by row.
+
+    Every row of lenses comes in layers, of which each holds a block per lens, see ``footprint_source.LAYERS``.
+    """
+
+    first_lens: tuple[int, int]
+    """Lattice indices (i, j) of the first lens; i runs fastest."""
+    corner: np.ndarray
+    """First pixel (column, row) of each lens's block, shape (lenses along j, lenses along i, 2), int32."""
+    edge: int
+    """Pixels along each side of a block."""
+    pixel: np.ndarray
+    """Sensor pixel of each ray, row by row; -1 outside the sensor. Shape (ray,), int32, some rays more than blocks."""
+    share: np.ndarray
+    """Fraction of the pixel's cell inside the pupil, shape (ray,), float32."""
+    sensor_shape: tuple[int, int]
+    """Rows and columns of the sensor [pixel]."""
+
+    @property
+    def size(self) -> int:
+        """Number of rays, padding included."""
+        return len(self.pixel)
+
+
+_LAY_OUT = (
+    f"const int LAYERS = {LAYERS}, SIDE_LAYERS = {SIDE_LAYERS}; const double LAYER_FALL = {LAYER_FALL};"
+    + """
+    auto most = [](float a, float b) { return a > b ? a : b; };
+    auto ramp = [](float x) { return x > 0.0f ? x * x : 0.0f; };
+    // most pixels lie clear of the pupil's edge, by more than half their diagonal
+    const float clear = 0.75f, inner = most(radius - clear, 0.0f), outer = radius + clear;
+    // fraction of the unit pixel at an offset from the pupil's centre inside it: its edge is straight within a pixel
+    auto disc_fraction = [&](float x, float y) {
+        const float square = x * x + y * y;
+        if (square < inner * inner || square > outer * outer) return square < radius * radius ? 1.0f : 0.0f;
+        const float distance = (float)sqrt((double)x * x + (double)y * y), outside = distance - radius;
+        const float normal_x = most(fabsf(x) / most(distance, 1e-6f), 1e-3f);
+        const float normal_y = most(fabsf(y) / most(distance, 1e-6f), 1e-3f);
+        const float reach = -(outside + curvature);
+        const float half_sum = (normal_x + normal_y) / 2.0f, half_gap = (normal_x - normal_y) / 2.0f;
+        const float share = ramp(reach + half_sum) - ramp(reach + half_gap) - ramp(reach - half_gap)
+            + ramp(reach - half_sum);
+        const float fraction = most(share / (2.0f * normal_x * normal_y), 0.0f);
+        return fraction < 1.0f ? fraction : 1.0f;
+    };
+    const int row_of_lenses = lens / lenses;
+    const int first_column = corner.data[2 * lens], first_row = corner.data[2 * lens + 1];
+    const double middle_x = centre.data[2 * lens], middle_y = centre.data[2 * lens + 1];
+    const int64_t layer_rays = (int64_t)lenses * edge * edge;
+    int64_t ray = layer_rays * LAYERS * row_of_lenses + (int64_t)(lens - row_of_lenses * lenses) * edge * edge;
+    for (int row = first_row; row < first_row + edge; ++row) {
+        for (int column = first_column; column < first_column + edge; ++column, ++ray) {
+            const bool seen = column >= 0 && column < columns && row >= 0 && row < rows;
+            const float inside = seen
+                ? disc_fraction((float)(column + 0.5 - middle_x), (float)(row + 0.5 - middle_y)) : 0.0f;
+            for (int layer = 0; layer < LAYERS; ++layer) {
+                // the middle of the part inside lies (1 - inside) / 2 inwards of the pixel's
+                const float fall = (float)(LAYER_FALL * (layer - SIDE_LAYERS));
+                share_out.data[ray + layer * layer_rays] = inside * (1.0f + fall * (1.0f - inside) / 2.0f);
+                pixel_out.data[ray + layer * layer_rays] = seen ? row * columns + column : -1;
+            }
+        }
+    }
+"""
+)
+
+
+@wp.func_native(_LAY_OUT)
+def _lay_out_lens(
+    lens: int,
+    centre: wp.array(dtype=wp.float64),
+    corner: wp.array(dtype=int),
+    lenses: int,
+    edge: int,
+    columns: int,
+    rows: int,
+    radius: float,
+    curvature: float,
+    pixel_out: wp.array(dtype=int),
+    share_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _lay_out(
+    # in
+    first_lens: int,
+    centre: wp.array(dtype=wp.float64),  # (lens, 2), flat
+    corner: wp.array(dtype=int),
+    lenses: int,  # in a row
+    edge: int,
+    columns: int,
+    rows: int,
+    radius: float,  # [pixel]
+    curvature: float,  # how far the edge's mean curvature moves it [pixel]
+    # out
+    pixel_out: wp.array(dtype=int),
+    share_out: wp.array(dtype=float),
+):
+    lens = first_lens + wp.tid()
+    _lay_out_lens(lens, centre, corner, lenses, edge, columns, rows, radius, curvature, pixel_out, share_out)
+
+
+def lay_out(first_lens, centre, radius, edge, sensor_shape):
+    """Lay a sensor's pixels out as the rays of its lenses.
+
+    A pixel at a microimage's edge shows the part of its cell inside the pupil, whose middle lies inwards of its own: so
+    a lens has more versions of its block, with shares for weights that fall or rise outwards.
+
+    Parameters
+    ----------
+    first_lens : tuple of int
+        Lattice indices (i, j) of the first lens.
+    centre : ndarray, shape (lenses along j, lenses along i, 2), float64
+        Centres (column, row) of the microimages; pixel n spans n to n + 1.
+    radius : float
+        Radius of a microimage [pixel].
+    edge : int
+        Pixels along each side of a block.
+    sensor_shape : tuple of int
+        Rows and columns of the sensor.
+
+    Returns
+    -------
+    Microimages
+    """
+    runtime.device()
+    wp.load_module(sys.modules[__name__], device="cpu")  # before threads use it
+    corner = np.floor(centre - radius).astype(np.int32)
+    count = LAYERS * centre[..., 0].size * edge**2
+    pixel, share = np.empty(count + LANES, np.int32), np.empty(count + LANES, np.float32)
+    pixel[count:], share[count:] = -1, 0.0
+    rows, columns = sensor_shape
+    inputs = [
+        *(wp.array(np.ravel(array), device="cpu", copy=False) for array in (centre, corner)),
+        *(centre.shape[1], edge, columns, rows, radius, 1 / (24 * max(radius, 1.0))),
+    ]
+    outputs = [wp.array(array, device="cpu", copy=False) for array in (pixel, share)]
+
+    def launch(_, first, last):
+        wp.launch(_lay_out, dim=last - first, inputs=[first, *inputs], outputs=outputs, device="cpu")
+
+    runtime.run_chunks(corner[..., 0].size, launch)
+    return Microimages(
+        first_lens=first_lens, corner=corner, edge=edge, pixel=pixel, share=share, sensor_shape=(rows, columns)
+    )

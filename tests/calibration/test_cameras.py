@@ -1,0 +1,412 @@
+"""Calibration as a whole: the mapping against true rays, files that come back the same, warnings where they are due."""
+
+import dataclasses
+import json
+import logging
+import re
+import shutil
+
+import numpy as np
+import pytest
+import tifffile
+from lightfield.test_lens_array import basis_of, render
+from scipy import ndimage
+from support.ideal_rig import rotation
+
+import lfpiv
+from lfpiv.calibration import checks
+from lfpiv.calibration.board.board import HELD_BYTES, Planes, agreeing_dots
+from lfpiv.calibration.cameras import warn_outside
+from lfpiv.calibration.thin_lens_model import thin_lens_model
+from lfpiv.experiment import nominal_checks
+from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.image_checks import APERTURE, microimage_px, stated_px
+from lfpiv.runs import summary
+from lfpiv.simulation.flows import KINDS, window_mean
+from lfpiv.simulation.scene import true_mapping
+from lfpiv.simulation.simulator import simulate
+
+MAPPING_PITCH = 0.015  # the project's limit for the mean error over the board's volume
+MAPPING_AIM_PITCH = 0.006  # its aim, reached on clean images
+INTERIOR_VOXEL = 0.45  # the project's limit for the mean displacement error of interior vectors
+FINITE = 0.95  # the project's limit for the part of grid points with a finite vector
+CORRECTION_SHARE = 0.1  # two samples of rays: voxel centres within the volume against all of the volume
+ROUND_TRIP_MM = 1e-9  # a calibration read back is the same to rounding
+
+SCENE = """
+name = "rig"
+seed = 9
+dt_s = 1e-3
+[board]
+dots = [5, 5]
+spacing_mm = 0.5
+dot_diameter_mm = 0.1
+planes_mm = [-0.8, -0.4, 0.0, 0.4, 0.8]
+[volume]
+size_mm = [2.0, 2.0, 1.2]
+voxel_mm = 0.1
+[particles]
+count = 40
+pairs = 1
+[flow]
+kind = "uniform"
+displacement_mm = [0.05, 0.0, 0.0]
+
+[[camera]]
+name = "only"
+focal_length_mm = 100.0
+magnification = -1.0
+f_number = 4.0
+microlens_pitch_mm = 0.1
+microlens_focal_length_mm = 0.8
+pixel_um = 8.0
+sensor_width_px = 420
+sensor_height_px = 400
+nominal_angle_deg = -30.0
+true_yaw_deg = -33.0
+true_pitch_deg = 0.8
+true_roll_deg = -1.1
+true_offset_mm = [0.05, -0.04, 0.1]
+true_array_roll_deg = 0.4
+true_array_offset_mm = [0.02, 0.03]
+"""
+
+
+def rays_in(low, high, count=50_000, radius=12.5, seed=0):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(low, high, (count, 3))
+    length, angle = radius * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    return points, np.stack([length * np.cos(angle), length * np.sin(angle)], axis=1)
+
+
+def mean_error_pitch(camera, spec, low, high):
+    points, pupil = rays_in(low, high)
+    return np.linalg.norm(camera.map(points, pupil) - true_mapping(spec)(points, pupil), axis=1).mean() / 0.1
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory, device):
+    """A misaligned camera's experiment, its true description and its calibration."""
+    folder = tmp_path_factory.mktemp("calibration")
+    (folder / "scene.toml").write_text(SCENE)
+    experiment = lfpiv.open_experiment(simulate(folder / "scene.toml", folder / "data"))
+    spec = json.loads((folder / "data" / "truth" / "spec.json").read_text())["camera"][0]
+    return experiment, spec, lfpiv.calibrate(experiment)
+
+
+def test_the_mapping_meets_the_true_rays(rig):
+    experiment, spec, calibration = rig
+    camera = calibration.cameras["only"]
+    error = mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8])
+    assert error <= MAPPING_AIM_PITCH
+    report = camera.report
+    assert report["dots_found"] == report["dots_expected"] == 125
+    assert error / 3 < report["sigma_nor_test"] < 10 * error  # the figure users see tells the order of the error
+    ideal = lfpiv.thin_lens(experiment).cameras["only"]
+    assert mean_error_pitch(ideal, spec, [-1, -1, -0.8], [1, 1, 0.8]) > 10 * MAPPING_PITCH  # it knows no misalignment
+
+
+def test_a_calibration_read_back_is_the_same(rig, tmp_path):
+    _, _, calibration = rig
+    calibration.save(tmp_path / "calibration.h5")
+    again = lfpiv.load_calibration(tmp_path / "calibration.h5").cameras["only"]
+    camera = calibration.cameras["only"]
+    points, pupil = rays_in([-1, -1, -1], [1, 1, 1], count=100)
+    assert np.abs(again.map(points, pupil) - camera.map(points, pupil)).max() <= ROUND_TRIP_MM
+    assert again.optics == camera.optics
+    assert again.lattice == camera.lattice
+    assert again.report == json.loads(json.dumps(camera.report))
+    assert again.gain.tobytes() == camera.gain.tobytes()
+    image = np.full(camera.optics.sensor_shape, 40.0)
+    assert again.decoder.background(image) == camera.decoder.background(image)
+
+
+def test_a_fan_of_rays_is_the_mapping(rig):
+    _, _, calibration = rig
+    camera = calibration.cameras["only"]
+    points, pupil = rays_in([-1, -1, -1], [1, 1, 1], count=20)
+    fan = camera.map_fan(points, pupil[:5])
+    assert fan.shape == (20, 5, 2)
+    for k in range(5):
+        single = camera.map(points, np.repeat(pupil[k : k + 1], 20, axis=0))
+        assert np.abs(fan[:, k] - single).max() <= 1e-5  # float32 of positions up to 2 mm, some sums deep
+
+
+def test_thin_lens_is_direct_ray_tracing_at_the_nominal_angle(rig):
+    experiment, _, _ = rig
+    points, pupil = rays_in([-1, -1, -1], [1, 1, 1], count=200)
+    for error, angle in ((0.0, -30.0), (1.0, -31.0)):  # Eqs. 11-12: every angle's magnitude is overestimated
+        camera = lfpiv.thin_lens(experiment, angle_error_deg=error).cameras["only"]
+        seen = points @ rotation(angle).T
+        m = 200 / (200 - seen[:, 2:])
+        expected = (1 - 200 / 100 + m) * pupil - m * seen[:, :2]
+        assert np.abs(camera.map(points, pupil) - expected).max() <= ROUND_TRIP_MM
+
+
+def test_a_volume_outside_the_board_is_warned_of_with_numbers(rig, caplog):
+    _, _, calibration = rig
+    with caplog.at_level(logging.WARNING):
+        warn_outside(calibration, lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2, 2, 1.6), voxel_mm=0.1))
+        assert not caplog.records
+        warn_outside(calibration, lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(4, 2, 1.6), voxel_mm=0.1))
+    # 40 columns of voxels at -1.95 ... 1.95 mm; the board spans -1 ... 1 and half a voxel more, which holds 22 of them
+    assert "only: 45 % of the volume lies outside" in caplog.text
+    assert "by up to 0.90 mm" in caplog.text
+
+
+def test_a_wrongly_named_dot_is_left_out(rig):
+    _, _, calibration = rig
+    dots = calibration.cameras["only"].dots
+    rng = np.random.default_rng(0)
+    departure = 0.0003 * rng.normal(size=dots.array_mm.shape) + 0.02 * dots.points_mm[:, :2] ** 2  # smooth distortion
+    assert agreeing_dots(dots, departure, 0.1).all()
+    wrong = dots.dot == dots.measured_dot[37]
+    departure[wrong] += 0.5
+    assert (agreeing_dots(dots, departure, 0.1) == ~wrong).all()
+
+
+@pytest.mark.parametrize("mistake", ["planes", "angle"])
+def test_a_board_that_no_such_camera_can_see_is_refused(rig, mistake):
+    experiment, _, _ = rig
+    if mistake == "planes":
+        board = experiment.board.model_copy(update={"planes_mm": tuple(-z for z in experiment.board.planes_mm)})
+        wrong = dataclasses.replace(experiment, board=board)
+    else:
+        camera = dataclasses.replace(experiment.cameras[0], nominal_angle_deg=-experiment.cameras[0].nominal_angle_deg)
+        wrong = dataclasses.replace(experiment, cameras=(camera,))
+    with pytest.raises(lfpiv.InputError, match="image_flip"):
+        lfpiv.calibrate(wrong)
+
+
+@pytest.mark.parametrize("stated", [(6, 6), (8, 5), (4, 4), (5, 3), (30, 30)])
+def test_a_board_stated_larger_or_smaller_than_it_is_is_refused(rig, stated):
+    """An even number for an odd one shifts all names by half a spacing and nothing else would tell."""
+    experiment, _, _ = rig
+    board = experiment.board.model_copy(update={"dots": stated})
+    with pytest.raises(lfpiv.InputError, match=r"planes 0-4: 5 x 5.* Set dots = \[5, 5\]"):
+        lfpiv.calibrate(dataclasses.replace(experiment, board=board))
+
+
+def spoiled(experiment, folder, images):
+    """The experiment with other images in some planes of its board."""
+    shutil.copytree(experiment.path.parent, folder)
+    for plane, image in images.items():
+        tifffile.imwrite(folder / experiment.board_path("only", plane).relative_to(experiment.path.parent), image)
+    return lfpiv.open_experiment(folder / experiment.path.name)
+
+
+def test_planes_without_dots_are_named_and_left_out(rig, tmp_path, caplog):
+    experiment, spec, _ = rig
+    rng = np.random.default_rng(0)
+    noise = [np.rint(40 + 3 * rng.standard_normal((400, 420))).astype(np.uint16) for _ in range(4)]
+    with caplog.at_level(logging.WARNING):
+        camera = lfpiv.calibrate(spoiled(experiment, tmp_path / "one", {2: noise[0]})).cameras["only"]
+    assert "plane 2 of the board (z = 0 mm)" in caplog.text and "plane_02.tif" in caplog.text
+    assert camera.report["dots_found_per_plane"] == [25, 25, 0, 25, 25]
+    assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8]) <= MAPPING_AIM_PITCH
+    with pytest.raises(lfpiv.InputError, match=r"dots in 2 planes or more, found them in 1 of 5.*plane_00\.tif"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "four", dict(enumerate(noise))))
+
+
+def some_planes(experiment, *planes_mm):
+    """The experiment with these depths of its first planes."""
+    return dataclasses.replace(experiment, board=experiment.board.model_copy(update={"planes_mm": planes_mm}))
+
+
+def test_saturated_dots_are_left_out_with_a_dark_image_too(rig, tmp_path):
+    """Dots five times too bright; less a dark image, the pixels at the range's end are no longer all alike."""
+    experiment, spec, _ = rig
+    rng = np.random.default_rng(0)
+    bright = {}
+    for plane in range(3):
+        image = experiment.board_image("only", plane)
+        level = np.median(image)
+        bright[plane] = np.clip(np.rint(level + 5 * (image - level)), 0, 4095).astype(np.uint16)
+    experiment = some_planes(spoiled(experiment, tmp_path / "data", bright), -0.8, -0.4, 0.0)
+    dark = tmp_path / "dark.tif"
+    tifffile.imwrite(dark, np.rint(level + 3 * rng.standard_normal((400, 420))).astype(np.uint16))
+    setup = dataclasses.replace(experiment.cameras[0], dark_path=dark)
+    camera = lfpiv.calibrate(dataclasses.replace(experiment, cameras=(setup,))).cameras["only"]
+    assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0]) <= MAPPING_AIM_PITCH
+    assert any("saturated and left out" in text for text in camera.report["warnings"])
+
+
+def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(rig, tmp_path):
+    experiment, spec, _ = rig
+    copy = experiment.board_image("only", 2).astype(np.uint16)
+    with pytest.raises(lfpiv.InputError, match=r"plane_03\.tif.*found the same image as .*plane_02\.tif"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "data", {3: copy}))
+    camera = lfpiv.calibrate(some_planes(experiment, -0.8, -0.4, 0.1, 0.4, 0.8)).cameras["only"]
+    (text,) = (text for text in camera.report["warnings"] if "do not fit the others" in text)
+    assert "25 of 25 dots of plane 2" in text and "z = 0.1 mm" in text and "plane_02.tif" in text
+    assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8]) <= MAPPING_AIM_PITCH  # it goes without them
+
+
+def test_few_dots_and_a_poor_mapping_are_warned_of(rig):
+    """Eight dots have six to train with; their labels are many, but tell no more than the dots' ray models."""
+    _, _, calibration = rig
+    camera = calibration.cameras["only"]
+    assert camera.report["warnings"] == []
+    for training_dots, sigma, expected in ((88, 0.004, []), (6, 0.09, ["72 values for its 162", "0.090 pitch off"])):
+        report = camera.report | {"sigma_nor_test": sigma, "warnings": []}
+        checks.warn(dataclasses.replace(camera, report=report), "lens_integral", training_dots)
+        assert len(report["warnings"]) == len(expected)
+        assert all(part in text for part, text in zip(expected, report["warnings"], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("pitch_px", "layout", "fill", "blur", "dark"),
+    [
+        (12.5, "square", 1.0, 1.0, False),
+        (12.6, "square", 0.5, 0.6, False),
+        (12.6, "square", 1.1, 0.7, True),
+        (23.3, "hexagonal", 0.85, 1.5, False),
+        (9.1, "hexagonal", 1.0, 1.0, True),
+        (7.0, "square", 0.75, 0.5, False),
+    ],
+)
+def test_the_white_image_tells_the_diameter_of_the_microimages(pitch_px, layout, fill, blur, dark):
+    """Whatever aperture is stated; dust, dead lenses, and light that falls towards the edges included."""
+    rng = np.random.default_rng(4)
+    side, level = max(220, int(14 * pitch_px)), 100
+    lenses = {"brightness": lambda centres: (rng.random(len(centres)) > 0.03) * (1.2 - centres[:, 0] / side)}
+    basis = basis_of(pitch_px, 0.4, layout)
+    light = render((side, side), np.array([side / 2, side / 2]), basis, fill * pitch_px, **lenses)
+    white = rng.normal(level + 1500 * ndimage.gaussian_filter(light, blur), 5)
+    capped = np.full(white.shape, float(level)) if dark else None
+    for stated in (0.85, 1.0, 1.15, 1.4):
+        pixel_mm = 0.1 / pitch_px
+        optics = Optics(
+            focal_length_mm=100, magnification=-1, f_number=100 * 0.8 / 200 / (stated * fill * 0.1),
+            microlens_pitch_mm=0.1 / 1.004, microlens_focal_length_mm=0.8, pixel_mm=pixel_mm,
+            sensor_shape=white.shape, layout=layout,
+        )  # fmt: skip
+        origin = optics.sensor_mm(np.array([side / 2, side / 2])) / 1.004
+        vectors = tuple(map(tuple, basis * pixel_mm / 1.004))
+        lattice = LensLattice(origin_mm=tuple(origin), basis_mm=vectors, layout=layout)
+        decoder = LightFieldDecoder.from_white(optics, lattice, white, capped)
+        assert stated_px(optics) == pytest.approx(stated * fill * pitch_px)
+        wrong = microimage_px(white, capped, decoder) / (fill * pitch_px) - 1
+        assert abs(wrong) < APERTURE  # the right optics raise no warning, others one or more
+
+
+def test_a_wrong_f_number_is_refused_or_warned_of(rig):
+    experiment, _, _ = rig
+
+    def with_f_number(number):
+        setup = experiment.cameras[0]
+        optics = dataclasses.replace(setup.optics, f_number=number)
+        wrong = dataclasses.replace(experiment, cameras=(dataclasses.replace(setup, optics=optics),))
+        return lfpiv.thin_lens(wrong).cameras["only"].report["warnings"]
+
+    assert with_f_number(4.0) == []
+    (text,) = with_f_number(3.6)
+    assert re.search(r"not 13\.9 px as f_number = 3\.6 .*; f_number = (3\.9\d|4|4\.0\d) would fit", text)
+    for number in (0.4, 2.8, 5.6):
+        with pytest.raises(lfpiv.InputError, match="white"):
+            with_f_number(number)
+
+
+def test_small_microimages_leave_enough_pixels(rig, tmp_path):
+    """At f/8 they are six pixels across."""
+    small = SCENE.replace("f_number = 4.0", "f_number = 8.0").replace("[-0.8, -0.4, 0.0, 0.4, 0.8]", "[-0.8, 0.0, 0.8]")
+    (tmp_path / "scene.toml").write_text(small)
+    experiment = lfpiv.open_experiment(simulate(tmp_path / "scene.toml", tmp_path / "data"))
+    spec = json.loads((tmp_path / "data" / "truth" / "spec.json").read_text())["camera"][0]
+    camera = lfpiv.calibrate(experiment).cameras["only"]
+    assert camera.report["dots_found"] >= 0.9 * 75
+    points, pupil = rays_in([-1, -1, -0.8], [1, 1, 0.8], radius=6.25)
+    miss = np.linalg.norm(camera.map(points, pupil) - true_mapping(spec)(points, pupil), axis=1)
+    assert miss.mean() / 0.1 <= MAPPING_AIM_PITCH
+
+
+def test_board_images_are_held_as_far_as_memory_allows():
+    rng, asked = np.random.default_rng(0), []
+    whole = rng.integers(0, 4096, (12, 6, 7)).astype(np.float32)
+    whole[1] += 0.5  # no whole counts
+
+    def read(plane):
+        asked.append(plane)
+        return whole[plane]
+
+    planes = Planes(read, len(whole))
+    for _ in range(3):
+        assert all(np.array_equal(image, true) for image, true in zip(planes, whole, strict=True))
+    held = HELD_BYTES // 2
+    assert [asked.count(plane) for plane in range(12)] == [1, 3, *[1] * (held - 1), *[3] * (11 - held)]
+
+
+def test_particle_images_in_place_of_boards_are_refused(rig, tmp_path):
+    experiment, _, _ = rig
+    frames = [experiment.particle_image("only", 0, frame).astype(np.uint16) for frame in "ab"]
+    wrong = {plane: frames[plane % 2][:: 1 - 2 * (plane // 2 % 2), :: 1 - 2 * (plane // 4)] for plane in range(5)}
+    with pytest.raises(lfpiv.InputError, match="board images"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "data", wrong))
+
+
+def test_a_volume_that_the_calibrated_camera_does_not_see_is_refused(rig, caplog):
+    experiment, _, calibration = rig
+    sees = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
+    assert nominal_checks.seen_share(calibration.cameras["only"], sees) == 1
+    beside = lfpiv.Grid.from_extent(centre_mm=(0, 4.0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
+    with pytest.raises(lfpiv.InputError, match=r"around \(0, 4, 0\) mm of which camera 'only' sees nothing"):
+        nominal_checks.require_seen(experiment.path, calibration, beside)
+    half = lfpiv.Grid.from_extent(centre_mm=(0, 2.2, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
+    with caplog.at_level(logging.WARNING):
+        nominal_checks.require_seen(experiment.path, calibration, half)
+    assert "% of the volume" in caplog.text
+
+
+def test_the_networks_part_is_what_it_adds_to_the_thin_lens(rig):
+    experiment, _, calibration = rig
+    camera = calibration.cameras["only"]
+    points, pupil = rays_in([-1, -1, -0.6], [1, 1, 0.6], count=20_000)
+    added = camera.map(points, pupil) - camera.baseline(points, pupil)
+    expected = np.sqrt((added**2).sum(1).mean()) / camera.lattice.pitch_mm
+    assert summary.network_correction(camera, experiment.grid) == pytest.approx(expected, rel=CORRECTION_SHARE)
+    assert summary.network_correction(lfpiv.thin_lens(experiment).cameras["only"], experiment.grid) is None
+
+
+def test_wrong_arguments_are_named(rig, tmp_path):
+    experiment, _, calibration = rig
+    for angle in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="angle_error_deg: expected a finite angle"):
+            lfpiv.thin_lens(experiment, angle_error_deg=angle)
+    with pytest.raises(ValueError, match="angle_deg: expected a finite"):
+        thin_lens_model(calibration.cameras["only"].optics, np.nan)
+    with pytest.raises(ValueError, match=r"expected shapes \(n, 3\) and \(n, 2\)"):
+        calibration.cameras["only"].map(np.zeros((3, 2)), np.zeros((3, 2)))
+    with pytest.raises(lfpiv.InputError, match="could not read it"):
+        lfpiv.load_calibration(tmp_path / "missing.h5")
+    (tmp_path / "damaged.h5").write_bytes(b"no calibration")
+    with pytest.raises(lfpiv.InputError, match="could not read it"):
+        lfpiv.load_calibration(tmp_path / "damaged.h5")
+
+
+@pytest.mark.sample_data
+def test_the_sample_experiment_reaches_the_projects_figures(sample_data, tmp_path, device):
+    """The main job on the sample data: mapping against the true rays, vectors against the true flow."""
+    import xarray as xr
+
+    folder = sample_data / "ring-vortex-2cam"
+    summary = lfpiv.run(folder / "experiment.toml", tmp_path, pairs=(0, 1), device=device.kind)
+    spec = json.loads((folder / "truth" / "spec.json").read_text())
+    calibration = lfpiv.load_calibration(tmp_path / "calibration.h5")
+    for truth in spec["camera"]:
+        error = mean_error_pitch(calibration.cameras[truth["name"]], truth, [-3, -3, -2], [3, 3, 2])
+        assert error <= MAPPING_AIM_PITCH
+        assert summary["calibration"][truth["name"]]["sigma_nor_test"] <= 0.03
+    vectors = xr.open_dataset(tmp_path / "vectors" / "pair_0000.nc")
+    flow = KINDS["ring"](**{key: value for key, value in spec["flow"].items() if key != "kind"})
+    z, y, x = np.meshgrid(vectors.z, vectors.y, vectors.x, indexing="ij")
+    window_mm = 0.1 * json.loads(vectors.attrs["settings"])["windows"][-1][0]
+    expected = window_mean(flow, np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1), window_mm) / 0.1
+    measured = np.stack([vectors[f"displacement_{axis}"].values.ravel() for axis in "xyz"], axis=1)
+    error = np.linalg.norm(measured - expected, axis=1).reshape(z.shape)
+    assert np.isfinite(measured).all(1).mean() >= FINITE
+    assert error[1:-1, 1:-1, 1:-1].mean() <= INTERIOR_VOXEL
+    for name, axis in (("u", "x"), ("v", "y"), ("w", "z")):
+        metres = vectors[f"displacement_{axis}"].values * 0.1e-3 / spec["dt_s"]
+        assert np.allclose(vectors[name].values, metres, rtol=1e-5)
+        assert vectors[name].attrs["units"] == "m/s"

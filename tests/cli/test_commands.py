@@ -1,0 +1,228 @@
+"""The command line: exit status, one message for what the user can mend, nothing left behind."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import tifffile
+import typer
+
+import lfpiv
+from lfpiv.cli import commands, terminal
+from lfpiv.errors import InputError
+from lfpiv.runs import memory, pipeline
+
+
+def run(*arguments):
+    """A real process: status, standard output, standard error."""
+    command = [sys.executable, "-m", "lfpiv", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "80"})
+    return done.returncode, done.stdout, done.stderr
+
+
+def edit(file, old, new):
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
+
+
+SPOILERS = {
+    "white image missing": (lambda e: (e.parent / "white/left.tif").unlink(), "white/left.tif"),
+    "plane missing": (lambda e: (e.parent / "board/right/plane_01.tif").unlink(), "board/right/plane_01.tif"),
+    "TIFF truncated": (
+        lambda e: os.truncate(e.parent / "board/left/plane_01.tif", 900),
+        "board/left/plane_01.tif",
+    ),
+    "first pair missing": (
+        lambda e: (e.parent / "particles/left/0000a.tif").unlink(),
+        "particles/left/0000a.tif",
+    ),
+    "first pair truncated": (
+        lambda e: os.truncate(e.parent / "particles/right/0000b.tif", 900),
+        "--pairs 1:",
+    ),
+    "shape": (
+        lambda e: tifffile.imwrite(e.parent / "board/left/plane_00.tif", np.ones((48, 60), np.uint16)),
+        "board/left/plane_00.tif",
+    ),
+    "dtype": (
+        lambda e: tifffile.imwrite(e.parent / "white/right.tif", np.ones((56, 40), np.complex64)),
+        "white/right.tif",
+    ),
+    "colour": (
+        lambda e: tifffile.imwrite(e.parent / "white/left.tif", np.ones((48, 64, 3), np.uint8), photometric="rgb"),
+        "white/left.tif",
+    ),
+    "all black": (
+        lambda e: tifffile.imwrite(e.parent / "white/left.tif", np.zeros((48, 64), np.uint16)),
+        "white/left.tif",
+    ),
+    "unknown key": (lambda e: edit(e, "pairs = 2", "pairs = 2\n[optics]\n"), "optics"),
+    "misspelt key": (lambda e: edit(e, "pairs = 2", "pairs = 2\n[smart]\niteration = 3"), "'iterations'"),
+    "text for a number": (lambda e: edit(e, "voxel_mm = 0.05", 'voxel_mm = "small"'), "volume.voxel_mm"),
+    "negative pitch": (
+        lambda e: edit(e, "microlens_pitch_mm = 0.1", "microlens_pitch_mm = -0.1"),
+        "microlens_pitch_mm",
+    ),
+    "zero size": (lambda e: edit(e, "size_mm = [0.8,", "size_mm = [0.0,"), "volume.size_mm[0]"),
+    "too little memory": (lambda e: edit(e, "voxel_mm = 0.05", "voxel_mm = 1e-5"), "GiB"),
+    "more than any memory": (lambda e: edit(e, "size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e6, 1e6, 1e6]"), "GiB"),
+    "no such pair": (lambda e: None, "pairs"),
+    "a million dots": (lambda e: edit(e, "dots = [5, 5]", "dots = [1000000, 1000000]"), "board.dots"),
+    "volume out of view": (lambda e: edit(e, "centre_mm = [0.0,", "centre_mm = [50.0,"), "volume.centre_mm"),
+    "a million threads": (lambda e: edit(e, "pairs = 2", "pairs = 2\n[compute]\nthreads = 1000000"), "compute.threads"),
+}
+
+
+@pytest.mark.parametrize("case", SPOILERS)
+def test_bad_input_is_status_2_with_one_line_and_nothing_left(tiny_experiment, tmp_path, capfd, case):
+    spoil, named = SPOILERS[case]
+    spoil(tiny_experiment)
+    before = sorted(tmp_path.rglob("*"))
+    pairs = ["--pairs", "1:3"] if case == "no such pair" else []
+    status = commands.call(["run", str(tiny_experiment), "--out", str(tmp_path / "new" / "out"), *pairs])
+    written, said = capfd.readouterr()
+    assert status == 2 and written == ""
+    assert said.count("\n") == 1 and said.startswith("lfpiv: ") and named in said, said
+    assert "Traceback" not in said
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_many_warnings_are_counted(capfd, tmp_path):
+    texts = [f"camera {number} sleeps" for number in range(terminal.WARNINGS_TOLD + 1234)]
+    summary = {"calibration": {}, "pairs": [], "warnings": texts, "timings_s": {"total": 1.0}, "peak_memory_mib": 1.0}
+    terminal.tell_run(summary, tmp_path)
+    said = capfd.readouterr().out.splitlines()
+    assert sum(line.startswith("warning: camera") for line in said) == terminal.WARNINGS_TOLD
+    assert f"1,234 more warnings are in {tmp_path / 'summary.json'}" in said
+
+
+@pytest.mark.parametrize("command", ["run", "calibrate", "reconstruct", "correlate", "report"])
+def test_every_step_refuses_a_folder_it_cannot_write(tiny_experiment, tmp_path, capfd, command):
+    (tmp_path / "file").write_text("not a folder")
+    status = commands.call([command, str(tiny_experiment), "--out", str(tmp_path / "file" / "out")])
+    said = capfd.readouterr().err
+    assert status == 2 and said.count("\n") == 1 and str(tmp_path / "file" / "out") in said
+
+
+@pytest.mark.parametrize(("name", "make"), [("vectors", "file"), ("volumes", "file"), ("calibration.h5", "folder")])
+def test_a_place_for_results_that_is_taken_is_refused_before_work(tiny_experiment, tmp_path, capfd, name, make):
+    place = tmp_path / "out" / name
+    place.parent.mkdir()
+    if make == "file":
+        place.write_text("not a folder")
+    else:
+        place.mkdir()
+    status = commands.call(["run", str(tiny_experiment), "--out", str(place.parent)])
+    said = capfd.readouterr().err
+    assert status == 2 and said.count("\n") == 1 and str(place) in said and "expected a" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run"], ["EXPERIMENT.toml"]),
+        (["run", "x.toml"], ["--out"]),
+        (["frobnicate"], ["frobnicate"]),
+        (["run", "x.toml", "--out", "x", "--device", "tpu"], ["--device", "tpu"]),
+        (["run", "x.toml", "--out", "x", "--pairs", "3"], ["--pairs", "A:B"]),
+        (["run", "no-such-file.toml", "--out", "x"], ["no-such-file.toml", "no such file"]),
+        (["run", ".", "--out", "x"], ["a folder"]),
+    ],
+)
+def test_wrong_usage_is_status_2_with_one_line(tmp_path, monkeypatch, capfd, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert commands.call(arguments) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and all(word in said for word in words), said
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (ZeroDivisionError("by zero"), 1, ["unexpected ZeroDivisionError: by zero", "--debug"]),
+        (KeyboardInterrupt(), 1, ["interrupted"]),
+        (MemoryError(), 1, ["out of memory"]),
+        (InputError("file.tif: expected light,\nfound none."), 2, ["file.tif: expected light, found none."]),
+    ],
+)
+def test_a_failure_inside_is_one_line_and_a_traceback_only_on_request(monkeypatch, capfd, error, status, words):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(pipeline, "run", fail)
+    assert commands.call(["run", "x.toml", "--out", "x"]) == status
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and all(word in said for word in words), said
+    assert commands.call(["run", "x.toml", "--out", "x", "--debug"]) == status
+    assert "Traceback" in capfd.readouterr().err
+
+
+def test_real_processes_end_with_the_same_status(tiny_experiment, tmp_path):
+    assert run("--version") == (0, f"lfpiv {lfpiv.__version__}\n", "")
+    (tiny_experiment.parent / "white/left.tif").unlink()
+    status, written, said = run("run", tiny_experiment, "--out", tmp_path / "out")
+    assert status == 2 and written == "" and said.count("\n") == 1 and "white/left.tif" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_json_is_the_whole_of_standard_output_and_quiet_says_nothing(monkeypatch, tmp_path, capfd):
+    summary = {"failed": [{"pair": 1, "reason": "dark"}], "experiment": {"pairs": 2}, "value": np.float32("nan")}
+    monkeypatch.setattr(pipeline, "run", lambda *args, **options: summary)
+    command = ["run", "x.toml", "--out", str(tmp_path)]
+    assert commands.call([*command, "--json"]) == 3
+    written, said = capfd.readouterr()
+    assert json.loads(written) == {**summary, "value": None} and "failed: pair 1: dark" in said
+    monkeypatch.setattr(pipeline, "run", lambda *args, **options: {**summary, "failed": []})
+    assert commands.call([*command, "--quiet"]) == 0 and capfd.readouterr() == ("", "")
+
+
+def test_options_of_one_call_do_not_reach_the_next(capfd):
+    assert commands.call(["doctor", "--json"]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert {"item", "finding", "good"} == set(found[0]) and all(item["good"] for item in found)
+    assert commands.call(["doctor"]) == 0
+    assert found[0]["finding"] in capfd.readouterr().out.splitlines()[0]
+
+
+@pytest.mark.parametrize("name", sorted(typer.main.get_command(commands.app).commands))
+def test_help_shows_examples_that_the_parser_takes(name, capfd, monkeypatch):
+    assert commands.call([name, "--help"]) == 0
+    shown = capfd.readouterr().out
+    examples = [line.split() for line in shown.split("Examples:")[1].splitlines() if line.strip()]
+    assert examples and all(words[:2] == ["lfpiv", name] for words in examples)
+    for _, *words in examples:
+        command = typer.main.get_command(commands.app).commands[name]
+        command.make_context(name, words[1:])  # raises on what it does not know
+
+
+def test_the_shell_completes_commands():
+    words = {"_LFPIV_COMPLETE": "complete_bash", "COMP_WORDS": "lfpiv re", "COMP_CWORD": "1"}
+    done = subprocess.run([sys.executable, "-m", "lfpiv"], capture_output=True, text=True, env={**os.environ, **words})
+    assert done.stdout.split() == ["reconstruct", "report", "reproduce"]
+
+
+def test_log_lines_tell_the_time_left(caplog, monkeypatch):
+    clock = iter([0.0, 5.0, 60.0, 120.0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
+    with terminal.Voice().speaking() as progress, caplog.at_level("INFO", "lfpiv"):
+        for fraction in (0.0, 0.05, 0.25, 1.0):
+            progress("step", fraction)
+    assert [record.getMessage() for record in caplog.records] == ["step: 0 %", "step: 25 %, about 3 min left"]
+    assert [terminal.duration(s) for s in (40, 299, 7800)] == ["40 s", "5 min", "2 h 10 min"]
+
+
+def test_memory_is_counted_before_the_work(tiny_experiment):
+    experiment = lfpiv.open_experiment(tiny_experiment)
+    needed = memory.least_bytes(experiment)
+    assert needed > 4 * experiment.grid.size
+    memory.require(needed, experiment, "volumes of")
+    with pytest.raises(InputError, match=r"8 x 12 x 16 voxels.* 1,024\.0 GiB"):
+        memory.require(1024 * memory.GIB, experiment, "volumes of")
+    edit(tiny_experiment, "pairs = 2", "pairs = 2\n[compute]\nmemory_gib = 0.001")
+    with pytest.raises(InputError, match=r"compute\.memory_gib"):
+        memory.require(needed, lfpiv.open_experiment(tiny_experiment), "volumes of")

@@ -1,0 +1,256 @@
+"""Images that are right in form and wrong otherwise: of another camera, misplaced, saturated, half exposed, copied."""
+
+import dataclasses
+import logging
+import re
+import shutil
+
+import numpy as np
+import pytest
+import tifffile
+from support import scenes
+
+import lfpiv
+from lfpiv import statistics, warn
+from lfpiv.lightfield import image_checks
+from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, SATURATED, dark_blocks, gap_light, saturated_share
+from lfpiv.results import netcdf
+from lfpiv.runs import pair, pipeline, summary_warnings
+from lfpiv.simulation.simulator import simulate
+
+CLEAR = GAP_LIGHT / 5  # what belongs together keeps clear of the limit; real images gave 0.013, rendered ones 0.001
+GOOD = 0.02  # pitch; nobody would look twice
+MAGNIFICATION = 0.002  # ten times the spread over rigs and seeds
+QUARTER_PITCH_PX = 3  # of 12.5
+OFFSETS_MM = ((0.0, 0.0), (0.05, 0.03))
+"""Of the arrays on their sensors: half a pitch and a third of one apart, as likely as any."""
+
+
+@pytest.fixture(scope="module", params=[("square", 4.0), ("hexagonal", 5.5)], ids=lambda rig: rig[0])
+def pair_of_cameras(request, tmp_path_factory, device):
+    """Experiment and calibration of two cameras whose arrays lie differently on their sensors.
+
+    At f/4 the microimages of a hexagonal array touch all around and leave no gaps to look at.
+    """
+    layout, f_number = request.param
+    optics = {"microlens_layout": layout, "f_number": f_number}
+    cameras = [
+        scenes.camera(name, angle, (420, 400), true_array_offset_mm=offset, **optics)
+        for name, angle, offset in zip(("left", "right"), (35.0, -35.0), OFFSETS_MM, strict=True)
+    ]
+    scene = scenes.scene(
+        "exposure",
+        cameras,
+        planes_mm=(-0.5, 0.5),
+        particles={"count": 60, "sigma_mm": 0.03},
+        displacement_mm=(0.05, 0.0, 0.0),
+    )
+    experiment = lfpiv.open_experiment(simulate(scene, tmp_path_factory.mktemp("exposure") / "data"))
+    return experiment, lfpiv.thin_lens(experiment)
+
+
+def test_light_between_the_microimages_tells_another_cameras_image(pair_of_cameras):
+    experiment, calibration = pair_of_cameras
+    left, right = (calibration.cameras[name].decoder for name in ("left", "right"))
+    for image in (experiment.particle_image("left", 0, "a"), experiment.board_image("left", 0)):
+        assert gap_light(image, left) < CLEAR
+        assert gap_light(image, right) > NO_PLACE
+        assert gap_light(np.roll(image, QUARTER_PITCH_PX, axis=1), left) > GAP_LIGHT
+        slope = np.add.outer(np.linspace(0, 1, len(image)), np.linspace(0, 1, image.shape[1])) * image.max()
+        assert gap_light(image + slope, left) < CLEAR  # ambient light
+        weak = 0.02 * image + np.random.default_rng(0).normal(100, 3, image.shape)
+        assert gap_light(weak, left) < CLEAR
+    noise = np.random.default_rng(0).normal(100, 5, left.gain.shape)
+    assert gap_light(noise, left) == 0 == gap_light(np.zeros(left.gain.shape), left)
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+@pytest.mark.parametrize("justified", ["right", "left"])
+def test_saturation_is_told_at_the_end_of_a_range(bits, justified):
+    rng = np.random.default_rng(bits)
+    top = 2**bits - 1
+    step = 2 ** (16 - bits) if justified == "left" else 1
+    light = rng.exponential(0.2 * top, (300, 300))
+    assert saturated_share(np.minimum(light * 4, top).round() * step) > SATURATED
+    assert saturated_share((light * 0.9 * top / light.max()).round() * step) == 0
+    assert saturated_share(np.minimum(light, 0.7 * top)) == 0  # flat, but not at the end
+
+
+def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
+    experiment, _ = pair_of_cameras
+    first, second = (experiment.particle_image("right", 0, frame) for frame in "ab")
+    assert dark_blocks(first, second) == 0 == dark_blocks(first, 0.4 * second)
+    half = second.copy()
+    half[200:] = np.median(half)
+    assert dark_blocks(first, half) >= 2 and dark_blocks(half, first) == dark_blocks(first, half)
+
+
+def test_what_is_suspicious_about_images_is_found(pair_of_cameras):
+    experiment, calibration = pair_of_cameras
+    decoder = calibration.cameras["left"].decoder
+    first, second = (experiment.particle_image("left", 0, frame) for frame in "ab")
+
+    def found(image):
+        return [item["what"] for item in image_checks.frame_findings(image, image - 40, decoder, "left", "a")]
+
+    assert found(first) == found(second) == image_checks.camera_findings(first, second, "left") == []
+    assert found(np.roll(first, QUARTER_PITCH_PX, axis=1)) == ["misplaced"]
+    assert found(np.minimum(first * 40, 4095)) == ["saturated"]
+    assert [item["what"] for item in image_checks.camera_findings(first, second * 0.05, "left")] == ["uneven"]
+    images = [(name, image_checks.fingerprint(image)) for name, image in (("one", first), ("other", second))]
+    image_checks.require_different(images)
+    with pytest.raises(lfpiv.InputError, match=r"a copy: .* found the same image as one\. Check particles\.images"):
+        image_checks.require_different([*images, ("a copy", image_checks.fingerprint(first.copy()))])
+
+
+@pytest.mark.parametrize(
+    ("cameras", "empty", "unmeasured"),
+    [
+        (1, ["a only"], True),
+        (2, [], False),
+        (2, ["b left"], True),
+        (3, ["a left", "b right"], False),  # two cameras saw each frame
+        (3, ["b left", "b right"], True),
+    ],
+)
+def test_vectors_count_where_two_cameras_saw_particles(cameras, empty, unmeasured):
+    findings = [{"what": "empty", "camera": name[2:], "frame": name[0], "value": 0.0} for name in empty]
+    findings.append({"what": "dim", "camera": "left", "frame": "a", "value": 0.04})
+    assert image_checks.unmeasured(findings, cameras) == unmeasured
+
+
+@pytest.fixture(scope="module")
+def spoilt(small_run, tmp_path_factory):
+    """A run of which every pair has other bad images; the user has silenced the log. File, folder, exit status."""
+    folder = tmp_path_factory.mktemp("spoilt")
+    file, out = small_run.images(folder / "data"), small_run.calibrated(folder / "out")
+    rng = np.random.default_rng(0)
+    spoil(file, "particles/*/*0000*", lambda image: rng.normal(np.median(image), 4, image.shape).round())
+    for path in file.parent.glob("particles/*/*0001_a.tif"):
+        shutil.copy(path, path.with_name(path.name.replace("_a", "_b")))
+    spoil(file, "particles/*/*0002*", lambda image: np.minimum(image * 40.0, 4095))
+    spoil(file, "particles/left/*0003_b*", lambda image: np.where(np.arange(400)[:, None] < 200, image, 40))
+    logger = logging.getLogger("lfpiv")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("lfpiv.report.write_report", lambda *arguments: None)
+            summary = pipeline.run(file, out, keep_volumes=True)
+    finally:
+        logger.setLevel(before)
+    return file, out, summary
+
+
+def test_the_images_of_every_pair_are_looked_at(spoilt):
+    """What cannot be is no result, what is doubtful is said once with its pairs, whatever the log shows."""
+    _, out, summary = spoilt
+    ((failed),) = summary["failed"]
+    assert failed["pair"] == 1 and "frame b: expected an image of its own, found the same image as" in failed["reason"]
+    assert [pair["pair"] for pair in summary["pairs"]] == [0, 2, 3] == lfpiv.open_results(out).pair.values.tolist()
+    said = summary["warnings"]
+    saturated = [text for text in said if "saturated" in text]
+    assert [text.split(": ")[0] for text in saturated] == [
+        f"{name}, frame {frame}, pair 2" for frame in "ab" for name in ("left", "right")
+    ]
+    (uneven,) = [text for text in said if "of 9 parts" in text]
+    assert uneven.startswith("left, pair 3: ")
+    assert all(
+        f"{name}, frame {frame}, pair 0: no particles" in " ".join(said) for name in ("left", "right") for frame in "ab"
+    )
+
+
+def test_a_pair_of_noise_enters_no_mean(spoilt):
+    """Correlation calls its vectors valid; the images say that there is nothing to measure."""
+    file, out, summary = spoilt
+    vectors = netcdf.read_vectors(out / "vectors" / "pair_0000.nc")
+    assert not vectors["valid"].any() and np.isnan(vectors["uncertainty"]).all()
+    assert vectors.attrs["verdict"] == summary["pairs"][0]["verdict"] == pair.NO_PARTICLES
+    assert summary["pairs"][0]["valid_fraction"] == 0 < summary["pairs"][1]["valid_fraction"]
+    results = lfpiv.open_results(out)
+    mean, good = statistics.mean(results), statistics.mean(results.sel(pair=[2, 3]))
+    assert int(mean["pairs_counted"].max()) == 2
+    np.testing.assert_array_equal(mean["u"], good["u"])
+    (out / "vectors" / "pair_0000.nc").unlink()  # and of volumes in files, the same
+    pipeline.correlate(file, out, pairs=(0, 1))
+    assert netcdf.read_vectors(out / "vectors" / "pair_0000.nc").equals(vectors)
+
+
+def test_warnings_outlive_the_invocation(spoilt, tmp_path, monkeypatch):
+    """The same command again, and a report made anew, say what the first run said."""
+    file, out, first = spoilt
+    pages = []
+    monkeypatch.setattr("lfpiv.report.write_report", lambda *arguments: pages.append(arguments[2]["warnings"]))
+    for again in (pipeline.run(file, out, keep_volumes=True), pipeline.report(file, out)):
+        assert again["warnings"] == first["warnings"] and len(first["warnings"]) > len(first["pairs"])
+    assert pages == [first["warnings"]] * 2
+    alone = shutil.copytree(out, tmp_path / "out")
+    shutil.rmtree(alone / "vectors")  # volumes know it, too
+    assert [text for text in pipeline.report(file, alone)["warnings"] if "saturated" in text or "of 9" in text]
+
+
+def test_warnings_are_kept_whatever_the_log_shows():
+    log = logging.getLogger("lfpiv.silent")
+    log.setLevel(logging.CRITICAL)
+    warn.warn(log, "nobody collects")
+    with warn.collected() as outer:
+        warn.warn(log, "%d %s", 2, "lenses")
+        with warn.collected() as inner:
+            warn.warn(log, "100 % dark")
+            warn.warn(log, "100 % dark")
+        warn.warn(log, "the end")
+    assert outer == ["2 lenses", "the end"] and inner == ["100 % dark"]
+
+
+def test_many_pairs_with_the_same_trouble_are_one_line():
+    trouble = [
+        {"what": "saturated", "camera": "left", "frame": "a", "value": 0.1 + number / 1e4} for number in range(1000)
+    ]
+    (text,) = summary_warnings.of_images({"pair": number, "findings": [found]} for number, found in enumerate(trouble))
+    assert text.startswith("left, frame a, pairs 0, 1, 2, 3, 4 and 995 more: 10 to 20 % of the bright pixels")
+    poor = [{"pair": number, "verdict": "look", "valid_fraction": 0.01 * number} for number in (3, 5)]
+    assert summary_warnings.of_pairs(poor) == ["pairs 3, 5: 3 to 5 % of the vectors are valid; look"]
+
+
+def spoil(experiment, pattern, change):
+    for path in experiment.parent.glob(pattern):
+        changed = np.ascontiguousarray(change(tifffile.imread(path)))
+        tifffile.imwrite(path, changed.astype(np.uint16))
+
+
+def calibrate_first(file):
+    experiment = lfpiv.open_experiment(file)
+    return lfpiv.calibrate(dataclasses.replace(experiment, cameras=experiment.cameras[:1])).cameras["left"]
+
+
+def test_a_white_image_of_another_place_is_refused(small_run, tmp_path):
+    file = small_run.images(tmp_path / "data")
+    spoil(file, "white/left.tif", lambda image: np.roll(image, 6, axis=1))
+    with pytest.raises(lfpiv.InputError, match=r"plane_01\.tif.*'left'.*light falls between the microimages"):
+        calibrate_first(file)
+
+
+def test_a_saturated_white_image_and_pictures_on_their_side_are_named(small_run, tmp_path):
+    file = small_run.images(tmp_path / "data")
+    spoil(file, "white/*.tif", lambda image: np.minimum(image * 4.0, 4095))
+    spoil(file, "**/*.tif", np.rot90)
+    report = calibrate_first(file).report
+    assert report["sigma_nor_test"] < GOOD
+    saturated, turned = report["warnings"]
+    assert "white image's bright pixels are saturated" in saturated and "turned by 90 degrees" in turned
+
+
+def test_wrong_spacing_and_size_of_the_dots_show(small_run, tmp_path, caplog):
+    """In the magnification, and in what the dots look like; kept with the calibration, whatever the log shows."""
+    file = small_run.images(tmp_path / "data")
+    text = file.read_text("utf-8").replace("spacing_mm = 0.5", "spacing_mm = 0.45")
+    assert "dot_diameter_mm = 0.1\n" in text
+    file.write_text(text.replace("dot_diameter_mm = 0.1\n", "dot_diameter_mm = 0.15\n"), "utf-8")
+    with caplog.at_level(logging.CRITICAL, "lfpiv"):
+        report = calibrate_first(file).report
+    assert report["sigma_nor_test"] < GOOD
+    magnified, wide = report["warnings"]
+    assert re.search(r"magnified 1\.(09\d|1\d\d) times, not 1", magnified)
+    assert wide.startswith("left: the board's dots look 0.") and wide.endswith("mm wide, not 0.15 mm")
+    right = small_run.summary["calibration"]["left"]
+    assert right["magnification"] == pytest.approx(1, abs=MAGNIFICATION) and right["warnings"] == []

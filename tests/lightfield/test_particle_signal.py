@@ -1,0 +1,120 @@
+"""Images of particles told from images of noise: rendered seedings here, the ways in which a camera is noisy there."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+import lfpiv
+from lfpiv.lightfield.image_checks import structure_findings
+from lfpiv.lightfield.particle_signal import EMPTY, NOISE, seen_structure, structure
+from lfpiv.runs import summary_warnings
+from lfpiv.simulation.scene import Scene
+from lfpiv.simulation.simulator import simulate
+
+PARTICLES = 4 * NOISE  # real images keep clear of the limit: 0.27 and more were seen at a signal of ten times the noise
+
+BACKGROUND, READ_NOISE = 40.0, 3.0  # counts, as simulated
+
+
+def scene(layout, count, sigma_mm, brightness):
+    camera = {
+        "name": "only",
+        "focal_length_mm": 100.0,
+        "magnification": -1.0,
+        "f_number": 4.0,
+        "microlens_pitch_mm": 0.1,
+        "microlens_focal_length_mm": 0.8,
+        "pixel_um": 6.5,
+        "microlens_layout": layout,
+        "sensor_width_px": 420,
+        "sensor_height_px": 400,
+        "nominal_angle_deg": 35.0,
+        "true_array_roll_deg": 0.4,
+        "lens_gain_sd": 0.02,
+        "vignetting": 0.2,
+    }
+    particles = {"count": count} | ({} if sigma_mm is None else {"sigma_mm": sigma_mm})
+    return Scene.model_validate(
+        {
+            "name": "structure",
+            "seed": count,
+            "dt_s": 1e-3,
+            "camera": (camera,),
+            "board": {"dots": (3, 3), "spacing_mm": 0.5, "dot_diameter_mm": 0.1, "planes_mm": (-0.5, 0.5)},
+            "volume": {"size_mm": (2.0, 2.0, 1.4), "voxel_mm": 0.1},
+            "particles": particles,
+            "flow": {"kind": "uniform", "displacement_mm": (0.05, 0.0, 0.0)},
+            "exposure": {"particle_counts": brightness},
+            "noise": {"background": BACKGROUND, "read_noise": READ_NOISE},
+        }
+    )
+
+
+def light_and_decoder(scene, folder):
+    experiment = lfpiv.open_experiment(simulate(scene, folder))
+    decoder = lfpiv.thin_lens(experiment).cameras["only"].decoder
+    return experiment, decoder
+
+
+def judged(image, decoder):
+    image = np.asarray(image, np.float32)
+    return seen_structure(image - np.float32(decoder.background(image)[0]), decoder)
+
+
+@pytest.mark.parametrize(
+    ("layout", "count", "sigma_mm", "brightness"),
+    [
+        ("square", 20, None, 30.0),  # 0.05 particles per microlens, ten times the read noise
+        ("square", 20, 0.05, 600.0),
+        ("hexagonal", 40, None, 600.0),
+        ("square", 400, 0.07, 30.0),  # 1 per microlens, as blobs: the smoothest images there are
+        ("hexagonal", 400, None, 600.0),
+    ],
+)
+def test_particles_at_any_seeding_are_no_noise(tmp_path, device, layout, count, sigma_mm, brightness):
+    experiment, decoder = light_and_decoder(scene(layout, count, sigma_mm, brightness), tmp_path / "data")
+    image = experiment.particle_image("only", 0, "a")
+    assert judged(image, decoder) > PARTICLES
+    hot = image.copy()
+    hot.ravel()[np.random.default_rng(0).integers(0, hot.size, hot.size // 500)] = 4095
+    assert judged(hot, decoder) > PARTICLES
+
+
+def test_one_bright_particle_on_a_large_sensor_is_no_noise(tmp_path, device):
+    """Clipping, which holds hot pixels down, holds it down too."""
+    experiment, decoder = light_and_decoder(scene("square", 1, None, 600.0), tmp_path / "data")
+    image = experiment.particle_image("only", 0, "a") - np.float32(BACKGROUND)
+    row, column = np.unravel_index(gaussian_filter(image, 5).argmax(), image.shape)
+    near = np.zeros(image.shape, bool)
+    near[max(row - 6, 0) : row + 6, max(column - 6, 0) : column + 6] = True
+    noise = READ_NOISE * np.random.default_rng(2).standard_normal(image.shape).astype(np.float32)
+    few = np.where(near, image, noise)
+    assert structure(few, decoder) < NOISE < PARTICLES < seen_structure(few, decoder)
+    assert seen_structure(noise, decoder) < EMPTY
+
+
+def test_noise_of_every_kind_is_noise(tmp_path, device):
+    experiment, decoder = light_and_decoder(scene("square", 20, None, 600.0), tmp_path / "data")
+    rng = np.random.default_rng(1)
+    white = np.maximum(experiment.white("only") - BACKGROUND, 0)
+    shape = white.shape
+    read = BACKGROUND + READ_NOISE * rng.standard_normal(shape)
+    noises = {
+        "read noise": np.rint(read),
+        "less than a count": np.rint(BACKGROUND + 0.4 * rng.standard_normal(shape)),
+        "any number": rng.integers(0, 4096, shape),
+        "even light through the lenses": read + rng.poisson(0.3 * white),
+        "light that fades across": read + rng.poisson(np.linspace(0, 0.3, shape[1]) * white),
+        "hot pixels": np.where(rng.random(shape) < 0.002, 4095, read),
+        "stripes both ways": read + 5 * rng.standard_normal((shape[0], 1)) + 5 * rng.standard_normal(shape[1]),
+        "smoothed by the camera": gaussian_filter(100 * rng.standard_normal(shape), 0.7),
+    }
+    found = {name: judged(image, decoder) for name, image in noises.items()}
+    assert max(found.values()) < EMPTY, found
+
+
+def test_images_without_particles_and_dim_ones_are_named():
+    found = structure_findings({"left": 0.6, "right": 0.001}, "b") + structure_findings({"left": 0.03}, "a")
+    dim, empty = summary_warnings.of_images([{"pair": 3, "findings": found}, {"pair": 4}])  # of which nothing is known
+    assert empty.startswith("right, frame b, pair 3: no particles, only noise") and "0.001" in empty
+    assert dim.startswith("left, frame a, pair 3: particles hardly rise above the noise") and "0.03" in dim

@@ -1,0 +1,299 @@
+"""The report in a real browser: the slider, the view in space, every width and scheme, keys, and what stands in."""
+
+import base64
+import json
+import time
+
+import cv2
+import numpy as np
+import pytest
+from support import report_run
+
+from lfpiv.report import markup
+
+pytestmark = pytest.mark.browser
+
+LAPTOP, PHONE = (1366, 768), (390, 844)
+PATIENCE_S = 90
+"""Longest wait for something drawn: software WebGL on a busy machine takes seconds."""
+CONTRAST_AA = 4.5
+"""Least contrast of text that WCAG 2.1 AA asks for."""
+COLOURS_DRAWN = 500
+"""Different colours in a picture of shaded cones; an empty view has a few dozen of axes and text."""
+
+NOT_INSIDE = """
+const width = document.documentElement.clientWidth;
+const exempt = (element) => element.closest('.scroll table') || element.closest('#js-plotly-tester, .unseen');
+return [...document.body.querySelectorAll('*')].filter((element) => {
+  const box = element.getBoundingClientRect();
+  return box.width > 0 && !exempt(element) && (box.right > width + 0.5 || box.left < -0.5);
+}).map((element) => `${element.tagName}#${element.id}.${element.getAttribute('class')}`);
+"""
+
+TOO_WIDE = """
+return [...document.querySelectorAll('.scroll')]
+  .filter((frame) => !frame.closest('details:not([open])') && frame.scrollWidth > frame.clientWidth)
+  .map((frame) => `${frame.querySelector('caption').textContent}: ${frame.scrollWidth} in ${frame.clientWidth}`);
+"""
+"""Tables that are open and have to be scrolled sideways."""
+
+FAINT = """
+const channel = (value) => (value <= 0.03928 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
+const light = ([r, g, b]) => 0.2126 * channel(r / 255) + 0.7152 * channel(g / 255) + 0.0722 * channel(b / 255);
+const parts = (colour) => (colour.match(/[\\d.]+/g) || [0, 0, 0, 0]).map(Number);
+const ground = (element) => {
+  for (let up = element; up; up = up.parentElement) {
+    const colour = parts(getComputedStyle(up).backgroundColor);
+    if (colour.length < 4 || colour[3] === 1) return colour;
+  }
+  return [255, 255, 255];
+};
+const found = [];
+for (const element of document.body.querySelectorAll('main *')) {
+  const own = [...element.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim());
+  if (!own || element.closest('.js-plotly-plot') || element.tagName === 'OPTION') continue;
+  const style = getComputedStyle(element);
+  const ink = light(parts(element.closest('svg') ? style.fill : style.color)), back = light(ground(element));
+  const contrast = (Math.max(ink, back) + 0.05) / (Math.min(ink, back) + 0.05);
+  if (contrast < arguments[0]) found.push([element.tagName, element.textContent.slice(0, 30), contrast]);
+}
+return found;
+"""
+
+
+class Tab:
+    """The report in one tab."""
+
+    def __init__(self, browser, path):
+        self.browser, self.path, self.added = browser, path, []
+
+    def open(self, size=LAPTOP, scheme="light", first=""):
+        if first:
+            added = self.browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": first})
+            self.added.append(added["identifier"])
+        self.show(size, scheme)
+        self.browser.get(self.path.as_uri())
+
+    def show(self, size, scheme, media=""):
+        metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size == PHONE}
+        self.browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": media, "features": features})
+
+    def js(self, script, *arguments):
+        return self.browser.execute_script(script, *arguments)
+
+    def wait(self, condition):
+        end = time.monotonic() + PATIENCE_S
+        while not (found := self.js(f"return {condition}")):
+            assert time.monotonic() < end, f"waited in vain for {condition}; {self.errors()}"
+            time.sleep(0.1)
+        return found
+
+    def draw_space(self):
+        self.js("document.getElementById('space').scrollIntoView()")
+        self.wait("document.getElementById('space').dataset.drawn")
+
+    def keys(self, *keys):
+        from selenium.webdriver import ActionChains
+
+        for key in keys:
+            ActionChains(self.browser, duration=0).send_keys(key).perform()
+
+    def of(self, name):
+        return self.js("return document.getElementById(arguments[0]).textContent", name)
+
+    def choose(self, name, label):
+        script = """const list = document.getElementById(arguments[0]);
+        list.value = [...list.options].find((option) => option.text.startsWith(arguments[1])).value;
+        list.dispatchEvent(new Event('change'));"""
+        self.js(script, name, label)
+
+    def shown(self, selector):
+        return self.js(
+            "return [...document.querySelectorAll(arguments[0])].some((e) => e.getClientRects().length > 0)", selector
+        )
+
+    def errors(self):
+        return [entry for entry in self.browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+@pytest.fixture
+def tab(browser, reported):
+    tab = Tab(browser, reported.page)
+    tab.errors()
+    yield tab
+    for identifier in tab.added:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", {"identifier": identifier})
+
+
+def test_the_slider_moves_through_all_depths(tab):
+    from selenium.webdriver.common.keys import Keys
+
+    tab.open()
+    tab.wait("document.getElementById('slices').classList.contains('ready')")
+    tab.js(
+        "const s = document.getElementById('slice-slider'); s.value = 0; s.focus(); s.dispatchEvent(new Event('input'))"
+    )
+    truth, pictures = report_run.field(0), set()
+    for k, depth in enumerate(truth["z"].values):
+        slab = truth.isel(z=k)
+        good = slab["valid"].values
+        means = [markup.significant(float(slab[name].values[good].mean())) for name in "uvw"]
+        place = f"z = {markup.number(depth, 3)} mm"
+        assert tab.of("slice-place") == place
+        assert tab.of("slice-reading").startswith(
+            f"{place}: {good.sum()} of {good.size} vectors valid; mean u {means[0]}, "
+        )
+        row = tab.js(
+            "return [...document.querySelectorAll('#depth-table tr')[arguments[0]].children].map((c) => c.textContent)",
+            k + 1,
+        )
+        assert row[3:6] == means
+        pictures.add(tab.js("return document.getElementById('slice-canvas').toDataURL()"))
+        tab.keys(Keys.ARROW_RIGHT)
+    assert len(pictures) == truth.sizes["z"]
+    tab.choose("slice-axis", "y")
+    assert (
+        tab.of("slice-place").startswith("y = ")
+        and int(tab.js("return document.getElementById('slice-slider').max")) == 5
+    )
+    for label, said in (
+        ("pair 2", "0 of 35 vectors valid"),
+        ("fluctuation", "mean u′"),
+        ("mean of 3", "vectors valid"),
+    ):
+        tab.choose("slice-field", label)
+        assert said in tab.of("slice-reading") and tab.of("depth-field").startswith(label)
+    assert not tab.errors()
+
+
+def test_a_vector_can_be_read_by_keys(tab):
+    from selenium.webdriver.common.keys import Keys
+
+    tab.open()
+    tab.wait("document.getElementById('slices').classList.contains('ready')")
+    tab.js("document.getElementById('slice-canvas').focus()")
+    tab.keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_UP)  # the first one goes to the middle
+    vector = report_run.field(0).isel(z=2, y=4, x=4)
+    speed = float(np.sqrt(sum(float(vector[name]) ** 2 for name in "uvw")))
+    said = tab.of("slice-reading")
+    where = ", ".join(markup.number(float(vector[axis]), 3) for axis in "xyz")
+    assert said.startswith(f"(x, y, z) = ({where}) mm: u {markup.significant(float(vector['u']))} m/s")
+    assert f"speed {markup.significant(speed)} m/s, vorticity {markup.significant(2 * report_run.OMEGA)} 1/s" in said
+    assert said.endswith("; valid." if bool(vector["valid"]) else "; replaced after validation.")
+    tab.js("document.getElementById('slice-slider').focus()")
+    assert tab.of("slice-reading").startswith("z = ")
+
+
+def test_numbers_read_as_in_the_tables(tab):
+    tab.open()
+    values = [0, 2443.2, -0.012345, 1.5e-7, 123456789.0, 999.6, 0.00009996, 1e6, -3.0]
+    assert tab.js("return arguments[0].map((value) => short(value))", values) == [*map(markup.significant, values)]
+
+
+def test_the_view_in_space_draws_turns_and_fits_every_page(tab):
+    from selenium.webdriver.common.keys import Keys
+
+    tab.open(PHONE)
+    tab.draw_space()
+    assert tab.js("return document.querySelectorAll('#space-scene canvas').length") >= 1 and not tab.shown(
+        "#space .still"
+    )
+    for size, scheme in ((PHONE, "light"), (PHONE, "dark"), (LAPTOP, "dark"), (LAPTOP, "light")):
+        tab.show(size, scheme)
+        tab.wait(f"window.innerWidth === {size[0]}")
+        assert tab.js("return document.documentElement.scrollWidth") <= size[0]
+        assert tab.js(NOT_INSIDE) == []
+        assert tab.js(FAINT, CONTRAST_AA) == []
+        if size == LAPTOP:
+            tab.js("document.querySelectorAll('details').forEach((details) => { details.open = true; })")
+        assert tab.js(TOO_WIDE) == []
+    buttons = tab.js("return [...document.querySelectorAll('.modebar-btn')].map((button) => button.dataset.title)")
+    assert len(buttons) == 6 and not any("hare" in title or "loud" in title for title in buttons)  # nothing is uploaded
+    picture = tab.browser.execute_async_script(
+        "Plotly.toImage('space-scene', {format: 'png', width: 500, height: 400}).then(arguments[0])"
+    )
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(picture.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > COLOURS_DRAWN
+
+    eye = "return JSON.stringify(document.getElementById('space-scene')._fullLayout.scene.camera.eye)"
+    before = json.loads(tab.js(eye))
+    tab.js("document.getElementById('space-scene').focus()")
+    tab.keys(Keys.ARROW_LEFT, "+")
+    after = json.loads(tab.js(eye))
+    assert np.linalg.norm(list(after.values())) == pytest.approx(np.linalg.norm(list(before.values())) / 1.12)
+    assert np.arctan2(after["y"], after["x"]) == pytest.approx(np.arctan2(before["y"], before["x"]) - 0.12)
+
+    tab.browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
+    takes = "return getComputedStyle(document.querySelector('#space-scene > *')).pointerEvents"
+    assert tab.js(takes) != "none"  # the view has the focus
+    tab.js("document.activeElement.blur()")
+    assert tab.js(takes) == "none", "a finger on the view does not scroll the page"
+    tab.browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
+
+    level = "return document.getElementById('space-scene').data.find((trace) => trace.type === 'isosurface').isomin"
+    tab.choose("space-quantity", "vorticity")
+    start = tab.js(level)
+    assert start == pytest.approx(report_run.OMEGA, rel=1e-3)  # half of the vorticity, which is the same everywhere
+    tab.js("document.getElementById('space-level').focus()")
+    tab.keys(Keys.ARROW_RIGHT)
+    tab.wait(f"document.getElementById('space-scene').data.some((trace) => trace.isomin > {start})")
+    for label in ("pair 2", "fluctuation", "mean of"):
+        tab.choose("space-field", label)
+    tab.choose("space-quantity", "none")
+    time.sleep(0.5)  # drawing goes on after the event
+    assert not tab.errors()
+
+
+def test_every_control_is_reached_by_the_tab_key_and_shows_it(tab):
+    from selenium.webdriver.common.keys import Keys
+
+    tab.open()
+    tab.wait("document.getElementById('slices').classList.contains('ready')")
+    tab.draw_space()
+    tab.js("window.scrollTo(0, 0); document.activeElement.blur()")
+    seen, script = [], "const e = document.activeElement; return [e.id || e.tagName, getComputedStyle(e).outlineStyle]"
+    for _ in range(70):
+        tab.keys(Keys.TAB)
+        name, outline = tab.js(script)
+        if name == "BODY":
+            break
+        assert outline != "none", f"{name} does not show that it has the focus"
+        seen.append(name)
+    wanted = [
+        *("A", "SUMMARY", "slice-field", "slice-colour", "slice-axis", "slice-slider", "slice-canvas"),
+        *("space-field", "space-quantity", "space-level", "space-arrows", "space-scene"),
+    ]
+    assert [name for name in dict.fromkeys(seen) if name in wanted] == wanted
+
+
+@pytest.mark.parametrize(
+    ("missing", "slices", "note"),
+    [
+        (
+            "const f = HTMLCanvasElement.prototype.getContext; HTMLCanvasElement.prototype.getContext ="
+            " function (kind, ...more) { return kind.startsWith('webgl') ? null : f.call(this, kind, ...more); };",
+            True,
+            "WebGL is missing",
+        ),
+        ("delete window.DecompressionStream;", False, "too old"),
+    ],
+    ids=["webgl", "unpacking"],
+)
+def test_still_pictures_stand_in(tab, missing, slices, note):
+    tab.open(first=missing)
+    tab.js("document.getElementById('space').scrollIntoView()")
+    tab.wait("document.getElementById('space-note').textContent")
+    assert note in tab.of("space-note")
+    assert tab.shown("#space .still svg") and not tab.shown("#space .live")
+    assert tab.shown("#slices .live") == slices and tab.shown("#slices .still svg") != slices
+    assert not tab.errors()
+
+
+def test_paper_shows_the_still_pictures(tab):
+    tab.open()
+    tab.wait("document.getElementById('slices').classList.contains('ready')")
+    tab.show(LAPTOP, "light", media="print")
+    assert tab.shown("#slices .still svg") and not tab.shown("#slices .live") and not tab.shown("nav")
+    tab.show(LAPTOP, "light")

@@ -1,0 +1,350 @@
+"""The report as a file: well-formed, self-contained, bounded, and right in its numbers."""
+
+import base64
+import dataclasses
+import gzip
+import html.parser
+import itertools
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from support import report_run
+
+import lfpiv
+from lfpiv.report import calibration, fields, flow_panels, markup, overview, vectors, volumes
+from lfpiv.report import pairs as pairs_section
+from lfpiv.report.dot_map import dot_map
+from lfpiv.report.fields import (
+    MOST_IN_FIELD,
+    MOST_READ,
+    MOST_SHOWN,
+    MOST_VECTORS,
+    NO_NUMBER,
+    Survey,
+    embed,
+    evenly,
+    survey,
+)
+from lfpiv.report.lens_map import lens_map
+from lfpiv.report.light_sheet import find_sheet
+from lfpiv.report.pairs import MOST_ROWS, group
+from lfpiv.results import netcdf
+
+PLOTLY_BYTES, PAGE_BYTES, CAMERA_BYTES, VECTOR_BYTES = 2.4e6, 1.5e6, 0.7e6, 24
+"""Largest size of a report: plotly.js packed (1.9 MB in version 7), pictures and tables, pictures of each camera, and
+what one vector takes: six values of two bytes in base64, hardly smaller when packed, and half as much again."""
+
+RMS_AGREEMENT = 0.15
+"""Two estimates of the rms distance from the lattice over some hundred microimages, relative: 1/sqrt(2 n) each, and
+another robust fit."""
+SHIFT_PX = 0.3
+SHIFT_TOLERANCE_PX = 0.02
+"""A lattice moved by SHIFT_PX shows it in the mean of every cell, to the noise of few microimages (0.03 px each)."""
+
+GRAIN = 0.05
+"""Relative error of the brightness of a few planes of 168 voxels, each uneven by 0.2 of its mean, and of rounding."""
+MISTAKEN = 3
+"""Of 100 uneven volumes, those that by chance look like a light sheet."""
+SHEET_EDGE_MM, SHEET_RATIO = 0.15, 0.15
+"""One and a half planes, for an edge that is a plane or two wide; light beyond the margin, and noise of few counts."""
+
+VOID = {"meta", "link", "input", "br", "img", "hr"}
+
+
+class Page(html.parser.HTMLParser):
+    """Elements of a page, their nesting checked while they are read."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.elements, self.text = [], [], {}
+        self.feed(text)
+        self.close()
+        assert self.open == [], f"not closed: {self.open}"
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-3:]}"
+        self.open.pop()
+
+    def handle_data(self, data):
+        if self.open:
+            self.text[self.open[-1]] = self.text.get(self.open[-1], "") + data
+
+    def all(self, *tags):
+        return [attributes for tag, attributes in self.elements if tag in tags]
+
+
+@pytest.fixture(scope="module")
+def text(reported):
+    return reported.page.read_text("utf-8")
+
+
+def unpacked(text, name):
+    data = re.search(rf'id="{name}">([^<]*)</script>', text)[1]
+    return gzip.decompress(base64.b64decode(data))
+
+
+def test_the_page_is_well_formed_and_whole(text):
+    page = Page(text)
+    names = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(names) == len(set(names)), "an identifier is used twice"
+    referred = [attributes["href"][1:] for _, attributes in page.elements if attributes.get("href", "").startswith("#")]
+    referred += re.findall(r"url\(#([^)]+)\)", text)
+    for key in ("aria-describedby", "aria-labelledby", "for"):
+        referred += [attributes[key] for _, attributes in page.elements if key in attributes]
+    assert len(referred) > 20 and set(referred) <= set(names)
+    assert all(attributes.get("aria-label") for attributes in page.all("svg"))
+    levels = [int(tag[1]) for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)]
+    assert levels[0] == 1 and all(b - a <= 1 for a, b in itertools.pairwise(levels)) and levels.count(1) == 1
+    for _, attributes in page.elements:
+        for key in ("src", "href"):
+            assert re.match("data:|#", attributes.get(key, "#")), "the page refers to something outside itself"
+    assert len(page.all("svg")) == 2 * 9 + 3 + 2 + 6 + 1 + 3 + 3  # cameras; volumes; slices, space, histograms; pairs
+    assert "figure" not in page.open and len(page.all("figure")) == len(page.all("figcaption"))
+
+
+def test_names_and_texts_of_others_stay_texts(text):
+    page = Page(text)
+    assert report_run.NAME in page.text["h1"] and report_run.NAME in page.text["title"]
+    assert page.text["li"].count(report_run.EVIL) == 2
+    assert not page.all("b") and not any("onerror" in attributes for _, attributes in page.elements)
+
+
+def test_failed_pairs_come_first_among_the_warnings_and_long_lists_end(reported, text):
+    assert (
+        text.index('id="warnings"')
+        < text.index("Pair 7 failed")
+        < text.index("left: &lt;/script")
+        < text.index('"run"')
+    )
+    failed = [{"pair": pair, "reason": "no light"} for pair in range(2000)]
+    section = overview.warnings(reported.summary | {"failed": failed})
+    assert section.index("Pair 0 failed: no light") < section.index("<details>")
+    assert section.count("failed: no light") == overview.WARNINGS_MOST
+    assert f"{2001 - overview.WARNINGS_MOST:,} more are in summary.json" in section
+    assert overview.warnings(reported.summary | {"failed": [], "warnings": []}) == ""
+
+
+def test_fields_are_stored_to_a_65000th_of_their_range(text):
+    listed = json.loads(re.search(r'id="field-list">([^<]*)</script>', text)[1])
+    block = unpacked(text, "field-values")
+    labels = [entry["label"] for entry in listed["fields"]]
+    assert labels[:3] == ["pair 0", "pair 1", "pair 2"] and labels[3].startswith("mean of 3 pairs") and len(labels) == 5
+    for number, entry in enumerate(listed["fields"][:3]):
+        truth = report_run.field(number)
+        assert np.frombuffer(block, "<i2", truth["u"].size, entry["valid"]).astype(bool).tolist() == [
+            *truth["valid"].values.ravel()
+        ]
+        expected = {name: truth[name].values for name in "uvw"}
+        expected["vorticity"] = np.full(truth["u"].shape, 2 * report_run.OMEGA * (1 + 0.1 * number))
+        for name, values in expected.items():
+            stored = np.frombuffer(block, "<i2", values.size, entry["values"][name]["at"])
+            scale = entry["values"][name]["scale"]
+            assert (stored != NO_NUMBER).all()
+            np.testing.assert_allclose(
+                stored * scale, values.ravel(), atol=0.51 * scale + 1e-6 * np.abs(values).max()
+            )  # half a step, and float32
+            assert scale * 65_000 < 2 * np.abs(values).max()
+
+
+def test_mean_and_fluctuation_are_those_of_the_valid_vectors(reported):
+    found = survey(reported.vectors)
+    every = [report_run.field(pair) for pair in reported.vectors]
+    masked = np.array([np.where(item["valid"], item["u"], np.nan) for item in every])[:2]  # the third has none
+    with np.errstate(invalid="ignore"):
+        counts = np.isfinite(masked).sum(0)
+        mean = np.nansum(masked, axis=0) / np.where(counts, counts, np.nan)
+    np.testing.assert_allclose(found.mean["u"].values, mean, rtol=1e-6, atol=1e-9)
+    both = counts == 2
+    np.testing.assert_allclose(found.fluctuation["u"].values[both], masked.std(0, ddof=1)[both], rtol=1e-4, atol=1e-8)
+    assert np.isnan(found.fluctuation["u"].values[~both]).all()
+    assert (found.mean["valid"].values == (counts > 0)).all() and found.read == 3
+
+
+def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, monkeypatch):
+    """Five thousand pairs, the files of two: the page hardly grows, and a sample of files is read."""
+    pairs = 5000
+    files = {pair: reported.vectors[pair % 2] for pair in range(pairs)}
+    items = [reported.summary["pairs"][pair % 3] | {"pair": pair} for pair in range(pairs)]
+    noted = {"pairs": items, "warnings": ["few valid vectors"] * pairs, "reused": [f"pair {k}" for k in range(pairs)]}
+    sections = {}
+    for name, summary, paths in (
+        ("few", reported.summary, reported.vectors),
+        ("many", reported.summary | noted, files),
+    ):
+        read = []
+        with monkeypatch.context() as patch:
+            for module, function in ((netcdf, "_read"), (fields, "_read_velocity")):
+                original = getattr(module, function)
+                patch.setattr(module, function, lambda *parts, o=original, r=read: r.append(parts) or o(*parts))
+            plain = overview.warnings(summary) + overview.timings(summary) + overview.head(reported.experiment, summary)
+            sections[name] = vectors.section(paths) + volumes.section(summary, paths) + pairs_section.section(summary)
+            sections[name] += plain
+        assert len(read) <= MOST_READ + MOST_SHOWN + 2  # the first once more, and its volumes
+    assert len(sections["many"]) - len(sections["few"]) < 0.2 * PAGE_BYTES
+    assert f"holds 6 of {pairs:,} pairs" in sections["many"]
+    assert f"those of {MOST_READ} evenly chosen pairs" in sections["many"]
+    assert len(text) < PLOTLY_BYTES + PAGE_BYTES + len(reported.calibration.cameras) * CAMERA_BYTES
+    Page(sections["many"])
+
+
+def test_large_fields_are_thinned_out():
+    large = report_run.field(0, (40, 120, 110))
+    html_text, step = embed(Survey(shown={0: large}, mean=None, fluctuation=None, read=1), {0: "pair 0"})
+    (entry,) = json.loads(re.search(r'id="field-list">([^<]*)</script>', html_text)[1])["fields"]
+    kept = len(entry["x"]) * len(entry["y"]) * len(entry["z"])
+    assert len(entry["z"]) == 40 and step == math.ceil(math.sqrt(large["u"].size / MOST_IN_FIELD))
+    assert kept <= 1.1 * MOST_IN_FIELD < large["u"].size and len(html_text) < 1.1 * MOST_IN_FIELD * VECTOR_BYTES
+    assert MOST_VECTORS * VECTOR_BYTES < 6e6
+    np.testing.assert_allclose(entry["x"], large["x"].values[::step], atol=1e-6)
+
+
+def test_pairs_are_put_together_without_loss(reported):
+    items = [reported.summary["pairs"][0] | {"pair": 2 * pair, "valid_fraction": pair / 1000} for pair in range(1001)]
+    groups = group(items)
+    assert len(groups.pairs) <= MOST_ROWS and groups.pairs.sum() == 1001
+    assert (groups.first[1:] > groups.last[:-1]).all() and groups.first[0] == 0 and groups.last[-1] == 2000
+    assert np.average(groups.mean["valid"], weights=groups.pairs) == pytest.approx(0.5)
+    assert groups.low["valid"].min() == 0 and groups.high["valid"].max() == 1
+    assert [len(group(items[:n]).pairs) for n in (1, 2, 99, 100, 101)] == [1, 2, 99, 100, 100]
+    assert evenly(range(5000), 6) == [0, 1000, 2000, 2999, 3999, 4999] and evenly([3, 5], 6) == [3, 5]
+
+
+def test_a_lattice_in_the_wrong_place_shows_in_every_cell(reported):
+    camera, experiment = reported.calibration.cameras["left"], reported.experiment
+    white, optics = experiment.white("left"), experiment.camera("left").optics
+    right = lens_map(white, None, optics, camera.lattice)
+    assert right.total_rms_px == pytest.approx(camera.report["lens_array_rms_px"], rel=RMS_AGREEMENT)
+    move = SHIFT_PX * optics.pixel_mm / (1 + optics.sensor_per_pupil)
+    origin = camera.lattice.origin_mm[0] + move, camera.lattice.origin_mm[1]
+    wrong = lens_map(white, None, optics, dataclasses.replace(camera.lattice, origin_mm=origin))
+    known = wrong.count >= 3
+    assert known.sum() > 20
+    difference = (wrong.mean_px - right.mean_px)[known & (right.count >= 3)]
+    np.testing.assert_allclose(difference.mean(0), (-SHIFT_PX, 0), atol=SHIFT_TOLERANCE_PX)
+    assert wrong.total_rms_px == pytest.approx(math.hypot(SHIFT_PX, right.total_rms_px), abs=SHIFT_TOLERANCE_PX)
+
+
+def test_a_dot_in_the_wrong_place_shows_where_it_is(reported):
+    camera = reported.calibration.cameras["left"]
+    before = dot_map(camera)
+    victim = before.number[7]
+    moved = camera.dots.array_mm + 0.5 * camera.lattice.pitch_mm * (camera.dots.dot == victim)[:, None]
+    after = dot_map(dataclasses.replace(camera, dots=dataclasses.replace(camera.dots, array_mm=moved)))
+    assert after.number[after.error.argmax()] == victim
+    assert after.error[7] == pytest.approx(math.sqrt(0.5), abs=before.error[7])
+    np.testing.assert_array_equal(np.delete(after.error, 7), np.delete(before.error, 7))
+    np.testing.assert_array_equal(after.position_mm[7], camera.dots.points_mm[camera.dots.dot == victim][0])
+
+
+def test_arrows_have_the_scale_that_is_stated(monkeypatch):
+    """The longest arrow drawn is as long as the scale in the title says of its speed; a field at rest has no scale."""
+    paths, titles = [], []
+    draw, style = flow_panels.arrows, flow_panels.style
+    monkeypatch.setattr(flow_panels, "arrows", lambda *parts: paths.append(draw(*parts)) or paths[-1])
+    monkeypatch.setattr(
+        flow_panels, "style", lambda axes, **names: titles.append(names["title"]) or style(axes, **names)
+    )
+    moving = report_run.field(0)
+    moving["valid"][:] = True
+    assert len(flow_panels.slices(moving)) == 5
+    length, speed = map(float, re.search(r"an arrow of (\S+) mm is (\S+) m/s", titles[0]).groups())
+    shafts = paths[0].vertices.reshape(-1, 5, 2)
+    longest = np.linalg.norm(shafts[:, 1] - shafts[:, 0], axis=1).max()
+    fastest = float(np.hypot(moving["u"], moving["v"]).max())
+    assert longest / fastest == pytest.approx(length / speed, rel=0.05)  # the title rounds to two digits
+    still = moving.assign({name: 0 * moving[name] for name in "uvw"})
+    titles.clear()
+    assert flow_panels.slices(still, most=1) and "m/s" not in titles[0]
+    assert [flow_panels.round_below(value) for value in (0.0, 0.0199, 1.0, 7e3, np.nan)] == [0, 0.01, 1, 5000, 0]
+
+
+def test_the_brightness_outside_the_light_sheet_tells_the_level_of_ghosts(reported, text):
+    low, high, ratio = re.search(
+        r"lies between z = (\S+) and (\S+) mm; .* is (\S+) times as bright inside as outside", text
+    ).groups()
+    assert (float(low.replace("−", "-")), float(high)) == (-report_run.SHEET_MM, report_run.SHEET_MM)
+    assert abs(1 / float(ratio) - report_run.EDGE_LEVEL) < GRAIN * report_run.EDGE_LEVEL
+    stored = netcdf.read_reconstruction(reported.vectors[0])
+    older = stored.drop_vars("profile_z")  # as the schema before had it
+    figure = volumes._quality_figure(0, older, {})
+    assert "an earlier version" in figure and "<svg" not in figure
+
+
+def uneven(kind, rng):
+    """Brightness over the depth of a volume that is lit all through, particles at random."""
+    planes = int(rng.integers(12, 120))
+    profile = ndimage.uniform_filter(rng.poisson(rng.integers(20, 400), planes).astype(float), 3)
+    ramp = np.minimum(np.arange(planes), np.arange(planes)[::-1])
+    return (
+        profile
+        * {
+            "even": 1.0,
+            "slope": np.linspace(1, rng.uniform(1, 1.8), planes),
+            "bright end": 1 + rng.uniform(0, 1) * np.exp(-np.arange(planes) / 2),
+            "dark ends": np.minimum(1, (ramp + 2) / 5),
+        }[kind]
+    )
+
+
+@pytest.mark.parametrize("kind", ["even", "slope", "bright end", "dark ends"])
+def test_no_light_sheet_is_found_where_none_ends(kind):
+    rng = np.random.default_rng(4)
+    found = [find_sheet(np.arange(len(p)) * 0.1, p) for p in (uneven(kind, rng) for _ in range(100))]
+    assert sum(sheet is not None for sheet in found) <= MISTAKEN
+    assert find_sheet(np.arange(5.0), np.zeros(5)) is None and find_sheet(np.zeros(1), np.ones(1)) is None
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_a_light_sheet_with_soft_edges_is_found(sides):
+    rng = np.random.default_rng(sides)
+    for _ in range(100):
+        planes, ratio, soft = int(rng.integers(24, 120)), rng.uniform(2, 10), rng.uniform(0.2, 0.5)
+        k = np.arange(planes)
+        low, high = (rng.integers(0.2 * planes, 0.3 * planes), planes - rng.integers(0.2 * planes, 0.3 * planes))
+        steps = 1 / (1 + np.exp((k - high + 0.5) / soft))
+        if sides == 2:
+            steps = steps / (1 + np.exp((low - 0.5 - k) / soft))
+        sheet = find_sheet(k * 0.1, rng.poisson(2000 * (1 + (ratio - 1) * steps) / ratio).astype(float))
+        assert sheet is not None and abs(sheet.high_mm - (high - 0.5) * 0.1) <= SHEET_EDGE_MM
+        assert sheet.ratio == pytest.approx(ratio, rel=SHEET_RATIO)
+
+
+def test_a_report_before_any_pair_is_finished(reported, tmp_path, monkeypatch):
+    monkeypatch.setattr("lfpiv.report.calibration.section", lambda *parts: "")  # tested elsewhere
+    nothing = reported.summary | {"pairs": [], "valid_fraction": None}
+    page = Page(reported.write(tmp_path / "none.html", summary=nothing, vectors={}))
+    assert "No pair is finished yet." in page.text["p"] and not page.all("canvas")
+
+
+def test_ray_tracing_at_nominal_angles_is_reported_without_dots(reported):
+    traced = lfpiv.thin_lens(reported.experiment)
+    summary = {"calibration": {name: dict(camera.report) for name, camera in traced.cameras.items()}}
+    page = Page(calibration.section(reported.experiment, traced, summary))
+    assert "Microlens array of left" in page.text["figcaption"] and "eld-out" not in page.text["figcaption"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (2443.2, "2440"),
+        (-0.012345, "−0.0123"),
+        (1.5e-7, "1.5e−7"),
+        (123456789.0, "1.23e8"),
+        (math.nan, "–"),
+    ],
+)
+def test_numbers_in_words(value, text):
+    assert markup.significant(value) == text

@@ -1,0 +1,399 @@
+"""Exports read back by the programs they are for, and LaVision images as input."""
+
+import csv
+import importlib.util
+import json
+import logging
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.vector_sets import DT_S, VOXEL_MM, from_flow, random_vectors, write_run
+
+import lfpiv
+from lfpiv import derived
+from lfpiv.cli import commands
+from lfpiv.errors import StorageError
+from lfpiv.experiment import davis, images
+from lfpiv.results import export, netcdf
+
+NUMBERS = (0, 2, 3)
+SINGLE = 1e-6  # relative rounding of single precision, in which images are stored
+TEXT = 1e-8  # of numbers with nine digits
+INTERVAL_S = 0.25
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Folder of a run with one kept pair of volumes, not to be changed, and the vectors in it."""
+    folder = tmp_path_factory.mktemp("run")
+    written = write_run(folder, NUMBERS)
+    places = {
+        name: (name, -0.4 + np.arange(n) * 0.1, {"units": "mm"}) for name, n in zip("zyx", (3, 4, 5), strict=True)
+    }
+    for frame in "ab":
+        values = np.random.default_rng(ord(frame)).random((3, 4, 5), np.float32)
+        volume = xr.DataArray(values, places, ("z", "y", "x"), attrs={"units": "counts"})
+        netcdf.write_volume(volume, folder / "volumes" / f"pair_0002_{frame}.nc", attributes={})
+    return folder, written
+
+
+def at_points(image, name):
+    """An array of a VTK image as (z, y, x[, component])."""
+    values = np.asarray(image.point_data[name])
+    return values.reshape(*image.dimensions[::-1], *values.shape[1:])
+
+
+def test_paraview_images_hold_the_vectors_at_their_places(run, tmp_path):
+    pyvista = pytest.importorskip("pyvista")
+    folder, written = run
+    collections = lfpiv.export_results(folder, "vti", out=tmp_path, interval_s=INTERVAL_S)
+    assert [path.name for path in collections] == ["vectors.pvd", "volumes_a.pvd", "volumes_b.pvd"]
+    reader = pyvista.get_reader(collections[0])
+    assert list(reader.time_values) == [INTERVAL_S * number for number in NUMBERS]
+    for number, time in zip(NUMBERS, reader.time_values, strict=True):
+        reader.set_active_time_value(time)
+        image, vectors = reader.read()[0], written[number]
+        z, y, x = np.meshgrid(*(vectors[axis] for axis in "zyx"), indexing="ij")
+        assert np.allclose(np.asarray(image.points).reshape(*x.shape, 3), np.stack([x, y, z], -1), rtol=SINGLE)
+        for name, parts in (("velocity", "uvw"), ("displacement", [f"displacement_{axis}" for axis in "xyz"])):
+            np.testing.assert_array_equal(at_points(image, name), np.stack([vectors[part] for part in parts], -1))
+        np.testing.assert_array_equal(at_points(image, "valid"), vectors.valid)
+        np.testing.assert_array_equal(at_points(image, "uncertainty"), vectors.uncertainty)
+        curl = derived.vorticity(vectors)
+        expected = np.stack([curl[f"vorticity_{axis}"] for axis in "xyz"], -1)
+        assert np.allclose(at_points(image, "vorticity"), expected, rtol=SINGLE, atol=SINGLE * np.abs(expected).max())
+        assert np.allclose(at_points(image, "q_criterion"), derived.q_criterion(vectors), rtol=SINGLE)
+    volumes = pyvista.get_reader(collections[2])
+    assert list(volumes.time_values) == [2 * INTERVAL_S]
+    stored = netcdf.read_volume(folder / "volumes" / "pair_0002_b.nc")
+    image = volumes.read()[0]
+    np.testing.assert_array_equal(at_points(image, "intensity"), stored.values)
+    assert np.allclose(image.origin, -0.4) and np.allclose(image.spacing, 0.1)
+
+
+def test_a_single_layer_of_vectors_is_an_image_too(tmp_path):
+    pyvista = pytest.importorskip("pyvista")
+    written = write_run(tmp_path, (0,), shape=(1, 5, 6))
+    lfpiv.export_results(tmp_path, "vti")
+    image = pyvista.read(tmp_path / "export" / "pair_0000.vti")
+    assert image.dimensions == (6, 5, 1) and "vorticity" not in image.point_data and image.spacing[2] > 0
+    np.testing.assert_array_equal(at_points(image, "valid"), written[0].valid)
+
+
+def test_volumes_of_other_settings_are_not_put_beside_vectors(tmp_path, caplog):
+    def depends_on(voxel_mm, images, **more):
+        return json.dumps({"volume": {"voxel_mm": voxel_mm}, "calibration": "cafe", "images": images, **more})
+
+    images = {0: [["a.tif", 7, 1]], 1: [["a.tif", 7, 2]], 2: [["a.tif", 7, 3]], 3: None}
+    for number, kept in images.items():  # vectors of one voxel size, of images that are gone by now for the last pair
+        write_run(tmp_path, (number,), depends_on=depends_on(0.08, kept, correlation={"overlap": 0.5}))
+    made = {0: (0.08, images[0]), 1: (0.1, images[1]), 2: (0.08, [["a.tif", 7, 9]]), 3: (0.08, [["a.tif", 7, 4]])}
+    places = {name: (name, np.arange(n) * 0.1) for name, n in zip("zyx", (3, 4, 5), strict=True)}
+    volume = xr.DataArray(np.ones((3, 4, 5), np.float32), places, ("z", "y", "x"))
+    for number, stamp in made.items():
+        for frame in "ab":
+            path = tmp_path / "volumes" / f"pair_{number:04d}_{frame}.nc"
+            netcdf.write_volume(volume, path, attributes={"depends_on": depends_on(*stamp)})
+    with caplog.at_level(logging.WARNING):
+        lfpiv.export_results(tmp_path, "vti", out=tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").glob("volume_*.vti")} == {
+        f"volume_{number:04d}_{frame}.vti" for number in (0, 3) for frame in "ab"
+    }
+    listed = (tmp_path / "out" / "volumes_b.pvd").read_text()
+    assert "volume_0003_b.vti" in listed and "volume_0001_b.vti" not in listed
+    assert "pair_0001_a.nc and 3 other volumes: not exported" in caplog.text and "--keep-volumes" in caplog.text
+
+
+def test_one_netcdf_holds_all_pairs(run, tmp_path):
+    folder, _ = run
+    (path,) = lfpiv.export_results(folder, "netcdf", out=tmp_path, interval_s=INTERVAL_S)
+    with xr.open_dataset(path) as opened:
+        expected = lfpiv.open_results(folder)
+        xr.testing.assert_equal(opened.drop_vars("time").load(), expected.load())
+        assert opened.time.values.tolist() == [INTERVAL_S * number for number in NUMBERS]
+        assert opened.time.attrs["units"] == "s" and opened.u.attrs == expected.u.attrs
+        assert opened.attrs["dt_s"] == expected.attrs["dt_s"]
+
+
+def test_a_table_has_a_row_per_vector_and_units_in_its_header(run, tmp_path):
+    folder, written = run
+    paths = lfpiv.export_results(folder, "csv", out=tmp_path, pairs=(2, None))
+    assert [path.name for path in paths] == ["pair_0002.csv", "pair_0003.csv"]
+    with paths[0].open(newline="", encoding="utf-8") as file:
+        titles, *rows = csv.reader(file)
+    assert titles[:7] == ["x [mm]", "y [mm]", "z [mm]", "u [m/s]", "v [m/s]", "w [m/s]", "displacement_x [voxel]"]
+    assert {"valid", "peak_ratio", "uncertainty [voxel]"} <= set(titles)
+    assert len(rows) == written[2].u.size
+    for number in (0, 7, len(rows) - 1):
+        row = {title.split(" [")[0]: float(value or "nan") for title, value in zip(titles, rows[number], strict=True)}
+        place = np.unravel_index(number, written[2].u.shape)  # x varies fastest
+        vector = written[2].isel(dict(zip("zyx", map(int, place), strict=True)))
+        for name, value in row.items():
+            assert np.isclose(value, float(vector[name]), rtol=TEXT, equal_nan=True), name
+
+
+def test_planes_have_the_form_pivpy_reads(run, tmp_path):
+    folder, written = run
+    paths = lfpiv.export_results(folder, "pivpy", out=tmp_path)
+    assert len(paths) == written[0].sizes["z"]
+    with xr.open_dataset(paths[1]) as plane:
+        assert plane.u.dims == plane.v.dims == plane.chc.dims == ("y", "x", "t")
+        assert plane.u.attrs["units"] == "mm/s" and plane.x.attrs["units"] == "mm" and plane.t.attrs["units"] == "frame"
+        assert plane.attrs["delta_t"] == 1e-3 and plane.t.values.tolist() == list(NUMBERS)
+        for index, number in enumerate(NUMBERS):
+            layer = written[number].isel(z=1)
+            assert np.allclose(plane.v.isel(t=index), 1e3 * layer.v, rtol=SINGLE)
+            np.testing.assert_array_equal(plane.chc.isel(t=index), layer.valid)
+        assert float(plane.z) == float(written[0].z[1])
+
+
+def test_pivpy_computes_with_the_planes(tmp_path):
+    pytest.importorskip("pivpy", reason="pivpy is not installed; its form is tested without it")
+    from pivpy import io, schema
+
+    rates = np.array([[1.0, 2.0, 0.0], [-3.0, 4.0, 0.0], [0.0, 0.0, 0.0]])  # velocity gradient [1/s]
+    flow = from_flow(lambda x, y, z: np.tensordot(rates, np.stack([x, y, z]), 1))
+    for number in range(3):
+        vectors = random_vectors(number)
+        for name, axis in zip("uvw", "xyz", strict=True):
+            vectors[name].values = flow[name]
+            vectors[f"displacement_{axis}"].values = flow[name] * DT_S / (1e-3 * VOXEL_MM)
+        path = tmp_path / "vectors" / f"pair_{number:04d}.nc"
+        netcdf.write_vectors(vectors, path, attributes={})
+    (path,) = lfpiv.export_results(tmp_path, "pivpy", depth_mm=float(flow.z[2]) + 0.1)
+    with xr.open_dataset(path) as plane:
+        schema.validate(plane)
+        plane = plane.load()
+    for data in (plane, io.read_piv(path)):
+        vorticity = data.piv.vorticity(name="curl")["curl"]
+        assert np.allclose(vorticity, rates[1, 0] - rates[0, 1], rtol=1e-4)
+        assert np.allclose(data.piv.divergence(name="source")["source"], rates[0, 0] + rates[1, 1], rtol=1e-4)
+        assert data.piv.average.u.shape[:2] == (5, 6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"to": "xlsx"}, "to: expected one of vti, netcdf, csv, pivpy, found 'xlsx'"),
+        ({"to": "csv", "depth_mm": 0.0}, "depth: expected with pivpy only"),
+        ({"to": "pivpy", "depth_mm": 9.0}, "depth: expected a z among the vectors, -1 to 0.8 mm, found 9 mm"),
+        ({"to": "pivpy", "depth_mm": float("nan")}, "depth: .*found nan"),
+        ({"to": "vti", "interval_s": 0.0}, "interval: expected a time above 0 s"),
+        ({"to": "vti", "pairs": (9, None)}, "found pairs 0 to 3"),
+        ({"to": "csv", "out": "file"}, "expected an output folder that can be written"),
+    ],
+)
+def test_bad_arguments_are_one_message_and_leave_nothing(run, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("not a folder")
+    with pytest.raises(lfpiv.InputError, match=words):
+        lfpiv.export_results(run[0], **{"out": "out", **arguments})
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("to", ["vti", "netcdf", "csv", "pivpy"])
+def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
+    folder, _ = run
+    (tmp_path / "new").mkdir()
+    first = lfpiv.export_results(folder, to, out=tmp_path / "old")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "old").iterdir()}
+    assert set(first) <= set((tmp_path / "old").iterdir())
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(export.os, "replace", full)  # of this module and of `dataset`: the last step of every writer
+    for name in ("old", "new"):
+        with pytest.raises(StorageError, match=r"(?i)cannot be written: no space left"):
+            lfpiv.export_results(folder, to, out=tmp_path / name)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "old").iterdir()} == before
+    assert not any((tmp_path / "new").iterdir())
+
+
+def test_a_full_disk_is_noticed_before_the_library_that_cannot_bear_it(run, tmp_path, monkeypatch):
+    free = lfpiv.open_results(run[0]).nbytes // 2  # a plane takes less than that, all pairs take more
+    monkeypatch.setattr(netcdf.shutil, "disk_usage", lambda path: Plain(free=free))
+    with pytest.raises(StorageError, match=r"(?i)no space left"):
+        lfpiv.export_results(run[0], "netcdf", out=tmp_path)
+    assert not any(tmp_path.iterdir())
+    assert lfpiv.export_results(run[0], "pivpy", out=tmp_path)
+
+
+def test_the_command_writes_and_says_where(run, tmp_path, capfd):
+    folder, _ = run
+    assert commands.call(["export", str(folder), "--to", "csv", "--out", str(tmp_path / "a"), "--pairs", "0:3"]) == 0
+    assert capfd.readouterr().out == f"export: 2 files in {tmp_path / 'a'}\n"
+    plane = ["export", str(folder), "--to", "pivpy", "--out", str(tmp_path / "a"), "--depth", "-0.9", "--interval", "2"]
+    assert commands.call(plane) == 0
+    said = capfd.readouterr().out
+    path = Path(said.removeprefix("export: ").strip())
+    with xr.open_dataset(path) as opened:
+        assert opened.t.values.tolist() == [0, 4, 6] and float(opened.z) == -1.0
+    for wrong, word in (([str(tmp_path), "--to", "csv"], "no vectors"), ([str(folder), "--to", "xls"], "--to")):
+        assert commands.call(["export", *wrong]) == 2
+        said = capfd.readouterr().err
+        assert said.count("\n") == 1 and word in said
+
+
+# -- LaVision images ---------------------------------------------------------------------------------------------------
+
+PAIRS_RECORDED = 50
+
+
+class Plain(types.SimpleNamespace):
+    """Something with attributes."""
+
+
+def frame(pixels, *, mask=None, slope=1.0, offset=0.0, component="PIXEL", planes=1, **attributes):
+    """A frame with the interface of lvpyio's."""
+    scales = Plain(i=Plain(slope=slope, offset=offset))
+    masks = [np.ones(pixels.shape, np.uint8) if mask is None else mask]
+    return Plain(
+        components={component: Plain(planes=[pixels] * planes)}, scales=scales, attributes=attributes, masks=masks
+    )
+
+
+class Buffers(dict):
+    """Frames of each file, and the files that were decoded, in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.decoded = []
+
+
+@pytest.fixture
+def lvpyio(monkeypatch):
+    """A stand-in for LaVision's library; buffers by the stem of their file, which notes what it decodes."""
+    buffers = Buffers()
+
+    def read_buffer(path):
+        buffers.decoded.append(Path(path).stem)
+        if Path(path).stem not in buffers:
+            raise RuntimeError("Invalid header.")
+        return buffers[Path(path).stem]
+
+    module = types.ModuleType("lvpyio")
+    module.read_buffer = read_buffer
+    monkeypatch.setitem(sys.modules, "lvpyio", module)
+    davis._buffer.cache_clear()
+    yield buffers
+    davis._buffer.cache_clear()
+
+
+def test_frames_of_a_buffer_are_images(lvpyio, tmp_path):
+    rng = np.random.default_rng(0)
+    pixels = [rng.integers(0, 4096, (5, 7), np.uint16) for _ in range(4)]
+    lvpyio["double"] = [frame(part) for part in pixels]
+    lvpyio["single"] = [frame(pixels[3], slope=2.0, offset=-1.0)]
+    for name in ("double.im7", "single.imx"):
+        (tmp_path / name).write_bytes(b"packed")
+    for number, part in enumerate(pixels):
+        for path in (tmp_path / f"double.im7#{number}", tmp_path / f"double.im7#{number // 2}.{number % 2}"):
+            image = images.read_image(path, "test", flip="both")
+            np.testing.assert_array_equal(image, part[::-1, ::-1])
+            assert image.dtype == np.float32 and image.flags.c_contiguous
+    np.testing.assert_array_equal(images.read_image(tmp_path / "single.imx", "test"), 2.0 * pixels[3] - 1.0)
+    assert lvpyio.decoded == ["double", "single"]  # each once, however many of its frames are asked for
+
+
+@pytest.mark.parametrize(
+    ("name", "buffer", "words"),
+    [
+        ("a.im7", [frame(np.ones((2, 3)))] * 4, "4 frames; name one.*#0 to #3"),
+        ("a.im7#4", [frame(np.ones((2, 3)))] * 4, "4 frames, none of them #4"),
+        ("a.im7#2.0", [frame(np.ones((2, 3)))] * 4, "none of them #2.0"),
+        ("a.im7#0.2", [frame(np.ones((2, 3)))] * 4, "exposures 0 and 1"),
+        ("a.im7#left", [frame(np.ones((2, 3)))] * 4, "'left'.*by number"),
+        ("a.im7", [frame(np.ones((2, 3)), component="U0")], "without pixels"),
+        ("a.im7", [frame(np.ones((2, 3)), mask=np.eye(2, 3))], "4 masked pixels"),
+        ("a.im7", [frame(np.ones((2, 3)), planes=2)], "2 planes"),
+        ("a.im7", [frame(np.ones((2, 3)), RGBFrame="1")], "colour filter"),
+        ("a.im7", [frame(np.ones((2, 3), complex))], "complex128"),
+        ("a.im7", None, r"damaged one \(Invalid header"),
+        ("a.vc7", None, "a file of vectors"),
+    ],
+)
+def test_what_is_no_single_image_is_refused_by_name(lvpyio, tmp_path, name, buffer, words):
+    (tmp_path / name.partition("#")[0]).write_bytes(b"packed")
+    if buffer is not None:
+        lvpyio["a"] = buffer
+    with pytest.raises(lfpiv.InputError, match=rf"(?s){name.partition('#')[0]}.*white_image.*{words}"):
+        images.read_image(tmp_path / name, "white_image of camera 'left'")
+
+
+@pytest.mark.parametrize(("name", "words"), [("a.im7#left", "'left'.*by number"), ("a.im7#0.2", "exposures 0 and 1")])
+def test_a_frame_that_cannot_be_is_refused_without_decoding(lvpyio, tmp_path, name, words):
+    (tmp_path / "a.im7").write_bytes(b"packed")
+    with pytest.raises(lfpiv.InputError, match=words):
+        images.read_header(tmp_path / name, "white_image of camera 'left'")
+    assert lvpyio.decoded == []
+
+
+def test_a_missing_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lvpyio", None)  # as where it is not installed
+    (tmp_path / "a.im7").touch()
+    with pytest.raises(lfpiv.InputError, match=r"a\.im7#0.*lvpyio.*pip install 'lfpiv\[davis\]'"):
+        images.read_image(tmp_path / "a.im7#0", "white_image of camera 'left'")
+
+
+@pytest.fixture
+def recorded(lvpyio, tiny_experiment, monkeypatch):
+    """Experiment of many pairs, both exposures of both cameras of each in one buffer; the rest of it as it was."""
+    monkeypatch.setattr("lfpiv.experiment.experiment.DECODED_PIXELS", 4 * 2 * (48 * 64 + 56 * 40))  # four pairs
+    rng = np.random.default_rng(1)
+    shapes = {"left": (48, 64), "right": (56, 40)}
+    for pair in range(PAIRS_RECORDED):
+        name = f"B{pair:05d}"
+        lvpyio[name] = [frame(rng.integers(0, 4096, shapes[camera], np.uint16)) for camera in shapes for _ in "ab"]
+        (tiny_experiment.parent / f"{name}.im7").write_bytes(b"pixels of pair %d" % pair)
+    text = tiny_experiment.read_text("utf-8").replace('"left"', '"0"').replace('"right"', '"1"')
+    text = text.replace("pairs = 2", f"pairs = {PAIRS_RECORDED}").replace(
+        'images = "particles/{camera}/{pair:04d}{frame}.tif"',
+        'images = "B{pair:05d}.im7#{camera}.{frame}"\nframes = ["0", "1"]',
+    )
+    tiny_experiment.write_text(text, "utf-8")
+    for number, camera in enumerate(shapes):
+        (tiny_experiment.parent / "board" / camera).rename(tiny_experiment.parent / "board" / str(number))
+    return tiny_experiment
+
+
+def test_an_experiment_of_buffers_opens(lvpyio, recorded):
+    """Opening decodes the first pairs alone, however many there are; each frame of a file is an image of its own."""
+    experiment = lfpiv.open_experiment(recorded)
+    assert lvpyio.decoded == [f"B{pair:05d}" for pair in range(4)]
+    last = PAIRS_RECORDED - 1
+    np.testing.assert_array_equal(
+        experiment.particle_image("1", last, "0"), lvpyio[f"B{last:05d}"][2].components["PIXEL"].planes[0]
+    )
+    hashes = {netcdf.content_hash([path]) for pair in range(2) for path in experiment.pair_paths(pair)}
+    assert len(hashes) == 8
+
+
+def test_a_bad_buffer_is_named_at_once_where_it_can_be_and_where_it_is_used_otherwise(lvpyio, recorded):
+    lvpyio["B00020"][3] = frame(np.ones((48, 64), np.uint16))  # of the other camera's size
+    del lvpyio["B00030"]  # damaged
+    experiment = lfpiv.open_experiment(recorded)
+    for pair, words in ((20, r"expected \(56, 40\) pixels.*found \(48, 64\)"), (30, "damaged one")):
+        with pytest.raises(lfpiv.InputError, match=rf"B000{pair}\.im7#1\.1 \(.*pair {pair}.*{words}"):
+            experiment.particle_image("1", pair, "1")
+    (recorded.parent / "B00040.im7").write_bytes(b"")
+    with pytest.raises(lfpiv.InputError, match=r"B00040\.im7#0\.0.*the file is empty"):
+        lfpiv.open_experiment(recorded)
+    (recorded.parent / "B00040.im7").unlink()
+    with pytest.raises(lfpiv.InputError, match=r"B00040\.im7#0\.0.*no such file"):
+        lfpiv.open_experiment(recorded)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("lvpyio") is None, reason="the extra davis is not installed")
+def test_lavisions_own_library_writes_what_is_read(tmp_path):
+    import lvpyio
+
+    rng = np.random.default_rng(0)
+    pixels = [rng.integers(0, 4096, (48, 64), np.uint16) for _ in range(2)]
+    lvpyio.write_buffer(lvpyio.arrays_to_buffer(pixels), str(tmp_path / "B00001.im7"))
+    for number, part in enumerate(pixels):
+        np.testing.assert_array_equal(images.read_image(tmp_path / f"B00001.im7#{number}", "test"), part)

@@ -1,0 +1,58 @@
+"""Memory that control groups leave, by trees of files in the forms that the kernel gives them."""
+
+import pytest
+
+from lfpiv.runs import memory
+from lfpiv.runs.memory import GIB
+
+PROGRAMS, CACHE, SHARED = 1, 12, 2
+"""What a group holds [GiB]: programs, files that the kernel may drop, and shared memory, which counts as a file, too,
+but which it may not drop."""
+
+NAMES = {2: ("memory.max", "memory.current", ""), 1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")}
+
+
+def write_group(folder, limit_gib, version):
+    """Files of one group; None: without limit, in the word or the number that stands for it."""
+    limit, used, total = NAMES[version]
+    folder.mkdir(parents=True, exist_ok=True)
+    endless = "max" if version == 2 else str(2**63 - 4096)
+    (folder / limit).write_text(f"{endless if limit_gib is None else limit_gib * GIB}\n")
+    (folder / used).write_text(f"{(PROGRAMS + CACHE + SHARED) * GIB}\n")
+    stat = {"file": CACHE + SHARED, "inactive_file": 0, "active_file": 0}
+    stat |= {f"{total}inactive_file": CACHE - 4, f"{total}active_file": 4, "shmem": SHARED}
+    (folder / "memory.stat").write_text("".join(f"{name} {value * GIB}\n" for name, value in stat.items()))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize(
+    ("own", "limits", "available"),
+    [
+        ("/", {}, 64),
+        ("/", {"": 16}, 13),  # a container: its own group is the root of all it sees
+        ("/docker/f00d", {"": 16}, 13),  # one that names a group which it does not see
+        ("/../f00d", {"": 16, "f00d": 4}, 13),  # a group beside the container's, whatever the container has by its name
+        ("/slurm/job_1/step_0", {"": None, "slurm": None, "slurm/job_1": 20, "slurm/job_1/step_0": None}, 17),
+        ("/slurm/job_1", {"": None, "slurm": 18, "slurm/job_1": 20, "slurm/job_2": 4}, 15),
+        ("/user.slice", {"": None, "user.slice": 2}, 0),  # more is in use than may be: the limit was lowered
+        ("/user.slice", {"": None, "user.slice": 500}, 64),
+    ],
+)
+def test_memory_is_what_the_tightest_group_above_the_process_leaves(
+    tmp_path, monkeypatch, version, own, limits, available
+):
+    root = tmp_path / ("memory" if version == 1 else "")
+    for name, limit_gib in limits.items():
+        write_group(root / name, limit_gib, version)
+    (tmp_path / "own").write_text(f"3:cpu,cpuacct:/\n2:memory:{own}\n0::/\n" if version == 1 else f"0::{own}\n")
+    monkeypatch.setattr(memory, "GROUPS", tmp_path)
+    monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "own")
+    monkeypatch.setattr(memory, "_meminfo", lambda key: 64 * GIB)
+    assert memory.available_bytes() == available * GIB
+
+
+def test_without_control_groups_the_machine_alone_counts(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "GROUPS", tmp_path / "none")
+    monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "none either")
+    monkeypatch.setattr(memory, "_meminfo", lambda key: 64 * GIB)
+    assert memory.available_bytes() == 64 * GIB

@@ -1,0 +1,340 @@
+"""Windows and aberrations: exact rays against Snell's law traced forward, kernels against twins, cameras set up."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from calibration.test_cameras import MAPPING_PITCH
+from calibration.test_cameras import SCENE as CALIBRATION_SCENE
+from scipy.optimize import fsolve
+from scipy.stats import qmc
+from simulation.test_simulator import SCENE, camera, land, lens_gain, points, relative_difference
+
+import lfpiv
+from lfpiv.errors import InputError
+from lfpiv.simulation.scene import SceneCamera, open_scene, true_mapping
+from lfpiv.simulation.simulator import image_area, render_camera, simulate
+from lfpiv_kernels.rendering import collect, real_optics, render
+
+SNELL_MM = 1e-8  # two float64 solvers: fsolve to 1e-11 in the slope, times 200 mm to the lens
+MOVED_RAYS = 3e-3  # share of the light in other pixels: float32 places these rays to 4e-4 px
+EDGE_SAMPLES = 2.5  # rays of one pixel that float32 may put on the other side of an edge
+FOCUS_MM = 1e-9  # cameras are moved until they are in focus to 1e-11 mm
+SEIDEL_MM = 1e-12  # polynomials of a few terms in float64
+
+GLASS = {"point_mm": (0, 0, 30), "normal": (0, 0, 1), "thickness_mm": 5.0, "index": 1.5}
+WATER = {"point_mm": (0, 0, 20), "normal": (0.1, 0.3, -1), "thickness_mm": 8.0, "index": 1.49, "medium_index": 1.333}
+OUTER = {"point_mm": (30, 0, 80), "normal": (0.8, -0.1, 1), "thickness_mm": 6.0, "index": 1.46}
+LENS = {
+    "spherical_pitch": 0.4,
+    "coma_pitch": -0.3,
+    "astigmatism_pitch": 0.15,
+    "field_curvature_pitch": -0.15,
+    "distortion_percent": 2.0,
+    "centre_mm": (0.1, -0.2),
+}
+RIGS = {
+    "glass": {"window": (GLASS,)},
+    "tank": {"window": (WATER, OUTER), "nominal_angle_deg": 25},
+    "lens": {"aberrations": LENS},
+    "all": {"window": (WATER, OUTER), "aberrations": LENS, "microlens_layout": "hexagonal", "nominal_angle_deg": -20},
+}
+
+
+def rig(name, **changes):
+    return camera("ideal", **({"nominal_angle_deg": 45} | RIGS[name] | changes))
+
+
+def pupil_points(count, radius=12.5, seed=3):
+    rng = np.random.default_rng(seed)
+    length, angle = radius * np.sqrt(rng.random(count)), rng.uniform(0, 2 * np.pi, count)
+    return np.stack([length * np.cos(angle), length * np.sin(angle)], 1)
+
+
+def snell(direction, normal, before, after):
+    """Refracted unit direction, from the law in vectors; `normal` points along the light's way."""
+    cosine = direction @ normal
+    across = before / after * (direction - cosine * normal)
+    return across + np.sqrt(1 - across @ across) * normal
+
+
+def forward(direction, point, scene_camera):
+    """Trace one ray from a point in the world out of its medium through all plates to the lens's plane: (u, v)."""
+    place, index = np.array(point, float), scene_camera.window[0].medium_index
+    towards_lens = scene_camera.rotation[2]
+    for window in scene_camera.window:
+        normal = np.array(window.normal) / np.linalg.norm(window.normal)
+        normal = normal * np.sign(normal @ towards_lens)
+        for surface, after in ((0.0, window.index), (window.thickness_mm, 1.0)):
+            level = normal @ window.point_mm + surface
+            place = place + (level - normal @ place) / (normal @ direction) * direction
+            direction = snell(direction, normal, index, after)
+            index = after
+    place, direction = (
+        scene_camera.rotation @ (place - scene_camera.axis_point_mm),
+        scene_camera.rotation @ direction,
+    )
+    slope = direction / direction[2]
+    return (place + (scene_camera.optics.object_distance_mm - place[2]) * slope)[:2], place, slope
+
+
+@pytest.mark.parametrize("name", ["glass", "tank"])
+def test_true_rays_obey_snell_s_law(name):
+    """The ray found by iteration from the lens is the one that Snell's law traces from the particle, by vectors."""
+    scene_camera = rig(name)
+    optics, at, pupil = scene_camera.optics, 8 * points(12, 1), pupil_points(12)
+    expected = []
+    for point, target in zip(at, pupil, strict=True):
+
+        def miss(tilt, point=point, target=target):
+            direction = np.array([*tilt, 1.0]) / np.linalg.norm([*tilt, 1.0])
+            return forward(scene_camera.rotation.T @ direction, point, scene_camera)[0] - target
+
+        tilt = fsolve(miss, [0.0, 0.0], xtol=1e-11)
+        direction = np.array([*tilt, 1.0]) / np.linalg.norm([*tilt, 1.0])
+        _, place, slope = forward(scene_camera.rotation.T @ direction, point, scene_camera)
+        in_focus = (place - place[2] * slope)[:2]  # where the ray in air, prolonged backward, meets the focal plane
+        expected.append(-in_focus * optics.image_distance_mm / optics.object_distance_mm)
+    found = true_mapping(scene_camera)(at, pupil)
+    assert np.abs(found - expected).max() < SNELL_MM
+    without = camera("ideal", nominal_angle_deg=scene_camera.nominal_angle_deg)
+    assert np.abs(found - true_mapping(without)(at, pupil)).max() > 0.02  # the windows matter: a fifth of a microlens
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_rays_go_back_the_way_they_came(name):
+    """From a point to the array and back to the point's plane: iterated one way, explicit the other."""
+    scene_camera = rig(name)
+    at, pupil, scales = points(200, 1), pupil_points(200), scene_camera.optics
+    array = true_mapping(scene_camera)(at, pupil)
+    start, direction = real_optics.object_lines(
+        array, pupil, scales.object_distance_mm, scales.image_distance_mm, scene_camera.plates, scene_camera.seidel
+    )
+    start, direction = start @ scene_camera.rotation + scene_camera.axis_point_mm, direction @ scene_camera.rotation
+    back = start + ((at[:, 2] - start[:, 2]) / direction[:, 2])[:, None] * direction
+    assert np.abs(back - at).max() < SNELL_MM
+
+
+def test_order_and_sense_of_windows_in_air_do_not_matter_and_air_is_no_window():
+    at, pupil = 5 * points(50), pupil_points(50)
+    both = true_mapping(rig("glass", window=(GLASS, OUTER)))(at, pupil)
+    other = true_mapping(rig("glass", window=(OUTER, GLASS | {"normal": (0, 0, -7), "point_mm": (9, 3, 30)})))(
+        at, pupil
+    )
+    assert np.abs(both - other).max() < SNELL_MM
+    halves = (GLASS | {"thickness_mm": 2.0}, GLASS | {"thickness_mm": 3.0, "point_mm": (0, 0, 40)})
+    whole = true_mapping(rig("glass"))(at, pupil)
+    assert np.abs(true_mapping(rig("glass", window=halves))(at, pupil) - whole).max() < SNELL_MM
+    air = GLASS | {"index": 1.0}
+    none = true_mapping(camera("ideal", nominal_angle_deg=45))(at, pupil)
+    assert np.abs(true_mapping(rig("glass", window=(air,)))(at, pupil) - none).max() < SNELL_MM
+
+
+@pytest.mark.parametrize("name", ["glass", "tank"])
+def test_a_camera_is_set_up_through_its_windows(name):
+    """The stated point is imaged at the sensor's centre, and its rays' mean slope over the pupil is zero: in focus."""
+    focused = (0.3, -0.2, 0.5)
+    scene_camera = rig(name, true_offset_mm=focused)
+    pupil = 12.5 / np.sqrt(2) * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    array = true_mapping(scene_camera)(np.tile(focused, (5, 1)), pupil)
+    assert np.abs(array[0]).max() < FOCUS_MM and abs((array * pupil).sum() / (pupil**2).sum()) < FOCUS_MM
+    assert np.linalg.norm(scene_camera.axis_point_mm - focused) > 1  # it had to move
+
+
+def test_each_aberration_is_what_its_name_says():
+    """Stated at the edge of pupil and field, in pitches; exponents of field and pupil as in Seidel's theory."""
+    optics = camera("ideal").optics
+    field = np.hypot(*optics.sensor_shape) * optics.pixel_mm / 2
+    edge, up, across = np.array([field, 0.0]), np.array([0, 12.5]), np.array([12.5, 0])
+
+    def error(array, pupil, **lens):
+        seidel = camera("ideal", aberrations=lens).seidel
+        return real_optics.aberration_mm(np.atleast_2d(array), np.atleast_2d(pupil), seidel)[0] / 0.1
+
+    cases = [
+        ({"spherical_pitch": 0.5}, 0 * edge, across / 2, [0.5 / 8, 0]),
+        ({"spherical_pitch": 0.5}, edge, up, [0, 0.5]),
+        ({"coma_pitch": 0.6}, edge, across, [0.6, 0]),  # tangential coma
+        ({"coma_pitch": 0.6}, edge, up, [0.2, 0]),  # sagittal: a third
+        ({"coma_pitch": 0.6}, edge / 2, -across / 2, [0.6 / 8, 0]),
+        ({"astigmatism_pitch": 0.3}, edge, across, [0.3, 0]),
+        ({"astigmatism_pitch": 0.3}, edge, up, [0, 0]),
+        ({"field_curvature_pitch": 0.7}, edge / 2, up, [0, 0.7 / 4]),
+        ({"distortion_percent": 2.0}, edge / 2, up, [0.02 * field / 8 / 0.1, 0]),
+        ({"coma_pitch": 0.6, "centre_mm": (field, 0)}, 0 * edge, across, [-0.6, 0]),  # decentred: coma on the axis
+    ]
+    for lens, array, pupil, expected in cases:
+        assert np.abs(error(array, pupil, **lens) - expected).max() < SEIDEL_MM / 0.1, lens
+
+
+def test_aberrations_are_the_gradient_of_one_wave_aberration():
+    """Rays belong to wave fronts (Malus and Dupin): the error's curl over the pupil vanishes."""
+    seidel = rig("lens").seidel
+    array, pupil, step = 0.4 * points(50)[:, :2], pupil_points(50), 1e-4
+    slopes = [
+        (real_optics.aberration_mm(array, pupil + h, seidel) - real_optics.aberration_mm(array, pupil - h, seidel))
+        / 2e-4
+        for h in step * np.eye(2)
+    ]
+    assert np.abs(slopes[0][:, 1] - slopes[1][:, 0]).max() < 1e-10  # differences of 1e-15 mm over 1e-4 mm
+
+
+def sources_twin(scene_camera, eye, centres, counts, extent, rays, rng):
+    """Twin of `render_sources`: float64 true rays, landed on the sensor by the slow twin of the ideal renderer."""
+    image, mapping = 0, true_mapping(scene_camera)
+    angles = rng.uniform(0, 2 * np.pi, (len(centres), 2))
+    for centre, count, (turn, roll) in zip(centres, counts, angles, strict=True):
+        pupil = 12.5 * rays[:, :2] @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+        unit = rays[:, 2:].astype(float)
+        unit[:, :2] = unit[:, :2] @ [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
+        weight = np.full(len(rays), count / len(rays))
+        image = image + land(scene_camera, eye, mapping(centre + extent * unit, pupil), pupil, weight)
+    return image
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_sources_seen_through_real_optics_equal_their_twin(device, name):
+    scene_camera = rig(name)
+    eye = render_camera(scene_camera)
+    centres, counts = points(10), np.full(10, 1e5)
+    rays = render.ray_table(4096, "ball", 0)
+    found = render.render_sources(eye, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
+    expected = sources_twin(scene_camera, eye, centres, counts, 0.03, rays, np.random.default_rng(2))
+    assert expected.sum() > 0.1 * counts.sum()
+    assert relative_difference(found, expected) < MOVED_RAYS
+    plain = render_camera(camera("ideal", nominal_angle_deg=scene_camera.nominal_angle_deg))
+    ideal = render.render_sources(plain, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
+    assert relative_difference(ideal, expected) > 10 * MOVED_RAYS
+
+
+@pytest.mark.parametrize("name", ["tank", "all"])
+def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
+    """Every pixel of a small sensor: its rays followed back in float64, without the kernel's short cut."""
+    weak = {key: 0.05 for key in LENS if key.endswith("pitch")} | {"spherical_pitch": 0.6}  # the field is tiny
+    changes = {"sensor_width_px": 40, "sensor_height_px": 30, "true_offset_mm": (0, 0, 0.15)}
+    scene_camera = rig(name, **changes | ({"aberrations": weak} if name == "all" else {}))
+    optics, lattice, eye = scene_camera.optics, scene_camera.lattice, render_camera(scene_camera)
+    board, samples = {"dots": (3, 2), "spacing_mm": 0.12, "dot_diameter_mm": 0.08}, 64
+    table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(3)).random(samples) - 0.5
+    cell = table[:, 2:] @ lattice.basis_mm
+    cell -= lattice.centres_mm(lattice.nearest(cell + lattice.origin_mm)) - lattice.origin_mm
+    scale, (rows, columns) = optics.sensor_per_pupil, optics.sensor_shape
+    expected = np.zeros((rows, columns))
+    for row, column in np.ndindex(rows, columns):
+        middle = (np.array([column, row]) + 0.5 - np.array([columns, rows]) / 2) * optics.pixel_mm
+        for step in np.ndindex(3, 3):
+            index = lattice.nearest(middle / (1 + scale)) + step - [1, 1]
+            lens = lattice.centres_mm(index)
+            array = lens + cell
+            pupil = array - (middle + table[:, :2] * optics.pixel_mm - lens) / scale
+            lit = (pupil**2).sum(1) < optics.pupil_radius_mm**2
+            if not lit.any():
+                continue
+            start, direction = real_optics.object_lines(
+                array, pupil, optics.object_distance_mm, optics.image_distance_mm, eye.plates, eye.aberrations
+            )
+            start, direction = start @ eye.rotation + eye.offset_mm, direction @ eye.rotation
+            x, y, _ = (start + ((0.15 - start[:, 2]) / direction[:, 2])[:, None] * direction).T
+            off = np.hypot(
+                *(np.abs(a[:, None] - (np.arange(n) - (n - 1) / 2) * 0.12).min(1) for a, n in ((x, 3), (y, 2)))
+            )
+            expected[row, column] += (lit & (off < 0.04)).mean() * lens_gain(eye, index[None])[0]
+    found = collect.render_board(eye, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
+    assert expected.max() > 0.3
+    assert np.abs(found - expected).max() <= EDGE_SAMPLES / samples
+    assert (np.abs(found - expected) < 1e-6).mean() > 0.95
+
+
+@pytest.mark.parametrize("name", ["glass", "all"])
+def test_dots_traced_forward_and_backward_agree(device, name):
+    """A dot's light from the area of its image, sent forward, is what pixels collect that look back at the dot."""
+    scene_camera = rig(name, true_offset_mm=(0, 0, 0.1))
+    eye, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
+    lenses = np.pi * 0.05**2 * image_area(scene_camera, dots) / abs(np.linalg.det(eye.basis_mm))
+    rays = render.ray_table(1 << 17, "disc", 0)
+    forward = render.render_sources(eye, dots, lenses * eye.microimage_px, 0.05, rays, rng=np.random.default_rng(0))
+    backward = collect.render_board(
+        eye, 0.1, dots=(2, 1), spacing_mm=0.2, dot_diameter_mm=0.1, dot_light=1, board_light=0, samples=1024, seed=0
+    )
+    uneven = 0.03  # a tilted radiant board favours one side of the pupil, and aberrations stretch the image unevenly
+    assert forward.sum() == pytest.approx(backward.sum(), rel=uneven)
+    assert np.linalg.norm(forward - backward) < (uneven + 0.03) * np.linalg.norm(backward)  # 3 %: noise of the rays
+
+
+def test_uniform_light_looks_the_same_through_everything(device):
+    plain = collect.render_white(render_camera(rig("all", window=(), aberrations={})), samples=64, seed=0)
+    assert np.array_equal(collect.render_white(render_camera(rig("all")), samples=64, seed=0), plain)
+
+
+OPTICS = """
+[window]
+point_mm = [0.0, 0.0, 30.0]
+normal = [0.0, 0.0, 1.0]
+thickness_mm = 5.0
+index = 1.5
+[aberrations]
+coma_pitch = 0.3
+"""
+
+
+def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_path):
+    own = "[camera.aberrations]\nspherical_pitch = 0.2\n[[camera.window]]\nindex = 1.4\nthickness_mm = 2.0\n"
+    own += "point_mm = [-20.0, 0.0, 20.0]\nnormal = [-1.0, 0.0, 1.0]\n"
+    text = SCENE.replace("dark_image = true\n", "dark_image = true\n" + own).replace("pairs = 2", "pairs = 1") + OPTICS
+    (tmp_path / "scene.toml").write_text(text)
+    scene = open_scene(tmp_path / "scene.toml")
+    one, two = scene.camera
+    assert one.window == scene.window and one.window[0].index == 1.5 and one.aberrations.coma_pitch == 0.3
+    assert two.window[0].index == 1.4 and two.aberrations.coma_pitch == 0 and two.aberrations.spherical_pitch == 0.2
+    path = simulate(scene, tmp_path / "data")
+    assert "[window" not in path.read_text() and "aberration" not in path.read_text()  # the user is not told
+    spec = json.loads((path.parent / "truth" / "spec.json").read_text())
+    at, pupil = points(20), pupil_points(20)
+    for number in (0, 1):
+        assert SceneCamera.model_validate(spec["camera"][number]) == scene.camera[number]
+        found = true_mapping(spec["camera"][number])(at, pupil)
+        assert np.array_equal(found, true_mapping(scene.camera[number])(at, pupil))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("point_mm = [0.0, 0.0, 30.0]", "point_mm = [0.0, 0.0, 0.1]", "window[0]"),  # cuts the particles
+        ("point_mm = [0.0, 0.0, 30.0]", "point_mm = [0.0, 0.0, 140.0]", "pupil"),  # cuts the lens at 45 degrees
+        ("normal = [0.0, 0.0, 1.0]", "normal = [0.0, 0.0, 0.0]", "direction other than"),
+        ("normal = [0.0, 0.0, 1.0]", "normal = [1.0, 0.0, -1.0]", "camera 'one' meets it at 89 degrees"),
+        ("index = 1.5", "index = 0.9", "window.index"),
+        ("index = 1.5", "index = 1.5\nmedium = 1.3", "medium"),
+        ("coma_pitch = 0.3", "coma_pitch = 99.0", "aberrations.coma_pitch"),
+        ("coma_pitch = 0.3", "distortion_percent = 9.0\ncentre_mm = [0.5, 0.0]", "camera 'one' has"),
+    ],
+)
+def test_impossible_optics_are_refused(tmp_path, old, new, said):
+    assert old in OPTICS
+    (tmp_path / "scene.toml").write_text(SCENE + OPTICS.replace(old, new))
+    with pytest.raises(InputError) as error:
+        simulate(tmp_path / "scene.toml", tmp_path / "out")
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_only_the_window_next_to_the_particles_has_a_medium():
+    with pytest.raises(ValueError, match="only in the first window"):
+        rig("glass", window=(GLASS, WATER))
+
+
+def test_the_network_learns_what_the_thin_lens_cannot(device, tmp_path):
+    """A camera that stands where it is said to, behind a window, its lens aberrated: DRT fails for that alone."""
+    lens = "[aberrations]\ncoma_pitch = 0.27\ndistortion_percent = 1.0\ncentre_mm = [-2.3, 0.0]\n"
+    text = re.sub(r"true_(yaw|pitch|roll|offset)\w* = .*\n", "", CALIBRATION_SCENE)
+    (tmp_path / "scene.toml").write_text(text + OPTICS.split("[aberrations]")[0] + lens)
+    experiment = lfpiv.open_experiment(simulate(tmp_path / "scene.toml", tmp_path / "data"))
+    truth = true_mapping(json.loads((tmp_path / "data" / "truth" / "spec.json").read_text())["camera"][0])
+    at = np.random.default_rng(5).uniform([-1, -1, -0.8], [1, 1, 0.8], (20_000, 3))
+    pupil = pupil_points(len(at))
+    error = {
+        name: np.linalg.norm(found.cameras["only"].map(at, pupil) - truth(at, pupil), axis=1).mean() / 0.1
+        for name, found in (("network", lfpiv.calibrate(experiment)), ("drt", lfpiv.thin_lens(experiment)))
+    }
+    assert error["network"] < MAPPING_PITCH
+    assert error["drt"] > 5 * MAPPING_PITCH, error
