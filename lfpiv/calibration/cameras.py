@@ -18,7 +18,8 @@ from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
 from lfpiv.calibration.virtual_samples import guide_between
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment
-from lfpiv.geometry.optics import Grid, LensLattice
+from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.optics import LensLattice
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.lens_array import find_lens_array
 

@@ -19,6 +19,7 @@ from lfpiv import metrics
 from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration
 from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.geometry.grid import AXES
 from lfpiv.reproduce import Progress, rigs, store
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import FULL_SCALE, render_camera
@@ -227,7 +228,7 @@ class Bench:
         coords = {axis: (axis, self.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
         pair_values, told = kept.pop("volumes"), {key: float(value) for key, value in kept.items()}
         attributes = {"sieve_voxel": told["sieve_voxel"]}  # the correlation smooths what is not smooth already
-        return [xr.DataArray(values, coords, ("z", "y", "x"), attrs=attributes) for values in pair_values], told
+        return [xr.DataArray(values, coords, AXES, attrs=attributes) for values in pair_values], told
 
     def judge(
         self,

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from lfpiv.calibration.cameras import Calibration, thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.motion import reconstruct_pair
 from lfpiv.reproduce import Progress, bench, page, plots, rigs, store
 from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
@@ -223,7 +224,7 @@ def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray
     kept = store.kept_arrays(own.folder / f"{name}.npz", settings, compute)
     coords = {axis: (axis, own.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
     smooth = {"sieve_voxel": float(kept["sieve_voxel"])}
-    volumes = [xr.DataArray(values, coords, ("z", "y", "x"), attrs=smooth) for values in kept["volumes"]]
+    volumes = [xr.DataArray(values, coords, AXES, attrs=smooth) for values in kept["volumes"]]
     return volumes, {"iterations": float(kept["iterations"])}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lfpiv import metrics
 from lfpiv.calibration.camera import CalibratedCamera
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.reproduce import Progress, page, plots
 from lfpiv.reproduce.rigs import VOXEL_MM, numerical_rig
 from lfpiv.weights.blocks import count_voxels

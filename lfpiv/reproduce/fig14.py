@@ -13,6 +13,7 @@ from skimage.measure import marching_cubes
 
 from lfpiv import metrics
 from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.geometry.grid import AXES
 from lfpiv.metrics.vector_fields import BELOW_VOXEL
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import Progress, angles, page, plots, rigs, store
@@ -353,7 +354,7 @@ def _draw_surface(axes: Any, packed: Fields, largest: float) -> None:
     field = packed["8_field"].astype(float)
     positions = [packed[f"8_{axis}"] for axis in "zyx"]
     coords = dict(zip("zyx", positions, strict=True))
-    velocity = {name: (("z", "y", "x"), field[..., k] * rigs.VOXEL_MM * 1e-3) for k, name in enumerate("uvw")}
+    velocity = {name: (AXES, field[..., k] * rigs.VOXEL_MM * 1e-3) for k, name in enumerate("uvw")}
     curl = derived.vorticity(xr.Dataset(velocity, coords))  # dt = 1 s: voxel per voxel
     magnitude = curl["vorticity_magnitude"].values
     step = [float(p[1] - p[0]) for p in positions]

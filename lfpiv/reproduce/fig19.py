@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from lfpiv import metrics
 from lfpiv.experiment.settings import Smart
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.reproduce import Progress, page, plots, store
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.rigs import Rig, reconstruct_images

@@ -12,7 +12,7 @@ import xarray as xr
 
 from lfpiv.calibration.cameras import warn_outside
 from lfpiv.experiment.settings import Correlation, Smart
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.reproduce import Progress, store
 from lfpiv.reproduce.planar_piv import SheetCamera, correlate_frames, sheet_images
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, reconstruct_images, recorded_images, true_field, volume_grid

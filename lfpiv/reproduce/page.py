@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lfpiv.results import netcdf
+from lfpiv import files
 
 log = logging.getLogger(__name__)
 
@@ -103,14 +103,14 @@ def write(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
         if not path.exists():
             continue
         stored = json.loads(path.read_text("utf-8"))
-        if stored["settings"] != netcdf.plain(settings):
+        if stored["settings"] != files.plain(settings):
             continue
         content[key] = stored["value"]
         for figure in content[key]["figures"]:
             shutil.copyfile(path.parent / figure["file"], out / f".{figure['file']}")
             (out / f".{figure['file']}").replace(out / figure["file"])
-    netcdf.write_json(content, out / "reproduce.json")
-    netcdf.write_text(_page(out, content), out / "index.html")
+    files.write_json(content, out / "reproduce.json")
+    files.write_text(_page(out, content), out / "index.html")
     return content
 
 

@@ -14,7 +14,7 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lfpiv.results import netcdf
+from lfpiv import files
 
 DPI = 150
 COLOURS = {
@@ -81,4 +81,4 @@ def save(drawn: Figure, path: Path) -> None:
     """Write a figure as PNG by rename."""
     buffer = io.BytesIO()
     drawn.savefig(buffer, format="png", dpi=DPI)
-    netcdf.write_bytes(buffer.getvalue(), path)
+    files.write_bytes(buffer.getvalue(), path)

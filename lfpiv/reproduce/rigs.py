@@ -14,15 +14,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from lfpiv import metrics
+from lfpiv import files, metrics
 from lfpiv.calibration.board.board import BoardDots
 from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.experiment import Experiment, open_experiment
 from lfpiv.experiment.settings import Smart
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.reconstruction.volume import reconstruct
-from lfpiv.results import netcdf
 from lfpiv.simulation.flows import Ring, window_mean
 from lfpiv.simulation.scene import Scene, true_mapping
 from lfpiv.simulation.simulator import expose, render_camera, simulate
@@ -170,11 +169,11 @@ def calibrated_rig(scene: Scene, folder: Path, progress: Callable[[str, float], 
     """Simulate the board of a scene and calibrate from it; both are kept in `folder` while the scene stays the same."""
     runtime.device()
     path, marker = folder / "experiment" / "experiment.toml", folder / "scene.json"
-    content = netcdf.plain(scene.model_dump(mode="json"))
+    content = files.plain(scene.model_dump(mode="json"))
     if not marker.exists() or json.loads(marker.read_text("utf-8")) != content:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
-        netcdf.write_json(content, marker)
+        files.write_json(content, marker)
     if not path.exists():
         simulate(scene, path.parent, progress=lambda what, done, total: progress(what, done / total))
     experiment = open_experiment(path)

@@ -18,11 +18,12 @@ from threadpoolctl import threadpool_limits
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.settings import Correlation
+from lfpiv.files import writing
 from lfpiv.lightfield import image_checks
 from lfpiv.lightfield.image_checks import Finding
 from lfpiv.lightfield.particle_signal import seen_structure
 from lfpiv.results import netcdf, provenance
-from lfpiv.results.folder import RETIRED, Folder, writing
+from lfpiv.results.folder import RETIRED, Folder
 from lfpiv.runs import summary, summary_warnings
 from lfpiv.velocity.cross_correlation import correlate
 

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv import warn
+from lfpiv import files, warn
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, check_pairs, read_experiment
-from lfpiv.results import netcdf, provenance
-from lfpiv.results.folder import Folder, make_writable, retire, writing
+from lfpiv.files import writing
+from lfpiv.results import provenance
+from lfpiv.results.folder import Folder, make_writable, retire
 from lfpiv.runs import memory, summary
 from lfpiv.runs.pair import Outcome, PairWork
 from lfpiv.runs.summary_warnings import NAMED, ONE_CAMERA, named
@@ -259,7 +260,7 @@ class Job:
     def build_weights(self, calibration: Calibration, todo: Sequence[int]) -> Weights:
         """Build the weights of the grid, for some pairs of which the first tells whether cameras moved."""
         from lfpiv.calibration.cameras import warn_outside
-        from lfpiv.experiment.nominal_checks import require_seen
+        from lfpiv.calibration.coverage import require_seen
         from lfpiv.runs import moved_cameras
         from lfpiv.weights.operator import build_weights, compare_with_count
 
@@ -372,7 +373,7 @@ class Job:
             result["timings_s"]["report"] = self.seconds["report"]
             self._stop_clock(result)
         with writing(self.folder.summary):
-            netcdf.write_json(result, self.folder.summary)
+            files.write_json(result, self.folder.summary)
         return result
 
     def _stop_clock(self, result: dict[str, Any]) -> None:
@@ -392,4 +393,4 @@ def _write_calibration(calibration: Calibration, path: Path, **attributes: Any) 
     with h5py.File(content, "a") as opened:
         opened.attrs.update(attributes)
     with writing(path):
-        netcdf.write_bytes(content.getbuffer(), path)
+        files.write_bytes(content.getbuffer(), path)

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from lfpiv import files, version
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.results import netcdf
 from lfpiv.runs import summary_warnings
 
 if TYPE_CHECKING:
     from lfpiv.calibration.cameras import CalibratedCamera, Calibration
-    from lfpiv.geometry.optics import Grid
+    from lfpiv.geometry.grid import Grid
     from lfpiv_kernels.runtime import Device
 
 SCHEMA_VERSION = 1
@@ -107,7 +108,7 @@ def build(
         },
         "device": {"kind": device.kind, "threads": device.threads, "reason": device.reason},
         "workers": dict(workers),
-        "versions": netcdf.versions(),
+        "versions": version.versions(),
         "settings": {
             "smart": experiment.smart.model_dump(),
             "correlation": experiment.correlation.model_dump(),
@@ -166,7 +167,7 @@ def pair_entry(number: int, path: Path, marks: Mapping[str, Any]) -> dict[str, A
     if "figures" in marks:
         figures = json.loads(marks["figures"])
     else:
-        figures = netcdf.plain(pair_figures(netcdf.read_vectors(path), netcdf.read_reconstruction(path)))
+        figures = files.plain(pair_figures(netcdf.read_vectors(path), netcdf.read_reconstruction(path)))
     return {"pair": number, "file": path.name, **figures}
 
 
@@ -234,4 +235,4 @@ def _mean(values: Iterable[float]) -> float | None:
 
 def _scalars(report: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers and short texts of a camera's report; arrays belong to the calibration file."""
-    return {key: netcdf.plain(value) for key, value in report.items() if not isinstance(value, np.ndarray)}
+    return {key: files.plain(value) for key, value in report.items() if not isinstance(value, np.ndarray)}

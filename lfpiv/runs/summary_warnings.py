@@ -10,7 +10,7 @@ from lfpiv.velocity.cross_correlation import Verdict
 
 if TYPE_CHECKING:
     from lfpiv.calibration.cameras import Calibration
-    from lfpiv.geometry.optics import Grid
+    from lfpiv.geometry.grid import Grid
 
 NAMED = 5
 """Pairs that a text names one by one."""
@@ -51,7 +51,7 @@ _SHOWN: dict[Fault, Callable[[float], str]] = {
 def of_rig(calibration: Calibration, grid: Grid) -> list[str]:
     """Say what is doubtful about the calibration, and about how cameras and volume lie to each other."""
     from lfpiv.calibration.cameras import outside_warnings
-    from lfpiv.experiment.nominal_checks import sight_warnings
+    from lfpiv.calibration.coverage import sight_warnings
 
     texts = [text for camera in calibration.cameras.values() for text in camera.report.get("warnings", ())]
     texts += [*outside_warnings(calibration, grid), *sight_warnings(calibration, grid)]

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lfpiv.calibration.coverage import SEEN_SHARE, warn_alone
 from lfpiv.errors import InputError
-from lfpiv.experiment.nominal_checks import SEEN_SHARE, warn_alone
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.weights.blocks import (
     BLOCK_BYTES,

@@ -14,11 +14,10 @@ from scipy import ndimage
 from support.ideal_rig import rotation
 
 import lfpiv
-from lfpiv.calibration import checks
+from lfpiv.calibration import checks, coverage
 from lfpiv.calibration.board.board import HELD_BYTES, Planes, agreeing_dots
 from lfpiv.calibration.cameras import warn_outside
 from lfpiv.calibration.thin_lens_model import thin_lens_model
-from lfpiv.experiment import nominal_checks
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.image_checks import APERTURE, microimage_px, stated_px
@@ -348,13 +347,13 @@ def test_particle_images_in_place_of_boards_are_refused(rig, tmp_path):
 def test_a_volume_that_the_calibrated_camera_does_not_see_is_refused(rig, caplog):
     experiment, _, calibration = rig
     sees = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
-    assert nominal_checks.seen_share(calibration.cameras["only"], sees) == 1
+    assert coverage.seen_share(calibration.cameras["only"], sees) == 1
     beside = lfpiv.Grid.from_extent(centre_mm=(0, 4.0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
     with pytest.raises(lfpiv.InputError, match=r"around \(0, 4, 0\) mm of which camera 'only' sees nothing"):
-        nominal_checks.require_seen(experiment.path, calibration, beside)
+        coverage.require_seen(experiment.path, calibration, beside)
     half = lfpiv.Grid.from_extent(centre_mm=(0, 2.2, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
     with caplog.at_level(logging.WARNING):
-        nominal_checks.require_seen(experiment.path, calibration, half)
+        coverage.require_seen(experiment.path, calibration, half)
     assert "% of the volume" in caplog.text
 
 
