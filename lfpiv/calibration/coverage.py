@@ -11,6 +11,7 @@ import numpy as np
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import Grid
+from lfpiv.warn import Code, Warning
 
 log = logging.getLogger(__name__)
 
@@ -48,21 +49,21 @@ def require_seen(path: Path, calibration: Calibration, grid: Grid) -> None:
                 f"{grid.centre_text()} of which camera {camera.name!r} sees nothing by its calibration. Check "
                 "volume.centre_mm and size_mm against the board's extent."
             )
-    for text in sight_warnings(calibration, grid):
-        log.warning("%s", text)
+    for warning in sight_warnings(calibration, grid):
+        log.warning("%s", warning.sentence)
 
 
-def sight_warnings(calibration: Calibration, grid: Grid) -> list[str]:
+def sight_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
     """Say of every calibrated camera that sees less than half of a volume how much it sees, and what two do not see."""
     sampled = {camera.name: _sees(camera, grid) for camera in calibration.cameras.values()}
-    texts = [
-        f"{name}: sees only about {100 * seen.mean():.0f} % of the volume"
+    warnings = [
+        Warning(code=Code.OUTSIDE_SIGHT, subject=name, figures={"share": float(seen.mean())})
         for name, seen in sampled.items()
         if seen.mean() < FEW
     ]
     if len(sampled) > 1:
-        texts += _alone(np.sum(list(sampled.values()), 0), _sampled_axes(grid))
-    return texts
+        warnings += _seen_by_one(np.sum(list(sampled.values()), 0), _sampled_axes(grid))
+    return warnings
 
 
 def seen_share(camera: CalibratedCamera, grid: Grid) -> float:
@@ -90,14 +91,14 @@ def _sees(camera: CalibratedCamera, grid: Grid) -> np.ndarray:
     return seen.reshape(x.shape)
 
 
-def warn_alone(views: np.ndarray, grid: Grid, cameras: int) -> None:
+def warn_seen_by_one(views: np.ndarray, grid: Grid, cameras: int) -> None:
     """Log a warning where voxels of a grid are seen by but one of several cameras; `views` counts them, (z, y, x)."""
     if cameras > 1:
-        for text in _alone(views, [grid.axis_mm(axis) for axis in range(3)]):
-            log.warning("%s", text)
+        for warning in _seen_by_one(views, [grid.axis_mm(axis) for axis in range(3)]):
+            log.warning("%s", warning.sentence)
 
 
-def _alone(views: np.ndarray, axes_mm: Sequence[np.ndarray]) -> list[str]:
+def _seen_by_one(views: np.ndarray, axes_mm: Sequence[np.ndarray]) -> list[Warning]:
     """Say how much of a volume fewer than two cameras see, and where; `views` counts them at places along z, y, x."""
     seen = views >= 2
     if 1 - seen.mean() < LEAST_ALONE:
@@ -109,7 +110,38 @@ def _alone(views: np.ndarray, axes_mm: Sequence[np.ndarray]) -> list[str]:
             inside = axes_mm[axis][seen.any(tuple({0, 1, 2} - {axis}))]
             reach.append(f"{name} {inside[0]:.3g} to {inside[-1]:.3g}")
         where = f"two see no more than {', '.join(reach)} mm"
-    share = 100 * (1 - seen.mean())
-    return [
-        f"about {share:.0f} % of the volume is seen by fewer than two cameras; vectors there are not valid: {where}"
-    ]
+    return [Warning(code=Code.SEEN_BY_ONE, figures={"share": float(1 - seen.mean()), "where": where})]
+
+
+def warn_outside(calibration: Calibration, grid: Grid) -> None:
+    """Log a warning for every camera whose calibrated region does not hold all voxels of a grid."""
+    for warning in outside_warnings(calibration, grid):
+        log.warning("%s", warning.sentence)
+
+
+def outside_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
+    """Say of every camera whose calibrated region does not hold all voxels of a grid how much lies outside.
+
+    The region is the box that the board's dots spanned, widened by half a voxel.
+    """
+    warnings = []
+    for camera in calibration.cameras.values():
+        if camera.region_mm is None:
+            continue
+        inside, distance = 1.0, 0.0
+        for axis in range(3):
+            centres = grid.axis_mm(2 - axis)
+            low, high = camera.region_mm[:, axis]
+            over = np.maximum(np.maximum(low - centres, centres - high) - grid.voxel_mm / 2, 0.0)
+            inside *= float((over <= 1e-9).mean())
+            distance = float(np.hypot(distance, over.max()))
+        if inside == 1:
+            continue
+        low, high = camera.region_mm
+        box = ", ".join(f"{name} {a:g} to {b:g}" for name, a, b in zip("xyz", low, high, strict=True))
+        advice = "shrink the volume or use a larger board or more planes"
+        if camera.baseline is None:
+            advice += ', or set network.baseline = "thin_lens": a network alone extrapolates badly'
+        figures = {"share": 1 - inside, "region": box, "distance_mm": distance, "advice": advice}
+        warnings.append(Warning(code=Code.OUTSIDE_CALIBRATION, subject=camera.name, figures=figures))
+    return warnings

@@ -10,7 +10,7 @@ from typing import Any, TypedDict
 import numpy as np
 import xarray as xr
 
-from lfpiv.calibration.cameras import warn_outside
+from lfpiv.calibration.coverage import warn_outside
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import Grid
 from lfpiv.reproduce import Progress, store

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from lfpiv import warn
 from lfpiv.errors import InputError
+from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ def _locked(path: Path) -> int | None:
             holder = os.pread(file, 1000, 0)
             os.close(file)
             if error.errno not in (errno.EAGAIN, errno.EACCES):
-                warn.warn(log, "%s: this file system knows no locks: start no second run on this folder", path.parent)
+                warn(log, Warning(code=Code.NO_LOCKS, subject=str(path.parent)))
                 return None
             raise InputError(
                 f"{path.parent}: expected a folder that no other run writes to, found it held by {_named(holder)}. "

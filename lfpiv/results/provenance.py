@@ -16,7 +16,6 @@ from typing import Any
 from lfpiv import files
 from lfpiv.experiment.davis import split_frame
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.results import netcdf
 from lfpiv.version import __version__
 
 
@@ -63,13 +62,13 @@ class Stamp:
 
 
 def marks(path: Path) -> dict[str, Any] | None:
-    """Stamp, figures and findings in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
+    """Stamp, figures and warnings in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
     import h5py
 
     found = {}
     try:
         with h5py.File(path, "r") as file:
-            for name in ("settings_hash", "depends_on", "figures", "findings"):
+            for name in ("settings_hash", "depends_on", "figures", "warnings", "findings"):
                 with contextlib.suppress(KeyError):
                     found[name] = file.attrs[name]
     except OSError:
@@ -89,7 +88,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
             "camera": cameras,
             "board": experiment.board.model_dump(),
             "network": experiment.network.model_dump(),
-            "images": netcdf.content_hash(experiment.calibration_paths()),
+            "images": content_hash(experiment.calibration_paths()),
         }
     )
 

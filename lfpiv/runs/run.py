@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv import files, warn
+from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, check_pairs, read_experiment
 from lfpiv.files import writing
@@ -22,7 +22,7 @@ from lfpiv.results import provenance
 from lfpiv.results.folder import Folder, make_writable, retire
 from lfpiv.runs import memory, summary
 from lfpiv.runs.pair import Outcome, PairWork
-from lfpiv.runs.summary_warnings import NAMED, ONE_CAMERA, named
+from lfpiv.warn import NAMED_PAIRS, Code, Warning, collected, name_pairs
 from lfpiv_kernels import runtime
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def open_job(
     made = make_writable(folder.path)
     try:
         with contextlib.ExitStack() as stack:
-            warnings = stack.enter_context(warn.collected())
+            warnings = stack.enter_context(collected())
             if writes_results:
                 stack.enter_context(folder.held())
                 folder.sweep()
@@ -98,7 +98,7 @@ class Job:
         progress: Progress | None,
         device_request: str,
         device: runtime.Device,
-        warnings: list[str],
+        warnings: list[Warning],
         start: float,
     ):
         self.experiment = experiment
@@ -158,7 +158,7 @@ class Job:
             )
         for reason, pairs in changed.items():
             if reason:
-                log.info("%s changed: %s made anew", reason, named(pairs))
+                log.info("%s changed: %s made anew", reason, name_pairs(pairs))
         return todo
 
     def check_images(self, todo: Sequence[int]) -> list[int]:
@@ -179,10 +179,10 @@ class Job:
             for pair, reason in bad.items():
                 self.note(Outcome(pair=pair, reason=reason))
             return []
-        for reason in list(bad.values())[:NAMED]:
+        for reason in list(bad.values())[:NAMED_PAIRS]:
             log.error("%s The other pairs will be done.", reason)
-        if len(bad) > NAMED:
-            log.error("%d pairs have images that cannot be used: %s", len(bad), named(list(bad)))
+        if len(bad) > NAMED_PAIRS:
+            log.error("%d pairs have images that cannot be used: %s", len(bad), name_pairs(list(bad)))
         return list(todo)
 
     def is_finished(self, pair: int) -> bool:
@@ -259,8 +259,7 @@ class Job:
 
     def build_weights(self, calibration: Calibration, todo: Sequence[int]) -> Weights:
         """Build the weights of the grid, for some pairs of which the first tells whether cameras moved."""
-        from lfpiv.calibration.cameras import warn_outside
-        from lfpiv.calibration.coverage import require_seen
+        from lfpiv.calibration.coverage import require_seen, warn_outside
         from lfpiv.runs import moved_cameras
         from lfpiv.weights.operator import build_weights, compare_with_count
 
@@ -268,8 +267,8 @@ class Job:
         require_seen(self.experiment.path, calibration, self.experiment.grid)
         warn_outside(calibration, self.experiment.grid)
         if len(calibration.cameras) == 1:
-            log.warning(ONE_CAMERA)
-        with warn.collected() as warnings:
+            log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
+        with collected() as warnings:
             with self.timed("weights"):
                 weights = build_weights(
                     calibration,
@@ -283,7 +282,12 @@ class Job:
             counted = compare_with_count(weights) if method == "footprint" else {}
             disparity = moved_cameras.check(self.experiment, weights, todo)
         memory_mib = weights.memory_bytes / memory.MIB
-        self.weights_report |= {"method": method, "memory_mib": memory_mib, "warnings": warnings, **disparity}
+        self.weights_report |= {
+            "method": method,
+            "memory_mib": memory_mib,
+            "warnings": [one.to_json() for one in warnings],
+            **disparity,
+        }
         if method == "footprint":
             self.weights_report |= {"form": dict(weights.forms), "cuts": dict(weights.cuts)}
             self.weights_report["profiles_check_l2"] = {
