@@ -12,7 +12,7 @@ from scipy import ndimage, optimize
 from threadpoolctl import threadpool_limits
 
 import lfpiv
-from lfpiv.calibration.network import train
+from lfpiv.calibration.training import train
 from lfpiv.geometry.grid import Grid
 from lfpiv.weights.blocks import COUNT_POINTS
 from lfpiv.weights.operator import COUNT_SAMPLES_ONE, compare_with_count

@@ -13,7 +13,7 @@ import warp as wp
 from support.ideal_rig import two_cameras
 
 import lfpiv
-from lfpiv.calibration.network import train
+from lfpiv.calibration.training import train
 from lfpiv_kernels import runtime
 from lfpiv_kernels.correlation import correlate, deform
 from lfpiv_kernels.weights import footprint, ray_model

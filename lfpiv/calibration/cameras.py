@@ -13,8 +13,8 @@ import numpy as np
 from lfpiv.calibration import checks
 from lfpiv.calibration.board.board import DotBoard, Planes, agreeing_dots, measure_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration, load_calibration
-from lfpiv.calibration.network import train
 from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
+from lfpiv.calibration.training import train
 from lfpiv.calibration.virtual_samples import guide_between
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment

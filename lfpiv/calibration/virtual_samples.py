@@ -32,7 +32,7 @@ def guide_between(
 def between_dots(
     points: np.ndarray, pupil: np.ndarray, outputs: np.ndarray, std: np.ndarray, *, pitch_mm: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return samples between the dots by a polynomial through the labels, for `lfpiv.calibration.network.train`.
+    """Return samples between the dots by a polynomial through the labels, for `lfpiv.calibration.training.train`.
 
     A network of tens of nodes can pass through every plane, row and column of dots and be wrong in between, where
     neither training nor held-out dots see it. These samples forbid that, loosely enough for dots to decide.

@@ -14,8 +14,9 @@ import numpy as np
 from lfpiv.calibration.board.board import BoardDots, DotBoard, measure_board
 from lfpiv.calibration.cameras import MODEL_ERROR_PITCH
 from lfpiv.calibration.levenberg_marquardt import levenberg_marquardt
-from lfpiv.calibration.network import sigma_nor, train
+from lfpiv.calibration.network import sigma_nor
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
+from lfpiv.calibration.training import train
 from lfpiv.calibration.virtual_samples import guide_between
 from lfpiv.reproduce import page, plots, store
 from lfpiv.reproduce.rigs import Rig, numerical_rig

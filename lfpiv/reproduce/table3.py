@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv.calibration.board.board import BoardDots
-from lfpiv.calibration.network import train
+from lfpiv.calibration.training import train
 from lfpiv.reproduce import page
 from lfpiv.reproduce.rigs import Rig, numerical_rig, volume_grid
 from lfpiv.reproduce.study import Progress

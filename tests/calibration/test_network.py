@@ -9,8 +9,9 @@ from scipy.optimize import least_squares
 
 from lfpiv.calibration import levenberg_marquardt as trainers
 from lfpiv.calibration.levenberg_marquardt import Samples, Stop, levenberg_marquardt, normal_equations
-from lfpiv.calibration.network import Network, sigma_nor, split_samples, train
+from lfpiv.calibration.network import Network, sigma_nor
 from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens, thin_lens_model
+from lfpiv.calibration.training import split_samples, train
 from lfpiv.calibration.virtual_samples import between_dots
 from lfpiv.geometry.optics import Optics
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping

@@ -11,7 +11,7 @@ from support import scenes
 
 import lfpiv
 from lfpiv.calibration.levenberg_marquardt import Samples, forward, levenberg_marquardt
-from lfpiv.calibration.network import train
+from lfpiv.calibration.training import train
 from lfpiv.errors import InputError
 from lfpiv.reproduce import fig19, lsi, lsi_twin, planar_piv, table1, table3, trainers
 from lfpiv.reproduce.rigs import Rig
