@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.geometry.optics import LAYOUTS, LensLattice, Optics, pair
+from lfpiv.geometry.optics import LAYOUTS, LensLattice, Optics, float_pair
 from lfpiv.lightfield.lens_basis import cell_angle_deg, find_basis, find_phase, indices_inside, lattice_pitch
 from lfpiv.lightfield.microimage_fit import BLUR_REACH_PX, cut_patches, measure, robust_fit
 from lfpiv.warn import Code, Warning, warn
@@ -87,7 +87,9 @@ class LensArray:
         scale = 1 + optics.sensor_per_pupil
         origin = optics.sensor_mm(np.asarray(self.origin_px)) / scale
         basis = np.asarray(self.basis_px) * optics.pixel_mm / scale
-        return LensLattice(origin_mm=pair(origin), basis_mm=(pair(basis[0]), pair(basis[1])), layout=self.layout)
+        return LensLattice(
+            origin_mm=float_pair(origin), basis_mm=(float_pair(basis[0]), float_pair(basis[1])), layout=self.layout
+        )
 
 
 def find_lens_array(
@@ -143,8 +145,8 @@ def find_lens_array(
     array = LensArray(
         centres_px=centres,
         index=index,
-        origin_px=pair(origin),
-        basis_px=(pair(basis[0]), pair(basis[1])),
+        origin_px=float_pair(origin),
+        basis_px=(float_pair(basis[0]), float_pair(basis[1])),
         layout=layout,
         rms_px=rms,
         measured=measured,

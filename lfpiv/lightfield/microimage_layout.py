@@ -50,7 +50,7 @@ def microimage_centres(optics: Optics, lattice: LensLattice, margin_px: float) -
     return first, lattice.centres_mm(index) * widening + half
 
 
-def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
+def microimages_of(optics: Optics, lattice: LensLattice) -> Microimages:
     """Lay a sensor's pixels out as the rays of its lenses.
 
     The microimage of the lens at s_l is centred at s_l (1 + f_m/s_i) on the sensor (Eq. 9) and as wide as the pupil's

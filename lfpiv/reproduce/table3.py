@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv.calibration.board.board import BoardDots
-from lfpiv.calibration.training import train
+from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.reproduce import page
 from lfpiv.reproduce.rigs import Rig, numerical_rig, volume_grid
 from lfpiv.reproduce.study import Progress
@@ -52,10 +52,8 @@ def compute(rig: Rig, scale: str, *, seed: int, progress: Progress) -> dict[str,
         training = train(
             np.hstack([points, pupil]),
             array,
-            epochs=EPOCHS[scale],
-            split=PARTS,
+            TrainingSettings(epochs=EPOCHS[scale], split=PARTS, seed=seed),
             groups=dot,
-            seed=seed,
             unit=camera.lattice.pitch_mm,
         )
         trained[name] = {

@@ -8,11 +8,17 @@ import pytest
 from scipy.optimize import least_squares
 
 from lfpiv.calibration import levenberg_marquardt as trainers
-from lfpiv.calibration.levenberg_marquardt import Samples, Stop, levenberg_marquardt, normal_equations
+from lfpiv.calibration.levenberg_marquardt import (
+    Samples,
+    TrainingStop,
+    levenberg_marquardt,
+    normal_equations,
+    second_order_gradient,
+)
 from lfpiv.calibration.network import Network, sigma_nor
 from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens, thin_lens_model
-from lfpiv.calibration.training import split_samples, train
-from lfpiv.calibration.virtual_samples import between_dots
+from lfpiv.calibration.training import TrainingSettings, split_samples, train
+from lfpiv.calibration.virtual_samples import VirtualSamples, between_dots
 from lfpiv.geometry.optics import Optics
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
 
@@ -134,8 +140,8 @@ def test_derivatives_match_complex_steps(sizes, monkeypatch):
     step, h = rng.normal(size=theta.size), 1e-5
     turned = [dense_jacobian(theta + sign * h * step, layers, samples) @ step for sign in (1, -1)]
     expected = jacobian.T @ (turned[0] - turned[1]) / (2 * h)
-    bending = trainers._bending(layers, unpack(step, layers), samples)
-    np.testing.assert_allclose(bending, expected, atol=DIFFERENCE * np.abs(expected).max())
+    second_order = second_order_gradient(layers, unpack(step, layers), samples)
+    np.testing.assert_allclose(second_order, expected, atol=DIFFERENCE * np.abs(expected).max())
 
 
 def test_training_error_never_rises_and_reaches_what_scipy_reaches():
@@ -164,11 +170,11 @@ def test_result_depends_on_the_seed_but_not_on_the_number_of_threads(monkeypatch
     inputs = np.hstack([points, pupil])
 
     def trained(seed):
-        network = train(inputs, array, hidden=(6,), epochs=12, groups=dot, seed=seed).network
+        network = train(inputs, array, TrainingSettings(hidden=(6,), epochs=12, seed=seed), groups=dot).network
         return np.concatenate([weight.ravel() for weight in network.weights])
 
     first = trained(4)
-    monkeypatch.setattr(trainers, "_cores", lambda: 1)
+    monkeypatch.setattr(trainers, "cores", lambda: 1)
     np.testing.assert_array_equal(trained(4), first)
     assert not np.array_equal(trained(5), first)
 
@@ -176,7 +182,8 @@ def test_result_depends_on_the_seed_but_not_on_the_number_of_threads(monkeypatch
 def test_groups_stay_together_and_parts_have_their_shares():
     rng = np.random.default_rng(1)
     groups = rng.integers(0, 300, 9000)
-    parts = split_samples(9000, groups=groups, rng=rng)
+    split = split_samples(9000, groups=groups, rng=rng)
+    parts = (split.training, split.validation, split.test)
     np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(9000))
     members = [set(groups[part]) for part in parts]
     assert not (members[0] & members[1] or members[0] & members[2] or members[1] & members[2])
@@ -188,10 +195,10 @@ def test_early_stopping_keeps_the_best_epoch():
     rng = np.random.default_rng(6)
     inputs = rng.uniform(-1, 1, (240, 3))
     outputs = np.sin(2 * inputs[:, :1]) + 0.3 * rng.standard_normal((240, 1))
-    training = train(inputs, outputs, hidden=(15,), epochs=100, patience=10, unit=2.0)
-    assert training.stop is Stop.VALIDATION
+    training = train(inputs, outputs, TrainingSettings(hidden=(15,), epochs=100, patience=10), unit=2.0)
+    assert training.stop is TrainingStop.VALIDATION
     assert training.validation_rms.argmin() < training.epochs  # it went on in vain
-    part = training.validation_index
+    part = training.split.validation
     rms = np.sqrt(np.mean((training.network(inputs[part]) - outputs[part]) ** 2)) / 2.0
     assert rms == pytest.approx(training.validation_rms.min(), rel=1e-9)
 
@@ -219,7 +226,9 @@ def test_network_learns_the_rays_of_a_camera(angle, noise, goal):
 def test_two_hidden_layers_beat_the_goal_too():
     rng = np.random.default_rng(12)
     points, pupil, array, dot = board_labels(aberrated, 4000, rng)
-    training = train(np.hstack([points, pupil]), array, hidden=(12, 12), epochs=60, groups=dot, unit=PITCH)
+    training = train(
+        np.hstack([points, pupil]), array, TrainingSettings(hidden=(12, 12), epochs=60), groups=dot, unit=PITCH
+    )
     points, pupil = box(10_000, rng), disc(10_000, rng)
     error = sigma_nor(training.network(np.hstack([points, pupil])), aberrated(points, pupil), PITCH)
     assert error <= 2 * GOAL_NOISE_FREE  # a third of the paper's nodes, and aberrations
@@ -234,7 +243,7 @@ def test_labels_count_by_their_standard_deviation():
     inputs = np.hstack([points, pupil])
     errors = []
     for known in (None, std):
-        network = train(inputs, array, hidden=(10,), epochs=60, groups=dot, std=known).network
+        network = train(inputs, array, TrainingSettings(hidden=(10,), epochs=60), groups=dot, std=known).network
         errors.append(sigma_nor(network(inputs), truth(points, pupil), PITCH))
     assert errors[1] < errors[0] / 10  # the better half alone has a hundredth of the noise
 
@@ -246,22 +255,23 @@ def test_network_on_a_fitted_thin_lens_extrapolates(noise):
     points, pupil, array, dot = board_labels(truth, 4000, rng, noise)
     inputs = np.hstack([points, pupil])
     lens = fit_thin_lens(points, pupil, array, OPTICS)
-    pure = train(inputs, array, epochs=60, groups=dot).network
-    correction = train(inputs, array - lens(points, pupil), groups=dot, shrink=True).network
+    pure = train(inputs, array, TrainingSettings(epochs=60), groups=dot).network
+    correction = train(inputs, array - lens(points, pupil), TrainingSettings(shrink=True), groups=dot).network
     points, pupil = box(20_000, rng, (10, 10, 8)), disc(20_000, rng)
     outside = (np.abs(points) > (3, 3, 2)).any(axis=1)  # up to 2 mm off the board
     inputs, true = np.hstack([points, pupil]), truth(points, pupil)
     for where, gain in ((~outside, 1.0), (outside, 5.0)):  # prototypes: 2 and 10 to 20
-        alone = sigma_nor(pure(inputs[where]), true[where], PITCH)
+        network_only = sigma_nor(pure(inputs[where]), true[where], PITCH)
         both = sigma_nor(lens(points[where], pupil[where]) + correction(inputs[where]), true[where], PITCH)
-        assert both < alone / gain
+        assert both < network_only / gain
 
 
 def test_correction_learns_the_aberrations_of_a_real_lens():
     rng = np.random.default_rng(16)
     points, pupil, array, dot = board_labels(aberrated, 6000, rng, noise=0.02)
     lens = fit_thin_lens(points, pupil, array, OPTICS)
-    correction = train(np.hstack([points, pupil]), array - lens(points, pupil), groups=dot, shrink=True)
+    settings = TrainingSettings(shrink=True)
+    correction = train(np.hstack([points, pupil]), array - lens(points, pupil), settings, groups=dot)
     assert correction.shrinkage > 0.9
     points, pupil = box(10_000, rng), disc(10_000, rng)
     rays = lens(points, pupil)
@@ -277,7 +287,7 @@ def test_a_correction_of_nothing_vanishes():
     residual = array - truth(points, pupil)
     errors = []
     for shrink in (False, True):
-        network = train(np.hstack([points, pupil]), residual, groups=dot, shrink=shrink).network
+        network = train(np.hstack([points, pupil]), residual, TrainingSettings(shrink=shrink), groups=dot).network
         errors.append(np.linalg.norm(network(np.hstack([points, pupil])), axis=1).mean() / PITCH)
     assert errors[1] < 0.7 * errors[0]
     assert errors[1] < GOAL_NOISY / 2
@@ -437,9 +447,9 @@ def test_kernel_refuses_other_arrays(device):
 def test_train_refuses_bad_input(change, message):
     rng = np.random.default_rng(40)
     arguments = {"inputs": rng.normal(size=(100, 5)), "outputs": rng.normal(size=(100, 2))} | change
-    inputs, outputs = arguments.pop("inputs"), arguments.pop("outputs")
+    settings = TrainingSettings(**{name: arguments.pop(name) for name in ("hidden", "split") if name in arguments})
     with pytest.raises(ValueError, match=message):
-        train(inputs, outputs, **arguments)
+        train(settings=settings, **arguments)
 
 
 def test_network_refuses_layers_that_do_not_fit():
@@ -450,8 +460,8 @@ def test_network_refuses_layers_that_do_not_fit():
         network(np.zeros((3, 4)))
 
 
-def test_the_guide_is_exact_for_a_polynomial_and_stays_among_the_dots():
-    """Few dots along an axis lower its order; what is within that order come back to rounding, none beyond the dots."""
+def test_virtual_samples_are_exact_for_a_polynomial_and_lie_among_the_dots():
+    """Few dots along an axis lower the order; a polynomial within it is met to rounding."""
     rng = np.random.default_rng(0)
     dots = np.stack(np.meshgrid([0, 1, 2.0], [0, 1, 2.0], [0, 1.0], indexing="ij"), -1).reshape(-1, 3)
     points, pupil = np.repeat(dots, 20, axis=0), rng.uniform(-1, 1, (360, 2))
@@ -460,32 +470,35 @@ def test_the_guide_is_exact_for_a_polynomial_and_stays_among_the_dots():
         return np.stack([x * u + z, v**3 - y], axis=1)
 
     outputs = mapping(*points.T, *pupil.T)
-    inputs, guided, std = between_dots(points, pupil, outputs, np.full(360, 0.01), pitch_mm=0.1, seed=0)
-    assert np.abs(guided - mapping(*inputs.T)).max() < 1e-12  # sums of a hundred terms of order 1 in float64
-    assert (inputs[:, :3] >= 0).all() and (inputs[:, :3] <= [2, 2, 1]).all() and (std > 0).all()
+    virtual = between_dots(points, pupil, outputs, np.full(360, 0.01), pitch_mm=0.1, seed=0)
+    assert np.abs(virtual.outputs - mapping(*virtual.inputs.T)).max() < 1e-12  # sums of a hundred terms of order 1
+    places = virtual.inputs[:, :3]
+    assert (places >= 0).all() and (places <= [2, 2, 1]).all() and (virtual.std > 0).all()
 
 
-def test_the_guide_knows_nothing_of_dots_held_out():
+def test_virtual_samples_come_from_dots_of_the_training_part_only():
     rng = np.random.default_rng(1)
     inputs = rng.uniform(-1, 1, (400, 5))
-    groups, told = np.repeat(np.arange(40), 10), []
+    groups, asked = np.repeat(np.arange(40), 10), []
 
-    def guide(part):
-        told.append(part)
-        return inputs[part], inputs[part, :2], np.full(len(part), 0.1)
+    def sampler(part):
+        asked.append(part)
+        return VirtualSamples(inputs=inputs[part], outputs=inputs[part, :2], std=np.full(len(part), 0.1))
 
-    train(inputs, inputs[:, :2], hidden=(5,), epochs=3, groups=groups, guide=guide)
-    (part,) = told
+    train(inputs, inputs[:, :2], TrainingSettings(hidden=(5,), epochs=3), groups=groups, virtual_samples=sampler)
+    (part,) = asked
     assert 0.6 < len(part) / len(inputs) < 0.8
     assert not set(groups[part]) & set(np.delete(groups, part))
 
 
-HONEST = 1.0  # error over stated deviation: three times the error is stated
-TIGHT_PITCH = 0.03  # three times 0.005, and what dots at even distances leave open: under a pitch of 0.1 no restraint
+LARGEST_ERROR_OVER_STD = 1.0  # a third is expected: the stated deviation is three times the expected error
+TIGHT_PITCH = (
+    0.03  # three times 0.005, and the polynomial's own error at even distances; a deviation of 0.1 is no bound
+)
 
 
-def test_the_guide_lets_go_where_planes_leave_the_mapping_open():
-    """Three planes close together and one far off: a cubic meets the noise of all four, and is anything between."""
+def test_virtual_samples_are_loose_where_planes_leave_the_mapping_open():
+    """Three planes close together and one far off: a cubic meets the noise of all four and is undetermined between."""
     deviation = []
     for planes in ((-3.0, -2.9, -2.8, 3.0), (-3.0, -1.0, 1.0, 3.0)):
         rng, axis = np.random.default_rng(3), np.linspace(-1, 1, 5)
@@ -493,7 +506,8 @@ def test_the_guide_lets_go_where_planes_leave_the_mapping_open():
         noise = 0.004 * PITCH * rng.standard_normal((len(dots), 2))  # shared by the labels of a dot; the truth is 0
         points, pupil, labels = np.repeat(dots, 37, axis=0), disc(37 * len(dots), rng), np.repeat(noise, 37, axis=0)
         std = np.full(len(points), 0.004 * PITCH)
-        _, guided, stated = between_dots(points, pupil, labels, std, pitch_mm=PITCH, seed=0)
-        assert np.sqrt(np.mean((guided / stated[:, None]) ** 2)) < HONEST
-        deviation.append(np.median(stated) / PITCH)
-    assert deviation[1] < TIGHT_PITCH and np.abs(stated).max() < 10 * np.abs(stated).min()
+        virtual = between_dots(points, pupil, labels, std, pitch_mm=PITCH, seed=0)
+        error = np.sqrt(np.mean((virtual.outputs / virtual.std[:, None]) ** 2))
+        assert error < LARGEST_ERROR_OVER_STD
+        deviation.append(np.median(virtual.std) / PITCH)
+    assert deviation[1] < TIGHT_PITCH and np.abs(virtual.std).max() < 10 * np.abs(virtual.std).min()

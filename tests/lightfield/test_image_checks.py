@@ -216,7 +216,7 @@ def test_a_saturated_white_image_and_pictures_on_their_side_are_named(small_run,
     spoil(file, "white/*.tif", lambda image: np.minimum(image * 4.0, 4095))
     spoil(file, "**/*.tif", np.rot90)
     camera = calibrate_first(file)
-    assert camera.report["sigma_nor_test"] < GOOD
+    assert camera.report.sigma_nor_test < GOOD
     saturated, turned = (warning.sentence for warning in camera.warnings)
     assert "white image's bright pixels are saturated" in saturated and "turned by 90 degrees" in turned
 
@@ -229,7 +229,7 @@ def test_wrong_spacing_and_size_of_the_dots_show(small_run, tmp_path, caplog):
     file.write_text(text.replace("dot_diameter_mm = 0.1\n", "dot_diameter_mm = 0.15\n"), "utf-8")
     with caplog.at_level(logging.CRITICAL, "lfpiv"):
         camera = calibrate_first(file)
-    assert camera.report["sigma_nor_test"] < GOOD
+    assert camera.report.sigma_nor_test < GOOD
     wide, magnified = (warning.sentence for warning in camera.warnings)
     assert re.search(r"magnified 1\.(09\d|1\d\d) times, not 1", magnified)
     assert wide.startswith("left: the board's dots look 0.") and wide.endswith("mm wide, not 0.15 mm")
