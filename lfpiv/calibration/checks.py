@@ -213,7 +213,7 @@ def check_rejected(experiment: Experiment, setup: CameraSetup, dots: BoardDots, 
 def check_mapping(
     setup: CameraSetup, quality: CalibrationQuality, network: Network, estimator: str, training_dots: int
 ) -> None:
-    """Warn of missing dots, an irregular lens array, too few dots for the network, and a large error on held-out dots."""
+    """Warn of missing dots, an irregular lens array, too few dots for the network, and a large test error."""
 
     def doubt(code: Code, **figures: float | str) -> None:
         warn(log, Warning(code=code, subject=setup.name, figures=figures))

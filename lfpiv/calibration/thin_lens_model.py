@@ -25,7 +25,7 @@ from lfpiv.geometry.optics import Optics
 FIT_SAMPLES = 20_000
 """Largest number of labels in a fit, evenly drawn from all labels."""
 PRIOR = np.repeat([1e3, 0.05], [6, 5])
-"""Standard deviation of each parameter: free for the pose, 5 % of the data sheet for the optics (0.5 mm for the axis)."""
+"""Prior standard deviation of each parameter: free for the pose, 5 % for the optics, 0.5 mm for the optical axis."""
 ITERATIONS, STEP, CONVERGED = 50, 1e-6, 1e-9
 """Largest number of steps, step of the finite differences, and length of the last step."""
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-12

@@ -96,7 +96,7 @@ class Training:
 def train(
     inputs: np.ndarray,
     outputs: np.ndarray,
-    settings: TrainingSettings = TrainingSettings(),  # noqa: B008  # frozen
+    settings: TrainingSettings = TrainingSettings(),
     *,
     groups: np.ndarray | None = None,
     std: np.ndarray | None = None,

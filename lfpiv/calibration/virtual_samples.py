@@ -48,7 +48,7 @@ VirtualSampler = Callable[[np.ndarray], VirtualSamples]
 def sampler_between_dots(
     points: np.ndarray, pupil: np.ndarray, outputs: np.ndarray, std: np.ndarray, *, pitch_mm: float, seed: int
 ) -> VirtualSampler:
-    """Return a function that calls `between_dots` for some of the labels. The parameters are those of `between_dots`."""
+    """Return a function that calls `between_dots` for some of the labels. Parameters as for `between_dots`."""
 
     def sampler(part: np.ndarray) -> VirtualSamples:
         return between_dots(points[part], pupil[part], outputs[part], std[part], pitch_mm=pitch_mm, seed=seed)
