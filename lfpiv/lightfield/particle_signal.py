@@ -1,8 +1,9 @@
 """Measure whether an image shows particles or only noise.
 
-A particle lights many neighbouring pixels of a microimage. Read-out and photon noise is independent from pixel to pixel.
-So the correlation of near pixels under one microlens separates the two at any brightness. SMART and the correlation of
-volumes do not notice noise: they give a volume, and vectors that agree with their neighbours, from noise as well.
+A particle lights many neighbouring pixels of a microimage. Read-out and photon noise is independent from pixel to
+pixel. So the correlation of near pixels under one microlens separates the two at any brightness. SMART and the
+correlation of volumes do not notice noise: they give a volume, and vectors that agree with their neighbours, from noise
+as well.
 """
 
 from __future__ import annotations
@@ -55,15 +56,11 @@ def structure(light: np.ndarray, decoder: LightFieldDecoder, *, clip: float = CL
     reach = int(_MEAN_REACH_PITCHES * pitch)
     share, mean = (ndimage.uniform_filter(part.astype(np.float32), 2 * reach + 1) for part in (core, flat))
     flat = _clipped(flat - mean / np.maximum(share, 1e-6), core, clip)
-    core[:reach], core[-reach:], core[:, :reach], core[:, -reach:] = (
-        False,
-        False,
-        False,
-        False,
-    )  # the local mean is one-sided there
+    inner = np.zeros_like(core)  # the local mean is one-sided at the edges
+    inner[reach:-reach, reach:-reach] = core[reach:-reach, reach:-reach]
     lag = max(1, round(_LAG * pitch))
     lens = np.ascontiguousarray(decoder.lens_index, np.int16).view(np.int32)[..., 0]  # both indices in one number
-    return min(_correlation(flat, core, lens, lag, side) for side in (lag, -lag))
+    return min(_correlation(flat, inner, lens, lag, side) for side in (lag, -lag))
 
 
 def seen_structure(light: np.ndarray, decoder: LightFieldDecoder) -> float:
