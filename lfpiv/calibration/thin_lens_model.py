@@ -184,8 +184,9 @@ def fit_thin_lens(
     start = _linear_start(points, pupil, array, optics)
 
     def residual_of(parameters: np.ndarray) -> np.ndarray:
-        deviation: np.ndarray = _moved(start, optics, parameters)(points, pupil) - array
-        return (deviation / std[:, None]).ravel()
+        deviation = _moved(start, optics, parameters)(points, pupil) - array
+        residual: np.ndarray = (deviation / std[:, None]).ravel()
+        return residual
 
     return _moved(start, optics, _robust_minimum(residual_of))
 

@@ -126,4 +126,5 @@ def _places_between(labelled: np.ndarray, rng: np.random.Generator) -> np.ndarra
     """Draw random points on lines between two random labels."""
     first, second = rng.integers(len(labelled), size=(2, len(labelled) // 2))
     part = rng.random((len(first), 1))
-    return part * labelled[first] + (1 - part) * labelled[second]
+    places: np.ndarray = part * labelled[first] + (1 - part) * labelled[second]
+    return places

@@ -60,7 +60,8 @@ class MicroimageFit:
 
 def patch_half_px(basis: np.ndarray, pitch: float) -> int:
     """Return the half width of the square patch around one lattice cell [pixel]."""
-    return math.ceil(pitch * min(0.5 * np.abs(basis).sum(0).max() / pitch, LONGEST_HALF_CELL))
+    half_cell = 0.5 * float(np.abs(basis).sum(0).max())
+    return math.ceil(pitch * min(half_cell / pitch, LONGEST_HALF_CELL))
 
 
 def whole_microimages(shape: tuple[int, ...], origin: np.ndarray, basis: np.ndarray, half: int) -> np.ndarray:
