@@ -1,4 +1,4 @@
-"""Network, trainer, thin lens and their kernel: derivatives, recovered mappings, held-out dots, extrapolation."""
+"""Network, trainer, thin lens and their kernel: derivatives, recovered mappings, held-out dots and extrapolation."""
 
 import dataclasses
 from itertools import pairwise
@@ -22,8 +22,8 @@ from lfpiv.calibration.virtual_samples import VirtualSamples, between_dots
 from lfpiv.geometry.optics import Optics
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
 
-EXACT = 1e-10  # float64 sums over some hundred terms, relative
-DIFFERENCE = 1e-6  # a central difference of exact first derivatives, relative
+EXACT = 1e-10  # relative, float64 sums of some hundred terms
+DIFFERENCE = 1e-6  # relative, central difference of exact first derivatives
 SINGLE = 1e-6  # the kernel in float32: a few roundings of 6e-8 of the range in each of at most three layers
 PITCH = 0.1  # [mm]
 
@@ -51,19 +51,19 @@ def random_network(sizes, rng):
 
 
 def disc(count, rng):
-    """Random pupil points [mm]."""
+    """Return random pupil points [mm]."""
     radius = OPTICS.pupil_radius_mm * np.sqrt(rng.random(count))
     angle = 2 * np.pi * rng.random(count)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def box(count, rng, size=(6, 6, 4)):
-    """Random points of a centred box (x, y, z) [mm]."""
+    """Return random points of a centred box (x, y, z) [mm]."""
     return (rng.random((count, 3)) - 0.5) * size
 
 
 def board_labels(mapping, count, rng, noise=0.0):
-    """Labels of a 7 x 7 board at nine depths: points, pupil, array positions with `noise` [pitch], dot numbers."""
+    """Return labels of a 7 x 7 board at nine depths: points, pupil, array positions with `noise` [pitch], dots."""
     axis = np.arange(-3.0, 4.0)
     dots = np.stack(np.meshgrid(axis, axis, np.arange(-2, 2.1, 0.5), indexing="ij"), axis=-1).reshape(-1, 3)
     dot = rng.integers(len(dots), size=count)
@@ -72,14 +72,14 @@ def board_labels(mapping, count, rng, noise=0.0):
 
 
 def aberrated(points, pupil):
-    """A camera at 38 degrees with 0.2 pitch of coma and a little distortion."""
+    """Trace rays of a camera at 38 degrees with 0.2 pitch of coma and a little distortion."""
     ideal = thin_lens_model(OPTICS, 38.0)(points, pupil)
     reach = pupil / OPTICS.pupil_radius_mm
     return ideal + 0.02 * (reach**2).sum(1, keepdims=True) * reach + 3e-4 * ideal * (ideal**2).sum(1, keepdims=True)
 
 
 def free_pose(rng):
-    """A camera in any pose whose optics differ from the data sheet."""
+    """Return a camera in a random pose whose optics differ from the data sheet."""
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     return ThinLensModel(
         rotation=turn * np.linalg.det(turn),
@@ -101,7 +101,7 @@ def unpack(theta, layers):
 
 
 def outputs_of(theta, layers, inputs):
-    """The network as one obvious function of its parameters; complex parameters give exact derivatives."""
+    """Evaluate the network as one plain function of its parameters. Complex parameters give exact derivatives."""
     for layer in unpack(theta, layers)[:-1]:
         inputs = np.tanh(inputs @ layer[:-1] + layer[-1])
     last = unpack(theta, layers)[-1]
@@ -109,7 +109,7 @@ def outputs_of(theta, layers, inputs):
 
 
 def dense_jacobian(theta, layers, samples):
-    """Derivative of all weighted outputs by all parameters, by complex steps: (n * m, p)."""
+    """Return the derivative of all weighted outputs by all parameters, by complex steps, shape (n * m, p)."""
     columns = []
     for number in range(theta.size):
         moved = theta.astype(complex)
@@ -121,7 +121,7 @@ def dense_jacobian(theta, layers, samples):
 @pytest.mark.parametrize("sizes", [(5, 6, 2), (3, 4, 5, 2), (2, 3, 4, 3, 1), (4, 3, 3, 2, 3, 3)], ids=str)
 def test_derivatives_match_complex_steps(sizes, monkeypatch):
     monkeypatch.setattr(trainers, "BLOCK_BYTES", 0)
-    monkeypatch.setattr(trainers, "LEAST_ROWS", 7)  # many blocks, so that their sums are tested too
+    monkeypatch.setattr(trainers, "LEAST_ROWS", 7)  # many blocks, so that their sums are tested
     rng = np.random.default_rng(3)
     layers = [rng.normal(0, 0.7, (a + 1, b)) for a, b in pairwise(sizes)]
     samples = Samples(
@@ -160,7 +160,7 @@ def test_training_error_never_rises_and_reaches_what_scipy_reaches():
         method="lm",
         max_nfev=1000,
     )
-    # Both end in a minimum; there are several, so that only "no worse by a fifth" is a fair demand.
+    # Both end in one of several minima.
     assert fit.training_rms[-1] <= 1.2 * np.sqrt(2 * oracle.cost / outputs.size)
 
 
@@ -179,7 +179,7 @@ def test_result_depends_on_the_seed_but_not_on_the_number_of_threads(monkeypatch
     assert not np.array_equal(trained(5), first)
 
 
-def test_groups_stay_together_and_parts_have_their_shares():
+def test_groups_are_not_divided_and_parts_have_their_shares():
     rng = np.random.default_rng(1)
     groups = rng.integers(0, 300, 9000)
     split = split_samples(9000, groups=groups, rng=rng)
@@ -191,13 +191,13 @@ def test_groups_stay_together_and_parts_have_their_shares():
     np.testing.assert_allclose(share, (0.70, 0.15, 0.15), atol=1 / 300)  # a group is a 300th
 
 
-def test_early_stopping_keeps_the_best_epoch():
+def test_early_stopping_returns_the_best_epoch():
     rng = np.random.default_rng(6)
     inputs = rng.uniform(-1, 1, (240, 3))
     outputs = np.sin(2 * inputs[:, :1]) + 0.3 * rng.standard_normal((240, 1))
     training = train(inputs, outputs, TrainingSettings(hidden=(15,), epochs=100, patience=10), unit=2.0)
     assert training.stop is TrainingStop.VALIDATION
-    assert training.validation_rms.argmin() < training.epochs  # it went on in vain
+    assert training.validation_rms.argmin() < training.epochs  # later epochs are worse
     part = training.split.validation
     rms = np.sqrt(np.mean((training.network(inputs[part]) - outputs[part]) ** 2)) / 2.0
     assert rms == pytest.approx(training.validation_rms.min(), rel=1e-9)
@@ -231,7 +231,7 @@ def test_two_hidden_layers_beat_the_goal_too():
     )
     points, pupil = box(10_000, rng), disc(10_000, rng)
     error = sigma_nor(training.network(np.hstack([points, pupil])), aberrated(points, pupil), PITCH)
-    assert error <= 2 * GOAL_NOISE_FREE  # a third of the paper's nodes, and aberrations
+    assert error <= 2 * GOAL_NOISE_FREE  # with aberrations and a third of the paper's nodes
 
 
 def test_labels_count_by_their_standard_deviation():
@@ -245,7 +245,7 @@ def test_labels_count_by_their_standard_deviation():
     for known in (None, std):
         network = train(inputs, array, TrainingSettings(hidden=(10,), epochs=60), groups=dot, std=known).network
         errors.append(sigma_nor(network(inputs), truth(points, pupil), PITCH))
-    assert errors[1] < errors[0] / 10  # the better half alone has a hundredth of the noise
+    assert errors[1] < errors[0] / 10  # the better half has a hundredth of the noise
 
 
 @pytest.mark.parametrize("noise", [0.005, 0.04])
@@ -325,7 +325,7 @@ def test_any_pose_is_found_without_an_angle_despite_wrong_dots(seed):
 
 
 def test_a_fit_to_an_unideal_lens_does_not_run_away():
-    """Third-order aberrations of a decentred lens: no thin lens fits, and full steps used to end 4.8 pitches off."""
+    """No thin lens fits third-order aberrations of a decentred lens. Undamped steps ended 4.8 pitches off."""
     table = {
         "name": "c", "focal_length_mm": 100.0, "magnification": -1.0, "f_number": 4.0, "microlens_pitch_mm": PITCH,
         "microlens_focal_length_mm": 0.8, "pixel_um": 5.5, "nominal_angle_deg": 45.0, "sensor_width_px": 1060,
