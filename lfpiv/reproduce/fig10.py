@@ -29,8 +29,8 @@ BATCH = 4
 PAPER_SSIM = 0.94
 
 CAPTION = (
-    f"Weights of the voxel at {VOXEL_AT_MM} mm on the lit part of each sensor: by the network, by DRT, their difference "
-    "on the same scale, and DRT's difference from counted rays."
+    f"Weights of the voxel at {VOXEL_AT_MM} mm on the lit part of each sensor: by the network, by DRT, their "
+    "difference on the same scale, and DRT's difference from counted rays."
 )
 NOTES = (
     "The paper does not state its SSIM settings. Over the whole sensor nearly all pixels are dark in both images and "

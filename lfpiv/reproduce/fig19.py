@@ -71,22 +71,26 @@ def compute(rig: Rig, planes: Sequence[int], work: Path, *, seed: int, progress:
         )
         found.append(kept["positions_mm"])
     progress("planes", 1.0)
-    positions = np.array(found)
-    planes_mm = [board.planes_mm[plane] for plane in planes]
+    positions, planes_mm = np.array(found), [board.planes_mm[plane] for plane in planes]
     error = metrics.dot_error(positions, board.spacing_mm, planes_mm)
-    expected = positions.shape[0] * positions.shape[1] * positions.shape[2]
-    columns, rows = (np.arange(n) - (n - 1) / 2 for n in board.dots)
-    place = np.stack(np.broadcast_arrays(columns * board.spacing_mm, rows[:, None] * board.spacing_mm), axis=-1)
-    absolute = positions - np.concatenate(
-        [
-            np.broadcast_to(place, (*positions.shape[:3], 2)),
-            np.broadcast_to(np.reshape(planes_mm, (-1, 1, 1, 1)), (*positions.shape[:3], 1)),
-        ],
-        axis=-1,
-    )
     _draw_dots(positions, planes_mm, work / "fig18.png")
     _draw_errors(error, planes_mm, work / "fig19.png")
-    rms = np.sqrt(np.nanmean(absolute**2, axis=(0, 1, 2)))
+    return _result(positions, planes_mm, error, rig)
+
+
+def _true_positions(rig: Rig, planes_mm: Sequence[float]) -> np.ndarray:
+    """Places of the dots on the board (plane, row, column, 3) [mm]."""
+    board = rig.experiment.board
+    columns, rows = ((np.arange(n) - (n - 1) / 2) * board.spacing_mm for n in board.dots)
+    z, y, x = np.meshgrid(planes_mm, rows, columns, indexing="ij")
+    return np.stack([x, y, z], axis=-1)
+
+
+def _result(positions: np.ndarray, planes_mm: Sequence[float], error: metrics.DotError, rig: Rig) -> dict[str, Any]:
+    """Put the errors into the form of the page; `positions` of shape (plane, row, column, 3) [mm]."""
+    board = rig.experiment.board
+    expected = positions.shape[0] * positions.shape[1] * positions.shape[2]
+    rms = np.sqrt(np.nanmean((positions - _true_positions(rig, planes_mm)) ** 2, axis=(0, 1, 2)))
     return page.result(
         {
             "lateral_mm": error.lateral_mean_mm,

@@ -1,6 +1,6 @@
-"""The trainers of Table 1 that this software does not use itself: Bayesian regularisation, and descent with momentum.
+"""Train networks by the other trainers of Table 1: Bayesian regularisation, and gradient descent with momentum.
 
-Both have the form of `lfpiv.calibration.levenberg_marquardt`, so that `lfpiv.calibration.network.train` takes them as its `trainer`.
+Both have the signature of `levenberg_marquardt`, so that `lfpiv.calibration.network.train` takes them as its `trainer`.
 
 References
 ----------
