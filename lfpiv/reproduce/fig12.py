@@ -1,4 +1,4 @@
-"""Figs. 11 and 12: how well random particles are reconstructed, by the network's weights and by ray tracing's."""
+"""Figs. 11 and 12: quality of random particles reconstructed with the network's weights and with ray tracing's."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ GOAL_Q = 0.80
 POINTS_PPM = {"small": (0.1, 0.5, 1.0), "paper": PPM["paper"]}
 """Seeding at which points are reconstructed too, by the network."""
 TRUTH_PPM = 0.5
-"""Seeding at which SMART is also started from the true particles: whether the images could tell ghosts at all."""
+"""Seeding at which SMART also starts from the true particles, to see whether the images distinguish ghosts at all."""
 DARK_SHARE = 1e-3
-"""Brightness it starts with where there is no particle, as a part of the brightest voxel."""
+"""First guess of that run in voxels without a particle, as a share of the brightest voxel."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "blobs": {},
     "points": {},
@@ -47,12 +47,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     },
     "no_sieve": {"sieve_voxel": 0.0},
 }
-"""SMART settings of each kind of run that differ from this software's own. "paper": the paper's number of iterations
-and relaxation; "no_sieve": voxels of any brightness, not Gaussians of the size that the images tell; both by the
-network. Particles are blobs, but points in "points"."""
+"""SMART settings of each kind of run that differ from the defaults. "paper" has the paper's number of iterations and
+relaxation. "no_sieve" reconstructs voxels instead of Gaussians of the particles' size. Particles are blobs, in "points"
+they are points."""
 CORRELATED_VOXEL = Correlation().smoothing_voxel
-"""What volumes are smoothed by before they are correlated, less what their sieve did already; Q is reported of such
-volumes as well [voxel]."""
+"""Smoothing before the correlation, the sieve's included [voxel]. Q is reported of volumes smoothed like this too."""
 
 
 FIGURES = (
@@ -263,7 +262,7 @@ def _verdict(
     no_sieve: Sequence[Mapping[str, Any]],
     from_truth: Mapping[str, Any],
 ) -> str:
-    """Say whether the goal for Q is reached, and what the run from the true particles tells of the reason."""
+    """Describe whether Q reaches its goal, and compare with the run that starts from the true particles."""
     ours = next(row for row in no_sieve if row["ppm"] == from_truth["ppm"])
     return (
         f"Mean Q of the network is {q_mean:.3f}, {min(r['q'] for r in rows):.2f} to {max(r['q'] for r in rows):.2f}, "

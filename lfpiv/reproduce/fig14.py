@@ -1,4 +1,4 @@
-"""Figs. 13 and 14: a ring vortex measured through the network's weights, and through direct ray tracing's."""
+"""Figs. 13 and 14: measure a ring vortex with the network's weights and with direct ray tracing's."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ SHOWN_PPM = 0.5
 ISO_VORTICITY = 0.12
 """Fig. 13's surface [voxel/voxel]."""
 SCHEDULES: dict[str, tuple[int, ...]] = {"default": DEFAULT_WINDOWS, "8": (24, 16, 8, 8)}
-"""Windows of the passes [voxel]: this software's own, and some that end with the paper's 8 x 8 x 8."""
+"""Windows of the passes [voxel]: the defaults, and windows that end with the paper's 8 x 8 x 8."""
 PAPER_MEAN = {"network": 0.35, "drt": 0.36, "drt_plus_1deg": 0.71}
 PAPER_BELOW = {"network": 0.756, "drt": None, "drt_plus_1deg": 0.643}
 WIDTHS = {"truth": 1.2, "network": 4.0, "drt": 1.2, "drt_plus_1deg": 1.2}
-"""Widths of lines [point]: the network's shows beneath DRT's where they coincide."""
+"""Widths of lines [point]. The network's line is wide, so that it shows beneath DRT's."""
 GOAL_MEAN, GOAL_BELOW, GOAL_CONTRAST = 0.30, 0.80, 1.5
 
 FIGURES = (
@@ -69,11 +69,11 @@ NOTES = (
 )
 
 Fields = dict[str, np.ndarray]
-"""Both schedules' vectors of a volume pair, and its Q: what `_pack` makes."""
+"""Vectors of a volume pair with both schedules, and its Q, as `_pack` makes them."""
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Reconstruct, correlate and judge; see the package for the arguments."""
+    """Reconstruct, correlate and judge; see `lfpiv.reproduce.study` for the arguments."""
     rig = rigs.numerical_rig(work.parent / "rig", scale, seed, progress)
     size, ppms = SIZE_MM[scale], PPM[scale]
     grid, flow = rigs.volume_grid(size), rigs.ring(size)

@@ -71,7 +71,7 @@ SIZES = {
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Record and measure the injector's flow both ways; see the package for the arguments."""
+    """Record and measure the injector's flow both ways; see `lfpiv.reproduce.study` for the arguments."""
     require_openpiv()
     rig = experimental_rig(work.parent / "experimental_rig", scale, seed, progress)
     return compute(rig, SIZES[scale], work, seed=seed, progress=progress)
@@ -128,8 +128,8 @@ def sample_profiles(twin: Twin, volume: LightField, planar: Sequence[Sheet]) -> 
 def _along(twin: Twin, axes_mm: list[np.ndarray], field: np.ndarray) -> np.ndarray:
     """Field (z, y, x, ...) along the profiles, shape (plane, y, ...): linear in x, a cubic spline along depth.
 
-    A plane may lie midway between two layers of windows: their mean, the linear one, would be that of a window half as
-    deep again.
+    A plane may lie midway between two layers of windows. Their mean, which linear interpolation gives, is that of a
+    window 1.5 times as deep.
     """
     z_mm, _, x_mm = axes_mm
     line = RegularGridInterpolator((x_mm,), np.moveaxis(field, 2, 0))([[twin.profile_x_mm]])[0]
@@ -145,7 +145,7 @@ def relative_error(values: np.ndarray, reference: np.ndarray) -> float:
 
 
 class ByPairs(TypedDict):
-    """What `error_by_pairs` returns."""
+    """Errors by the number of averaged pairs."""
 
     pairs: list[int]
     error: list[list[float]]
@@ -153,7 +153,7 @@ class ByPairs(TypedDict):
 
 
 def error_by_pairs(twin: Twin, volume: LightField, reference: np.ndarray) -> ByPairs:
-    """Error of the profiles' average over more and more pairs, against the truth in the same windows.
+    """Compare the profiles averaged over more and more pairs with the truth in the same windows.
 
     Parameters
     ----------
@@ -167,8 +167,8 @@ def error_by_pairs(twin: Twin, volume: LightField, reference: np.ndarray) -> ByP
     Returns
     -------
     ByPairs
-        ``pairs``; for each ``error``, mean distance of the average of the first pairs, for (u, v); ``chance``: what
-        their scatter from pair to pair lets expect, sqrt(2 / pi) of the standard error, were there no bias.
+        ``pairs``; for each ``error``, the mean distance of the average of the first pairs, for (u, v); ``chance``, the
+        error without bias that the scatter between pairs leads to, sqrt(2 / pi) of the standard error.
     """
     scale = 1 / 1000 / twin.dt_s / np.abs(reference).mean(axis=(0, 1))
     each = np.moveaxis(volume["departures_mm"][..., :2], 0, -2)

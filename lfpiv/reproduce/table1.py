@@ -43,23 +43,23 @@ PAPER_BEST = 0.038
 SHALLOW = ((20,), (10, 10))
 """Hidden layers of the networks that this software prefers."""
 ESTIMATORS = ("lens_integral", "gaussian")
-"""Dot centres: those used here, and the Gaussian fits of the paper."""
+"""Estimators of the dots: the default, and the Gaussian fits of the paper."""
 MUCH_WORSE = 1.2
-"""A deep network with more than this times the paper's error does worse than the paper says."""
+"""Ratio to the paper's error above which a deep network counts as worse than in the paper."""
 TRUE_RAYS = 20_000
-"""Rays held against the true ones."""
+"""Number of rays compared with the true ones."""
 PROBE_SEED = 11
-"""Number of the random stream of those rays; other cases draw from others."""
+"""Number of the random stream of those rays."""
 
 Fit = dict[str, Any]
-"""What `fit` tells of a network, or an entry of the shallow ones: JSON-able."""
+"""Result of `fit`, or entry of the shallow networks, JSON-able."""
 Deep = dict[str, dict[int, list[Fit]]]
 """Trainer -> hidden layers -> the cameras' fits."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """How much is trained at a scale."""
+    """Sizes of the training at one scale."""
 
     layers: tuple[int, ...]
     """Numbers of hidden layers."""
@@ -80,7 +80,7 @@ SIZES = {
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Train all networks; see the package for the arguments."""
+    """Train all networks; see `lfpiv.reproduce.study` for the arguments."""
     rig = numerical_rig(work.parent / "rig", scale, seed, progress)
     return compute(rig, SIZES[scale], work, seed=seed, progress=progress)
 
@@ -151,8 +151,8 @@ def fit(
     """Train one network on the labels of one camera: errors on held-out dots and against the true rays [pitch].
 
     Whole dots are held out, so the test part holds none that training saw. Where the thin lens is the baseline, labels
-    count by their standard errors and a polynomial guides the network between the dots, as in `lfpiv.calibrate`; the
-    paper's network takes all labels alike, and nothing else.
+    are weighted by their standard errors and a polynomial gives virtual samples between the dots, as in
+    `lfpiv.calibrate`. The paper's network has equal weights and no virtual samples.
     """
     camera = next(camera for camera in rig.scene.camera if camera.name == name)
     pitch = rig.calibration.cameras[name].lattice.pitch_mm
@@ -195,7 +195,7 @@ def fit(
 
 
 def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
-    """Label the board anew by the paper's estimator."""
+    """Label the board with the paper's estimator."""
     experiment, camera = rig.experiment, rig.calibration.cameras[name]
     board = experiment.board
     planes = range(len(board.planes_mm))
@@ -233,7 +233,7 @@ class Best:
 
     @classmethod
     def of(cls, deep: Deep, shallow: Sequence[Fit]) -> Best:
-        """Choose them."""
+        """Choose the best networks."""
         value, name = min(
             (max(_both(fits)), f"{trainer}, {layers} hidden layers of {NODES}")
             for trainer, rows in deep.items()

@@ -1,4 +1,4 @@
-"""Table 3: how much data the mapping takes, and how long training and weights last."""
+"""Table 3: number of samples of the mapping, and time of training and of weights."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MATCH_TRAINING_S, MATCH_WEIGHTS_S = 60.0, 30.0
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Time training and weights; see the package for the arguments."""
+    """Time training and weights; see `lfpiv.reproduce.study` for the arguments."""
     rig = numerical_rig(work.parent / "rig", scale, seed, progress)
     return compute(rig, scale, seed=seed, progress=progress)
 
