@@ -1,8 +1,11 @@
-"""Warp kernel that transforms volumes along z for `spectral_kernels`; `correlate` launches it. CPU only."""
+"""Transform of volumes along z for the spectral correlation; `transforms` gives its folds and waves. CPU only."""
 
 import warp as wp
 
 from lfpiv_kernels.correlation.blocks import VECTORS
+from lfpiv_kernels.correlation.layout import Phased
+from lfpiv_kernels.correlation.memory import Call
+from lfpiv_kernels.correlation.transforms import PlaneTransform
 from lfpiv_kernels.native import read_native
 
 wp.set_module_options(
@@ -15,6 +18,9 @@ wp.set_module_options(
 
 MOST_ROWS = 6
 """Rows that are summed in registers at once."""
+
+PART = 1 << 10
+"""Elements of a plane that a task transforms: its scratch memory fits a core's own cache."""
 
 _TRANSFORM = (
     "#if !defined(__CUDA_ARCH__)"
@@ -53,41 +59,52 @@ def _combine(
 @wp.kernel
 def _transform_planes(
     # in
-    volume: wp.array(dtype=float),  # split by phase
-    quads: wp.array(dtype=int),  # of `correlation_transforms.Planes`, as are rows, counts and matrix
-    folds: int,
-    rows: wp.array(dtype=int),
-    counts: wp.vec4i,
-    matrix: wp.array(dtype=float),
+    volume: Phased,
+    transform: PlaneTransform,
     first_plane: int,  # of layer 0
     stride: int,  # distance of layers
-    pitch: int,  # elements per plane
     part: int,  # elements per thread, a multiple of `LANES`
-    slot: int,
     scratch_pitch: wp.int64,  # elements of scratch memory per slot
+    slot: int,
     begin: int,
     # out
     scratch_out: wp.array(dtype=float),
     plane_out: wp.array(dtype=float),  # (layer, row, element)
 ):
     index = begin + wp.tid()
-    parts = (pitch + part - 1) // part
+    parts = (volume.plane + part - 1) // part
     layer = index // parts
     start = index % parts * part
+    counts = transform.counts
     _combine(
-        volume,
-        quads,
-        folds,
-        rows,
+        volume.values,
+        transform.quads,
+        transform.folds,
+        transform.rows,
         counts,
-        matrix,
+        transform.matrix,
         wp.int64(first_plane + layer * stride),
-        wp.int64(pitch),
+        wp.int64(volume.plane),
         wp.int64(start),
-        wp.int64(wp.min(start + part, pitch)),
+        wp.int64(wp.min(start + part, volume.plane)),
         wp.int64(layer * (counts[0] + counts[1] + counts[2] + counts[3])),
         slot,
         scratch_pitch,
         scratch_out,
         plane_out,
     )
+
+
+def transform_call(
+    volume: Phased,
+    transform: PlaneTransform,
+    layers: range,
+    stride: int,
+    scratch: wp.array,
+    scratch_pitch: int,
+    planes: wp.array,
+) -> Call:
+    """Return the call that transforms the planes of each layer, (layer, row, element)."""
+    inputs = [volume, transform, layers.start * stride, stride, PART, scratch_pitch]
+    size = len(layers) * -(-volume.plane // PART)
+    return Call(_transform_planes, size, inputs, [scratch, planes], scratch=True)

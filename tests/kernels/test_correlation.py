@@ -9,16 +9,19 @@ import warp as wp
 from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, uniform
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.correlation import blocks as correlation_kernels
-from lfpiv_kernels.correlation import box_sum as boxsum
-from lfpiv_kernels.correlation import correlate as kernel
-from lfpiv_kernels.correlation import deform, neighbours
-from lfpiv_kernels.correlation import peaks as peak_kernels
-from lfpiv_kernels.correlation import plan as correlation_plan
-from lfpiv_kernels.correlation import planes as plane_kernels
-from lfpiv_kernels.correlation import spectra as spectral_kernels
-from lfpiv_kernels.correlation import transforms as correlation_transforms
-from lfpiv_kernels.correlation import windows as window_kernels
+from lfpiv_kernels.correlation import (
+    blocks,
+    box_sum,
+    correlate,
+    deform,
+    neighbours,
+    peaks,
+    plan,
+    planes,
+    spectra,
+    transforms,
+    windows,
+)
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -27,9 +30,16 @@ TOLERANCE_SPLINE = 1e-5  # 64 float32 products, coefficients up to 2.5 times the
 TOLERANCE_MEDIAN = 1e-6  # order statistics of float32 values near 1
 
 
+def possible_plans(shape, window, step, search):
+    """Plans that the device can follow by name; windows that share no blocks leave "whole" ones only."""
+    names = ("whole", "shared", "whole-spectral", "shared-spectral")
+    found = dict(zip(names, plan.possible_plans(shape, window, step, search), strict=False))
+    return {name: way for name, way in found.items() if "shared" not in name or way.block != window}
+
+
 def coefficients_twin(first, second, window, step, search):
     """Correlation coefficient of every window at every lag, from the definition, in float64."""
-    origin, count = kernel.window_grid(first.shape, window, step)
+    origin, count = correlate.window_grid(first.shape, window, step)
     padded = np.pad(second.astype(float), [(r, r) for r in search])
     result = np.zeros((*count, *(2 * r + 1 for r in search)))
     for cell in np.ndindex(*count):
@@ -73,7 +83,6 @@ def peaks_twin(score, search):
 
 
 @pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
-@pytest.mark.parametrize("method", ["direct", "spectral", "fft"])
 @pytest.mark.parametrize(
     ("window", "step", "search"),
     [
@@ -90,37 +99,33 @@ def peaks_twin(score, search):
         ((12, 12, 8), (12, 12, 8), (11, 2, 3)),  # lags along z in two parts; blocks longer than half a transform
     ],
 )
-def test_peaks_equal_the_definition(monkeypatch, window, step, search, method, symmetric):
-    monkeypatch.setattr(kernel, "_SLAB_BYTES", 1)  # every layer of windows on its own
-    if method != "fft":
-        monkeypatch.setattr(correlation_plan, "_SPECTRAL_SECONDS", 1e9 if method == "direct" else 0.0)
-        method = "direct"
+def test_peaks_equal_the_definition(monkeypatch, window, step, search, symmetric):
+    monkeypatch.setattr(correlate, "SLAB_BYTES", 1)  # every layer of windows is a slab
     first, second = particle_pair((21, 26, 28), uniform(0.4, -1.2, 0.8), seed=1, ghosts=0.5, noise=0.05)
     score = coefficients_twin(first, second, window, step, search)
     if symmetric:
         score = 0.5 * (score + coefficients_twin(second, first, window, step, search)[..., ::-1, ::-1, ::-1])
-    peaks = kernel.correlate_windows(
-        first, second, window=window, step=step, search=search, method=method, symmetric=symmetric
-    )
-    assert peaks.correlation.shape == score.shape[:3]
-    for cell in np.ndindex(*score.shape[:3]):
-        displacement, second_displacement, highest, rival = peaks_twin(score[cell], search)
-        np.testing.assert_allclose(peaks.correlation[cell], highest, atol=TOLERANCE_SUM)
-        np.testing.assert_allclose(peaks.rival[cell], rival, atol=TOLERANCE_SUM)
-        np.testing.assert_allclose(peaks.displacement[cell], displacement, atol=TOLERANCE_PEAK)
-        np.testing.assert_allclose(peaks.second_displacement[cell], second_displacement, atol=TOLERANCE_PEAK)
-        assert peaks.measured[cell] == np.isfinite(displacement).all()
+    expected = {cell: peaks_twin(score[cell], search) for cell in np.ndindex(*score.shape[:3])}
+    for name, way in possible_plans(first.shape, window, step, search).items():
+        found = correlate.correlate_by_plan(way, first, second, symmetric=symmetric)
+        assert found.correlation.shape == score.shape[:3], name
+        for cell, (displacement, second_displacement, highest, rival) in expected.items():
+            np.testing.assert_allclose(found.correlation[cell], highest, atol=TOLERANCE_SUM)
+            np.testing.assert_allclose(found.rival[cell], rival, atol=TOLERANCE_SUM)
+            np.testing.assert_allclose(found.displacement[cell], displacement, atol=TOLERANCE_PEAK)
+            np.testing.assert_allclose(found.second_displacement[cell], second_displacement, atol=TOLERANCE_PEAK)
+            assert found.measured[cell] == np.isfinite(displacement).all()
 
 
-def planes_twin(planes, values):
+def planes_twin(transform, values):
     """Rows that `_transform_planes` makes of one column of planes."""
-    folds = planes.quads.reshape(-1, 4)
+    folds = transform.quads.reshape(-1, 4)
     up, down, far_up, far_down = np.append(values, 0)[folds].T  # the place -1 holds nothing
     classes = [up + down + far_up + far_down, up - down - far_up + far_down]
     classes += [up + down - far_up - far_down, up - down + far_up - far_down]
-    parts = np.split(planes.matrix, len(folds) * np.cumsum(planes.counts)[:-1])
-    rows = np.empty(len(planes.rows))
-    rows[planes.rows] = np.concatenate([c @ m.reshape(len(folds), -1) for c, m in zip(classes, parts, strict=True)])
+    parts = np.split(transform.matrix, len(folds) * np.cumsum(transform.counts)[:-1])
+    rows = np.empty(len(transform.rows))
+    rows[transform.rows] = np.concatenate([c @ m.reshape(len(folds), -1) for c, m in zip(classes, parts, strict=True)])
     return rows
 
 
@@ -128,8 +133,8 @@ def planes_twin(planes, values):
 def test_spectra_of_blocks_and_surroundings_give_their_correlation(edge, search):
     rng = np.random.default_rng(7)
     block, around = rng.normal(size=edge), rng.normal(size=edge + 2 * search)
-    spectrum = correlation_transforms.Spectrum.of((edge,) * 3, (search,) * 3)
-    rows = [planes_twin(planes, values) for planes, values in zip(spectrum.planes, (block, around), strict=True)]
+    spectrum = transforms.Spectrum.of((edge,) * 3, (search,) * 3)
+    rows = [planes_twin(*of) for of in zip(spectrum.planes, (block, around), strict=True)]
     half = spectrum.size[0] // 2
     taps, near = (row[: half + 1] + 1j * np.pad(row[half + 1 :], 1) for row in rows)
     found = np.fft.irfft(taps.conj() * near, spectrum.size[0])[np.arange(-search, search + 1)]
@@ -139,7 +144,7 @@ def test_spectra_of_blocks_and_surroundings_give_their_correlation(edge, search)
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
 @pytest.mark.parametrize(
     "module",
-    [boxsum, correlation_kernels, peak_kernels, plane_kernels, spectral_kernels, window_kernels],
+    [blocks, box_sum, deform, neighbours, peaks, planes, spectra, windows],
     ids=lambda module: module.__name__.rpartition(".")[2],
 )
 def test_correlation_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):
@@ -149,45 +154,59 @@ def test_correlation_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_p
 
 
 @pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
-def test_peaks_do_not_depend_on_how_they_are_computed(monkeypatch, device, symmetric):
+def test_peaks_do_not_depend_on_how_they_are_computed(monkeypatch, symmetric):
     pair = particle_pair((30, 34, 38), uniform(0.4, -1.2, 0.8), seed=8, ghosts=0.5, noise=0.05)
-    arguments = {"window": (12, 12, 12), "step": (6, 6, 6), "search": (4, 4, 4), "symmetric": symmetric}
+    ways = possible_plans(pair[0].shape, (12,) * 3, (6,) * 3, (4,) * 3)
 
-    def peaks():
-        found = kernel.correlate_windows(*pair, method="direct", **arguments)
+    def values(way):
+        found = correlate.correlate_by_plan(way, *pair, symmetric=symmetric)
         return {name: getattr(found, name) for name in ("displacement", "second_displacement", "correlation", "rival")}
 
-    ways = []
-    for cost in (0.0, 1e9):  # of transforms that replace products
-        monkeypatch.setattr(correlation_plan, "_SPECTRAL_SECONDS", cost)
-        ways.append(peaks())
-        plan = correlation_plan.make_plan(pair[0].shape, pair[1].shape, (12,) * 3, (6,) * 3, (4,) * 3, "direct")[0]
-        assert device.kind == "cuda" or plan.spectral == (cost == 0)
-    for name, values in ways[0].items():
-        np.testing.assert_allclose(values, ways[1][name], atol=TOLERANCE_PEAK, err_msg=name)
+    expected = values(ways["whole"])
+    for name, way in ways.items():
+        for field, found in values(way).items():
+            np.testing.assert_allclose(found, expected[field], atol=TOLERANCE_PEAK, err_msg=f"{field}, {name}")
+    before = {name: values(way) for name, way in ways.items()}
     with ThreadPoolExecutor(1) as pool:
         monkeypatch.setattr(runtime, "_pool", pool)
-        for name, values in peaks().items():
-            np.testing.assert_array_equal(values, ways[1][name], err_msg=f"{name} depends on the number of threads")
+        for name, way in ways.items():
+            for field, found in values(way).items():
+                np.testing.assert_array_equal(found, before[name][field], err_msg=f"{field} depends on the threads")
+
+
+@pytest.mark.parametrize(
+    ("window", "step", "search", "way"),
+    [
+        (5, 4, 3, "whole"),
+        (12, 6, 3, "shared"),
+        (13, 5, 6, "whole-spectral"),
+        (16, 8, 8, "shared-spectral"),
+    ],
+)
+def test_the_cheapest_plan_is_chosen(device, window, step, search, way):
+    arguments = (70, 140, 140), (window,) * 3, (step,) * 3, (search,) * 3
+    plans, chosen = possible_plans(*arguments), plan.make_plan(*arguments)
+    assert chosen == min(plans.values(), key=plan.Plan.seconds)
+    assert device.kind == "cuda" or chosen == plans[way]
 
 
 def test_windows_without_signal_are_not_measured():
     first, second = particle_pair((16, 24, 40), uniform(0, 0, 0), seed=2)
     first[:, :, :20], second[:, :, :20] = 0, 0
-    peaks = kernel.correlate_windows(first, second, window=(8, 8, 8), step=(8, 8, 8), search=(3, 3, 3))
-    assert not peaks.measured[:, :, :2].any() and peaks.measured[:, :, 3:].all()
+    measured = correlate.correlate_windows(first, second, window=(8,) * 3, step=(8,) * 3, search=(3,) * 3).measured
+    assert not measured[:, :, :2].any() and measured[:, :, 3:].all()
 
 
 @pytest.mark.parametrize("window", [(1, 5, 16), (7, 12, 9)])
 def test_box_sums(window):
     volume = np.random.default_rng(3).random((19, 21, 23), dtype=np.float32)
     expected = np.lib.stride_tricks.sliding_window_view(volume.astype(float), window).sum((-1, -2, -3))
-    result = boxsum.box_sum(volume, window)
+    result = box_sum.box_sum(volume, window)
     inside = tuple(slice(n) for n in expected.shape)
     np.testing.assert_allclose(result[inside], expected, rtol=TOLERANCE_SUM)
     assert result.sum(dtype=float) == pytest.approx(result[inside].sum(dtype=float))
     keep = (slice(0, 12, 3), slice(2, 9, 2), slice(0, 6, 5))
-    np.testing.assert_array_equal(boxsum.box_sum(volume, window, keep), result[keep])
+    np.testing.assert_array_equal(box_sum.box_sum(volume, window, keep), result[keep])
 
 
 def test_deformation_samples_the_spline():
@@ -247,13 +266,13 @@ def test_the_kernel_refuses_what_is_not_finite():
     pair = particle_pair((16, 16, 16), uniform(0, 0, 0), seed=42)
     pair[1][3, 4, 5] = np.nan
     with pytest.raises(ValueError, match="second: expected finite values"):
-        kernel.correlate_windows(*pair, window=(8, 8, 8), step=(4, 4, 4), search=(3, 3, 3))
+        correlate.correlate_windows(*pair, window=(8, 8, 8), step=(4, 4, 4), search=(3, 3, 3))
 
 
 def test_moving_both_volumes_moves_the_field():
     pair = particle_pair((36, 48, 48), ring((36, 48, 48)), seed=33)
     options = {"window": (12, 12, 12), "step": (6, 6, 6), "search": (3, 3, 3), "symmetric": True}
-    still = kernel.correlate_windows(*pair, **options).displacement
-    moved = kernel.correlate_windows(*(np.roll(v, (6, -6, 6), (0, 1, 2)) for v in pair), **options).displacement
+    still = correlate.correlate_windows(*pair, **options).displacement
+    moved = correlate.correlate_windows(*(np.roll(v, (6, -6, 6), (0, 1, 2)) for v in pair), **options).displacement
     # by one step of the grid; windows at the edge see what was rolled in
     np.testing.assert_allclose(moved[2:-1, 1:-2, 2:-1], still[1:-2, 2:-1, 1:-2], atol=TOLERANCE_PEAK)
