@@ -71,7 +71,7 @@ def _predict(
 
 
 def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Prediction:
-    """Predict vectors of a field from their neighbours alone.
+    """Predict vectors of a field from their neighbours, without the vectors themselves.
 
     Parameters
     ----------

@@ -25,6 +25,15 @@ SCORE_BYTES = 1 << 23
 
 
 @wp.struct
+class Sums:
+    """Sums of products of blocks, (layer, lag, lane)."""
+
+    ahead: wp.array(dtype=float)  # of blocks of the first volume
+    behind: wp.array(dtype=float)  # of blocks of the second volume: lags count backwards
+    symmetric: int  # 1: average both; 0: `behind` is not read
+
+
+@wp.struct
 class Windows:
     """Windows whose peaks a launch finds, and the memory of their sums, coefficients and peaks."""
 
@@ -44,14 +53,9 @@ class Windows:
     peak_pitch: wp.int64  # elements per value of the peaks
 
 
-@wp.func_native(
-    "lfpiv::find_peaks(ahead.data, behind.data, symmetric != 0, first, second, windows, slot, task, scratch_out.data, "
-    "peak_out.data);"
-)
+@wp.func_native("lfpiv::find_peaks(sums, first, second, windows, slot, task, scratch_out.data, peak_out.data);")
 def _find_peaks_of_group(
-    ahead: wp.array(dtype=float),
-    behind: wp.array(dtype=float),
-    symmetric: int,
+    sums: Sums,
     first: Statistics,
     second: Statistics,
     windows: Windows,
@@ -65,9 +69,7 @@ def _find_peaks_of_group(
 @wp.kernel
 def _find_peaks(
     # in
-    ahead: wp.array(dtype=float),  # sums of products of blocks of the first volume, (layer, lag, lane)
-    behind: wp.array(dtype=float),  # the same of blocks of the second volume: lags count backwards
-    symmetric: int,  # 1: average both; 0: `behind` is not read
+    sums: Sums,
     first: Statistics,  # of windows at every lag if symmetric, else at lag 0
     second: Statistics,  # at every lag
     windows: Windows,
@@ -77,8 +79,7 @@ def _find_peaks(
     scratch_out: wp.array(dtype=float),
     peak_out: wp.array(dtype=float),  # two displacements (z, y, x), best and rival coefficient; each (layer, lane)
 ):
-    task = begin + wp.tid()
-    _find_peaks_of_group(ahead, behind, symmetric, first, second, windows, slot, task, scratch_out, peak_out)
+    _find_peaks_of_group(sums, first, second, windows, slot, begin + wp.tid(), scratch_out, peak_out)
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,9 @@ class PeakFinder:
     def find(self, ahead: wp.array, behind: wp.array, layers: range) -> None:
         """Find the peaks of some layers of windows from the sums of products of their blocks in both directions."""
         first, second = self.sides
-        windows = self._windows(layers)
-        inputs = [ahead, behind, int(self.symmetric), first.statistics, second.statistics, windows]
+        sums, windows = Sums(), self._windows(layers)
+        sums.ahead, sums.behind, sums.symmetric = ahead, behind, int(self.symmetric)
+        inputs = [sums, first.statistics, second.statistics, windows]
         launch(Call(_find_peaks, len(layers) * windows.groups, inputs, [self.scratch, self.peaks], scratch=True))
 
     def _windows(self, layers: range) -> Windows:

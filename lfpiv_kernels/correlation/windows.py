@@ -102,16 +102,17 @@ def _extent(plan: Plan, search: Triple) -> Extent:
     return extent
 
 
-def _sums_shape(plan: Plan, search: Triple) -> Triple:
-    """Planes of the volume, and the windows that fit along y and x with zeros around it."""
+def plane_sums_shape(plan: Plan, search: Triple) -> Triple:
+    """Return the planes of the volume, and the windows that fit along y and x with zeros around it."""
     depth, *along = plan.shape
     reach = zip(along, search[1:], plan.window[1:], strict=True)
     return depth, *(n + 2 * r - w + 1 for n, r, w in reach)
 
 
-def plane_sums_call(volume: wp.array, plan: Plan, search: Triple, lattice: Lattice) -> Call:
-    """Return the call that sums values and squares of each plane over the windows' y and x, into new arrays."""
-    sums = [new_array(math.prod(_sums_shape(plan, search))) for _ in range(2)]
+def plane_sums_call(
+    volume: wp.array, plan: Plan, search: Triple, lattice: Lattice, sums: tuple[wp.array, wp.array]
+) -> Call:
+    """Return the call that sums values and squares of each plane over the windows' y and x."""
     pitch = whole_groups(plan.shape[2] + 2 * search[2] + LANES)
     scratch_pitch = pitch * (4 + 2 * plan.shape[1] + 2 * (plan.shape[1] + 2 * search[1] + 1))
     on_cpu = runtime.device().kind == "cpu"
@@ -120,15 +121,20 @@ def plane_sums_call(volume: wp.array, plan: Plan, search: Triple, lattice: Latti
     return Call(_sum_planes, plan.shape[0], inputs, [scratch, *sums], scratch=True)
 
 
-def statistics_call(
-    volume: np.ndarray, squares: float, sums: list[wp.array], plan: Plan, search: Triple, lattice: Lattice
-) -> Call:
-    """Return the call that finds mean and scale of windows from `plane_sums_call`'s sums, into new arrays.
+def signal_floor(volume: np.ndarray, square: float, plan: Plan) -> float:
+    """Return the largest sum of squared deviations of a window without signal; `square`: sum of the volume's squares."""
+    variance = square / volume.size - float(volume.mean()) ** 2
+    return SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
 
-    `squares` is the sum of the volume's squares.
-    """
-    variance = squares / volume.size - float(volume.mean()) ** 2
-    floor = SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
+
+def statistics_call(
+    sums: tuple[wp.array, wp.array],
+    plan: Plan,
+    search: Triple,
+    lattice: Lattice,
+    floor: float,
+    statistics: tuple[wp.array, wp.array],
+) -> Call:
+    """Return the call that finds mean and scale of windows from the sums of their planes."""
     inputs = [*sums, _extent(plan, search), floor, lattice]
-    size = lattice.planes * lattice.phases[1] * lattice.phases[2] * lattice.lanes
-    return Call(_window_statistics, _sums_shape(plan, search)[1], inputs, [new_array(size) for _ in range(2)])
+    return Call(_window_statistics, plane_sums_shape(plan, search)[1], inputs, statistics)

@@ -80,10 +80,9 @@ struct Scores {
 };
 
 /// Form the coefficients of a task's windows from the sums of products of their blocks, in one direction or in both.
-template <class Statistics, class Windows>
-LFPIV_INLINE void score_windows(const float* ahead, const float* behind, bool symmetric, const Statistics& first,
-                                const Statistics& second, const Windows& windows, const WindowTask& task,
-                                const Scores& scores) {
+template <class Sums, class Statistics, class Windows>
+LFPIV_INLINE void score_windows(const Sums& sums, const Statistics& first, const Statistics& second,
+                                const Windows& windows, const WindowTask& task, const Scores& scores) {
     const int nz = scores.nz, ny = scores.ny, nx = scores.nx, lags = nz * ny * nx;
     const int plane = task.layer * windows.stride;
     const float voxels = (float)windows.voxels;
@@ -95,15 +94,15 @@ LFPIV_INLINE void score_windows(const float* ahead, const float* behind, bool sy
             for (int x = 0; x < nx; ++x, ++lag) {
                 float* to = scores.score + (int64_t)lag * scores.pitch;
                 const int64_t around = place_of(second, plane, z, y, x, task.lane);
-                sum_blocks(ahead, windows, task, lag, lags, columns, [&](int k, V total) {
+                sum_blocks(sums.ahead.data, windows, task, lag, lags, columns, [&](int k, V total) {
                     const V expected =
                         voxels * load(first.mean.data + first_at + k) * load(second.mean.data + around + k);
                     const V scale = load(first.scale.data + first_at + k) * load(second.scale.data + around + k);
                     store(to + k, (total - expected) * scale);
                 });
-                if (!symmetric) continue;
+                if (!sums.symmetric) continue;
                 const int64_t back = place_of(first, plane, nz - 1 - z, ny - 1 - y, nx - 1 - x, task.lane);
-                sum_blocks(behind, windows, task, lags - 1 - lag, lags, columns, [&](int k, V total) {
+                sum_blocks(sums.behind.data, windows, task, lags - 1 - lag, lags, columns, [&](int k, V total) {
                     const V expected =
                         voxels * load(second.mean.data + second_at + k) * load(first.mean.data + back + k);
                     const V scale = load(second.scale.data + second_at + k) * load(first.scale.data + back + k);
@@ -228,16 +227,15 @@ LFPIV_INLINE void write_peaks(const Scores& scores, int k, const Peaks& peaks, i
 
 /// Find the peaks of a group of windows. Tasks are numbered (layer, group of lanes); a negative `slot` shares the
 /// scratch memory between all tasks, element by element.
-template <class Statistics, class Windows>
-LFPIV_INLINE void find_peaks(const float* ahead, const float* behind, bool symmetric, const Statistics& first,
-                             const Statistics& second, const Windows& windows, int slot, int task, float* scratch,
-                             float* out) {
+template <class Sums, class Statistics, class Windows>
+LFPIV_INLINE void find_peaks(const Sums& sums, const Statistics& first, const Statistics& second,
+                             const Windows& windows, int slot, int task, float* scratch, float* out) {
     const int layer = windows.begin + task / windows.groups, lane = task % windows.groups * windows.group;
     const WindowTask where{layer * windows.block_step, lane, min(windows.group, windows.lanes - lane)};
     const int nz = windows.lags[0], ny = windows.lags[1], nx = windows.lags[2];
     float* score = scratch + (slot < 0 ? (int64_t)task : slot * windows.slot_pitch);
     const Scores scores{score, score + (int64_t)nz * ny * nx * windows.score_pitch, windows.score_pitch, nz, ny, nx};
-    score_windows(ahead, behind, symmetric, first, second, windows, where, scores);
+    score_windows(sums, first, second, windows, where, scores);
     float* peak = out + (int64_t)layer * windows.lanes + lane;
     for (int k = 0; k < where.lanes; k += WIDTH) {
         Peaks peaks = find_best(scores, k);
