@@ -68,13 +68,13 @@ def _correlate_blocks(
     layers: Layers,
     parts: int,  # parts of the lags along z, each of which is a task
     scratch_pitch: int,  # elements of scratch memory per slot
-    slot: int,
+    slot: int,  # -1 on CUDA, where none is needed
     begin: int,
     # out
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
 ):
-    scratch = wp.int64(slot) * wp.int64(scratch_pitch)
+    scratch = wp.int64(wp.max(slot, 0)) * wp.int64(scratch_pitch)
     _correlate_group(first, second, layers, parts, begin + wp.tid(), scratch, scratch_out, sum_out)
 
 
@@ -130,7 +130,7 @@ class DirectProducts:
     def sum(self, first: Phased, second: Phased, layers: range, sums: wp.array) -> None:
         """Sum the products of some layers of blocks and their surroundings at every lag."""
         group, parts = (LANES, 1) if runtime.device().kind == "cpu" else (1, self.plan.lags[0])
-        described = make_layers(self.plan, layers, self.ring, group)
-        inputs = [first, second, described, parts, self.scratch_pitch]
-        size = len(layers) * described.groups * parts
+        tasks = make_layers(self.plan, layers, self.ring, group)
+        inputs = [first, second, tasks, parts, self.scratch_pitch]
+        size = len(layers) * tasks.groups * parts
         launch(Call(_correlate_blocks, size, inputs, [self.scratch, sums], scratch=True))

@@ -92,10 +92,10 @@ class SpectralProducts:
             transform_call(of, planes.transform, layers, plan.stride[0], *scratch, to) for of, planes, to in transforms
         ]
         launch(*calls)
-        described = make_layers(plan, layers, self.ring, GROUP)
+        tasks = make_layers(plan, layers, self.ring, GROUP)
         transformed = [_with_values(*pair) for pair in zip((first, second), self.spectra, strict=True)]
-        inputs = [*transformed, spectrum.transform, described, _lanes_past(plan), self.scratch_pitch]
-        size = len(layers) * described.groups
+        inputs = [*transformed, spectrum.transform, tasks, _lanes_past(plan), self.scratch_pitch]
+        size = len(layers) * tasks.groups
         launch(Call(_correlate_spectra, size, inputs, [self.scratch, sums], scratch=True))
 
 

@@ -122,7 +122,10 @@ def plane_sums_call(
 
 
 def signal_floor(volume: np.ndarray, square: float, plan: Plan) -> float:
-    """Return the largest sum of squared deviations of a window without signal; `square`: sum of the volume's squares."""
+    """Return the sum of squared deviations up to which a window holds no signal.
+
+    `square` is the sum of the volume's squares.
+    """
     variance = square / volume.size - float(volume.mean()) ** 2
     return SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
 

@@ -6,31 +6,36 @@
 
 namespace lfpiv {
 
-/// Store one plane of a volume by phase, 0 outside the volume.
+/// Copy every `stride`th voxel of a row to the lanes `first` to `last - 1` of `count`, and 0 to the others.
+LFPIV_INLINE void split_row(const float* voxel, int stride, int first, int last, int count, float* lane) {
+    for (int k = 0; k < first; ++k) lane[k] = 0.0f;
+    for (int k = first; k < last; ++k) lane[k] = voxel[k * stride];
+    for (int k = last; k < count; ++k) lane[k] = 0.0f;
+}
+
+/// Store one plane of a volume by phase, 0 outside the volume. Lanes are written in order: what is read at a distance
+/// stays in the caches.
 template <class Triple, class Lattice>
 LFPIV_INLINE void split_plane(const float* volume, const Triple& shape, const Lattice& lattice, int plane,
                               float* split) {
     const int ny = shape[1], nx = shape[2], stride_y = lattice.stride[1], stride_x = lattice.stride[2];
     const int rows = (lattice.lanes + lattice.pitch - 1) / lattice.pitch, z = lattice.corner[0] + plane;
     float* to = split + (int64_t)plane * lattice.phases[1] * lattice.phases[2] * lattice.lanes;
-    for (int phase_y = 0; phase_y < lattice.phases[1]; ++phase_y) {
+    for (int phase_y = 0; phase_y < lattice.phases[1]; ++phase_y)
         for (int phase_x = 0; phase_x < lattice.phases[2]; ++phase_x, to += lattice.lanes) {
-            const int x = lattice.corner[2] + phase_x;                         // of lane 0
-            const int low = x < 0 ? (stride_x - 1 - x) / stride_x : 0;         // first lane inside the volume
-            const int high = x < nx ? (nx - x + stride_x - 1) / stride_x : 0;  // first lane behind it
-            for (int row = 0; row < rows; ++row) {                             // written in order, read from the caches
+            // voxel of lane 0, first lane inside the volume, first lane behind it
+            const int x = lattice.corner[2] + phase_x;
+            const int low = x < 0 ? (stride_x - 1 - x) / stride_x : 0;
+            const int high = x < nx ? (nx - x + stride_x - 1) / stride_x : 0;
+            for (int row = 0; row < rows; ++row) {
                 const int y = lattice.corner[1] + row * stride_y + phase_y;
                 const int count = min(lattice.lanes - row * lattice.pitch, lattice.pitch);
                 const bool inside = z >= 0 && z < shape[0] && y >= 0 && y < ny;
-                const int last = inside ? min(max(high, 0), count) : 0, first = min(low, last);
+                const int last = inside ? min(high, count) : 0;
                 const float* voxel = volume + (inside ? ((int64_t)z * ny + y) * nx : 0) + x;
-                float* lane = to + row * lattice.pitch;
-                for (int k = 0; k < first; ++k) lane[k] = 0.0f;
-                for (int k = first; k < last; ++k) lane[k] = voxel[k * stride_x];
-                for (int k = last; k < count; ++k) lane[k] = 0.0f;
+                split_row(voxel, stride_x, min(low, last), last, count, to + row * lattice.pitch);
             }
         }
-    }
 }
 
 #if defined(__CUDA_ARCH__)
@@ -119,14 +124,14 @@ LFPIV_INLINE void correlate_blocks(const Volume& first, const Volume& second, co
     for (int lag = begin; lag < end; ++lag)
         sum_lags(voxels, layers.block, layers.lags, lag, layers.lanes, to + lag * plane_pitch);
 #else
-    const int block_size = rows * columns * LANES, around_size = (rows + ny - 1) * (columns + nx - 1) * LANES;
-    BlockVoxels voxels{scratch,         scratch + (int64_t)depth * block_size, depth, rows, columns, rows + ny - 1,
-                       columns + nx - 1};
+    const int rows_around = rows + ny - 1, columns_around = columns + nx - 1, block_size = rows * columns * LANES;
+    float* around = scratch + (int64_t)depth * block_size;
+    BlockVoxels voxels{scratch, around, depth, rows, columns, rows_around, columns_around};
     auto copy_around = [&](int z) {  // the last `depth` planes are held
-        copy_plane(second, plane + z, lane, voxels.rows_around, voxels.columns_around,
-                   voxels.around + (int64_t)(z % depth) * around_size);
+        float* to = around + (int64_t)(z % depth) * rows_around * columns_around * LANES;
+        copy_plane(second, plane + z, lane, rows_around, columns_around, to);
     };
-    for (int z = 0; z < depth; ++z) copy_plane(first, plane + z, lane, rows, columns, voxels.block + z * block_size);
+    for (int z = 0; z < depth; ++z) copy_plane(first, plane + z, lane, rows, columns, scratch + z * block_size);
     for (int z = begin; z < begin + depth - 1; ++z) copy_around(z);
     for (int lag = begin; lag < end; ++lag) {
         copy_around(lag + depth - 1);
@@ -136,7 +141,7 @@ LFPIV_INLINE void correlate_blocks(const Volume& first, const Volume& second, co
 #endif
 }
 
-/// Add to each lane the `count - 1` that follow at a distance, in place: what is read is not yet written.
+/// Add to each lane the `count - 1` that follow at a distance. In place: lanes that are read have not been written yet.
 LFPIV_INLINE void add_following(float* sums, int lanes, int count, int distance) {
     for (int k = 0; k < lanes; k += WIDTH) {
         V total = load(sums + k);

@@ -12,7 +12,7 @@ struct WindowTask {
     int lane, lanes;
 };
 
-/// Return the voxels' place in statistics at a lag, which is counted from the farthest.
+/// Return the place of a lane's statistics at a lag, counted from the farthest lag.
 template <class Statistics>
 LFPIV_INLINE int64_t place_of(const Statistics& of, int plane, int z, int y, int x, int lane) {
     return (int64_t)(plane + z) * of.plane + of.along_y.data[y] + of.along_x.data[x] + lane;
@@ -32,7 +32,7 @@ LFPIV_INLINE V sum_column(const float* from, const Windows& windows, int layer, 
     return total;
 }
 
-/// Ask for the sums of a later lag: no processor guesses a distance that large.
+/// Prefetch the sums of a later lag: they lie farther away than processors predict.
 template <class Windows>
 LFPIV_INLINE void fetch_blocks(const float* from, const Windows& windows, const WindowTask& task, int64_t layer_pitch) {
     const int count = task.lanes + (windows.blocks[1] - 1) * windows.pitch + windows.blocks[2] - 1;

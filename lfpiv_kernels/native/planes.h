@@ -1,5 +1,4 @@
-// Transform of planes along z, folded about half and a quarter of its length; see ``correlation/transforms.py``. CPU
-// only.
+// Transform of planes along z, folded twice, on the CPU; see ``correlation/transforms.py``.
 #ifndef LFPIV_PLANES_H
 #define LFPIV_PLANES_H
 
@@ -9,7 +8,7 @@ namespace lfpiv {
 
 #if !defined(__CUDA_ARCH__)
 
-/// Rows that are summed in registers at once, and elements of each: ROW_VECTORS vectors.
+/// Rows that are summed in registers at once, and vectors of each.
 constexpr int MOST_ROWS = 6, ROW_VECTORS = 4;
 
 /// Store four values of a transform, given in the order of `fold` in ``transforms.py``, as the sums and differences

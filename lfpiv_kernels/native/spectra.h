@@ -1,5 +1,4 @@
-// Correlation of blocks with their surroundings by transforms along z and y; see ``correlation/transforms.py``. CPU
-// only.
+// Correlation of blocks with their surroundings by transforms, on the CPU; see ``correlation/transforms.py``.
 #ifndef LFPIV_SPECTRA_H
 #define LFPIV_SPECTRA_H
 
