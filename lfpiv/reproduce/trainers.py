@@ -1,6 +1,6 @@
 """Train networks by the other trainers of Table 1: Bayesian regularisation, and gradient descent with momentum.
 
-Both have the signature of `levenberg_marquardt`, so that `lfpiv.calibration.training.train` takes them as its `trainer`.
+Both have the signature of `levenberg_marquardt` and go into `lfpiv.calibration.training.TrainingSettings.trainer`.
 
 References
 ----------
