@@ -21,6 +21,10 @@ class LensArrayQuality:
     lenses: int
     """Microimages whose centres lie on the sensor."""
 
+    def __getitem__(self, name: str) -> Any:
+        """Return a figure by its name, so that scripts can read the report as they read the summary."""
+        return self.to_json()[name]
+
     def to_json(self) -> dict[str, Any]:
         """Return the figures by name. `from_json` is the inverse."""
         return dataclasses.asdict(self)

@@ -103,6 +103,7 @@ def test_the_mapping_meets_the_true_rays(rig):
     assert error <= MAPPING_AIM_PITCH
     report = camera.report
     assert report.dots_found == report.dots_expected == 125
+    assert report["dots_found"] == 125  # by name, as in the summary
     assert error / 3 < report.sigma_nor_test < 10 * error  # users see the order of the error
     ideal = lfpiv.thin_lens(experiment).cameras["only"]
     assert mean_error_pitch(ideal, spec, [-1, -1, -0.8], [1, 1, 0.8]) > 10 * MAPPING_PITCH  # nominal angles
