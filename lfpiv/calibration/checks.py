@@ -115,16 +115,7 @@ def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, residual_pit
 
     No result depends on the stated values. A difference shows rotated images or a wrong spacing of dots or planes, and
     no other check finds them. The magnification is compared only where the thin lens fits the labels, so not behind a
-    tilted window.
-
-    Parameters
-    ----------
-    setup : CameraSetup
-        The stated camera.
-    fitted : ThinLensModel
-        Thin lens fitted to the labels.
-    residual_pitch : float
-        Median distance of the labels from it [microlens pitch].
+    tilted window. `residual_pitch` is the labels' median distance from the fitted thin lens [microlens pitch].
     """
     nominal = thin_lens_model(setup.optics, setup.nominal_angle_deg)
     turn = Rotation.from_matrix(fitted.rotation @ nominal.rotation.T).magnitude() * 180 / math.pi

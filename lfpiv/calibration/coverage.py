@@ -34,19 +34,10 @@ LEAST_UNPAIRED = 0.01
 def require_seen(path: Path, calibration: Calibration, grid: Grid) -> None:
     """Refuse a volume that a calibrated camera does not see. Warn where a camera sees less than half of it.
 
-    Parameters
-    ----------
-    path : Path
-        The experiment file, for the message.
-    calibration : Calibration
-        The calibrated cameras.
-    grid : Grid
-        The volume.
-
     Raises
     ------
     InputError
-        Names the camera.
+        Names `path`, the experiment file, and the camera.
     """
     for camera in calibration.cameras.values():
         share = seen_share(camera, grid)
@@ -102,17 +93,7 @@ def _sees(camera: CalibratedCamera, grid: Grid) -> np.ndarray:
 
 
 def warn_seen_by_one(camera_counts: np.ndarray, grid: Grid, cameras: int) -> None:
-    """Log a warning where only one of several cameras sees voxels of a grid.
-
-    Parameters
-    ----------
-    camera_counts : ndarray, shape (z, y, x)
-        Number of cameras that see each voxel.
-    grid : Grid
-        The voxels.
-    cameras : int
-        Number of cameras. A single camera raises no warning.
-    """
+    """Log a warning where only one of several cameras sees voxels. `camera_counts` has the shape (z, y, x)."""
     if cameras > 1:
         for warning in _seen_by_one(camera_counts, [grid.axis_mm(axis) for axis in range(3)]):
             log.warning("%s", warning.sentence)

@@ -150,7 +150,7 @@ def find_lens_array(
     nominal = _checked_pitch(nominal_pitch_px, image.shape)
 
     basis = find_basis(image, nominal, layout)
-    lattice = _fit_lattice(image, _Lattice(find_phase(image, basis, layout), basis), layout)
+    lattice, rms, measured = _fit_lattice(image, _Lattice(find_phase(image, basis, layout), basis), layout)
     rows, columns = image.shape
     index = indices_inside(lattice.origin, lattice.basis, (-0.5, -0.5), (columns - 0.5, rows - 0.5))
     centres = lattice.nodes(index)
@@ -162,13 +162,13 @@ def find_lens_array(
         origin_px=float_pair(origin),
         basis_px=(float_pair(lattice.basis[0]), float_pair(lattice.basis[1])),
         layout=layout,
-        rms_px=lattice.rms_px,
-        measured=lattice.measured,
+        rms_px=rms,
+        measured=measured,
         sensor_shape=image.shape,
     )
     log.info(
         "%s lens array: %d microimages, pitch %.4f px, rotation %.4f degrees, %d measured, rms %.4f px",
-        layout, len(index), array.pitch_px, array.rotation_deg, array.measured, array.rms_px,
+        layout, len(index), array.pitch_px, array.rotation_deg, measured, rms,
     )  # fmt: skip
     return array
 
@@ -242,14 +242,8 @@ class _Lattice:
         return centres
 
 
-@dataclass(frozen=True, eq=False)
-class _FittedLattice(_Lattice):
-    rms_px: float
-    measured: int
-
-
-def _fit_lattice(image: np.ndarray, start: _Lattice, layout: str) -> _FittedLattice:
-    """Measure the microimages and fit a lattice to their centres."""
+def _fit_lattice(image: np.ndarray, start: _Lattice, layout: str) -> tuple[_Lattice, float, int]:
+    """Measure the microimages and fit a lattice. Return it, its rms residual [pixel] and the number of centres."""
     pitch = lattice_pitch(start.basis, layout)
     half = patch_half_px(start.basis, pitch)
     lattice, mean_microimage = _fit_sample(image, start, half)
@@ -273,7 +267,7 @@ def _fit_lattice(image: np.ndarray, start: _Lattice, layout: str) -> _FittedLatt
             "pitch. Check the file, the layout and the exposure."
         )
     _warn_of_distortion(index[inliers] @ lattice.basis, residual[inliers])
-    return _FittedLattice(lattice.origin, lattice.basis, rms, int(inliers.sum()))
+    return lattice, rms, int(inliers.sum())
 
 
 def _fit_sample(image: np.ndarray, lattice: _Lattice, half: int) -> tuple[_Lattice, np.ndarray]:

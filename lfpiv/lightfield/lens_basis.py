@@ -41,19 +41,10 @@ DISC_RADII = np.arange(0.2, 0.81, 0.02)
 def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndarray:
     """Return the lattice vectors, rows (column, row) [pixel], in the order of `LensArray.basis_px`.
 
-    Parameters
-    ----------
-    image : ndarray, shape (rows, columns), float32
-        White image above the dark level [counts].
-    nominal : float or None
-        Nominal pitch [pixel].
-    layout : {"square", "hexagonal"}
-        Stated layout.
-
     Raises
     ------
     InputError
-        If the image shows no array, or one of another layout or pitch.
+        If the image shows no array, or one of another layout or nominal pitch [pixel].
     """
     tile = _middle(image)
     width, best = nominal or min(tile.shape) / 4, -1.0
@@ -223,15 +214,7 @@ def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np
 
 
 def indices_inside(origin: np.ndarray, basis: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
-    """Return the indices (i, j) of all lattice nodes with low <= node < high, shape (node, 2). i runs fastest.
-
-    Parameters
-    ----------
-    origin, basis : ndarray, shapes (2,) and (2, 2)
-        Node (0, 0) and lattice vectors.
-    low, high : array_like, shape (2,)
-        Corners of the box, in the unit of `origin`.
-    """
+    """Return the indices (i, j) of all lattice nodes with low <= node < high, shape (node, 2). i runs fastest."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
     reach = (corners - origin) @ np.linalg.inv(basis)
@@ -252,15 +235,6 @@ def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
     The mean cell is symmetric under a quarter turn (hexagonal: a sixth) about a lens centre. A square cell has the same
     symmetry about the gap between four lenses. The cell correlates better with discs about the lens centres than with
     discs about the gaps, even where overlaps make the gap brighter than the centre.
-
-    Parameters
-    ----------
-    image : ndarray, shape (rows, columns), float32
-        White image above the dark level [counts].
-    basis : ndarray, shape (2, 2)
-        Lattice vectors (column, row) [pixel].
-    layout : {"square", "hexagonal"}
-        Layout of the array.
     """
     pitch = lattice_pitch(basis, layout)
     crop = _flattened(_middle(image), pitch)

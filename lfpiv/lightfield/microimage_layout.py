@@ -59,17 +59,6 @@ def microimages_of(optics: Optics, lattice: LensLattice) -> Microimages:
     A microimage is as wide as the image of the pupil (Eq. 9). A pixel at its edge sees only the part of its cell inside
     the pupil, and the middle of that part lies nearer to the centre than the pixel's own. Versions of each block hold
     the shares of such pixels for weights that fall or rise outwards.
-
-    Parameters
-    ----------
-    optics : Optics
-        The camera.
-    lattice : LensLattice
-        Its microlenses.
-
-    Returns
-    -------
-    Microimages
     """
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
     first, centre = microimage_centres(optics, lattice, radius + 1)
