@@ -75,6 +75,15 @@ class Optics:
         return np.asarray(position_mm, float) / self.pixel_mm + np.array([columns, rows]) / 2 - 0.5
 
 
+def spread_over_pupil(radius_mm: float) -> np.ndarray:
+    """Return points spread evenly over the pupil: the centre and rings of 6, 12 and 18, shape (37, 2) [mm]."""
+    rings = [np.zeros((1, 2))]
+    for ring in (1, 2, 3):
+        angle = (np.arange(6 * ring) + 0.5 * (ring % 2)) * np.pi / (3 * ring)
+        rings.append(ring / 3 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return radius_mm * np.concatenate(rings)
+
+
 def pair(values: ArrayLike) -> tuple[float, float]:
     """Return two numbers as a tuple of Python floats."""
     first, second = np.asarray(values, float).tolist()

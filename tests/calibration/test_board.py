@@ -9,11 +9,13 @@ import tifffile
 from scipy.spatial import cKDTree
 
 from lfpiv.calibration.board.board import DotBoard, measure_board
-from lfpiv.calibration.board.detect import _on_lattice
-from lfpiv.calibration.board.dot_model import BENDS, TERMS, DotFit, LensIntegral, ray_terms
-from lfpiv.calibration.board.dot_shared import Shared, update_bend
-from lfpiv.calibration.board.edges import MARGIN, outline, require_stated
-from lfpiv.calibration.board.pose import BIN_PITCHES, search_radius_mm
+from lfpiv.calibration.board.detect import on_lattice, search_radius_mm
+from lfpiv.calibration.board.dot_fit import DotFit
+from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
+from lfpiv.calibration.board.dot_shared import estimate_bend, follow_bend
+from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated
+from lfpiv.calibration.board.planes import HELD_BYTES, Planes
+from lfpiv.calibration.board.pose import BIN_PITCHES
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.lightfield.decoder import LightFieldDecoder
@@ -316,9 +318,12 @@ def test_light_of_a_pixel_against_counted_rays(layout):
     """F of the dot model: rays of a tilted dot towards one pixel behind one lens, counted."""
     random, optics = np.random.default_rng(5), SCENES["hexagonal, steep"].optics
     scene = replace(SCENES["hexagonal, steep"], layout=layout, sensor_shape=(200, 200))
-    decoder = LightFieldDecoder.from_white(scene.optics, scene.lattice, Renderer(scene).images()[0])
     bend = 1e-3 * random.normal(size=(BENDS, 2))
-    model = LensIntegral(decoder, 0.12, 0.4, bend, 1.0, 1.0)
+
+    def model(diameter, blur):
+        shared = SharedParameters(diameter_mm=diameter, blur_px=blur, bend_mm=bend)
+        return LensIntegral(scene.optics, scene.lattice, shared)
+
     jacobian = np.array([[-0.7, 0.02], [0.03, -1.05]])
     tilt = np.zeros((2, 2, 2))
     tilt[0, 0, 0], tilt[1, 0, 1] = 0.06, 0.06
@@ -330,7 +335,7 @@ def test_light_of_a_pixel_against_counted_rays(layout):
     here = slope_at(np.vstack([theta, bend]), pupil) / optics.pupil_radius_mm
     image = np.linalg.inv(np.eye(2) - here) @ here * optics.pupil_pixel_mm  # of each pixel on the array
     pixel_mm2 = np.stack([(image[:, a] * image[:, b]).sum(1) for a, b in ((0, 0), (0, 1), (1, 1))], axis=1)
-    share, gradient, growth = model.table(jacobian, tilt, theta)(offset, pupil, pixel_mm2)
+    share, gradient, growth = model(0.12, 0.4).table(jacobian, tilt, theta)(offset, pupil, pixel_mm2)
 
     count = 20_000
     radius, angle = 0.06 * np.sqrt(random.random(count)), 2 * np.pi * random.random(count)
@@ -344,7 +349,7 @@ def test_light_of_a_pixel_against_counted_rays(layout):
         )
         counted = (lattice.nearest(landed) == 0).all(1).mean()
         assert abs(share[k] - counted) < F_ERROR
-    table, step = model.table(jacobian, tilt, theta), 2e-3
+    table, step = model(0.12, 0.4).table(jacobian, tilt, theta), 2e-3
     same = np.tile(table.pixel_mm2, (len(offset), 1))
     _, gradient, growth = table(offset, 0 * pupil, same)
     for axis in (0, 1):
@@ -353,9 +358,9 @@ def test_light_of_a_pixel_against_counted_rays(layout):
         assert np.sqrt((miss**2).mean()) < GRADIENT_ERROR * np.abs(gradient).max()
     for column, steps in enumerate([(0.05, 0), (0, 0.05)]):
         up, down = (
-            LensIntegral(
-                decoder, 0.12 * np.exp(sign * steps[0]), np.sqrt(0.16 + sign * steps[1]), bend, 1.0, 1.0
-            ).table(jacobian, tilt, theta)(offset, 0 * pupil, same)[0]
+            model(0.12 * np.exp(sign * steps[0]), np.sqrt(0.16 + sign * steps[1])).table(jacobian, tilt, theta)(
+                offset, 0 * pupil, same
+            )[0]
             for sign in (1, -1)
         )
         miss = (up - down) / 0.1 - growth[:, column]
@@ -381,18 +386,20 @@ def test_a_bend_is_found_by_all_dots_together_and_none_is_made_of_noise(count):
     """Errors of each dot as large as the bend, and twice what the dots state."""
     random, pitch = np.random.default_rng(7), 30.0  # so large that the prior has no say
     none = np.zeros((BENDS, 2))
-    start = Shared(diameter_mm=0.1, blur_px=0.3, bend_mm=0.5 * random.normal(size=(BENDS, 2)))
+    start = SharedParameters(diameter_mm=0.1, blur_px=0.3, bend_mm=0.5 * random.normal(size=(BENDS, 2)))
     found = [
-        update_bend(start, [None, *dots_that_say(none, count, 2.0, start.bend_mm, random)[0]], pitch)[0].bend_mm
+        estimate_bend(start, [None, *dots_that_say(none, count, 2.0, start.bend_mm, random)[0]], pitch).bend_mm
         for _ in range(200)
     ]
     assert np.mean([bend.any() for bend in found]) < FALSE_BENDS
     true = 2.5 * random.normal(size=(BENDS, 2))
     fits, following = dots_that_say(true, count, 2.0, start.bend_mm, random)
-    shared, moved = update_bend(start, fits, pitch)
+    shared = estimate_bend(start, fits, pitch)
     assert np.abs(shared.bend_mm - true).max() < 5 * 2 / np.sqrt(count) * 1.5  # five standard errors, and thin dots
+    moved = follow_bend([None, *fits], shared.bend_mm - start.bend_mm)
+    assert moved[0] is None
     change = following[:, 2:] @ (shared.bend_mm - start.bend_mm).T.ravel()
-    assert np.allclose(moved[0].coefficients.T.ravel(), change)
+    assert np.allclose(moved[1].coefficients.T.ravel(), change)
 
 
 @pytest.mark.parametrize("spacing_pitches", [3.2, 4.5, 7.0])
@@ -402,10 +409,26 @@ def test_fine_boards_in_focus_are_told_from_chance(spacing_pitches):
     board = DotBoard(dots=(7, 7), spacing_mm=spacing_pitches * pitch, diameter_mm=0.1, planes_mm=(0.0,))
     places = board.points_mm(0)[:, :2]
     focused = random.uniform(-pitch / 2, pitch / 2, places.shape)
-    angle, radius = 2 * np.pi * random.random(49), search_radius_mm(board.spacing_mm) * np.sqrt(random.random(49))
+    angle, radius = 2 * np.pi * random.random(49), search_radius_mm(board) * np.sqrt(random.random(49))
     anywhere = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert _on_lattice(focused, places, board, BIN_PITCHES * pitch)
-    assert not _on_lattice(anywhere, places, board, BIN_PITCHES * pitch)
+    assert on_lattice(focused, places, board, BIN_PITCHES * pitch)
+    assert not on_lattice(anywhere, places, board, BIN_PITCHES * pitch)
+
+
+def test_board_images_are_held_as_far_as_memory_allows():
+    rng, asked = np.random.default_rng(0), []
+    whole = rng.integers(0, 4096, (12, 6, 7)).astype(np.float32)
+    whole[1] += 0.5  # no whole counts
+
+    def read(plane):
+        asked.append(plane)
+        return whole[plane]
+
+    planes = Planes(read, len(whole))
+    for _ in range(3):
+        assert all(np.array_equal(image, true) for image, true in zip(planes, whole, strict=True))
+    held = HELD_BYTES // 2
+    assert [asked.count(plane) for plane in range(12)] == [1, 3, *[1] * (held - 1), *[3] * (11 - held)]
 
 
 def seen_board(true, stated, view, offset=(0, 0), planes=3, hidden=()):
@@ -429,13 +452,13 @@ ALL = ((-9, 20), (-9, 20))
 def test_the_outline_names_the_dots():
     """Whole in view, cut on one side, cut on both: the names follow the edges in view and nothing else."""
     for offset in ((0, 0), (1, -1), (-2, 0)):
-        columns, rows = outline(*seen_board((7, 7), (7, 7), ALL, offset), (7, 7))
+        columns, rows = find_extents(*seen_board((7, 7), (7, 7), ALL, offset), (7, 7))
         assert (columns.shift, rows.shift) == offset and columns.fits and rows.fits
-    columns, _ = outline(*seen_board((7, 7), (7, 7), ((-9, 4), (-9, 20)), (1, 0)), (7, 7))  # its right side is cut
+    columns, _ = find_extents(*seen_board((7, 7), (7, 7), ((-9, 4), (-9, 20)), (1, 0)), (7, 7))  # its right side is cut
     assert columns.starts and not columns.ends and columns.shift == 1 and columns.fits
-    columns, _ = outline(*seen_board((7, 7), (7, 7), ((3, 20), (-9, 20)), (-1, 0)), (7, 7))  # its left side
+    columns, _ = find_extents(*seen_board((7, 7), (7, 7), ((3, 20), (-9, 20)), (-1, 0)), (7, 7))  # its left side
     assert columns.ends and not columns.starts and columns.shift == -1 and columns.fits
-    columns, rows = outline(*seen_board((9, 9), (20, 20), ((5, 12), (5, 12)), (4, 4)), (20, 20))
+    columns, rows = find_extents(*seen_board((9, 9), (20, 20), ((5, 12), (5, 12)), (4, 4)), (20, 20))
     assert columns.open and rows.open and columns.shift == 0 and columns.fits  # nothing tells: the nominal axis stands
 
 
@@ -443,7 +466,7 @@ def test_the_outline_names_the_dots():
 def test_another_number_of_dots_than_stated_is_refused(stated):
     offset = tuple((n - 7) // 2 for n in stated)
     found, in_view = seen_board((7, 7), stated, ALL, offset)
-    extents = outline(found, in_view, stated)
+    extents = find_extents(found, in_view, stated)
     with pytest.raises(InputError, match=r"planes 0-2: 7 x 7.* Set dots = \[7, 7\]"):
         require_stated(extents, found)
 
@@ -451,9 +474,9 @@ def test_another_number_of_dots_than_stated_is_refused(stated):
 def test_a_hidden_edge_is_refused_and_a_hidden_middle_is_not():
     found, in_view = seen_board((7, 7), (7, 7), ALL, hidden=(0,))
     with pytest.raises(InputError, match="6 columns"):
-        require_stated(outline(found, in_view, (7, 7)), found)
+        require_stated(find_extents(found, in_view, (7, 7)), found)
     found, in_view = seen_board((7, 7), (7, 7), ALL, hidden=(3,))
-    require_stated(outline(found, in_view, (7, 7)), found)
+    require_stated(find_extents(found, in_view, (7, 7)), found)
 
 
 def test_bad_boards_are_refused():
