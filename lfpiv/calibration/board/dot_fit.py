@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from lfpiv.calibration.board.dot_model import TERMS, LensIntegral, LensTable, cell_reach, ray_terms, slope_of
+from lfpiv.calibration.board.dot_model import TERMS, LensIntegral, LensTable, ray_terms, slope_of
 from lfpiv.calibration.board.dots import ExpectedDot
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.lightfield.decoder import LightFieldDecoder, disc_fraction
@@ -250,7 +250,7 @@ class _Problem:
         """Return whether the dot lights enough pixels for a fit."""
         optics = self.model.optics
         half = _FEWEST_SHARE * np.pi * (optics.pupil_radius_mm / optics.pupil_pixel_mm) ** 2
-        return np.count_nonzero(state.share > _SEEN_SHARE) >= int(np.clip(half, FEWEST_PIXELS, _ENOUGH))
+        return int(np.count_nonzero(state.share > _SEEN_SHARE)) >= int(np.clip(half, FEWEST_PIXELS, _ENOUGH))
 
     def weight(self, state: _State) -> np.ndarray:
         """Return the inverse variance of each pixel: read noise, shot noise, the model's own error."""
@@ -303,7 +303,7 @@ def _fit_dot(problem: _Problem) -> DotFit | None:
     if len(problem.signal) < FEWEST_PIXELS:
         return None
     radius, pixel_mm = problem.model.optics.pupil_radius_mm, problem.model.optics.pupil_pixel_mm
-    oldest = _TABLE_AGE * cell_reach(problem.model.lattice).min()
+    oldest = _TABLE_AGE * problem.model.cell_reach_mm.min()
     slope, table = slope_of(problem.dot.theta, radius), problem.table(problem.dot.theta)
     step = _Step(problem.state(problem.dot.theta, table, None), 1e-3, False)
     for _ in range(_ITERATIONS):

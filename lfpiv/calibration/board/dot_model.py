@@ -28,10 +28,13 @@ import numpy as np
 from scipy import fft, special
 from scipy.spatial import Voronoi
 
-from lfpiv.geometry.optics import LensLattice, Optics, spread_over_pupil
+from lfpiv.geometry.optics import LensLattice, Optics, pair, spread_over_pupil
 
 _BEND_ORDER = 3
 _POWERS = [(order - j, j) for order in range(_BEND_ORDER + 1) for j in range(order + 1)]  # of (u, v)
+
+Basis = tuple[tuple[float, float], ...]
+"""Two lattice vectors (s, t) [mm]."""
 
 TERMS = 6
 """Terms of a dot's own ray model per coordinate: 1, u, v, u^2, u v, v^2, with (u, v) in pupil radii."""
@@ -73,9 +76,19 @@ class LensIntegral:
     shared: SharedParameters
     """Diameter, blur and bend of all dots."""
 
+    @property
+    def cell_reach_mm(self) -> np.ndarray:
+        """Half extent (s, t) of the cell of a lens [mm], shape (2,)."""
+        return _cell_reach(self._basis)
+
+    @property
+    def _basis(self) -> Basis:
+        return tuple(pair(vector) for vector in self.lattice.basis_mm)
+
     def rays_mm(self, terms: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return s(u) [mm], shape (n, 2), from `ray_terms` and the dot's own coefficients."""
-        return terms @ self._bent(theta)
+        rays: np.ndarray = terms @ self._bent(theta)
+        return rays
 
     def offset_mm(self, terms: np.ndarray, theta: np.ndarray, lens_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where the central ray of each pixel lands from its lens's centre, g, and the factor (I - K)^-1.
@@ -110,7 +123,7 @@ class LensIntegral:
         """Return the half extent (s, t) of F [mm]: a lens further away receives no light of the dot, shape (2,)."""
         ellipse, pixel = self._ellipse(board_jacobian, theta), self._pixel(theta)
         blurred = np.abs(pixel).sum(1) * (0.5 + 2 * self.shared.blur_px)
-        extent: np.ndarray = cell_reach(self.lattice) + np.hypot(*ellipse.T) + blurred
+        extent: np.ndarray = self.cell_reach_mm + np.hypot(*ellipse.T) + blurred
         return extent
 
     def table(self, board_jacobian: np.ndarray, tilt: np.ndarray, theta: np.ndarray) -> LensTable:
@@ -129,7 +142,7 @@ class LensIntegral:
         change = [inverse @ tilt[:, :, axis] * (self.shared.diameter_mm / 2) for axis in (0, 1)]
         size = int(np.ceil(np.log(self.support_mm(board_jacobian, theta).max()) / _SIZE_STEP))
         step = _TABLE_SUPPORTS * np.exp(size * _SIZE_STEP) / TABLE
-        cell = _cell_spectrum(self.lattice, step)
+        cell = _cell_spectrum(self._basis, step)
         ellipse, pixel = self._ellipse(board_jacobian, theta), self._pixel(theta)
         return LensTable(cell, step, ellipse, pixel, self.shared.blur_px, change)
 
@@ -251,9 +264,9 @@ def slope_of(theta: np.ndarray, pupil_radius_mm: float) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=8)
-def cell_reach(lattice: LensLattice) -> np.ndarray:
+def _cell_reach(basis: Basis) -> np.ndarray:
     """Return the half extent (s, t) of the lattice's Voronoi cell [mm], shape (2,)."""
-    voronoi = Voronoi(np.vstack([np.zeros(2), _neighbours(lattice)]))
+    voronoi = Voronoi(np.vstack([np.zeros(2), _neighbours(basis)]))
     reach: np.ndarray = np.abs(voronoi.vertices[voronoi.regions[voronoi.point_region[0]]]).max(0)
     return reach
 
@@ -278,19 +291,19 @@ def _spread_terms() -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=32)
-def _cell_spectrum(lattice: LensLattice, step_mm: float) -> np.ndarray:
+def _cell_spectrum(basis: Basis, step_mm: float) -> np.ndarray:
     """Return the transform of each table element's share in the Voronoi cell of a lens at the table's origin."""
     fine = (np.arange(TABLE * _RASTER) + 0.5 - (TABLE + 1) * _RASTER / 2) * step_mm / _RASTER
     inside = np.ones((fine.size, fine.size), bool)
-    for vector in _neighbours(lattice):
+    for vector in _neighbours(basis):
         inside &= fine[:, None] * vector[0] + fine[None] * vector[1] < vector @ vector / 2
     share = inside.reshape(TABLE, _RASTER, TABLE, _RASTER).mean((1, 3))
     spectrum: np.ndarray = fft.rfft2(fft.ifftshift(share))
     return spectrum
 
 
-def _neighbours(lattice: LensLattice) -> np.ndarray:
+def _neighbours(basis: Basis) -> np.ndarray:
     """Return the vectors to the eight lattice neighbours of a lens [mm], shape (8, 2)."""
     steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)], float)
-    neighbours: np.ndarray = steps @ np.asarray(lattice.basis_mm)
+    neighbours: np.ndarray = steps @ np.asarray(basis)
     return neighbours
