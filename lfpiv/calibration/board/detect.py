@@ -44,16 +44,7 @@ _LIT_GAIN = 0.3  # least gain of a lit pixel; less is a vignetted corner or a de
 def find_dots(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, nominal_angle_deg: float) -> Detection:
     """Find and name the dots: the lattice in the first plane that shows one, then each plane with the fitted pose.
 
-    Parameters
-    ----------
-    signals : Signals
-        Images of the planes.
-    decoder : LightFieldDecoder
-        The camera's decoder.
-    board : DotBoard
-        The board.
-    nominal_angle_deg : float
-        Planned camera angle, correct to about 10 degrees [degree].
+    The nominal camera angle must be correct to about 10 degrees.
 
     Raises
     ------
@@ -264,7 +255,6 @@ def on_lattice(miss: np.ndarray, sites_mm: np.ndarray, board: DotBoard, bin_mm: 
     sites_mm : ndarray, shape (n, 2)
         The sites (x, y) [mm].
     board : DotBoard
-        The board.
     bin_mm : float
         Spacing of the elements of the rectified image [mm].
     """

@@ -37,41 +37,43 @@ _OWN = _RAYS + 2  # unknowns of a dot
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PixelModel:
-    """Response and noise of a camera's pixels."""
-
-    response: np.ndarray
-    """Counts of the white image above the dark level, shape (rows, columns)."""
-    noise: float
-    """Read noise [counts]."""
-    counts_per_photon: float
-    """Shot noise: variance over mean [counts]."""
-    response_share: float
-    """Share of the white image's scatter from pixel to pixel that is taken as response."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class BoardPixels:
-    """Pixels of a camera's board images that dots are fitted to. Made by `from_decoder`."""
+    """Pixels of a camera's board images, with their response and noise. Made by `from_decoder`."""
 
     signals: Signals
     """Images of the planes."""
+    sign: int
+    """+1 for dots brighter than the board, -1 for darker ones."""
     decoder: LightFieldDecoder
     """Lens and pupil point of each pixel."""
     usable: np.ndarray
     """Pixels wholly inside one microimage and free of the light of the next, shape (rows, columns), bool."""
-    sign: int
-    """+1 for dots brighter than the board, -1 for darker ones."""
+    response_share: float
+    """Share of the white image's scatter from pixel to pixel that is pixel response."""
+    counts_per_photon: float
+    """Shot noise: variance over mean [counts]."""
 
     @classmethod
-    def from_decoder(cls, signals: Signals, decoder: LightFieldDecoder, sign: int) -> BoardPixels:
-        """Choose the usable pixels of a camera."""
+    def from_decoder(cls, signals: Signals, sign: int, decoder: LightFieldDecoder) -> BoardPixels:
+        """Choose the usable pixels, and take all scatter of the white image as noise."""
         optics = decoder.optics
         to_px = optics.sensor_per_pupil / optics.pixel_mm
         own, _ = disc_fraction(decoder.pupil_mm * np.float32(to_px), optics.pupil_radius_mm * to_px)
         beside = ndimage.maximum_filter(decoder.coverage - own, 3)  # blur takes light one pixel further
-        usable = (own > _FIT_COVERAGE) & (beside < _BESIDE_COVERAGE) & (decoder.gain > 0)
-        return cls(signals=signals, decoder=decoder, usable=usable, sign=sign)
+        return cls(
+            signals=signals,
+            sign=sign,
+            decoder=decoder,
+            usable=(own > _FIT_COVERAGE) & (beside < _BESIDE_COVERAGE) & (decoder.gain > 0),
+            response_share=0.0,
+            counts_per_photon=decoder.counts_per_photon,
+        )
+
+    def response(self) -> np.ndarray:
+        """Return the counts of the white image above the dark level, shape (rows, columns)."""
+        decoder = self.decoder
+        response: np.ndarray = decoder.coverage * decoder.shrunk_gain(self.response_share)
+        return response * np.float32(decoder.white_counts)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -110,13 +112,9 @@ class DotFit:
 
 
 def fit_dots(
-    model: LensIntegral,
-    pixels: BoardPixels,
-    pixel_model: PixelModel,
-    expected: Sequence[ExpectedDot],
-    margin_mm: float,
+    model: LensIntegral, pixels: BoardPixels, expected: Sequence[ExpectedDot], margin_mm: float
 ) -> list[DotFit | None]:
-    """Fit dots, each to the pixels that its light may reach.
+    """Fit dots, each to the pixels that its light may reach; None where a dot lights too few pixels.
 
     Parameters
     ----------
@@ -124,20 +122,14 @@ def fit_dots(
         Dot model of the camera.
     pixels : BoardPixels
         Pixels of all planes.
-    pixel_model : PixelModel
-        Response and noise of the pixels.
     expected : sequence of ExpectedDot
         The dots, plane by plane.
     margin_mm : float
         Distance beyond the expected light that is fitted too [mm].
-
-    Returns
-    -------
-    list of DotFit or None
-        None where the dot lights too few pixels.
     """
+    response = pixels.response()
     return [
-        _fit_dot(_Problem.of_dot(model, pixels, pixel_model, dot, signal, margin_mm))
+        _fit_dot(_Problem.of_dot(model, pixels, dot, signal, response, margin_mm))
         for plane, dots in itertools.groupby(expected, lambda dot: dot.plane)
         for signal in [pixels.signals.of_plane(plane)]
         for dot in dots
@@ -198,9 +190,9 @@ class _Problem:
         cls,
         model: LensIntegral,
         pixels: BoardPixels,
-        pixel_model: PixelModel,
         dot: ExpectedDot,
         signal: np.ndarray,
+        response: np.ndarray,
         margin_mm: float,
     ) -> _Problem:
         where = _pixels_around(model, pixels, dot, margin_mm)
@@ -212,11 +204,11 @@ class _Problem:
             model=model,
             dot=dot,
             sign=pixels.sign,
-            noise_variance=pixel_model.noise**2,
-            counts_per_photon=pixel_model.counts_per_photon,
+            noise_variance=pixels.signals.noise**2,
+            counts_per_photon=pixels.counts_per_photon,
             pixel=where,
             signal=signal[at].astype(float),
-            response=pixel_model.response[at].astype(float),
+            response=response[at].astype(float),
             pupil_mm=pupil,
             lens_mm=decoder.lattice.centres_mm(decoder.lens_index[at]),
             terms=ray_terms(pupil, model.optics.pupil_radius_mm),

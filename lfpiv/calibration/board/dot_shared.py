@@ -14,10 +14,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from lfpiv.calibration.board.dot_fit import BoardPixels, DotFit, PixelModel, converged, fit_dots
+from lfpiv.calibration.board.dot_fit import BoardPixels, DotFit, converged, fit_dots
 from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
 from lfpiv.calibration.board.dots import ExpectedDot
-from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
@@ -38,7 +37,6 @@ _NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its med
 
 def estimate_shared(
     pixels: BoardPixels,
-    pixel_model: PixelModel,
     expected: Sequence[ExpectedDot],
     stated_diameter_mm: float,
     margin_mm: float,
@@ -52,8 +50,6 @@ def estimate_shared(
     ----------
     pixels : BoardPixels
         Pixels of all planes.
-    pixel_model : PixelModel
-        Response and noise of the pixels.
     expected : sequence of ExpectedDot
         The dots.
     stated_diameter_mm : float
@@ -70,7 +66,7 @@ def estimate_shared(
     at = np.zeros(len(prior))  # log(diameter / stated), blur^2 [pixel^2], bend [pitch]
     for _ in range(_ROUNDS):
         model = LensIntegral(optics, lattice, _shared(at, stated_diameter_mm, pitch))
-        fits, typical = _typical(fit_dots(model, pixels, pixel_model, sample, margin_mm))
+        fits, typical = _typical(fit_dots(model, pixels, sample, margin_mm))
         if not fits:
             break
         total = sum(one.pull_information for one in fits) * np.outer(unit, unit) / typical + np.diag(1 / prior**2)
@@ -163,26 +159,13 @@ def _edge(bend: np.ndarray) -> float:
     return float(np.sqrt(((edge @ bend.reshape(2, BENDS).T) ** 2).sum(1).mean()))
 
 
-def nominal_pixels(decoder: LightFieldDecoder, noise: float) -> PixelModel:
-    """Return the pixel model of the white image, with all its scatter taken as noise. `noise`: read noise [counts]."""
-    return _pixel_model(decoder, noise, decoder.counts_per_photon, 0.0)
+def estimate_pixels(pixels: BoardPixels, fits: Sequence[DotFit | None]) -> BoardPixels:
+    """Return the pixels with the shot noise, and the response share of the white image's scatter, of fitted dots.
 
-
-def estimate_pixels(fits: Sequence[DotFit | None], decoder: LightFieldDecoder, noise: float) -> PixelModel:
-    """Measure the shot noise, and the share of the white image's scatter that is pixel response.
-
-    For true response, light over fit minus 1 equals white over smooth white minus 1; for noise of the white image the
+    For true response, light over fit minus 1 equals white over smooth white minus 1. For noise of the white image the
     two are independent. The slope of the first over the second is the share.
-
-    Parameters
-    ----------
-    fits : sequence of DotFit or None
-        Fits of all dots by `nominal_pixels`.
-    decoder : LightFieldDecoder
-        Decoder of the camera.
-    noise : float
-        Read noise [counts].
     """
+    decoder = pixels.decoder
     deviations, lights, misses = [], [], []
     for fit in converged(fits):
         chosen = fit.share > _SHARE
@@ -195,16 +178,12 @@ def estimate_pixels(fits: Sequence[DotFit | None], decoder: LightFieldDecoder, n
         misses.append(fit.misfit[chosen][use])
         deviations.append((decoder.gain[at] / np.maximum(smooth, 1e-3) - 1)[use])
     if not lights:
-        return _pixel_model(decoder, noise, decoder.counts_per_photon, 1.0)
+        return replace(pixels, response_share=1.0)
     deviation, expected, miss = (np.concatenate(part).astype(float) for part in (deviations, lights, misses))
     relative = miss / expected
     limit = _CALM_SIGMA * _NORMAL_MAD * np.median(np.abs(relative))
     calm = (np.abs(relative) < limit) & (np.abs(deviation) < _CALM_DEVIATION)
     share = float(np.clip((deviation * relative)[calm].sum() / max((deviation**2)[calm].sum(), 1e-12), 0, 1))
     left = (miss - share * deviation * expected) ** 2 / expected
-    return _pixel_model(decoder, noise, max(float(np.median(left)) * _NORMAL_MAD**2, 1e-3), share)
-
-
-def _pixel_model(decoder: LightFieldDecoder, noise: float, photon: float, share: float) -> PixelModel:
-    response = decoder.coverage * decoder.shrunk_gain(share) * np.float32(decoder.white_counts)
-    return PixelModel(response=response, noise=noise, counts_per_photon=photon, response_share=share)
+    photon = max(float(np.median(left)) * _NORMAL_MAD**2, 1e-3)
+    return replace(pixels, response_share=share, counts_per_photon=photon)

@@ -92,11 +92,8 @@ def expect_dots(
     Parameters
     ----------
     pose : CameraPose
-        Pose of the camera.
     board : DotBoard
-        The board.
     optics : Optics
-        Nominal optics of the camera.
     dots : ndarray, shape (d,)
         Numbers of the dots.
     theta : ndarray, shape (d, 6, 2)

@@ -17,13 +17,7 @@ import numpy as np
 from lfpiv.calibration.board.detect import FEWEST_DOTS
 from lfpiv.calibration.board.dot_fit import FEWEST_PIXELS, BoardPixels, DotFit, converged, fit_dots
 from lfpiv.calibration.board.dot_model import TERMS, LensIntegral, ray_terms, slope_of
-from lfpiv.calibration.board.dot_shared import (
-    estimate_bend,
-    estimate_pixels,
-    estimate_shared,
-    follow_bend,
-    nominal_pixels,
-)
+from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_pixels, estimate_shared, follow_bend
 from lfpiv.calibration.board.dots import Detection, DotBoard, Labels, expect_dots
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
@@ -49,44 +43,32 @@ _ORDER = np.array([0, 1, 1, 2, 2, 2])  # order in the pupil of each term of the 
 def label_by_integral(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, detection: Detection) -> Labels:
     """Fit every dot to its raw pixels and sample its rays.
 
-    Parameters
-    ----------
-    signals : Signals
-        Images of the planes.
-    decoder : LightFieldDecoder
-        The camera's decoder.
-    board : DotBoard
-        The board.
-    detection : Detection
-        From `find_dots`.
-
     Raises
     ------
     InputError
         If fewer detected blobs than make a board look like dots.
     """
     optics, pitch = decoder.optics, decoder.optics.microlens_pitch_mm
-    pixels = BoardPixels.from_decoder(signals, decoder, detection.sign)
-    pixel_model = nominal_pixels(decoder, signals.noise)
+    pixels = BoardPixels.from_decoder(signals, detection.sign, decoder)
     theta = _pose_terms(detection.pose, board.of_dots_mm(detection.dot), optics.pupil_radius_mm)
     theta[:, 0] = detection.chief_mm
     sigma = np.broadcast_to((np.take(_PRIOR_PITCHES, _ORDER) * pitch)[:, None], theta.shape)
     expected = expect_dots(detection.pose, board, optics, detection.dot, theta, sigma)
     margin = _MARGIN_PITCHES[0] * pitch
-    shared = estimate_shared(pixels, pixel_model, expected, board.diameter_mm, margin)
-    fits = fit_dots(LensIntegral(optics, decoder.lattice, shared), pixels, pixel_model, expected, margin)
+    shared = estimate_shared(pixels, expected, board.diameter_mm, margin)
+    fits = fit_dots(LensIntegral(optics, decoder.lattice, shared), pixels, expected, margin)
     bent = estimate_bend(shared, fits, pitch)
     fits = follow_bend(fits, bent.bend_mm - shared.bend_mm)
 
-    pixel_model = estimate_pixels(fits, decoder, signals.noise)
+    pixels = estimate_pixels(pixels, fits)
     prior = _predict(fits, detection, board, optics)
     expected = expect_dots(prior.pose, board, optics, prior.dot, prior.theta, prior.sigma)
     model = LensIntegral(optics, decoder.lattice, bent)
-    fits = fit_dots(model, pixels, pixel_model, expected, _MARGIN_PITCHES[1] * pitch)
+    fits = fit_dots(model, pixels, expected, _MARGIN_PITCHES[1] * pitch)
     trusted = _trusted(fits, prior, board, pitch, detection.sign)
     rejected = prior.dot[np.isin(prior.dot, detection.dot) & ~trusted]
     measured = {int(dot): fit for dot, fit, sure in zip(prior.dot, fits, trusted, strict=True) if sure and fit}
-    return _sample(measured, rejected, model, pixel_model.response_share)
+    return _sample(measured, rejected, model, pixels.response_share)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -28,17 +28,6 @@ def label_by_gaussian(signals: Signals, decoder: LightFieldDecoder, board: DotBo
 
     On a square array this is the three-point estimator of each axis. On a hexagonal array the paraboloid goes through
     all six neighbours.
-
-    Parameters
-    ----------
-    signals : Signals
-        Images of the planes.
-    decoder : LightFieldDecoder
-        The camera's decoder.
-    board : DotBoard
-        The board.
-    detection : Detection
-        From `find_dots`.
     """
     lattice = decoder.lattice
     slope = detection.pose.rays(board.of_dots_mm(detection.dot))[1]
