@@ -49,7 +49,7 @@ def read_header(path: Path, label: str) -> Header | None:
     Returns
     -------
     Header or None
-        None for a DaVis image, which has no header that can be read alone. Such a file exists, is not empty, and the
+        None for a DaVis image, which has no header that can be read separately. Such a file exists, is not empty, and the
         library that decodes it is installed.
 
     Raises

@@ -37,7 +37,7 @@ def checked_volume(volume: xr.DataArray | np.ndarray, grid: Grid | None, name: s
         raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
     if isinstance(volume, xr.DataArray):
         if grid is not None:
-            raise ValueError("grid: expected no value with a DataArray, whose coordinates tell it. Leave it out.")
+            raise ValueError("grid: expected no value with a DataArray, whose coordinates define it. Leave it out.")
         return values, _grid_of(volume, name)
     if grid is None or values.shape != tuple(grid.shape):
         fault = "no grid" if grid is None else f"a grid of shape {grid.shape}"

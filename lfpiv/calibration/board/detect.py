@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv.calibration.board.dots import Detection, DotBoard
+from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard
 from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated, sites_found
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import BIN_PITCHES, Blobs, CameraPose, Rectified, Rectifier
@@ -23,9 +23,6 @@ from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
-
-FEWEST_DOTS = 4
-"""Dots that make a board."""
 
 _FIRST_PLANES = 3  # planes that are searched for the lattice with the nominal pose
 _FEWEST_SHARE = 0.25  # least share of the dots in the field on the first lattice
@@ -37,7 +34,7 @@ _JUDGED_DOTS = 6  # least number of blobs of a plane that distinguish a board fr
 _JUDGED_BINS = 3  # least search radius that distinguishes them [elements]
 _CHANCE = 0.2  # largest scatter of a board's dots about their sites [search radius],
 _CHANCE_PITCHES = 0.5  # or [microlens pitch], because a focused dot is located to a lens only
-_WHOLLY_SEEN = 0.9  # least share of a site's light on lit pixels for an empty site to mean something
+_FULLY_SEEN = 0.9  # least share of a site's light on lit pixels for an empty site to mean something
 _LIT_GAIN = 0.3  # least gain of a lit pixel; less is a vignetted corner or a dead lens
 
 
@@ -210,7 +207,7 @@ class _PlaneDots:
 def _find_in_planes(
     signals: Signals, rectify: Rectifier, board: DotBoard, pose: CameraPose, sign: int, optics: Optics
 ) -> tuple[list[_PlaneDots], CameraPose]:
-    """Find the dots of every plane near where the pose expects them; fit the pose anew after each plane."""
+    """Find the dots of every plane near where the pose expects them; fit the pose again after each plane."""
     seen: dict[int, _PlaneDots] = {}
     for plane in _order(board):
         z_mm, sites = board.planes_mm[plane], board.points_mm(plane, MARGIN)
@@ -276,7 +273,7 @@ def _shift_to_edges(
     """Return the columns and rows by which the names must move to match the board's edges in view."""
     found = sites_found(sites, board.dots)
     points = [board.points_mm(plane, MARGIN) for plane in range(len(sites))]
-    in_view = np.stack([_lit_share(pose, at, decoder) >= _WHOLLY_SEEN for at in points]).reshape(found.shape)
+    in_view = np.stack([_lit_share(pose, at, decoder) >= _FULLY_SEEN for at in points]).reshape(found.shape)
     extents = find_extents(found, in_view, board.dots)
     if extents is None:
         return 0, 0

@@ -25,7 +25,7 @@ _FEWEST_SHARE, _ENOUGH = 0.5, 60  # a dot must also light this share of a microi
 _FIT_COVERAGE = 0.9  # least share of a fitted pixel inside its own microimage
 _BESIDE_COVERAGE = 0.01  # largest share of a fitted pixel inside the next microimage
 _SEEN_SHARE = 0.05  # least share of a pixel's rays from the dot for the pixel to see the dot
-_TABLE_AGE = 0.02  # F is tabulated anew when the pixels' images change by this share of a lens
+_TABLE_AGE = 0.02  # F is tabulated again when the pixels' images change by this share of a lens
 _ROBUST_SIGMA = 4.0  # residuals beyond this count linearly [standard deviations]
 _MODEL_ERROR = 0.01  # share of the light that white image and dot shape leave unexplained
 _ITERATIONS = 25
@@ -47,7 +47,7 @@ class BoardPixels:
     decoder: LightFieldDecoder
     """Lens and pupil point of each pixel."""
     usable: np.ndarray
-    """Pixels wholly inside one microimage and free of the light of the next, shape (rows, columns), bool."""
+    """Pixels inside one microimage and free of the light of the next, shape (rows, columns), bool."""
     response_share: float
     """Share of the white image's scatter from pixel to pixel that is pixel response."""
     counts_per_photon: float
@@ -231,7 +231,7 @@ class _Problem:
         return _State(theta, linear, share, growth, along, misfit)
 
     def _linear_start(self, share: np.ndarray) -> np.ndarray:
-        """Find base and amplitude by weighted least squares; the amplitude keeps its sign."""
+        """Find base and amplitude by weighted least squares; the amplitude has the sign of the dots."""
         weight = 1 / (self.noise_variance + self.counts_per_photon * np.maximum(self.signal, 0))
         design = self.response[:, None] * np.stack([np.ones_like(share), share], 1)
         normal = design.T @ (design * weight[:, None]) + 1e-9 * np.eye(2)

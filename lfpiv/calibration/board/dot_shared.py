@@ -1,7 +1,7 @@
 """Parameters of one camera that its dots share: diameter, blur and bend; and the noise and response of its pixels.
 
 The bend is the third-order part of the rays over the pupil, mostly spherical aberration. One dot measures the shared
-parameters poorly, all dots together measure them well. Each `DotFit` holds the Gauss-Newton equations of the shared
+parameters poorly, all dots measure them well. Each `DotFit` holds the Gauss-Newton equations of the shared
 parameters with the dot's own unknowns eliminated, so the sum of these equations over the dots is the joint fit of all.
 """
 

@@ -14,6 +14,9 @@ import numpy as np
 from lfpiv.calibration.board.pose import CameraPose
 from lfpiv.geometry.optics import Optics
 
+FEWEST_DOTS = 4
+"""Least number of dots that make a board."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DotBoard:

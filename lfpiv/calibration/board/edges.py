@@ -91,7 +91,7 @@ def find_extents(found: np.ndarray, in_view: np.ndarray, dots: tuple[int, int]) 
     found : ndarray of bool, shape (plane, rows + 2 MARGIN, columns + 2 MARGIN)
         Lattice sites where a dot was found.
     in_view : ndarray of bool, same shape
-        Sites whose dot would be wholly in view.
+        Sites whose dot would be fully in view.
     dots : (int, int)
         Stated columns and rows.
 

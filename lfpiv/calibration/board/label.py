@@ -14,11 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv.calibration.board.detect import FEWEST_DOTS
 from lfpiv.calibration.board.dot_fit import FEWEST_PIXELS, BoardPixels, DotFit, converged, fit_dots
 from lfpiv.calibration.board.dot_model import TERMS, LensIntegral, ray_terms, slope_of
 from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_pixels, estimate_shared, follow_bend
-from lfpiv.calibration.board.dots import Detection, DotBoard, Labels, expect_dots
+from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard, Labels, expect_dots
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
 from lfpiv.errors import InputError

@@ -1,6 +1,6 @@
 """Label the rays of the detected dots by Gaussian fits in sub-aperture views (section 3.1 (2) of the paper).
 
-These labels are biased towards the lens centres because a dot is hardly wider than a lens.
+These labels are biased towards the lens centres because a dot is about as wide as a lens.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from lfpiv.calibration.board.planes import Signals
 from lfpiv.geometry.optics import LensLattice, spread_over_pupil
 from lfpiv.lightfield.decoder import LightFieldDecoder
 
-_PUPIL_SHARE = 0.92  # views lie within this share of the pupil's radius, where pixels are wholly lit
+_PUPIL_SHARE = 0.92  # views lie within this share of the pupil's radius, where pixels are fully lit
 _NEIGHBOUR_PITCHES = 1.2  # lenses around a dot's brightest lens that a fit takes
 _CLIMBS = 3  # steps from the expected lens to the brightest one
 _BOARD_PERCENTILE = 75  # level of the board among the lenses around a dark dot

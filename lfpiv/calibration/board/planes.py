@@ -11,7 +11,7 @@ from lfpiv.errors import InputError
 from lfpiv.lightfield.decoder import LightFieldDecoder
 
 HELD_BYTES = 16
-"""Memory that the images of all planes may take together, per pixel of the sensor [byte]."""
+"""Memory for the images of all planes, per pixel of the sensor [byte]."""
 
 _SATURATED_PIXELS = 10  # least number of pixels at the highest value that count as saturated
 _SATURATED_SIGMA = 20.0  # their least height above the dark level [standard deviations of the noise]
@@ -84,7 +84,7 @@ class Signals:
     def of_plane(self, plane: int) -> np.ndarray:
         """Return the image of a plane above its dark level [counts], nan where saturated, float32.
 
-        The raw image tells which pixels are saturated, because the dark image scatters them.
+        Saturated pixels are found in the raw image; after the dark image is subtracted their values differ.
         """
         image = np.asarray(self.images[plane])
         level, sigma = self.levels[plane]
