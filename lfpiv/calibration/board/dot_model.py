@@ -165,7 +165,7 @@ class LensIntegral:
 
     def _pixel(self, theta: np.ndarray) -> np.ndarray:
         """Return the sides of a pixel's image on the array, as columns [mm], mean square over the pupil."""
-        inverse = self._inverse(_spread_terms(), theta)
+        inverse = self._inverse(_spread_terms(self.optics.pupil_radius_mm), theta)
         sides = np.moveaxis(inverse, -1, 0) - np.eye(2)  # (I - K)^-1 K
         spread, axes = np.linalg.eigh(np.einsum("nab,ncb->ac", sides, sides) / len(sides))
         size = axes * np.sqrt(np.maximum(spread, 0)) @ axes.T
@@ -284,10 +284,10 @@ def _derivative(axis: int) -> np.ndarray:
 _PER_U, _PER_V = _derivative(0), _derivative(1)
 
 
-@functools.lru_cache(maxsize=1)
-def _spread_terms() -> np.ndarray:
+@functools.lru_cache(maxsize=8)
+def _spread_terms(pupil_radius_mm: float) -> np.ndarray:
     """Return `ray_terms` at points spread evenly over the pupil."""
-    return ray_terms(spread_over_pupil(1.0), 1.0)
+    return ray_terms(spread_over_pupil(pupil_radius_mm), pupil_radius_mm)
 
 
 @functools.lru_cache(maxsize=32)
