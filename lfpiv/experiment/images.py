@@ -49,8 +49,8 @@ def read_header(path: Path, label: str) -> Header | None:
     Returns
     -------
     Header or None
-        None for a DaVis image, which has no header that can be read separately. Such a file exists, is not empty, and the
-        library that decodes it is installed.
+        None for a DaVis image, which has no header that can be read separately. Then only the file's existence, its
+        length and the library that decodes it are checked.
 
     Raises
     ------

@@ -39,7 +39,7 @@ class Smart(Table):
     normalisation: Literal["column", "paper"] = "column"
     """Exponent of Eq. 5: divided by the voxel's column sum, or as printed with weights scaled to a maximum of 1."""
     accelerate: Flag = True
-    """Whether Nesterov's momentum in the volume's logarithm reaches the same limit in fewer iterations."""
+    """Whether Nesterov's momentum in the volume's logarithm reduces the number of iterations to the same limit."""
     smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
     """Standard deviation of a Gaussian smoothing of the volume after each iteration [voxel]; 0 switches it off."""
     floor_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1

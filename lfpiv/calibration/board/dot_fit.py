@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -48,6 +48,8 @@ class BoardPixels:
     """Lens and pupil point of each pixel."""
     usable: np.ndarray
     """Pixels inside one microimage and free of the light of the next, shape (rows, columns), bool."""
+    response: np.ndarray
+    """Counts of the white image above the dark level, shape (rows, columns)."""
     response_share: float
     """Share of the white image's scatter from pixel to pixel that is pixel response."""
     counts_per_photon: float
@@ -65,15 +67,20 @@ class BoardPixels:
             sign=sign,
             decoder=decoder,
             usable=(own > _FIT_COVERAGE) & (beside < _BESIDE_COVERAGE) & (decoder.gain > 0),
+            response=_response(decoder, 0.0),
             response_share=0.0,
             counts_per_photon=decoder.counts_per_photon,
         )
 
-    def response(self) -> np.ndarray:
-        """Return the counts of the white image above the dark level, shape (rows, columns)."""
-        decoder = self.decoder
-        response: np.ndarray = decoder.coverage * decoder.shrunk_gain(self.response_share)
-        return response * np.float32(decoder.white_counts)
+    def measured(self, response_share: float, counts_per_photon: float) -> BoardPixels:
+        """Return the same pixels with measured response and shot noise."""
+        response = _response(self.decoder, response_share)
+        return replace(self, response=response, response_share=response_share, counts_per_photon=counts_per_photon)
+
+
+def _response(decoder: LightFieldDecoder, share: float) -> np.ndarray:
+    response: np.ndarray = decoder.coverage * decoder.shrunk_gain(share) * np.float32(decoder.white_counts)
+    return response
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,9 +134,8 @@ def fit_dots(
     margin_mm : float
         Distance beyond the expected light that is fitted too [mm].
     """
-    response = pixels.response()
     return [
-        _fit_dot(_Problem.of_dot(model, pixels, dot, signal, response, margin_mm))
+        _fit_dot(_Problem.of_dot(model, pixels, dot, signal, margin_mm))
         for plane, dots in itertools.groupby(expected, lambda dot: dot.plane)
         for signal in [pixels.signals.of_plane(plane)]
         for dot in dots
@@ -192,7 +198,6 @@ class _Problem:
         pixels: BoardPixels,
         dot: ExpectedDot,
         signal: np.ndarray,
-        response: np.ndarray,
         margin_mm: float,
     ) -> _Problem:
         where = _pixels_around(model, pixels, dot, margin_mm)
@@ -208,7 +213,7 @@ class _Problem:
             counts_per_photon=pixels.counts_per_photon,
             pixel=where,
             signal=signal[at].astype(float),
-            response=response[at].astype(float),
+            response=pixels.response[at].astype(float),
             pupil_mm=pupil,
             lens_mm=decoder.lattice.centres_mm(decoder.lens_index[at]),
             terms=ray_terms(pupil, model.optics.pupil_radius_mm),

@@ -178,12 +178,11 @@ def estimate_pixels(pixels: BoardPixels, fits: Sequence[DotFit | None]) -> Board
         misses.append(fit.misfit[chosen][use])
         deviations.append((decoder.gain[at] / np.maximum(smooth, 1e-3) - 1)[use])
     if not lights:
-        return replace(pixels, response_share=1.0)
+        return pixels.measured(1.0, decoder.counts_per_photon)
     deviation, expected, miss = (np.concatenate(part).astype(float) for part in (deviations, lights, misses))
     relative = miss / expected
     limit = _CALM_SIGMA * _NORMAL_MAD * np.median(np.abs(relative))
     calm = (np.abs(relative) < limit) & (np.abs(deviation) < _CALM_DEVIATION)
     share = float(np.clip((deviation * relative)[calm].sum() / max((deviation**2)[calm].sum(), 1e-12), 0, 1))
     left = (miss - share * deviation * expected) ** 2 / expected
-    photon = max(float(np.median(left)) * _NORMAL_MAD**2, 1e-3)
-    return replace(pixels, response_share=share, counts_per_photon=photon)
+    return pixels.measured(share, max(float(np.median(left)) * _NORMAL_MAD**2, 1e-3))
