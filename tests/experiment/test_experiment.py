@@ -65,7 +65,7 @@ def test_a_byte_order_mark_is_no_part_of_the_file(tiny_experiment):
 
 @pytest.mark.parametrize("centre", [(1.2, 0.0, 0.0), (0.0, -1.2, 0.0), (0.0, 0.0, 3.0)])
 def test_a_volume_that_a_misaligned_camera_may_see_is_accepted(tiny_experiment, centre):
-    """Two fields of view aside is odd, but nothing that the nominal rig could be sure of."""
+    """Two fields of view beside the axis are accepted, because the nominal rig may be wrong by as much."""
     edit(tiny_experiment, "centre_mm = [0.0, 0.0, 0.1]", f"centre_mm = {list(centre)}")
     assert open_experiment(tiny_experiment).grid.size == 8 * 12 * 16
 
@@ -160,13 +160,13 @@ def test_text_of_another_encoding_is_named(tiny_experiment, encoding, words):
     if words:
         with pytest.raises(InputError, match=rf"experiment\.toml.*UTF-8.*{words}.*Save it as UTF-8"):
             open_experiment(tiny_experiment)
-    else:  # the mark and the line ends of Windows do no harm
+    else:  # the byte order mark and line ends of Windows are accepted
         assert open_experiment(tiny_experiment).name == "tiny"
 
 
 @pytest.mark.parametrize("model", [ExperimentTable, Smart, Correlation, Network, Compute])
 def test_every_misspelt_key_finds_its_own(tiny_experiment, model):
-    """A key with its last letter lost is answered with the right one, in every table."""
+    """The message suggests the right key for a key without its last letter, in every table."""
     for key in model.model_fields:
         text = {Smart: "[smart]", Correlation: "[correlation]", Network: "[network]", Compute: "[compute]"}.get(
             model, ""
@@ -257,7 +257,7 @@ def test_bad_image_is_named_with_what_was_expected(tiny_experiment, case):
 @pytest.mark.parametrize("compression", [None, "zlib", "lzw"])
 @pytest.mark.parametrize("suffix", [".tif", ".png"])
 def test_a_file_cut_anywhere_is_refused(tmp_path, suffix, compression):
-    """Cut after any of its bytes, an image is refused already by its header or at the latest when decoded."""
+    """An image cut after any of its bytes is refused by its header or when decoded."""
     pixels = np.random.default_rng(1).integers(0, 4096, (40, 30), dtype=np.uint16)
     path, part = tmp_path / f"whole{suffix}", tmp_path / f"part{suffix}"
     if suffix == ".png":
