@@ -16,7 +16,7 @@ from support.ideal_rig import rotation
 import lfpiv
 from lfpiv import warn
 from lfpiv.calibration import checks, coverage
-from lfpiv.calibration.board.board import HELD_BYTES, Planes, agreeing_dots
+from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.coverage import warn_outside
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.geometry.optics import LensLattice, Optics
@@ -321,22 +321,6 @@ def test_small_microimages_leave_enough_pixels(rig, tmp_path):
     points, pupil = rays_in([-1, -1, -0.8], [1, 1, 0.8], radius=6.25)
     miss = np.linalg.norm(camera.map(points, pupil) - true_mapping(spec)(points, pupil), axis=1)
     assert miss.mean() / 0.1 <= MAPPING_AIM_PITCH
-
-
-def test_board_images_are_held_as_far_as_memory_allows():
-    rng, asked = np.random.default_rng(0), []
-    whole = rng.integers(0, 4096, (12, 6, 7)).astype(np.float32)
-    whole[1] += 0.5  # no whole counts
-
-    def read(plane):
-        asked.append(plane)
-        return whole[plane]
-
-    planes = Planes(read, len(whole))
-    for _ in range(3):
-        assert all(np.array_equal(image, true) for image, true in zip(planes, whole, strict=True))
-    held = HELD_BYTES // 2
-    assert [asked.count(plane) for plane in range(12)] == [1, 3, *[1] * (held - 1), *[3] * (11 - held)]
 
 
 def test_particle_images_in_place_of_boards_are_refused(rig, tmp_path):
