@@ -13,6 +13,7 @@ import warp as wp
 from scipy import ndimage
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.native import read_native
 
 wp.set_module_options(
     {
@@ -28,46 +29,7 @@ MARGIN = 6
 """Voxels of zeros around a volume before the spline's prefilter: samples fall smoothly to 0 outside the volume."""
 
 
-_SAMPLE = """
-#if defined(__CUDA_ARCH__)
-    struct V {
-        float x[4];
-        __device__ V operator*(const V& o) const { V r; for (int k = 0; k < 4; ++k) r.x[k] = x[k] * o.x[k]; return r; }
-        __device__ V operator+(const V& o) const { V r; for (int k = 0; k < 4; ++k) r.x[k] = x[k] + o.x[k]; return r; }
-        __device__ float operator[](int k) const { return x[k]; }
-    };
-    auto load = [](const float* p) { return V{p[0], p[1], p[2], p[3]}; };
-#else
-    typedef float V __attribute__((vector_size(16)));
-    typedef float U __attribute__((vector_size(16), aligned(4)));
-    auto load = [](const float* p) { return (V)*(const U*)p; };
-#endif
-    auto all = [](float v) { return V{v, v, v, v}; };
-    // four neighbouring B-splines at fraction t behind the second one's node, as polynomials in t
-    const V c0 = {1.0f / 6, 4.0f / 6, 1.0f / 6, 0}, c1 = {-0.5f, 0, 0.5f, 0}, c2 = {0.5f, -1, 0.5f, 0};
-    const V c3 = {-1.0f / 6, 0.5f, -0.5f, 1.0f / 6};
-    auto place = [&](float position, int count, V& weight) {  // first of four coefficients, kept inside the array
-        int cell = (int)floorf(position) - 1;
-        cell = cell < 0 ? 0 : cell > count - 4 ? count - 4 : cell;
-        float t = position - (float)(cell + 1);
-        t = t < 0.0f ? 0.0f : t > 1.0f ? 1.0f : t;
-        weight = c0 + all(t) * (c1 + all(t) * (c2 + all(t) * c3));
-        return cell;
-    };
-    V wz, wy, wx;
-    const int cz = place(z, shape[0], wz), cy = place(y, shape[1], wy), cx = place(x, shape[2], wx);
-    const int pitch = shape[2];
-    const float* from = coefficients.data + ((int64_t)cz * shape[1] + cy) * pitch + cx;
-    V total = all(0.0f);
-    #pragma unroll
-    for (int i = 0; i < 4; ++i, from += (int64_t)shape[1] * pitch) {
-        const V near = all(wy[0]) * load(from) + all(wy[1]) * load(from + pitch);
-        const V far = all(wy[2]) * load(from + 2 * pitch) + all(wy[3]) * load(from + 3 * pitch);
-        total = total + all(wz[i]) * (near + far);
-    }
-    total = total * wx;
-    return (total[0] + total[1]) + (total[2] + total[3]);
-"""
+_SAMPLE = read_native("deform_sample.inc")
 
 
 @wp.func_native(_SAMPLE)

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.native import read_native
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
@@ -48,102 +49,7 @@ class Prediction:
     """Number of neighbours, shape (vector,)."""
 
 
-_PREDICT = """
-#if defined(__CUDA_ARCH__)
-    typedef float V;
-    typedef int M;
-    const int lanes = 1;
-    auto put = [](auto& v, int k, auto value) { v = value; };
-    auto get = [](auto v, int k) { return v; };
-#else
-    typedef float V __attribute__((vector_size(64)));
-    typedef int M __attribute__((vector_size(64)));
-    const int lanes = 16;
-    auto put = [](auto& v, int k, auto value) { v[k] = value; };
-    auto get = [](auto v, int k) { return v[k]; };
-#endif
-    const int nz = shape[0], ny = shape[1], nx = shape[2], some = count < lanes ? count : lanes;
-    const V none = V{} + INFINITY;  // stands for a missing value, behind all others
-    auto order = [](V& a, V& b) { const V low = a < b ? a : b; b = a < b ? b : a; a = low; };
-    auto sort26 = [&](V* v) { SORT26 };
-    auto sort18 = [&](V* v) { SORT18 };
-    auto middle = [](const V* v, int most, M number) {  // median of the first `number` of sorted values
-        V low = v[0], high = v[0];
-        for (int i = 1; i <= most / 2; ++i) {
-            low = (number - 1) / 2 == i ? v[i] : low;
-            high = number / 2 == i ? v[i] : high;
-        }
-        return 0.5f * (low + high);
-    };
-    V cube[27];
-    M present[27], number = M{};
-    int64_t at[lanes][27];
-    for (int i = 0; i < 27; ++i) present[i] = M{};
-    for (int k = 0; k < some; ++k) {
-        const int point = points.data[first + k], z = point / (ny * nx), y = point / nx % ny, x = point % nx;
-        for (int i = 0; i < 27; ++i) {
-            const int pz = z + i / 9 - 1, py = y + i / 3 % 3 - 1, px = x + i % 3 - 1;
-            const bool inside = pz >= 0 && py >= 0 && px >= 0 && pz < nz && py < ny && px < nx;
-            at[k][i] = inside ? ((int64_t)pz * ny + py) * nx + px : 0;
-            if (i != 13 && inside && keep.data[at[k][i]]) put(present[i], k, -1);
-        }
-    }
-    for (int i = 0; i < 27; ++i) number = number + (present[i] != 0 ? M{} + 1 : M{});
-    for (int component = 0; component < 3; ++component) {
-        for (int i = 0; i < 27; ++i) {
-            V value = V{};
-            for (int k = 0; k < some; ++k) put(value, k, field.data[3 * at[k][i] + component]);
-            cube[i] = present[i] != 0 ? value : none;
-        }
-        V v[26], result[6];
-        auto robust = [&](V* out) {  // median of v, and the median distance from it
-            sort26(v);
-            out[0] = middle(v, 26, number);
-            for (int i = 0; i < 26; ++i) {
-                const V distance = v[i] - out[0];
-                v[i] = distance < 0.0f ? -distance : distance;
-            }
-            sort26(v);
-            out[1] = middle(v, 26, number);
-        };
-        for (int i = 0; i < 26; ++i) v[i] = cube[i < 13 ? i : i + 1];
-        robust(result);
-        V slope[3];
-        for (int axis = 0; axis < 3; ++axis) {  // median difference of adjacent neighbours, 0 without any
-            const int stride = axis == 0 ? 9 : axis == 1 ? 3 : 1;
-            M pairs = M{};
-            int n = 0;
-            for (int i = 0; i < 27 - stride; ++i) {
-                if (i / stride % 3 == 2) continue;
-                const M both = (present[i] != 0) & (present[i + stride] != 0);
-                v[n++] = both != 0 ? cube[i + stride] - cube[i] : none;
-                pairs = pairs + (both != 0 ? M{} + 1 : M{});
-            }
-            sort18(v);
-            slope[axis] = pairs > 0 ? middle(v, 18, pairs) : V{};
-        }
-        result[4] = none;
-        result[5] = -none;
-        for (int i = 0, n = 0; i < 27; ++i) {
-            if (i == 13) continue;
-            const V value = cube[i];
-            const V away = slope[0] * (float)(i / 9 - 1) + slope[1] * (float)(i / 3 % 3 - 1)
-                + slope[2] * (float)(i % 3 - 1);
-            result[4] = value < result[4] ? value : result[4];
-            result[5] = (present[i] != 0) & (value > result[5]) ? value : result[5];
-            v[n++] = present[i] != 0 ? value - away : none;
-        }
-        robust(result + 2);
-        for (int j = 0; j < 6; ++j) for (int k = 0; k < some; ++k)
-            prediction_out.data[((int64_t)(first + k) * 3 + component) * 6 + j] = get(result[j], k);
-    }
-    for (int k = 0; k < some; ++k) {
-        const int neighbours = get(number, k);
-        count_out.data[first + k] = neighbours;
-        if (neighbours == 0)
-            for (int j = 0; j < 18; ++j) prediction_out.data[(int64_t)(first + k) * 18 + j] = NAN;
-    }
-""".replace("SORT26", _sort(26)).replace("SORT18", _sort(18))
+_PREDICT = read_native("neighbours_predict.inc").replace("SORT26", _sort(26)).replace("SORT18", _sort(18))
 
 
 @wp.func_native(_PREDICT)
