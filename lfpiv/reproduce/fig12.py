@@ -13,7 +13,7 @@ from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.metrics.particles import PEAK_SHARE
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import Progress, page, plots, rigs, store
-from lfpiv.velocity.cross_correlation import emphasise, missing_smoothing
+from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.weights.operator import Weights
 
 TITLE = "Fig. 12: reconstructed particles; Fig. 11: at 0.1 particles per microlens"
@@ -200,7 +200,7 @@ def _judge(
     return {
         "q": metrics.reconstruction_quality(result, truth),
         "q_as_correlated": metrics.reconstruction_quality(
-            result.copy(data=emphasise(result.values, missing_smoothing(CORRELATED_VOXEL, result), 1.0)), truth
+            result.copy(data=preprocess(result.values, missing_smoothing(CORRELATED_VOXEL, result), 1.0)), truth
         ),
         "q_zero_mean": metrics.reconstruction_quality(result, truth, zero_mean=True),
         "accuracy": quality.accuracy,
