@@ -5,11 +5,10 @@ import re
 
 import numpy as np
 import pytest
-from calibration.test_cameras import MAPPING_PITCH
-from calibration.test_cameras import SCENE as CALIBRATION_SCENE
 from scipy.optimize import fsolve
 from scipy.stats import qmc
-from simulation.test_simulator import SCENE, camera, land, lens_gain, points, relative_difference
+from support.calibration_scene import CALIBRATION_SCENE, MAPPING_PITCH
+from support.simulated_cameras import SMALL_SCENE, camera, land, lens_gain, points, relative_difference
 
 import lfpiv
 from lfpiv.errors import InputError
@@ -180,7 +179,7 @@ def test_aberrations_are_the_gradient_of_one_wave_aberration():
     assert np.abs(slopes[0][:, 1] - slopes[1][:, 0]).max() < 1e-10  # differences of 1e-15 mm over 1e-4 mm
 
 
-def sources_twin(scene_camera, eye, centres, counts, extent, rays, rng):
+def sources_twin(scene_camera, renderer, centres, counts, extent, rays, rng):
     """Twin of `render_sources`: float64 true rays, landed on the sensor by the slow twin of the ideal renderer."""
     image, mapping = 0, true_mapping(scene_camera)
     angles = rng.uniform(0, 2 * np.pi, (len(centres), 2))
@@ -189,18 +188,18 @@ def sources_twin(scene_camera, eye, centres, counts, extent, rays, rng):
         unit = rays[:, 2:].astype(float)
         unit[:, :2] = unit[:, :2] @ [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
         weight = np.full(len(rays), count / len(rays))
-        image = image + land(scene_camera, eye, mapping(centre + extent * unit, pupil), pupil, weight)
+        image = image + land(scene_camera, renderer, mapping(centre + extent * unit, pupil), pupil, weight)
     return image
 
 
 @pytest.mark.parametrize("name", RIGS)
 def test_sources_seen_through_real_optics_equal_their_twin(device, name):
     scene_camera = rig(name)
-    eye = render_camera(scene_camera)
+    renderer = render_camera(scene_camera)
     centres, counts = points(10), np.full(10, 1e5)
     rays = render.ray_table(4096, "ball", 0)
-    found = render.render_sources(eye, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
-    expected = sources_twin(scene_camera, eye, centres, counts, 0.03, rays, np.random.default_rng(2))
+    found = render.render_sources(renderer, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
+    expected = sources_twin(scene_camera, renderer, centres, counts, 0.03, rays, np.random.default_rng(2))
     assert expected.sum() > 0.1 * counts.sum()
     assert relative_difference(found, expected) < MOVED_RAYS
     plain = render_camera(camera("ideal", nominal_angle_deg=scene_camera.nominal_angle_deg))
@@ -214,7 +213,7 @@ def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
     weak = {key: 0.05 for key in LENS if key.endswith("pitch")} | {"spherical_pitch": 0.6}  # the field is tiny
     changes = {"sensor_width_px": 40, "sensor_height_px": 30, "true_offset_mm": (0, 0, 0.15)}
     scene_camera = rig(name, **changes | ({"aberrations": weak} if name == "all" else {}))
-    optics, lattice, eye = scene_camera.optics, scene_camera.lattice, render_camera(scene_camera)
+    optics, lattice, renderer = scene_camera.optics, scene_camera.lattice, render_camera(scene_camera)
     board, samples = {"dots": (3, 2), "spacing_mm": 0.12, "dot_diameter_mm": 0.08}, 64
     table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(3)).random(samples) - 0.5
     cell = table[:, 2:] @ lattice.basis_mm
@@ -232,15 +231,15 @@ def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
             if not lit.any():
                 continue
             start, direction = real_optics.object_lines(
-                array, pupil, optics.object_distance_mm, optics.image_distance_mm, eye.plates, eye.aberrations
+                array, pupil, optics.object_distance_mm, optics.image_distance_mm, renderer.plates, renderer.aberrations
             )
-            start, direction = start @ eye.rotation + eye.offset_mm, direction @ eye.rotation
+            start, direction = start @ renderer.rotation + renderer.offset_mm, direction @ renderer.rotation
             x, y, _ = (start + ((0.15 - start[:, 2]) / direction[:, 2])[:, None] * direction).T
             off = np.hypot(
                 *(np.abs(a[:, None] - (np.arange(n) - (n - 1) / 2) * 0.12).min(1) for a, n in ((x, 3), (y, 2)))
             )
-            expected[row, column] += (lit & (off < 0.04)).mean() * lens_gain(eye, index[None])[0]
-    found = collect.render_board(eye, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
+            expected[row, column] += (lit & (off < 0.04)).mean() * lens_gain(renderer, index[None])[0]
+    found = collect.render_board(renderer, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
     assert expected.max() > 0.3
     assert np.abs(found - expected).max() <= EDGE_SAMPLES / samples
     assert (np.abs(found - expected) < 1e-6).mean() > 0.95
@@ -250,12 +249,22 @@ def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
 def test_dots_traced_forward_and_backward_agree(device, name):
     """A dot's light from the area of its image, sent forward, is what pixels collect that look back at the dot."""
     scene_camera = rig(name, true_offset_mm=(0, 0, 0.1))
-    eye, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
-    lenses = np.pi * 0.05**2 * image_area(scene_camera, dots) / abs(np.linalg.det(eye.basis_mm))
+    renderer, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
+    lenses = np.pi * 0.05**2 * image_area(scene_camera, dots) / abs(np.linalg.det(renderer.basis_mm))
     rays = render.ray_table(1 << 17, "disc", 0)
-    forward = render.render_sources(eye, dots, lenses * eye.microimage_px, 0.05, rays, rng=np.random.default_rng(0))
+    forward = render.render_sources(
+        renderer, dots, lenses * renderer.microimage_px, 0.05, rays, rng=np.random.default_rng(0)
+    )
     backward = collect.render_board(
-        eye, 0.1, dots=(2, 1), spacing_mm=0.2, dot_diameter_mm=0.1, dot_light=1, board_light=0, samples=1024, seed=0
+        renderer,
+        0.1,
+        dots=(2, 1),
+        spacing_mm=0.2,
+        dot_diameter_mm=0.1,
+        dot_light=1,
+        board_light=0,
+        samples=1024,
+        seed=0,
     )
     uneven = 0.03  # a tilted radiant board favours one side of the pupil, and aberrations stretch the image unevenly
     assert forward.sum() == pytest.approx(backward.sum(), rel=uneven)
@@ -281,7 +290,10 @@ coma_pitch = 0.3
 def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_path):
     own = "[camera.aberrations]\nspherical_pitch = 0.2\n[[camera.window]]\nindex = 1.4\nthickness_mm = 2.0\n"
     own += "point_mm = [-20.0, 0.0, 20.0]\nnormal = [-1.0, 0.0, 1.0]\n"
-    text = SCENE.replace("dark_image = true\n", "dark_image = true\n" + own).replace("pairs = 2", "pairs = 1") + OPTICS
+    text = (
+        SMALL_SCENE.replace("dark_image = true\n", "dark_image = true\n" + own).replace("pairs = 2", "pairs = 1")
+        + OPTICS
+    )
     (tmp_path / "scene.toml").write_text(text)
     scene = open_scene(tmp_path / "scene.toml")
     one, two = scene.camera
@@ -312,7 +324,7 @@ def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_pa
 )
 def test_impossible_optics_are_refused(tmp_path, old, new, said):
     assert old in OPTICS
-    (tmp_path / "scene.toml").write_text(SCENE + OPTICS.replace(old, new))
+    (tmp_path / "scene.toml").write_text(SMALL_SCENE + OPTICS.replace(old, new))
     with pytest.raises(InputError) as error:
         simulate(tmp_path / "scene.toml", tmp_path / "out")
     assert said in str(error.value) and "\n" not in str(error.value)
