@@ -1,4 +1,4 @@
-"""What a bug report needs: versions, devices, memory, and a self-test of the kernels on this machine."""
+"""`lfpiv doctor`: versions, devices and memory for a bug report, and a self-test of the kernels on this machine."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from lfpiv.version import versions
 from lfpiv_kernels import runtime
 
 TOLERANCE_MAPPING = 1e-4
-"""Single precision through sums of 20 terms of size 1, with room for a device's own exp."""
+"""Largest error of the network on the device: rounding of sums of 20 terms of size 1, and of the device's exp."""
 
 TOLERANCE_SHIFT_VOXEL = 0.05
-"""The self-test's blobs are noise-free; a correct sub-voxel peak is well within this."""
+"""Largest error of the displacement in the self-test [voxel]; its particles are noise-free."""
 
 SHIFT_VOXEL = (0.7, -0.4, 1.3)
 """Displacement (z, y, x) of the self-test [voxel]."""
 
 
 def examine(device: str = "auto") -> Iterator[tuple[str, str, bool]]:
-    """Yield (item, finding, good) one after the other; the last items test the kernels and take some seconds.
+    """Yield (item, finding, good) one by one. The last items test the kernels and take some seconds.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def examine(device: str = "auto") -> Iterator[tuple[str, str, bool]]:
         start = time.perf_counter()
         try:
             finding, good = test()
-        except Exception as error:  # whatever breaks a kernel is the finding
+        except Exception as error:  # any failure of a kernel is the finding
             finding, good = f"{type(error).__name__}: {error}", False
         yield name, f"{finding}, {time.perf_counter() - start:.1f} s with compilation", good
 
@@ -66,6 +66,7 @@ def _cuda() -> Iterator[tuple[str, str, bool]]:
 
 
 def _blobs(shape: tuple[int, int, int], centres: np.ndarray) -> np.ndarray:
+    """Return a volume of Gaussian particles with a standard deviation of 1 voxel."""
     axes = np.ogrid[tuple(slice(n) for n in shape)]
     volume = np.zeros(shape, np.float32)
     for centre in centres:
@@ -74,7 +75,7 @@ def _blobs(shape: tuple[int, int, int], centres: np.ndarray) -> np.ndarray:
 
 
 def _test_mapping() -> tuple[str, bool]:
-    """Evaluate a random network on the device and in NumPy."""
+    """Compare a random network on the device with NumPy."""
     from lfpiv.calibration.network import Network
     from lfpiv_kernels.rays import mapping
 

@@ -7,7 +7,6 @@ windows, and validates the peaks. Fields are displacements averaged over a windo
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -170,16 +169,17 @@ def correlate_passes(
     given = PassInput(windows=grids[0], centres=grids[0].centres, search=search, volumes=(first, second))
     result = _correlate_pass(given, seen if last == 0 else None, symmetric=last > 0)
     figures = [result.figures]
-    splines = [deform.spline_coefficients(volume) for volume in (first, second)] if last > 0 else []
-    for number, windows in enumerate(grids[1:], start=1):
-        given = _deform(splines, result, windows)
-        result = _correlate_pass(given, seen if number == last else None, symmetric=True)
-        figures.append(result.figures)
+    if last > 0:
+        splines = deform.spline_coefficients(first), deform.spline_coefficients(second)
+        for number, windows in enumerate(grids[1:], start=1):
+            given = _deform(splines, result, windows)
+            result = _correlate_pass(given, seen if number == last else None, symmetric=True)
+            figures.append(result.figures)
     log.debug("correlation passes: %s", figures)
     return result, tuple(figures)
 
 
-def _deform(splines: Sequence[np.ndarray], before: Pass, windows: Windows) -> PassInput:
+def _deform(splines: tuple[np.ndarray, np.ndarray], before: Pass, windows: Windows) -> PassInput:
     """Deform both volumes by the field of the pass before."""
     shape = triple(before.given.volumes[0].shape)
     predictor = Predictor.between(before.given.centres, before.next_guess, shape)

@@ -92,11 +92,11 @@ def test_bad_input_is_status_2_with_one_line_and_nothing_left(tiny_experiment, t
 
 
 def test_many_warnings_are_counted(capfd, tmp_path):
-    texts = [f"camera {number} sleeps" for number in range(terminal.WARNINGS_TOLD + 1234)]
+    texts = [f"camera {number} sleeps" for number in range(terminal.LISTED_WARNINGS + 1234)]
     summary = {"calibration": {}, "pairs": [], "warnings": texts, "timings_s": {"total": 1.0}, "peak_memory_mib": 1.0}
-    terminal.tell_run(summary, tmp_path)
+    terminal.print_run(summary, tmp_path)
     said = capfd.readouterr().out.splitlines()
-    assert sum(line.startswith("warning: camera") for line in said) == terminal.WARNINGS_TOLD
+    assert sum(line.startswith("warning: camera") for line in said) == terminal.LISTED_WARNINGS
     assert f"1,234 more warnings are in {tmp_path / 'summary.json'}" in said
 
 
@@ -206,10 +206,10 @@ def test_the_shell_completes_commands():
     assert done.stdout.split() == ["reconstruct", "report", "reproduce"]
 
 
-def test_log_lines_tell_the_time_left(caplog, monkeypatch):
+def test_log_lines_state_the_remaining_time(caplog, monkeypatch):
     clock = iter([0.0, 5.0, 60.0, 120.0])
     monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
-    with terminal.Voice().speaking() as progress, caplog.at_level("INFO", "lfpiv"):
+    with terminal.Output().progress() as progress, caplog.at_level("INFO", "lfpiv"):
         for fraction in (0.0, 0.05, 0.25, 1.0):
             progress("step", fraction)
     assert [record.getMessage() for record in caplog.records] == ["step: 0 %", "step: 25 %, about 3 min left"]
