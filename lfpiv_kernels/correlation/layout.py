@@ -113,9 +113,9 @@ def _distances(reach: int, stride: int, phase_pitch: int, lane_pitch: int) -> wp
 
 
 def make_layers(plan: Plan, layers: range, ring: int, group: int) -> Layers:
-    """Describe some layers of blocks whose lanes are handled in groups."""
-    described = Layers()
-    described.block, described.stride, described.lags = (wp.vec3i(*of) for of in (plan.block, plan.stride, plan.lags))
-    described.begin, described.ring = layers.start, ring
-    described.groups, described.group, described.lanes = -(-plan.lanes // group), group, plan.lanes
-    return described
+    """Return the structure of some layers of blocks, with lanes in groups of `group`."""
+    blocks = Layers()
+    blocks.block, blocks.stride, blocks.lags = (wp.vec3i(*of) for of in (plan.block, plan.stride, plan.lags))
+    blocks.begin, blocks.ring = layers.start, ring
+    blocks.groups, blocks.group, blocks.lanes = -(-plan.lanes // group), group, plan.lanes
+    return blocks

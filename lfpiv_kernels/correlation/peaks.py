@@ -11,58 +11,26 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.correlation.blocks import VECTORS, is_gathered
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation.blocks import is_gathered
 from lfpiv_kernels.correlation.layout import Statistics
 from lfpiv_kernels.correlation.memory import Call, launch, new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan
 from lfpiv_kernels.correlation.sides import Side
-from lfpiv_kernels.native import read_native
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
-)
+wp.set_module_options(native.options("peaks.h", contract="fast"))
 
-_PEAKS = VECTORS + read_native("peaks_peaks.inc")
+SCORE_BYTES = 1 << 23
+"""Memory for the coefficients of a CPU task [byte]."""
 
 
-@wp.func_native(_PEAKS)
-def _measure_windows(
-    ahead: wp.array(dtype=float),
-    behind: wp.array(dtype=float),
-    symmetric: int,
-    first_mean: wp.array(dtype=float),
-    first_scale: wp.array(dtype=float),
-    second_mean: wp.array(dtype=float),
-    second_scale: wp.array(dtype=float),
-    first_y: wp.array(dtype=int),
-    first_x: wp.array(dtype=int),
-    second_y: wp.array(dtype=int),
-    second_x: wp.array(dtype=int),
-    first_pitch: int,
-    second_pitch: int,
-    first_centre: wp.vec3i,
-    stride: int,
-    count: int,
-    blocks: wp.vec3i,
-    lags: wp.vec3i,
-    layer: int,
-    lane: int,
-    lanes: int,
-    ring: int,
-    pitch: int,
-    sum_pitch: int,
-    scratch: wp.int64,
-    score_pitch: int,
-    out_lane: wp.int64,
-    out_pitch: wp.int64,
-    scratch_out: wp.array(dtype=float),
-    peak_out: wp.array(dtype=float),
-): ...
+@wp.struct
+class Sums:
+    """Sums of products of blocks, (layer, lag, lane)."""
+
+    ahead: wp.array(dtype=float)  # of blocks of the first volume
+    behind: wp.array(dtype=float)  # of blocks of the second volume: lags count backwards
+    symmetric: int  # 1: average both; 0: `behind` is not read
 
 
 @wp.struct
@@ -85,12 +53,23 @@ class Windows:
     peak_pitch: wp.int64  # elements per value of the peaks
 
 
+@wp.func_native("lfpiv::find_peaks(sums, first, second, windows, slot, task, scratch_out.data, peak_out.data);")
+def _find_peaks_of_group(
+    sums: Sums,
+    first: Statistics,
+    second: Statistics,
+    windows: Windows,
+    slot: int,
+    task: int,
+    scratch_out: wp.array(dtype=float),
+    peak_out: wp.array(dtype=float),
+): ...
+
+
 @wp.kernel
 def _find_peaks(
     # in
-    ahead: wp.array(dtype=float),  # sums of products of blocks of the first volume, (layer, lag, lane)
-    behind: wp.array(dtype=float),  # the same of blocks of the second volume: lags count backwards
-    symmetric: int,  # 1: average both; 0: `behind` is not read
+    sums: Sums,
     first: Statistics,  # of windows at every lag if symmetric, else at lag 0
     second: Statistics,  # at every lag
     windows: Windows,
@@ -100,49 +79,7 @@ def _find_peaks(
     scratch_out: wp.array(dtype=float),
     peak_out: wp.array(dtype=float),  # two displacements (z, y, x), best and rival coefficient; each (layer, lane)
 ):
-    index = begin + wp.tid()
-    lane = (index % windows.groups) * windows.group
-    layer = windows.begin + index // windows.groups
-    lanes = wp.min(windows.group, windows.lanes - lane)
-    scratch = wp.int64(slot) * windows.slot_pitch
-    if slot < 0:
-        scratch = wp.int64(index)
-    _measure_windows(
-        ahead,
-        behind,
-        symmetric,
-        first.mean,
-        first.scale,
-        second.mean,
-        second.scale,
-        first.along_y,
-        first.along_x,
-        second.along_y,
-        second.along_x,
-        first.plane,
-        second.plane,
-        first.centre,
-        windows.stride,
-        windows.voxels,
-        windows.blocks,
-        windows.lags,
-        layer * windows.block_step,
-        lane,
-        lanes,
-        windows.ring,
-        windows.pitch,
-        windows.lanes,
-        scratch,
-        windows.score_pitch,
-        wp.int64(layer) * wp.int64(windows.lanes) + wp.int64(lane),
-        windows.peak_pitch,
-        scratch_out,
-        peak_out,
-    )
-
-
-SCORE_BYTES = 1 << 23
-"""Memory for the coefficients of a CPU task [byte]."""
+    _find_peaks_of_group(sums, first, second, windows, slot, begin + wp.tid(), scratch_out, peak_out)
 
 
 @dataclass(frozen=True)
@@ -177,8 +114,9 @@ class PeakFinder:
     def find(self, ahead: wp.array, behind: wp.array, layers: range) -> None:
         """Find the peaks of some layers of windows from the sums of products of their blocks in both directions."""
         first, second = self.sides
-        windows = self._windows(layers)
-        inputs = [ahead, behind, int(self.symmetric), first.statistics, second.statistics, windows]
+        sums, windows = Sums(), self._windows(layers)
+        sums.ahead, sums.behind, sums.symmetric = ahead, behind, int(self.symmetric)
+        inputs = [sums, first.statistics, second.statistics, windows]
         launch(Call(_find_peaks, len(layers) * windows.groups, inputs, [self.scratch, self.peaks], scratch=True))
 
     def _windows(self, layers: range) -> Windows:

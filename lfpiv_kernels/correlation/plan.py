@@ -11,13 +11,13 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from lfpiv_kernels import runtime
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation.transforms import transform_size
 
 Triple = tuple[int, int, int]
 """Values in the order (z, y, x)."""
 
-LANES = 16
+LANES = native.constant("products.h", "LANES")
 """Neighbouring windows that a CPU task handles at once; rows of windows are padded to a multiple of it."""
 GROUP = 32
 """Neighbouring blocks that a CPU task correlates by transforms at once."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,10 +10,10 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels.correlation.blocks import split_call
-from lfpiv_kernels.correlation.layout import Lattice, Phased, Statistics, Storage
-from lfpiv_kernels.correlation.memory import launch, new_array, to_device
+from lfpiv_kernels.correlation.layout import Phased, Statistics, Storage
+from lfpiv_kernels.correlation.memory import Call, launch, new_array, to_device
 from lfpiv_kernels.correlation.plan import Plan, Triple
-from lfpiv_kernels.correlation.windows import plane_sums_call, statistics_call
+from lfpiv_kernels.correlation.windows import plane_sums_call, plane_sums_shape, signal_floor, statistics_call
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Side:
 
 @dataclass(frozen=True)
 class _Volume:
-    """One volume and the memory layout of its voxels and statistics."""
+    """One volume, and the memory that its kernels write."""
 
     values: np.ndarray
     flat: wp.array
@@ -37,17 +38,50 @@ class _Volume:
     """Largest lags at which its windows are measured; 0 if only at lag 0."""
     voxels: Storage
     statistics: Storage
+    split: wp.array
+    """Voxels stored by phase."""
+    sums: tuple[wp.array, wp.array]
+    """Sums of values and of squares over the windows' y and x."""
+    measured: tuple[wp.array, wp.array]
+    """Mean and scale of the windows, stored by phase."""
 
     @classmethod
     def of(cls, plan: Plan, volume: np.ndarray, search: Triple) -> _Volume:
+        """Allocate memory for a volume whose windows are measured at lags up to `search`."""
         values = np.ascontiguousarray(volume, np.float32)
         lags = tuple(2 * r + 1 for r in search)
-        reach = tuple(b + n - 1 for b, n in zip(plan.block, lags, strict=True))
-        return cls(values, to_device(values.ravel()), search, Storage.of(plan, reach), Storage.of(plan, lags))
+        voxels = Storage.of(plan, tuple(b + n - 1 for b, n in zip(plan.block, lags, strict=True)))
+        statistics = Storage.of(plan, lags)
+        split, sums = new_array(voxels.size), math.prod(plane_sums_shape(plan, search))
+        first_sums, second_sums = new_array(sums), new_array(sums)
+        mean, scale = new_array(statistics.size), new_array(statistics.size)
+        flat = to_device(values.ravel())
+        return cls(values, flat, search, voxels, statistics, split, (first_sums, second_sums), (mean, scale))
 
-    def voxel_lattice(self, plan: Plan) -> Lattice:
-        """Blocks of the volume at the farthest negative lag."""
-        return self.voxels.lattice(plan, tuple(o - r for o, r in zip(plan.origin, self.search, strict=True)))
+    def calls(self, plan: Plan, square: float) -> tuple[Call, Call, Call]:
+        """Return the calls that store voxels by phase, sum over windows, and then measure the windows."""
+        corner = tuple(o - r for o, r in zip(plan.origin, self.search, strict=True))
+        windows = self.statistics.lattice(plan, plan.origin)
+        return (
+            split_call(self.flat, plan, self.voxels.lattice(plan, corner), self.split),
+            plane_sums_call(self.flat, plan, self.search, windows, self.sums),
+            statistics_call(
+                self.sums, plan, self.search, windows, signal_floor(self.values, square, plan), self.measured
+            ),
+        )
+
+    def side(self) -> Side:
+        """Describe voxels and statistics for the kernels."""
+        storage, (along_z, along_y, along_x) = self.voxels, self.search
+        surroundings, blocks, statistics = Phased(), Phased(), Statistics()
+        surroundings.values, surroundings.plane = self.split, storage.plane
+        surroundings.along_y, surroundings.along_x = storage.along_y, storage.along_x
+        blocks.values, blocks.plane = self.split[along_z * storage.plane :], storage.plane
+        blocks.along_y, blocks.along_x = storage.along_y[along_y:], storage.along_x[along_x:]
+        statistics.mean, statistics.scale = self.measured
+        statistics.along_y, statistics.along_x = self.statistics.along_y, self.statistics.along_x
+        statistics.plane, statistics.centre = self.statistics.plane, wp.vec3i(*self.search)
+        return Side(blocks, surroundings, statistics)
 
 
 def make_sides(
@@ -65,30 +99,7 @@ def make_sides(
         Largest lags at which windows of each volume are measured, order (z, y, x) [voxel].
     """
     first, second = (_Volume.of(plan, *pair) for pair in zip(volumes, searches, strict=True))
-    both = (first, second)
-    voxels = [new_array(volume.voxels.size) for volume in both]
-    lattices = [volume.statistics.lattice(plan, plan.origin) for volume in both]
-    sums = [plane_sums_call(v.flat, plan, v.search, lattice) for v, lattice in zip(both, lattices, strict=True)]
-    splits = [split_call(v.flat, plan, v.voxel_lattice(plan), to) for v, to in zip(both, voxels, strict=True)]
+    splits, sums, statistics = zip(first.calls(plan, squares[0]), second.calls(plan, squares[1]), strict=True)
     launch(*splits, *sums)
-    statistics = [
-        statistics_call(volume.values, total, call.outputs[1:], plan, volume.search, lattice)
-        for volume, total, call, lattice in zip(both, squares, sums, lattices, strict=True)
-    ]
     launch(*statistics)
-    first_side, second_side = (_side(*of) for of in zip(both, voxels, statistics, strict=True))
-    return first_side, second_side
-
-
-def _side(volume: _Volume, voxels: wp.array, statistics_call) -> Side:
-    """Describe a volume's voxels and statistics for the kernels."""
-    storage, lags, (along_z, along_y, along_x) = volume.voxels, volume.statistics, volume.search
-    surroundings, blocks, statistics = Phased(), Phased(), Statistics()
-    surroundings.values, surroundings.plane = voxels, storage.plane
-    surroundings.along_y, surroundings.along_x = storage.along_y, storage.along_x
-    blocks.values, blocks.plane = voxels[along_z * storage.plane :], storage.plane
-    blocks.along_y, blocks.along_x = storage.along_y[along_y:], storage.along_x[along_x:]
-    statistics.mean, statistics.scale = statistics_call.outputs
-    statistics.along_y, statistics.along_x, statistics.plane = lags.along_y, lags.along_x, lags.plane
-    statistics.centre = wp.vec3i(*volume.search)
-    return Side(blocks, surroundings, statistics)
+    return first.side(), second.side()

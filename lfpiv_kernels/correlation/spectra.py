@@ -9,65 +9,29 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.correlation.blocks import MOST_LAGS, VECTORS
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation.layout import Layers, Phased, make_layers
 from lfpiv_kernels.correlation.memory import Call, launch, new_array
 from lfpiv_kernels.correlation.plan import GROUP, Plan, whole_groups
 from lfpiv_kernels.correlation.planes import PART, transform_call
 from lfpiv_kernels.correlation.transforms import ROWS, Spectrum, Transform
-from lfpiv_kernels.native import read_native
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
-)
-
-SYNTHESISE = read_native("spectra_synthesise.inc")
-
-_SPECTRAL = (
-    "#if !defined(__CUDA_ARCH__)"
-    + VECTORS
-    + SYNTHESISE
-    + read_native("spectra_spectral.inc")
-    .replace(
-        "CASES",
-        "\n".join(
-            f"                    case {n}: {{ V re[{n}]; correlate(re, i, g, real, k, lag); break; }}"
-            for n in range(3, MOST_LAGS + 1)
-        ),
-    )
-    .replace("MOST_LAGS", str(MOST_LAGS))
-    .replace("ROWS", str(ROWS))
-)
+wp.set_module_options(native.options("spectra.h", contract="fast"))
 
 
-@wp.func_native(_SPECTRAL)
-def _sum_spectral(
-    first: wp.array(dtype=float),
-    second: wp.array(dtype=float),
-    first_y: wp.array(dtype=int),
-    first_x: wp.array(dtype=int),
-    second_y: wp.array(dtype=int),
-    second_x: wp.array(dtype=int),
-    first_pitch: int,
-    second_pitch: int,
-    quads: wp.array(dtype=int),
-    folds: wp.vec3i,
-    matrices: wp.array(dtype=float),
-    size: wp.vec2i,
-    stride: int,
-    block: wp.vec3i,
-    lags: wp.vec3i,
-    layer: int,
-    lane: int,
-    lanes: int,
-    wide: int,
-    sum_row: wp.int64,
-    sum_pitch: int,
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const auto scratch = scratch_out.data + (int64_t)slot * scratch_pitch;
+    lfpiv::correlate_spectra(first, second, transform, layers, past, task, scratch, sum_out.data);
+#endif
+""")
+def _correlate_group(
+    first: Phased,
+    second: Phased,
+    transform: Transform,
+    layers: Layers,
+    past: int,
+    task: int,
     slot: int,
     scratch_pitch: wp.int64,
     scratch_out: wp.array(dtype=float),
@@ -90,39 +54,8 @@ def _correlate_spectra(
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
 ):
-    index = begin + wp.tid()
-    lane = index % layers.groups * layers.group
-    lanes = wp.min(layers.group, layers.lanes - lane)
-    layer = index // layers.groups
-    row = (layers.begin + layer) % layers.ring
-    lags = layers.lags
-    _sum_spectral(
-        first.values,
-        second.values,
-        first.along_y,
-        first.along_x,
-        second.along_y,
-        second.along_x,
-        first.plane,
-        second.plane,
-        transform.quads,
-        transform.folds,
-        transform.matrices,
-        transform.size,
-        layers.stride[2],
-        layers.block,
-        lags,
-        layer,
-        lane,
-        lanes,
-        (lanes + past + 15) // 16 * 16,
-        wp.int64(row) * wp.int64(lags[0] * lags[1] * lags[2]),
-        layers.lanes,
-        slot,
-        scratch_pitch,
-        scratch_out,
-        sum_out,
-    )
+    task = begin + wp.tid()
+    _correlate_group(first, second, transform, layers, past, task, slot, scratch_pitch, scratch_out, sum_out)
 
 
 @dataclass(frozen=True)
@@ -159,10 +92,10 @@ class SpectralProducts:
             transform_call(of, planes.transform, layers, plan.stride[0], *scratch, to) for of, planes, to in transforms
         ]
         launch(*calls)
-        described = make_layers(plan, layers, self.ring, GROUP)
+        tasks = make_layers(plan, layers, self.ring, GROUP)
         transformed = [_with_values(*pair) for pair in zip((first, second), self.spectra, strict=True)]
-        inputs = [*transformed, spectrum.transform, described, _lanes_past(plan), self.scratch_pitch]
-        size = len(layers) * described.groups
+        inputs = [*transformed, spectrum.transform, tasks, _lanes_past(plan), self.scratch_pitch]
+        size = len(layers) * tasks.groups
         launch(Call(_correlate_spectra, size, inputs, [self.scratch, sums], scratch=True))
 
 

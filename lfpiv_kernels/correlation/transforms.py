@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lfpiv_kernels import native
 from lfpiv_kernels.correlation.memory import to_device
 
-ROWS = 3
+ROWS = native.constant("spectra.h", "ROWS")
 """Frequencies that are computed at once; rows of the matrices along y are padded to a multiple of it."""
 
 

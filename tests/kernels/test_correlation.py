@@ -1,6 +1,6 @@
 """Kernels of the correlation against slow NumPy twins."""
 
-from concurrent.futures import ThreadPoolExecutor
+import dataclasses
 
 import numpy as np
 import pytest
@@ -154,7 +154,7 @@ def test_correlation_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_p
 
 
 @pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
-def test_peaks_do_not_depend_on_how_they_are_computed(monkeypatch, symmetric):
+def test_peaks_do_not_depend_on_how_they_are_computed(monkeypatch, device, symmetric):
     pair = particle_pair((30, 34, 38), uniform(0.4, -1.2, 0.8), seed=8, ghosts=0.5, noise=0.05)
     ways = possible_plans(pair[0].shape, (12,) * 3, (6,) * 3, (4,) * 3)
 
@@ -167,11 +167,10 @@ def test_peaks_do_not_depend_on_how_they_are_computed(monkeypatch, symmetric):
         for field, found in values(way).items():
             np.testing.assert_allclose(found, expected[field], atol=TOLERANCE_PEAK, err_msg=f"{field}, {name}")
     before = {name: values(way) for name, way in ways.items()}
-    with ThreadPoolExecutor(1) as pool:
-        monkeypatch.setattr(runtime, "_pool", pool)
-        for name, way in ways.items():
-            for field, found in values(way).items():
-                np.testing.assert_array_equal(found, before[name][field], err_msg=f"{field} depends on the threads")
+    monkeypatch.setattr(runtime, "device", lambda: dataclasses.replace(device, threads=1))
+    for name, way in ways.items():
+        for field, found in values(way).items():
+            np.testing.assert_array_equal(found, before[name][field], err_msg=f"{field} depends on the threads")
 
 
 @pytest.mark.parametrize(
