@@ -1,6 +1,7 @@
-"""What a run leaves behind, opened by xarray alone and by `open_results`: complete, lazy, refused where it differs."""
+"""Results of a run, opened by xarray and by `open_results`: complete, lazy, and refused if pairs differ."""
 
 import importlib.util
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -9,7 +10,7 @@ import xarray as xr
 from support.vector_sets import random_vectors, write_run
 
 import lfpiv
-from lfpiv.results import netcdf, reader
+from lfpiv.results import netcdf
 
 NUMBERS = (0, 1, 3, 7)  # pairs may be missing
 
@@ -66,15 +67,16 @@ def test_any_part_is_what_numpy_would_take(run, dask, index):
 def test_values_are_read_when_they_are_asked_for(tmp_path, dask, monkeypatch):
     written = write_run(tmp_path, NUMBERS)
     opened = lfpiv.open_results(tmp_path)
-    read, inner = [], reader._Stack._pair
+    read, get = [], h5py.Group.__getitem__
 
-    def pair(self, number, where):
-        read.append((self.name, number))
-        return inner(self, number, where)
+    def record(group, name):
+        read.append((Path(group.file.filename).name, name))
+        return get(group, name)
 
-    monkeypatch.setattr(reader._Stack, "_pair", pair)
+    monkeypatch.setattr(h5py.Group, "__getitem__", record)
     assert float(opened.w.isel(pair=2, z=0, y=1, x=2)) == float(written[3].w[0, 1, 2])
-    assert read == [("w", 2)]
+    assert read == [("pair_0003.nc", "w")]
+    monkeypatch.setattr(h5py.Group, "__getitem__", get)
     (tmp_path / "vectors" / "pair_0007.nc").write_bytes(b"damaged since")
     assert np.isfinite(opened.u.isel(pair=slice(0, 3)).values).all()
     with pytest.raises(lfpiv.InputError, match=r"pair_0007\.nc.*damaged"):

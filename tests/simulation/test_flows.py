@@ -158,7 +158,7 @@ def test_tracers_predict_left_out_tracers_of_a_turbulent_flow(sample_data, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         (None, "no file"),
         ({"t0": np.zeros((50, 3))}, "'t1'"),
@@ -167,11 +167,11 @@ def test_tracers_predict_left_out_tracers_of_a_turbulent_flow(sample_data, tmp_p
         ({"t0": np.full((50, 3), np.nan), "t1": np.zeros((50, 3))}, "finite"),
     ],
 )
-def test_bad_tracer_files_are_named(tmp_path, arrays, said):
+def test_bad_tracer_files_are_named(tmp_path, arrays, message):
     path = tmp_path / "bad.npz"
     if arrays is not None:
         np.savez(path, **arrays)
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=message) as error:
         flows.Tracers(file=str(path), size_mm=(1, 1, 1)).tracers()
     assert "bad.npz" in str(error.value)
 
@@ -206,7 +206,7 @@ def test_swirl_number_of_profiles_in_closed_form():
 
 
 @pytest.mark.parametrize(
-    ("profiles", "said"),
+    ("profiles", "message"),
     [
         (([0, 1], [1, 1, 1], [0, 0]), "one length"),
         (([1, 0], [1, 1], [0, 0]), "rise"),
@@ -214,8 +214,8 @@ def test_swirl_number_of_profiles_in_closed_form():
         (([0, np.nan], [1, 1], [1, 1]), "finite"),
     ],
 )
-def test_bad_profiles_are_named(profiles, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_profiles_are_named(profiles, message):
+    with pytest.raises(ValueError, match=message):
         swirl.swirl_number(*profiles, nozzle_radius=1.0)
 
 

@@ -300,7 +300,7 @@ def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_pa
     assert one.window == scene.window and one.window[0].index == 1.5 and one.aberrations.coma_pitch == 0.3
     assert two.window[0].index == 1.4 and two.aberrations.coma_pitch == 0 and two.aberrations.spherical_pitch == 0.2
     path = simulate(scene, tmp_path / "data")
-    assert "[window" not in path.read_text() and "aberration" not in path.read_text()  # the user is not told
+    assert "[window" not in path.read_text() and "aberration" not in path.read_text()  # the truth stays hidden
     spec = json.loads((path.parent / "truth" / "spec.json").read_text())
     at, pupil = points(20), pupil_points(20)
     for number in (0, 1):
@@ -310,7 +310,7 @@ def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("point_mm = [0.0, 0.0, 30.0]", "point_mm = [0.0, 0.0, 0.1]", "window[0]"),  # cuts the particles
         ("point_mm = [0.0, 0.0, 30.0]", "point_mm = [0.0, 0.0, 140.0]", "pupil"),  # cuts the lens at 45 degrees
@@ -322,12 +322,12 @@ def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_pa
         ("coma_pitch = 0.3", "distortion_percent = 9.0\ncentre_mm = [0.5, 0.0]", "camera 'one' has"),
     ],
 )
-def test_impossible_optics_are_refused(tmp_path, old, new, said):
+def test_impossible_optics_are_refused(tmp_path, old, new, message):
     assert old in OPTICS
     (tmp_path / "scene.toml").write_text(SMALL_SCENE + OPTICS.replace(old, new))
     with pytest.raises(InputError) as error:
         simulate(tmp_path / "scene.toml", tmp_path / "out")
-    assert said in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_only_the_window_next_to_the_particles_has_a_medium():
@@ -336,7 +336,7 @@ def test_only_the_window_next_to_the_particles_has_a_medium():
 
 
 def test_the_network_learns_what_the_thin_lens_cannot(device, tmp_path):
-    """A camera that stands where it is said to, behind a window, its lens aberrated: DRT fails for that alone."""
+    """A camera at its nominal position, behind a window and with aberrations: only the network maps it."""
     lens = "[aberrations]\ncoma_pitch = 0.27\ndistortion_percent = 1.0\ncentre_mm = [-2.3, 0.0]\n"
     text = re.sub(r"true_(yaw|pitch|roll|offset)\w* = .*\n", "", CALIBRATION_SCENE)
     (tmp_path / "scene.toml").write_text(text + OPTICS.split("[aberrations]")[0] + lens)

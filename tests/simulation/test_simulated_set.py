@@ -99,7 +99,7 @@ def test_same_seed_same_files_and_a_flip_only_mirrors(small, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("f_number = 4.0", "f_numer = 4.0", "f_numer"),
         ('kind = "swirl"', 'kind = "whirl"', "'uniform' or 'shear' or 'ring' or 'swirl' or 'swirling_jet'"),
@@ -117,13 +117,13 @@ def test_same_seed_same_files_and_a_flip_only_mirrors(small, tmp_path):
         ),
     ],
 )
-def test_a_bad_scene_is_refused_before_any_work(tmp_path, old, new, said):
+def test_a_bad_scene_is_refused_before_any_work(tmp_path, old, new, message):
     path = tmp_path / "scene.toml"
     assert old in SMALL_SCENE
     path.write_text(SMALL_SCENE.replace(old, new, 1))
     with pytest.raises(InputError) as error:
         simulate(path, tmp_path / "out")
-    assert said in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
     assert os.listdir(tmp_path) == ["scene.toml"]
 
 
