@@ -34,9 +34,10 @@ from lfpiv.velocity.multi_pass import peak_ratio
 from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
+from lfpiv.velocity.windows import Windows
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.correlation import deform
-from lfpiv_kernels.correlation.correlate import correlate_windows, window_grid
+from lfpiv_kernels.correlation.correlate import correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 
 log = logging.getLogger(__name__)
@@ -235,12 +236,14 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     )
     first, second = deform.deform_pair(first, second, control.midway.field, control.midway.spacing)
     step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(control.nodes, first.shape, strict=True))
-    origin, count = window_grid(first.shape, window, step)
-    scatter = displacement_deviation(first, second, window=window, origin=origin, step=step, count=count)
+    windows = Windows.covering(first.shape, window, step)
+    scatter = displacement_deviation(
+        first, second, window=window, origin=windows.origin, step=step, count=windows.count
+    )
     search = (REFINE_SEARCH,) * 3
     left = correlate_windows(first, second, window=window, step=step, search=search, symmetric=True)
     measured = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
-    shown = control.midway.window_means(origin, step, count, window) + left.displacement
+    shown = control.midway.window_means(windows) + left.displacement
     deviation = np.maximum(scatter, np.abs(shown - measured))
     deviation[~vectors["valid"].values] = np.nan
     stated = {f"uncertainty_{axis}": deviation[..., k] for k, axis in enumerate("zyx")}

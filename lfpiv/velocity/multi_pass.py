@@ -14,8 +14,9 @@ import numpy as np
 from lfpiv.velocity import validation
 from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings, Triple, triple
+from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation import deform
-from lfpiv_kernels.correlation.correlate import WindowPeaks, correlate_windows, window_grid
+from lfpiv_kernels.correlation.correlate import WindowPeaks, correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 
 log = logging.getLogger(__name__)
@@ -27,39 +28,12 @@ LOWEST_RIVAL = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
-class Windows:
-    """Grid of interrogation windows in a volume; tuples are ordered (z, y, x) [voxel]."""
-
-    window: Triple
-    """Edges of a window."""
-    overlap: float
-    """Part of a window that its neighbour shares."""
-    origin: Triple
-    """First voxel of the first window."""
-    step: Triple
-    """Distance of neighbouring windows."""
-    count: Triple
-    """Number of windows."""
-
-    @classmethod
-    def covering(cls, shape: Triple, window: Triple, overlap: float) -> Windows:
-        """Return the grid that covers a volume."""
-        step = triple(max(1, round(edge * (1 - overlap))) for edge in window)
-        origin, count = window_grid(shape, window, step)
-        return cls(window=window, overlap=overlap, origin=origin, step=step, count=count)
-
-    @property
-    def centres(self) -> list[np.ndarray]:
-        """Window centres along each axis [voxel]."""
-        layout = zip(self.window, self.origin, self.step, self.count, strict=True)
-        return [origin + (edge - 1) / 2 + step * np.arange(count) for edge, origin, step, count in layout]
-
-
-@dataclass(frozen=True, kw_only=True)
 class PassInput:
     """Volumes of one pass and where their windows lie."""
 
     windows: Windows
+    overlap: float
+    """Part of a window that its neighbour shares."""
     centres: list[np.ndarray]
     """Positions of the vectors along each axis of the given volumes [voxel]."""
     search: Triple
@@ -161,34 +135,44 @@ def correlate_passes(
     """
     shape, last = triple(first.shape), len(settings.windows) - 1
     coarse = max(settings.overlap, COARSE_OVERLAP)
-    grids = [
-        Windows.covering(shape, window, settings.overlap if number == last else coarse)
-        for number, window in enumerate(settings.windows)
-    ]
-    search = settings.first_search(shape)
-    given = PassInput(windows=grids[0], centres=grids[0].centres, search=search, volumes=(first, second))
+    overlaps = [coarse] * last + [settings.overlap]
+    windows = _cover(shape, settings.windows[0], overlaps[0])
+    given = PassInput(
+        windows=windows,
+        overlap=overlaps[0],
+        centres=windows.centres,
+        search=settings.first_search(shape),
+        volumes=(first, second),
+    )
     result = _correlate_pass(given, seen if last == 0 else None, symmetric=last > 0)
     figures = [result.figures]
     if last > 0:
         splines = deform.spline_coefficients(first), deform.spline_coefficients(second)
-        for number, windows in enumerate(grids[1:], start=1):
-            given = _deform(splines, result, windows)
+        for number in range(1, last + 1):
+            given = _deform(splines, result, settings.windows[number], overlaps[number])
             result = _correlate_pass(given, seen if number == last else None, symmetric=True)
             figures.append(result.figures)
     log.debug("correlation passes: %s", figures)
     return result, tuple(figures)
 
 
-def _deform(splines: tuple[np.ndarray, np.ndarray], before: Pass, windows: Windows) -> PassInput:
-    """Deform both volumes by the field of the pass before."""
+def _cover(shape: Triple, window: Triple, overlap: float) -> Windows:
+    """Return the windows that cover a volume with a given overlap."""
+    return Windows.covering(shape, window, triple(max(1, round(edge * (1 - overlap))) for edge in window))
+
+
+def _deform(splines: tuple[np.ndarray, np.ndarray], before: Pass, window: Triple, overlap: float) -> PassInput:
+    """Deform both volumes by the field of the pass before, and lay out the windows of the next one."""
     shape = triple(before.given.volumes[0].shape)
+    windows = _cover(shape, window, overlap)
     predictor = Predictor.between(before.given.centres, before.next_guess, shape)
     return PassInput(
         windows=windows,
+        overlap=overlap,
         centres=[centre + deform.OFFSET for centre in windows.centres],
         search=(REFINE_SEARCH,) * 3,
         volumes=deform.deform_pair(*splines, predictor.field, predictor.spacing),
-        predicted=predictor.window_means(windows.origin, windows.step, windows.count, windows.window),
+        predicted=predictor.window_means(windows),
     )
 
 
@@ -200,7 +184,7 @@ def _correlate_pass(given: PassInput, seen: np.ndarray | None, *, symmetric: boo
     )
     windows_seen = np.ones(grid.count, bool)
     if seen is not None:
-        windows_seen = validation.seen_windows(seen, grid.window, grid.origin, grid.step, grid.count)
+        windows_seen = validation.seen_windows(seen, grid)
     offset = np.zeros(3) if predicted is None else predicted
     field, valid = validation.validate(
         peaks.displacement + offset,
@@ -208,7 +192,7 @@ def _correlate_pass(given: PassInput, seen: np.ndarray | None, *, symmetric: boo
         peaks.measured,
         given.search,
         seen=windows_seen,
-        predicted=predicted if grid.overlap < COARSE_OVERLAP else None,
+        predicted=predicted if given.overlap < COARSE_OVERLAP else None,
         peak_ratio=peak_ratio(peaks),
     )
     return Pass(given=given, peaks=peaks, field=field, valid=valid, seen=windows_seen)

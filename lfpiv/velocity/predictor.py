@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 
+from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation import deform
 
 CONTROL_SPACING = 4
@@ -45,20 +46,14 @@ class Predictor:
         z, y, x = (float(points[1] - points[0]) for points in self.points)
         return z, y, x
 
-    def window_means(
-        self,
-        origin: tuple[int, int, int],
-        step: tuple[int, int, int],
-        count: tuple[int, int, int],
-        window: tuple[int, int, int],
-    ) -> np.ndarray:
+    def window_means(self, windows: Windows) -> np.ndarray:
         """Return the displacement averaged over windows, shape (z, y, x, 3) [voxel]."""
         means = self.field.astype(float)
         for axis in range(3):
             points, positions = self.points[axis], deform.OFFSET + np.arange(self.shape[axis])
             linear = make_interp_spline(points, np.eye(len(points)), k=1)(positions)  # extends beyond the last point
-            first = origin[axis] + step[axis] * np.arange(count[axis])
-            means = _apply(np.stack([linear[start : start + window[axis]].mean(0) for start in first]), means, axis)
+            edge, first = windows.window[axis], windows.first_voxels[axis]
+            means = _apply(np.stack([linear[start : start + edge].mean(0) for start in first]), means, axis)
         return means
 
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.ndimage
 
+from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation.neighbours import Prediction, predict
 
 THRESHOLD = 2.0
@@ -99,30 +100,14 @@ def validate(
     return fill(np.where(rescued[..., None], second, first), valid | rescued), valid | rescued
 
 
-def seen_windows(
-    seen: np.ndarray,
-    window: tuple[int, int, int],
-    origin: tuple[int, int, int],
-    step: tuple[int, int, int],
-    count: tuple[int, int, int],
-) -> np.ndarray:
-    """Return whether at least `LEAST_SEEN` of a window's voxels are seen.
+def seen_windows(seen: np.ndarray, windows: Windows) -> np.ndarray:
+    """Return whether at least `LEAST_SEEN` of each window's voxels are seen, shape (z, y, x).
 
-    Parameters
-    ----------
-    seen : ndarray of bool, shape (z, y, x)
-        True where two cameras see the voxel.
-    window, origin, step, count : tuple of int
-        Edges of the windows, first voxel of the first one, distance and number of them along z, y, x.
-
-    Returns
-    -------
-    ndarray of bool, shape `count`
+    `seen` is true where two cameras see the voxel, shape (z, y, x).
     """
     share = seen.astype(float)
-    for axis, (edge, first, distance, number) in enumerate(zip(window, origin, step, count, strict=True)):
+    for axis, (edge, start) in enumerate(zip(windows.window, windows.first_voxels, strict=True)):
         below = np.insert(share.cumsum(axis), 0, 0, axis)
-        start = first + distance * np.arange(number)
         share = (below.take(start + edge, axis) - below.take(start, axis)) / edge
     return share >= LEAST_SEEN * (1 - 1e-9)  # the shares have rounding errors
 
