@@ -18,7 +18,7 @@ import xarray as xr
 from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import is_finite
 from lfpiv.velocity.multi_pass import Pass, correlate_passes, peak_ratio
-from lfpiv.velocity.settings import CorrelationSettings, triple
+from lfpiv.velocity.settings import CorrelationSettings, triple, windows_of
 from lfpiv.velocity.volume_pair import (
     VoxelAxes,
     missing_smoothing,
@@ -135,21 +135,21 @@ def correlate(
     if not (is_finite(dt_s) and dt_s > 0):
         raise ValueError(f"dt_s: expected a positive time [s], got {dt_s!r}.")
     shape = triple(first.shape)
-    settings = CorrelationSettings.checked(
-        shape,
-        windows=windows,
+    settings = CorrelationSettings(
+        windows=windows_of(windows, shape),
         overlap=overlap,
         max_displacement_voxel=max_displacement_voxel,
         smoothing_voxel=smoothing_voxel,
         intensity_power=intensity_power,
     )
+    first_search = settings.first_search(shape)
     missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
     first, second = (preprocess(volume, missing, intensity_power) for volume in (first, second))
     last, figures = correlate_passes(first, second, settings, seen=seen_by_two(volume_a, volume_b))
     share = float(last.valid[last.seen].mean()) if last.seen.any() else 0.0
     verdict = Verdict.GOOD if share >= GOOD_SHARE else Verdict.POOR if share >= POOR_SHARE else Verdict.FAILED
     if verdict is not Verdict.GOOD:
-        if moves_beyond(first, second, settings.first_search(shape)):
+        if moves_beyond(first, second, first_search):
             verdict = Verdict.TOO_FAR
         log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
     attributes = {

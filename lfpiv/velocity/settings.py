@@ -33,43 +33,20 @@ class CorrelationSettings:
     """Settings of `lfpiv.correlate`, which describes them. Stored as JSON in the attribute ``settings``."""
 
     windows: tuple[Triple, ...]
-    """Window of each pass (z, y, x) [voxel]."""
+    """Window of each pass (z, y, x) [voxel], from `windows_of`."""
     overlap: float
     max_displacement_voxel: float | None
     smoothing_voxel: float
     intensity_power: float
 
-    @classmethod
-    def checked(
-        cls,
-        shape: Triple,
-        *,
-        windows: Sequence[int | Sequence[int]] | None,
-        overlap: float,
-        max_displacement_voxel: float | None,
-        smoothing_voxel: float,
-        intensity_power: float,
-    ) -> CorrelationSettings:
-        """Check the arguments of `lfpiv.correlate` for volumes of `shape`; raise ValueError."""
-        if not (is_finite(overlap) and 0 <= overlap < 1):
-            raise ValueError(f"overlap: expected 0 <= overlap < 1, got {overlap!r}.")
-        if not (is_finite(smoothing_voxel) and smoothing_voxel >= 0):
-            raise ValueError(f"smoothing_voxel: expected a value >= 0, got {smoothing_voxel!r}.")
-        if not (is_finite(intensity_power) and intensity_power > 0):
-            raise ValueError(f"intensity_power: expected a value > 0, got {intensity_power!r}.")
-        farthest = max_displacement_voxel
-        checked = _check_windows(windows, shape)
-        if farthest is not None and not (is_finite(farthest) and 0 < farthest < max(shape)):
-            raise ValueError(
-                f"max_displacement_voxel: expected a value > 0 and within the volume {shape}, got {farthest}."
-            )
-        return cls(
-            windows=checked,
-            overlap=overlap,
-            max_displacement_voxel=farthest,
-            smoothing_voxel=smoothing_voxel,
-            intensity_power=intensity_power,
-        )
+    def __post_init__(self) -> None:
+        """Check the values that do not depend on the volume: raise ValueError."""
+        if not (is_finite(self.overlap) and 0 <= self.overlap < 1):
+            raise ValueError(f"overlap: expected 0 <= overlap < 1, got {self.overlap!r}.")
+        if not (is_finite(self.smoothing_voxel) and self.smoothing_voxel >= 0):
+            raise ValueError(f"smoothing_voxel: expected a value >= 0, got {self.smoothing_voxel!r}.")
+        if not (is_finite(self.intensity_power) and self.intensity_power > 0):
+            raise ValueError(f"intensity_power: expected a value > 0, got {self.intensity_power!r}.")
 
     @classmethod
     def of(cls, vectors: xr.Dataset) -> CorrelationSettings:
@@ -82,10 +59,14 @@ class CorrelationSettings:
         return json.dumps(asdict(self))
 
     def first_search(self, shape: Triple) -> Triple:
-        """Return the largest lag of the first pass. A peak can be located up to one lag less."""
+        """Return the largest lag of the first pass in a volume. A peak can be located up to one lag less."""
         farthest = self.max_displacement_voxel
         if farthest is None:
             return triple(max(REFINE_SEARCH, math.ceil(FIRST_SEARCH * edge) + 1) for edge in self.windows[0])
+        if not (is_finite(farthest) and 0 < farthest < max(shape)):
+            raise ValueError(
+                f"max_displacement_voxel: expected a value > 0 and within the volume {shape}, got {farthest}."
+            )
         return triple(min(max(REFINE_SEARCH, math.ceil(farthest) + 1), max(2, n - 1)) for n in shape)
 
 
@@ -95,8 +76,8 @@ def triple(values: Iterable[int]) -> Triple:
     return z, y, x
 
 
-def _check_windows(windows: Sequence[Any] | None, shape: Triple) -> tuple[Triple, ...]:
-    """Return the window of each pass as (z, y, x)."""
+def windows_of(windows: Sequence[int | Sequence[int]] | None, shape: Triple) -> tuple[Triple, ...]:
+    """Check the windows that a caller gives for volumes of a shape, and return each as (z, y, x)."""
     if windows is None:
         return tuple(triple(min(edge, n) for n in shape) for edge in DEFAULT_WINDOWS)
     if isinstance(windows, (int, float, str)):

@@ -7,6 +7,7 @@ from support.vector_sets import axes, from_flow, random_vectors
 
 import lfpiv
 from lfpiv import derived, statistics
+from lfpiv.velocity.derived import check_velocity
 from lfpiv.velocity.statistics import STRESSES
 
 ROUNDING = 1e-9  # of double precision differences of positions in millimetres, relative to gradients of order 1
@@ -207,7 +208,7 @@ def test_statistics_are_their_definitions_over_the_valid_vectors():
         assert np.isclose(energy.isel(at), np.trace(covariance) / 2)
         assert np.allclose([rms[f"{name}_rms"].isel(at) for name in "uvw"], np.sqrt(np.diag(covariance)))
     assert stresses.uv.attrs["units"] == energy.attrs["units"] == "m^2/s^2" and rms.u_rms.attrs["units"] == "m/s"
-    assert derived.check_velocity(mean) is None and mean.x.attrs["units"] == "mm"
+    assert check_velocity(mean) is None and mean.x.attrs["units"] == "mm"
 
 
 def test_a_known_gaussian_ensemble_gives_its_covariance():
