@@ -1,4 +1,4 @@
-"""The command line: exit status, one message for what the user can mend, nothing left behind."""
+"""The command line: exit status, one message per user error, no files after a failure."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from lfpiv.runs import memory, pipeline
 
 
 def run(*arguments):
-    """A real process: status, standard output, standard error."""
+    """Run a process; return status, standard output and standard error."""
     command = [sys.executable, "-m", "lfpiv", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "80"})
     return done.returncode, done.stdout, done.stderr
@@ -170,7 +170,7 @@ def test_real_processes_end_with_the_same_status(tiny_experiment, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_json_is_the_whole_of_standard_output_and_quiet_says_nothing(monkeypatch, tmp_path, capfd):
+def test_json_is_all_of_standard_output_and_quiet_prints_nothing(monkeypatch, tmp_path, capfd):
     summary = {"failed": [{"pair": 1, "reason": "dark"}], "experiment": {"pairs": 2}, "value": np.float32("nan")}
     monkeypatch.setattr(pipeline, "run", lambda *args, **options: summary)
     command = ["run", "x.toml", "--out", str(tmp_path)]

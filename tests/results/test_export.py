@@ -39,7 +39,7 @@ def run(tmp_path_factory):
 
 
 def at_points(image, name):
-    """An array of a VTK image as (z, y, x[, component])."""
+    """Return an array of a VTK image as (z, y, x[, component])."""
     values = np.asarray(image.point_data[name])
     return values.reshape(*image.dimensions[::-1], *values.shape[1:])
 
@@ -81,7 +81,7 @@ def test_a_single_layer_of_vectors_is_an_image_too(tmp_path):
     np.testing.assert_array_equal(at_points(image, "valid"), written[0].valid)
 
 
-def test_volumes_of_other_settings_are_not_put_beside_vectors(tmp_path, caplog):
+def test_volumes_of_other_settings_are_not_exported(tmp_path, caplog):
     def depends_on(voxel_mm, images, **more):
         return json.dumps({"volume": {"voxel_mm": voxel_mm}, "calibration": "cafe", "images": images, **more})
 
@@ -211,7 +211,7 @@ def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
     assert not any((tmp_path / "new").iterdir())
 
 
-def test_a_full_disk_is_noticed_before_the_library_that_cannot_bear_it(run, tmp_path, monkeypatch):
+def test_a_full_disk_is_refused_before_the_netcdf_library_writes(run, tmp_path, monkeypatch):
     free = lfpiv.open_results(run[0]).nbytes // 2  # a plane takes less than that, all pairs take more
     monkeypatch.setattr(netcdf.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
     with pytest.raises(StorageError, match=r"(?i)no space left"):
@@ -220,7 +220,7 @@ def test_a_full_disk_is_noticed_before_the_library_that_cannot_bear_it(run, tmp_
     assert lfpiv.export_results(run[0], "pivpy", out=tmp_path)
 
 
-def test_the_command_writes_and_says_where(run, tmp_path, capfd):
+def test_the_command_writes_and_prints_the_path(run, tmp_path, capfd):
     folder, _ = run
     assert commands.call(["export", str(folder), "--to", "csv", "--out", str(tmp_path / "a"), "--pairs", "0:3"]) == 0
     assert capfd.readouterr().out == f"export: 2 files in {tmp_path / 'a'}\n"

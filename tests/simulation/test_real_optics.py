@@ -1,4 +1,4 @@
-"""Windows and aberrations: exact rays against Snell's law traced forward, kernels against twins, cameras set up."""
+"""Windows and aberrations: rays against Snell's law, kernels against twins, cameras in focus."""
 
 import json
 import re
@@ -52,14 +52,14 @@ def pupil_points(count, radius=12.5, seed=3):
 
 
 def snell(direction, normal, before, after):
-    """Refracted unit direction, from the law in vectors; `normal` points along the light's way."""
+    """Return the refracted unit direction by the vector form of Snell's law. `normal` points along the light."""
     cosine = direction @ normal
     across = before / after * (direction - cosine * normal)
     return across + np.sqrt(1 - across @ across) * normal
 
 
 def forward(direction, point, scene_camera):
-    """Trace one ray from a point in the world out of its medium through all plates to the lens's plane: (u, v)."""
+    """Trace one ray from a world point through all plates to the plane of the lens: (u, v)."""
     place, index = np.array(point, float), scene_camera.window[0].medium_index
     towards_lens = scene_camera.rotation[2]
     for window in scene_camera.window:
@@ -80,7 +80,7 @@ def forward(direction, point, scene_camera):
 
 @pytest.mark.parametrize("name", ["glass", "tank"])
 def test_true_rays_obey_snell_s_law(name):
-    """The ray found by iteration from the lens is the one that Snell's law traces from the particle, by vectors."""
+    """The ray iterated from the lens equals the ray traced from the particle by Snell's law."""
     scene_camera = rig(name)
     optics, at, pupil = scene_camera.optics, 8 * points(12, 1), pupil_points(12)
     expected = []
@@ -102,8 +102,8 @@ def test_true_rays_obey_snell_s_law(name):
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_rays_go_back_the_way_they_came(name):
-    """From a point to the array and back to the point's plane: iterated one way, explicit the other."""
+def test_rays_are_reversible(name):
+    """A ray from a point to the array, and back to the plane of the point: iterated one way, explicit the other."""
     scene_camera = rig(name)
     at, pupil, scales = points(200, 1), pupil_points(200), scene_camera.optics
     array = true_mapping(scene_camera)(at, pupil)
@@ -115,7 +115,7 @@ def test_rays_go_back_the_way_they_came(name):
     assert np.abs(back - at).max() < SNELL_MM
 
 
-def test_order_and_sense_of_windows_in_air_do_not_matter_and_air_is_no_window():
+def test_order_and_normal_sign_of_windows_in_air_do_not_matter():
     at, pupil = 5 * points(50), pupil_points(50)
     both = true_mapping(rig("glass", window=(GLASS, OUTER)))(at, pupil)
     other = true_mapping(rig("glass", window=(OUTER, GLASS | {"normal": (0, 0, -7), "point_mm": (9, 3, 30)})))(
@@ -131,8 +131,8 @@ def test_order_and_sense_of_windows_in_air_do_not_matter_and_air_is_no_window():
 
 
 @pytest.mark.parametrize("name", ["glass", "tank"])
-def test_a_camera_is_set_up_through_its_windows(name):
-    """The stated point is imaged at the sensor's centre, and its rays' mean slope over the pupil is zero: in focus."""
+def test_cameras_are_in_focus_through_their_windows(name):
+    """The stated point is imaged at the sensor's centre. The mean slope of its rays over the pupil is zero."""
     focused = (0.3, -0.2, 0.5)
     scene_camera = rig(name, true_offset_mm=focused)
     pupil = 12.5 / np.sqrt(2) * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -141,8 +141,8 @@ def test_a_camera_is_set_up_through_its_windows(name):
     assert np.linalg.norm(scene_camera.axis_point_mm - focused) > 1  # it had to move
 
 
-def test_each_aberration_is_what_its_name_says():
-    """Stated at the edge of pupil and field, in pitches; exponents of field and pupil as in Seidel's theory."""
+def test_each_aberration_follows_seidel_theory():
+    """Values hold at the edge of pupil and field, in pitches. Exponents of field and pupil are Seidel's."""
     optics = camera("ideal").optics
     field = np.hypot(*optics.sensor_shape) * optics.pixel_mm / 2
     edge, up, across = np.array([field, 0.0]), np.array([0, 12.5]), np.array([12.5, 0])
@@ -168,7 +168,7 @@ def test_each_aberration_is_what_its_name_says():
 
 
 def test_aberrations_are_the_gradient_of_one_wave_aberration():
-    """Rays belong to wave fronts (Malus and Dupin): the error's curl over the pupil vanishes."""
+    """Rays are normal to wave fronts (Malus and Dupin): the curl of the error over the pupil is zero."""
     seidel = rig("lens").seidel
     array, pupil, step = 0.4 * points(50)[:, :2], pupil_points(50), 1e-4
     slopes = [
@@ -180,7 +180,7 @@ def test_aberrations_are_the_gradient_of_one_wave_aberration():
 
 
 def sources_twin(scene_camera, renderer, centres, counts, extent, rays, rng):
-    """Twin of `render_sources`: float64 true rays, landed on the sensor by the slow twin of the ideal renderer."""
+    """Twin of `render_sources`: true rays in float64, added up on the sensor by definition."""
     image, mapping = 0, true_mapping(scene_camera)
     angles = rng.uniform(0, 2 * np.pi, (len(centres), 2))
     for centre, count, (turn, roll) in zip(centres, counts, angles, strict=True):
@@ -209,7 +209,7 @@ def test_sources_seen_through_real_optics_equal_their_twin(device, name):
 
 @pytest.mark.parametrize("name", ["tank", "all"])
 def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
-    """Every pixel of a small sensor: its rays followed back in float64, without the kernel's short cut."""
+    """Trace the rays of each pixel of a small sensor back in float64, without the short cut of the kernel."""
     weak = {key: 0.05 for key in LENS if key.endswith("pitch")} | {"spherical_pitch": 0.6}  # the field is tiny
     changes = {"sensor_width_px": 40, "sensor_height_px": 30, "true_offset_mm": (0, 0, 0.15)}
     scene_camera = rig(name, **changes | ({"aberrations": weak} if name == "all" else {}))
@@ -247,7 +247,7 @@ def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
 
 @pytest.mark.parametrize("name", ["glass", "all"])
 def test_dots_traced_forward_and_backward_agree(device, name):
-    """A dot's light from the area of its image, sent forward, is what pixels collect that look back at the dot."""
+    """The light of a dot, traced forward from the area of its image, equals the light that pixels collect backward."""
     scene_camera = rig(name, true_offset_mm=(0, 0, 0.1))
     renderer, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
     lenses = np.pi * 0.05**2 * image_area(scene_camera, dots) / abs(np.linalg.det(renderer.basis_mm))
@@ -271,7 +271,7 @@ def test_dots_traced_forward_and_backward_agree(device, name):
     assert np.linalg.norm(forward - backward) < (uneven + 0.03) * np.linalg.norm(backward)  # 3 %: noise of the rays
 
 
-def test_uniform_light_looks_the_same_through_everything(device):
+def test_windows_and_aberrations_do_not_change_uniform_light(device):
     plain = collect.render_white(render_camera(rig("all", window=(), aberrations={})), samples=64, seed=0)
     assert np.array_equal(collect.render_white(render_camera(rig("all")), samples=64, seed=0), plain)
 
@@ -287,7 +287,7 @@ coma_pitch = 0.3
 """
 
 
-def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_path):
+def test_cameras_and_truth_take_the_optics_of_the_scene(device, tmp_path):
     own = "[camera.aberrations]\nspherical_pitch = 0.2\n[[camera.window]]\nindex = 1.4\nthickness_mm = 2.0\n"
     own += "point_mm = [-20.0, 0.0, 20.0]\nnormal = [-1.0, 0.0, 1.0]\n"
     text = (

@@ -25,7 +25,7 @@ def small(tmp_path_factory, device):
     return folder, path, steps
 
 
-def test_data_set_is_what_the_contract_asks_for(small):
+def test_data_set_is_a_valid_experiment_with_truth(small):
     folder, path, steps = small
     experiment = open_experiment(path)
     assert path == folder / "data" / "experiment.toml" and sorted(os.listdir(folder)) == ["data", "scene.toml"]
@@ -81,7 +81,7 @@ def test_particle_images_show_the_truth_at_both_instants(small):
             assert error < 0.2 and other > 2 * error  # rays of two tables, shot and read noise leave 10 to 15 %
 
 
-def test_same_seed_same_files_and_a_flip_only_mirrors(small, tmp_path):
+def test_equal_seeds_give_equal_files_and_a_flip_mirrors(small, tmp_path):
     folder, path, _ = small
     text = SMALL_SCENE.replace('name = "two"', 'name = "two"\nimage_flip = "both"')
     text = text.replace('name = "one"', 'name = "one"\nimage_flip = "vertical"')

@@ -1,4 +1,4 @@
-"""Simulator: kernels against slow twins and a geometric ray trace, radiometry, noise, the sample data."""
+"""Simulator: kernels against slow twins and geometric rays, radiometry, noise, sample data."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ EDGE_SAMPLES = 2.5  # rays of one pixel that float32 may put on the other side o
 
 
 def sources_twin(scene_camera, renderer, centres, counts, extent, rays, rng):
-    """Twin of `render_sources`, ray by ray in float64, in the words of DRT: s = k u - m x_c."""
+    """Twin of `render_sources`, ray by ray in float64, by DRT: s = k u - m x_c."""
     optics, image = scene_camera.optics, 0
     f, si, so = optics.focal_length_mm, optics.image_distance_mm, optics.object_distance_mm
     angles = rng.uniform(0, 2 * np.pi, (len(centres), 2))
@@ -43,7 +43,7 @@ def sources_twin(scene_camera, renderer, centres, counts, extent, rays, rng):
 
 @pytest.mark.parametrize("rig", RIGS)
 def test_true_mapping_is_a_thin_lens(rig):
-    """A ray through pupil point u meets the array where the line to the point's thin-lens image does."""
+    """A ray through pupil point u meets the array on the line to the thin-lens image of the point."""
     scene_camera = camera(rig)
     optics, at = scene_camera.optics, 5 * points(200, 1)
     pupil = np.random.default_rng(2).uniform(-10, 10, (200, 2))
@@ -105,7 +105,7 @@ def test_white_equals_rays_of_uniform_light(device, rig):
 
 
 def board_twin(scene_camera, plane, dots, spacing, diameter, table):
-    """Twin of `render_board` (bright dots), pixel by pixel: where on the board does the light of a pixel come from?"""
+    """Twin of `render_board` (bright dots): trace the light of each pixel back to the board."""
     optics, lattice = scene_camera.optics, scene_camera.lattice
     scale = optics.microlens_focal_length_mm / optics.image_distance_mm
     rows, columns = optics.sensor_shape
@@ -208,8 +208,8 @@ def test_images_add_exactly_and_do_not_depend_on_threads(device, tmp_path):
     assert done.stdout.split()[-1] == hashlib.sha256(whole.tobytes()).hexdigest()
 
 
-def test_exposure_has_the_noise_it_says():
-    """Mean kept; variance = read noise^2 + signal / (electrons per count) + rounding; nothing else."""
+def test_exposure_has_the_stated_noise():
+    """The mean is unchanged. Variance = read noise^2 + signal / (electrons per count) + rounding."""
     level = np.repeat(np.array([0.0, 300.0, 2500.0]), 200_000).reshape(600, 1000)
     noise = Noise(background=50.0, read_noise=4.0, full_well_e=8190.0)  # two electrons per count
     image = expose(level, camera(blur_px=0.0), noise, np.random.default_rng(0)).astype(float)
@@ -229,7 +229,7 @@ def test_exposure_has_the_noise_it_says():
 
 
 def shift_px(model, image):
-    """Sub-pixel shift (column, row) of an image against a model with fitted level, by least squares on the gradient."""
+    """Fit the sub-pixel shift (column, row) of an image against a model, by least squares on the gradient."""
     slope_y, slope_x = np.gradient(model)
     design = np.stack([model.ravel(), np.ones(model.size), -slope_x.ravel(), -slope_y.ravel()], 1)
     solved = np.linalg.lstsq(design.T @ design, design.T @ image.ravel(), rcond=None)[0]
@@ -243,7 +243,7 @@ SAMPLE_NOISE = 12.0  # count: variance per count of the sample's images, most of
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_reproduces_the_sample_data(device, sample_data, number):
-    """White, board and particle images of an independent ray tracer, from its specification of the rig alone."""
+    """White, board and particle images equal those of an independent ray tracer with the same specification."""
     folder = sample_data / "ring-vortex-2cam"
     scene_camera = SceneCamera.model_validate(
         json.loads((folder / "truth" / "spec.json").read_text())["camera"][number]

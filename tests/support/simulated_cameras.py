@@ -112,14 +112,14 @@ def points(count, seed=0):
 
 
 def lens_gain(renderer, index):
-    """Transmission of lenses (i, j), zero outside the table."""
+    """Return the transmission of lenses (i, j), zero outside the table."""
     i, j = (index - renderer.first_lens).astype(int).T
     inside = (i >= 0) & (i < renderer.lens_gain.shape[0]) & (j >= 0) & (j < renderer.lens_gain.shape[1])
     return np.where(inside, renderer.lens_gain[np.where(inside, i, 0), np.where(inside, j, 0)], 0)
 
 
 def land(scene_camera, renderer, s_t, pupil, weight):
-    """Twin of the sensor: Eq. 9 for rays (s, t) and (u, v), added up per pixel with the weight of each."""
+    """Add up weighted rays (s, t), (u, v) per pixel of the sensor by Eq. 9."""
     lattice, optics = scene_camera.lattice, scene_camera.optics
     index = lattice.nearest(s_t)
     place = lattice.centres_mm(index) + optics.microlens_focal_length_mm / optics.image_distance_mm * (s_t - pupil)
