@@ -275,10 +275,10 @@ def _doctor(
         from lfpiv.cli.doctor import examine
 
         found = []
-        for item, finding, good in examine(device):
-            found.append({"item": item, "finding": finding, "good": good})
-            if not _output.json and not (_output.quiet and good):
-                print(f"{'  ' if good else '! '}{item:24s} {finding}", flush=True)
+        for one in examine(device):
+            found.append(one._asdict())
+            if not _output.json and not (_output.quiet and one.good):
+                print(f"{'  ' if one.good else '! '}{one.item:24s} {one.finding}", flush=True)
     _output.show(found, lambda: None)
     if not all(item["good"] for item in found):
         raise typer.Exit(1)
