@@ -19,7 +19,6 @@ is noise. So the volumes of each frame by itself stay with them, and `unshared_q
 from __future__ import annotations
 
 import enum
-import json
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -30,11 +29,15 @@ import xarray as xr
 from scipy import ndimage
 
 from lfpiv.reconstruction.volume import Stop, reconstruct
-from lfpiv.velocity.cross_correlation import LOWEST_RIVAL, REFINE_SEARCH, correlate, emphasise, missing_smoothing
+from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.multi_pass import peak_ratio
 from lfpiv.velocity.predictor import Predictor
+from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings
+from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
+from lfpiv.velocity.windows import Windows
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.correlation import deform
-from lfpiv_kernels.correlation.correlate import correlate_windows, window_grid
+from lfpiv_kernels.correlation.correlate import correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 
 log = logging.getLogger(__name__)
@@ -219,33 +222,34 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
         if any(volume.attrs.get("motion") == Motion.FOLLOWED.value for volume in volumes):
             log.warning("motion: volumes without what each frame shows by itself; the uncertainty is too small")
         return vectors
-    settings = json.loads(vectors.attrs["settings"])
-    if len(settings["windows"]) == 1 or not vectors["valid"].any():
+    settings = CorrelationSettings.of(vectors)
+    if len(settings.windows) == 1 or not vectors["valid"].any():
         return vectors
-    control, window = _Control(volumes[0], vectors), tuple(settings["windows"][-1])
-    missing = missing_smoothing(settings["smoothing_voxel"], *volumes)
+    control, window = _Control(volumes[0], vectors), settings.windows[-1]
+    missing = missing_smoothing(settings.smoothing_voxel, *volumes)
     alone = (volume[UNSHARED].values for volume in volumes)  # their scale does not matter
     first, second = (
         deform.spline_coefficients(
-            emphasise((light - np.median(light)).astype(np.float32), missing, settings["intensity_power"])
+            preprocess((light - np.median(light)).astype(np.float32), missing, settings.intensity_power)
         )
         for light in alone
     )
     first, second = deform.deform_pair(first, second, control.midway.field, control.midway.spacing)
     step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(control.nodes, first.shape, strict=True))
-    origin, count = window_grid(first.shape, window, step)
-    scatter = displacement_deviation(first, second, window=window, origin=origin, step=step, count=count)
+    windows = Windows.covering(first.shape, window, step)
+    scatter = displacement_deviation(
+        first, second, window=window, origin=windows.origin, step=step, count=windows.count
+    )
     search = (REFINE_SEARCH,) * 3
     left = correlate_windows(first, second, window=window, step=step, search=search, symmetric=True)
     measured = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
-    shown = control.midway.window_means(origin, step, count, window) + left.displacement
+    shown = control.midway.window_means(windows) + left.displacement
     deviation = np.maximum(scatter, np.abs(shown - measured))
     deviation[~vectors["valid"].values] = np.nan
     stated = {f"uncertainty_{axis}": deviation[..., k] for k, axis in enumerate("zyx")}
     stated["uncertainty"] = np.sqrt((deviation**2).sum(-1))
     stated["correlation"] = left.correlation
-    ratio = left.correlation / np.maximum(left.rival, LOWEST_RIVAL)
-    stated["peak_ratio"] = np.where(left.correlation > 0, ratio, np.nan)
+    stated["peak_ratio"] = peak_ratio(left)
     return vectors.assign({name: vectors[name].copy(data=values.astype(np.float32)) for name, values in stated.items()})
 
 
@@ -297,7 +301,7 @@ class _Control:
         """Places of the vectors along each axis [voxel]."""
         nz, ny, nx = volume.shape
         displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], axis=-1).astype(float)
-        self.midway = Predictor(displacement, self.nodes, (nz, ny, nx))
+        self.midway = Predictor.between(self.nodes, displacement, (nz, ny, nx))
         """Displacement of what is at a control point midway in time."""
         trust = vectors["valid"].values.astype(float)
         for axis, (nodes, count) in enumerate(zip(self.nodes, volume.shape, strict=True)):
