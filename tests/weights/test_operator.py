@@ -10,7 +10,7 @@ from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, 
 
 import lfpiv
 from lfpiv.lightfield.decoder import disc_fraction
-from lfpiv.lightfield.microimage_layout import microimages_of, microimage_centres
+from lfpiv.lightfield.microimage_layout import microimage_centres, microimages_of
 from lfpiv.warn import collected
 from lfpiv.weights import blocks as weightblocks
 from lfpiv.weights import choice as weightcheck

@@ -28,7 +28,7 @@ import numpy as np
 from scipy import fft, special
 from scipy.spatial import Voronoi
 
-from lfpiv.geometry.optics import LensLattice, Optics, pair, spread_over_pupil
+from lfpiv.geometry.optics import LensLattice, Optics, float_pair, spread_over_pupil
 
 _BEND_ORDER = 3
 _POWERS = [(order - j, j) for order in range(_BEND_ORDER + 1) for j in range(order + 1)]  # of (u, v)
@@ -83,7 +83,7 @@ class LensIntegral:
 
     @property
     def _basis(self) -> Basis:
-        return tuple(pair(vector) for vector in self.lattice.basis_mm)
+        return tuple(float_pair(vector) for vector in self.lattice.basis_mm)
 
     def rays_mm(self, terms: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return s(u) [mm], shape (n, 2), from `ray_terms` and the dot's own coefficients."""
