@@ -13,7 +13,7 @@ from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.geometry.grid import Grid
 from lfpiv.reproduce import Progress, page, plots
 from lfpiv.reproduce.rigs import VOXEL_MM, numerical_rig
-from lfpiv.weights.blocks import count_voxels
+from lfpiv.weights.counting import count_voxels
 from lfpiv.weights.operator import COUNT_SAMPLES_ONE
 
 TITLE = "Fig. 10: weights of one voxel"

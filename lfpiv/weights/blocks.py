@@ -1,4 +1,9 @@
-"""Weights of voxels for one camera: blocks integrated in closed form, and rays counted in windows of the sensor."""
+"""Weights of one camera as blocks of 8-bit levels, integrated in closed form.
+
+The input is a camera and the ray models of voxels (`lfpiv.weights.ray_fit`). The kernels of
+`lfpiv_kernels.weights.footprint` integrate a voxel's projection over microlens and pupil pixel, the limit of Eq. 10 for
+many rays. The output is `Blocks`, one per camera.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +14,12 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from lfpiv.errors import InputError
-from lfpiv.geometry.grid import Grid
 from lfpiv.lightfield.microimage_layout import microimage_edge
-from lfpiv.weights.ray_fit import fit_rays, grid_models, ray_models
-from lfpiv_kernels import runtime
-from lfpiv_kernels.rays.count import count_rays
+from lfpiv.weights.ray_fit import grid_models, ray_models
+from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.rays.lattice import Lattice, cell_frame, cell_steps, pack_lattice
 from lfpiv_kernels.reconstruction.projector import Blocks
 from lfpiv_kernels.weights import footprint
@@ -26,42 +28,63 @@ from lfpiv_kernels.weights.ray_model import LANES, LEVELS
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
-Progress = Callable[[float], None]
 Cuts = tuple[int, int, int]
-"""Parts of a voxel along x, y, z whose footprints are integrated apart and added."""
+"""Number of equal parts of a voxel along x, y, z. The footprints of the parts are integrated separately and added."""
 
 WHOLE: Cuts = (1, 1, 1)
-"""A voxel in one piece."""
+"""Voxel that is not cut."""
 CHUNK_VOXELS = 16384
-"""Voxels whose ray models are held at once."""
+"""Number of voxels whose ray models are in memory at once."""
 SAMPLED_VOXELS = 1024
-"""Voxels from which the memory of all is estimated."""
+"""Number of voxels from which the memory of all voxels is estimated."""
 MOST_BLOCKS = np.iinfo(np.int32).max
-"""Blocks of a camera at most: their numbers have 32 bits."""
+"""Largest number of blocks of a camera: block indices have 32 bits."""
 BLOCK_BYTES, VOXEL_BYTES = 6, 16
-"""Memory of a block beside its values, and of a voxel beside its blocks [byte]."""
-COUNT_POINTS = 8
-"""Object points per voxel edge: 512 per voxel, the paper has 500."""
+"""Memory of a block without its values, and of a voxel without its blocks [byte]."""
 
 
-@dataclass(kw_only=True)
-class CameraKernels:
-    """One camera's constants as the kernels take them."""
+@dataclass(frozen=True, kw_only=True)
+class PackedCamera:
+    """Constants of one camera in the form that the kernels take."""
 
-    setup: CalibratedCamera
+    calibrated: CalibratedCamera
     camera: footprint.Camera
     lattice: Lattice
     cell_mm: float
     frame: np.ndarray
     outline: np.ndarray
 
+    @classmethod
+    def of(cls, camera: CalibratedCamera) -> PackedCamera:
+        """Pack a camera."""
+        optics, lattice = camera.optics, camera.lattice
+        basis = np.asarray(lattice.basis_mm)
+        if lattice.layout == "square":
+            cell = 0.5 * np.abs(basis).sum(0).max()
+        else:
+            cell = lattice.pitch_mm / math.sqrt(3)
+        return cls(
+            calibrated=camera,
+            camera=footprint.pack_camera(
+                sensor_per_pupil=optics.sensor_per_pupil,
+                pixel_mm=optics.pixel_mm,
+                sensor_shape=optics.sensor_shape,
+                pupil_radius_mm=optics.pupil_radius_mm,
+                edge=microimage_edge(optics),
+            ),
+            lattice=pack_lattice(np.asarray(lattice.origin_mm), basis),
+            cell_mm=float(cell),
+            frame=cell_frame(basis, lattice.layout),
+            outline=cell_steps(lattice.layout),
+        )
+
     def footprints(self, form: str, cuts: Cuts = WHOLE) -> footprint.Footprints:
-        """Return what computes this camera's blocks of a form."""
+        """Return the kernel's launcher for this camera's blocks of a form."""
         return footprint.Footprints(
             self.camera,
             self.lattice,
             self.cell_mm,
-            self.setup.microimages,
+            self.calibrated.microimages,
             frame=self.frame,
             outline=self.outline,
             form=form,
@@ -69,39 +92,15 @@ class CameraKernels:
         )
 
 
-def pack_camera(camera: CalibratedCamera) -> CameraKernels:
-    """Pack a camera for the kernels."""
-    optics, lattice = camera.optics, camera.lattice
-    basis = np.asarray(lattice.basis_mm)
-    if lattice.layout == "square":
-        cell = 0.5 * np.abs(basis).sum(0).max()
-    else:
-        cell = lattice.pitch_mm / math.sqrt(3)
-    return CameraKernels(
-        setup=camera,
-        camera=footprint.pack_camera(
-            sensor_per_pupil=optics.sensor_per_pupil,
-            pixel_mm=optics.pixel_mm,
-            sensor_shape=optics.sensor_shape,
-            pupil_radius_mm=optics.pupil_radius_mm,
-            edge=microimage_edge(optics),
-        ),
-        lattice=pack_lattice(np.asarray(lattice.origin_mm), basis),
-        cell_mm=float(cell),
-        frame=cell_frame(basis, lattice.layout),
-        outline=cell_steps(lattice.layout),
-    )
-
-
 class _Growing:
-    """An array of unknown length, filled piece by piece; memory that nobody wrote to yet costs nothing."""
+    """Array of unknown length that is filled piece by piece. Memory that is reserved but not written costs nothing."""
 
     def __init__(self, dtype: type, expected: int):
         self._array: np.ndarray = np.empty(max(expected, 1), dtype)
         self._used = 0
 
     def take(self, count: int) -> np.ndarray:
-        """Return the next `count` entries, to be written before the next call."""
+        """Return the next `count` entries. Write them before the next call."""
         first, self._used = self._used, self._used + count
         if self._used > len(self._array):
             self._array.resize(self._used + self._used // 8, refcheck=False)  # moves pages where the system can
@@ -117,23 +116,23 @@ def footprint_blocks(
     stored: StoredGrid,
     camera: CalibratedCamera,
     form: str,
-    progress: Progress,
-    allow: Callable[[int], None] = lambda _: None,
+    progress: Callable[[float], None],
+    allow: Callable[[int], None],
     cuts: Cuts = WHOLE,
 ) -> Blocks:
-    """Compute the blocks of one camera.
+    """Integrate the blocks of all voxels of a grid for one camera.
 
-    `allow` is called with the memory they will take [byte], known from a sample of the voxels, and may raise.
+    `allow` is called with the estimated memory of the blocks [byte] before they are computed, and may raise.
 
     Raises
     ------
     InputError
-        If there are more blocks than can be numbered: before they are computed.
+        If there are more blocks than 32-bit indices can number, before they are computed.
     """
     size = stored.grid.size
     plane = size // stored.shape[0]
-    pack = pack_camera(camera)
-    blocks, values = sample_blocks(pack, stored, form, cuts)
+    packed = PackedCamera.of(camera)
+    blocks, values = sample_blocks(packed, stored, form, cuts)
     require_numbers(size * blocks, stored.grid.shape)
     allow(int(size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)))
     outer, middle, inner = (2 - axis for axis in stored.order)
@@ -141,16 +140,16 @@ def footprint_blocks(
 
     def batches() -> Iterator[np.ndarray]:
         step = max(1, CHUNK_VOXELS // plane)
-        with threadpool_limits(1, "blas"):  # products of a plane each: BLAS's own threads cost more than they bring
+        with threadpool_limits(1, "blas"):  # one product per plane is too small for BLAS's own threads
             for first in range(0, stored.shape[0], step):
                 yield np.concatenate(list(islice(planes, step)))
                 progress(min(first + step, stored.shape[0]) / stored.shape[0])
 
-    return blocks_of(pack, batches(), form, (int(size * blocks), int(size * values)), cuts)
+    return blocks_of(packed, batches(), form, expected=(int(size * blocks), int(size * values)), cuts=cuts)
 
 
 def require_numbers(blocks: float, shape: tuple[int, ...]) -> None:
-    """Refuse more blocks than 32-bit numbers can tell apart."""
+    """Refuse more blocks than 32-bit indices can number."""
     if blocks > MOST_BLOCKS:
         voxels = " x ".join(map(str, shape))
         raise InputError(
@@ -159,35 +158,40 @@ def require_numbers(blocks: float, shape: tuple[int, ...]) -> None:
         )
 
 
-def sample_blocks(pack: CameraKernels, stored: StoredGrid, form: str, cuts: Cuts = WHOLE) -> tuple[float, float]:
-    """Blocks and values per voxel, from a sample of a grid's voxels."""
+def sample_blocks(packed: PackedCamera, stored: StoredGrid, form: str, cuts: Cuts = WHOLE) -> tuple[float, float]:
+    """Return the mean number of blocks and of values per voxel in a sample of a grid's voxels."""
     sample = np.unique(np.linspace(0, stored.grid.size - 1, SAMPLED_VOXELS).astype(np.int64))
-    model = ray_models(pack.setup, stored.centres_mm(sample), stored.grid.voxel_mm)
+    model = ray_models(packed.calibrated, stored.centres_mm(sample), stored.grid.voxel_mm)
     blocks, values = (
-        np.concatenate(counts) for counts in zip(*pack.footprints(form, cuts).compute(model), strict=True)
+        np.concatenate(counts) for counts in zip(*packed.footprints(form, cuts).compute(model), strict=True)
     )
     return float(blocks.mean()), float(values.mean())
 
 
 def blocks_of(
-    pack: CameraKernels, models: Iterable[np.ndarray], form: str, expected: tuple[int, int], cuts: Cuts = WHOLE
+    packed: PackedCamera,
+    models: Iterable[np.ndarray],
+    form: str,
+    *,
+    expected: tuple[int, int] = (0, 0),
+    cuts: Cuts = WHOLE,
 ) -> Blocks:
-    """Compute the blocks of voxels from their ray models, batch by batch.
+    """Integrate the blocks of voxels from their ray models, batch by batch.
 
     Parameters
     ----------
-    pack : CameraKernels
+    packed : PackedCamera
         The camera.
     models : iterable of ndarray, shape (voxel, 30), float32
         Ray models, one batch after the other.
     form : {"profiles", "pixels"}
         Form of the blocks.
     expected : tuple of int
-        Blocks and values to be expected: what is reserved at first.
+        Expected numbers of blocks and values, for which memory is reserved.
     cuts : tuple of int
-        Parts of the voxels, where the form is "pixels".
+        Parts of a voxel along x, y, z, with the form "pixels".
     """
-    footprints = pack.footprints(form, cuts)
+    footprints = packed.footprints(form, cuts)
     blocks, values = (int(1.02 * count) + LANES for count in expected)
     ray, height, width = (_Growing(dtype, blocks) for dtype in (np.int32, np.uint8, np.uint8))
     value = _Growing(np.uint8, values)
@@ -213,12 +217,12 @@ def blocks_of(
         width=width.done(),
         value=value.done(),
         scale=np.concatenate(scales),
-        microimages=pack.setup.microimages,
+        microimages=packed.calibrated.microimages,
     )
 
 
 def largest_weight(blocks: Blocks) -> float:
-    """Largest weight of a ray: of a pixel, where it is not reached through two lenses."""
+    """Return the largest weight of a ray. A pixel that a voxel reaches through two lenses has two rays."""
     order = 2 if blocks.form == "profiles" else 1
     share = blocks.microimages.share
     bound = blocks.scale.astype(np.float64) * LEVELS**order * share.max(initial=0.0)
@@ -238,7 +242,7 @@ def largest_weight(blocks: Blocks) -> float:
 
 
 def _levels(blocks: Blocks, first: int, last: int) -> np.ndarray:
-    """Largest level of each voxel from `first` to `last`; of profiles the product of two."""
+    """Return the largest level of each voxel from `first` to `last`. With profiles it is a product of two levels."""
     some = slice(blocks.first_block[first], blocks.first_block[last])
     width, height = (array[some].astype(np.int64) for array in (blocks.width, blocks.height))
     largest = np.zeros(last - first)

@@ -1,30 +1,29 @@
-"""Counted rays (Eq. 10): of a few voxels, the judge of integrated weights and of their form; of all, weights."""
+"""Choice of the form in which a camera's integrated weights are stored.
+
+Products of profiles are small and fast, and suit straight rays and upright square microlenses. Values pixel by pixel
+suit any optics and take three times the memory. A few counted voxels (`CountedVoxels`) measure the error of each form;
+`choose_form` returns the smaller form if its error is small enough. `choose_cuts` finds into how many parts a voxel
+must be cut if its edges lie oblique to the microlenses.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lfpiv.lightfield.microimage_layout import plain
+from lfpiv.errors import InputError
+from lfpiv.geometry.grid import Grid
 from lfpiv.warn import Code, Warning, warn
-from lfpiv.weights.blocks import (
-    WHOLE,
-    Cuts,
-    Progress,
-    StoredGrid,
-    blocks_of,
-    count_voxels,
-    pack_camera,
-    require_numbers,
-)
+from lfpiv.weights.blocks import WHOLE, Cuts, PackedCamera, blocks_of
+from lfpiv.weights.counting import CountedVoxels, draw_seen
 from lfpiv.weights.ray_fit import fit_rays, ray_models
+from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.rays.count import POWERS
 from lfpiv_kernels.reconstruction.projector import Blocks
-from lfpiv_kernels.weights.ray_model import LANES, LEVELS
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -32,24 +31,23 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PROFILES_MEAN, PROFILES_WORST = 0.015, 0.025
-"""Largest relative L2 difference from counted rays, mean and worst voxel of the sample, with which profiles serve:
-three quarters of the aims below, for a small sample may miss the worst; straight rays have about 0.010, 0.017."""
+"""Largest relative L2 error of profiles with which they are chosen: mean and worst voxel of the sample."""
 AIM_MEAN, AIM_WORST = 0.02, 0.035
-"""Difference from counted rays, mean and worst voxel of the sample, above which a warning is due."""
-CLEARLY = 0.8
-"""Pixels, of three times the memory, are taken where their mean difference is at most this part of that of profiles."""
+"""Relative L2 error of weights above which a warning is logged: mean and worst voxel of the sample."""
+PIXELS_GAIN = 0.8
+"""Largest ratio of the mean error of pixels to that of profiles with which pixels are chosen."""
 CUTS: tuple[Cuts, ...] = (
     *(WHOLE, (2, 2, 1), (2, 1, 2), (1, 2, 2), (2, 2, 2), (3, 3, 1), (3, 1, 3), (1, 3, 3)),
     *((4, 4, 1), (4, 1, 4), (1, 4, 4), (3, 3, 3), (4, 4, 4)),
 )
-"""Cuts of a voxel, in the order of their cost. One edge alone is never cut: its projection has a covariance, only all
-three together have none, or two where the third lies along an axis of the lenses."""
-CUT_NEAR = 0.0125
-"""Mean relative L2 difference from the finest cut with which a coarser one serves: with the 0.8 % that straight rays
-have anyway it stays below `PROFILES_MEAN`."""
+"""Cuts of a voxel, cheapest first."""
+CUT_ERROR = 0.0125
+"""Largest mean relative L2 difference from the finest cut with which a coarser cut is chosen."""
 BENT, WIDE = 0.01, 2.0
-"""Rays beyond second order, and a voxel's projected edge [microlens pitch], above which they explain a difference: rays
-off by a hundredth change weights by about 2 %."""
+"""Departure of rays from second order, and projected voxel edge, above which they are named as the cause of an error
+[microlens pitch]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Choice:
     """How one camera's footprints are computed and stored."""
@@ -57,20 +55,20 @@ class Choice:
     form: str
     """"profiles" or "pixels"."""
     cuts: Cuts = WHOLE
-    """Parts of the voxels, where the form is "pixels"."""
-    profile_errors: list[float] = field(default_factory=list)
-    """Difference of profiles from counted rays, where these decided."""
+    """Parts of a voxel along x, y, z, with the form "pixels"."""
+    profile_errors: tuple[float, ...] | None = None
+    """Relative L2 error of profiles per counted voxel. None if the form was not chosen by counted rays."""
 
 
 def choose_form(counted: CountedVoxels) -> Choice:
-    """Profiles where they are near enough to counted rays, or pixels hardly nearer; says why, and warns."""
-    profiles = errors = counted.errors_of_form("profiles")
-    choice = Choice(form="profiles", profile_errors=profiles)
+    """Choose profiles unless their error is too large and that of pixels is clearly smaller. Log why, and warn."""
+    profiles = errors = form_errors(counted, "profiles")
+    choice = Choice(form="profiles", profile_errors=tuple(profiles))
     if not profiles_serve(profiles):
         cuts = choose_cuts(counted.stored, counted.camera)
-        pixels = counted.errors_of_form("pixels", cuts)
-        if np.mean(pixels) <= CLEARLY * np.mean(profiles):
-            choice, errors = Choice(form="pixels", cuts=cuts, profile_errors=profiles), pixels
+        pixels = form_errors(counted, "pixels", cuts)
+        if np.mean(pixels) <= PIXELS_GAIN * np.mean(profiles):
+            choice, errors = Choice(form="pixels", cuts=cuts, profile_errors=tuple(profiles)), pixels
         log.info("%s: pixel by pixel weights differ by %.1f %%", counted.camera.name, 100 * np.mean(pixels))
     if profiles:
         log.info(
@@ -78,30 +76,67 @@ def choose_form(counted: CountedVoxels) -> Choice:
             *(counted.camera.name, 100 * np.mean(profiles), 100 * max(profiles)),
             "as products of profiles" if choice.form == "profiles" else "pixel by pixel",
         )
-    counted.warn(choice.form, errors, asked=False)
+    warn_of_errors(counted, choice.form, errors, requested=False)
     return choice
 
 
+def choose_uncounted(stored: StoredGrid, camera: CalibratedCamera, form: str) -> Choice:
+    """Choose a camera's form without counted rays: the requested one, or pixels for hexagonal microlenses."""
+    if form == "profiles":
+        return Choice(form="profiles")
+    if form == "auto":
+        log.info("%s: weights pixel by pixel: profiles need a square microlens layout", camera.name)
+    return Choice(form="pixels", cuts=choose_cuts(stored, camera))
+
+
+def memory_check(name: str, grid: Grid, choice: Choice, left: float) -> Callable[[int], None]:
+    """Return a check that refuses weights of more than `left` byte."""
+    other = ""
+    if choice.profile_errors and choice.form == "pixels":
+        percent = 100 * np.mean(choice.profile_errors)
+        other = f", or set compute.weights_form to 'profiles', {percent:.0f} % from counted rays here"
+
+    def allow(needed: int) -> None:
+        if needed > left:
+            voxels = " x ".join(map(str, grid.shape))
+            raise InputError(
+                f"volume: the weights of {voxels} voxels (z, y, x) on camera {name!r} need {needed / 2**30:.1f} GiB as "
+                f"{choice.form}, {max(left, 0) / 2**30:.1f} GiB are left. Raise volume.voxel_mm, shrink "
+                f"volume.size_mm{other}."
+            )
+
+    return allow
+
+
+def form_errors(counted: CountedVoxels, form: str, cuts: Cuts = WHOLE) -> list[float]:
+    """Return the errors of footprints in a form, one per counted voxel. Only these voxels are integrated."""
+    if not len(counted.voxels):
+        return []
+    model = ray_models(counted.camera, counted.centres_mm, counted.stored.grid.voxel_mm)
+    blocks = blocks_of(PackedCamera.of(counted.camera), [model], form, cuts=cuts)
+    return counted.errors(blocks, range(len(model)))
+
+
 def profiles_serve(errors: Sequence[float]) -> bool:
-    """Whether profiles are near enough to counted rays; where no voxel is seen, the smaller form does."""
+    """Whether profiles are near enough to counted rays; true if the camera sees no voxel."""
     return not errors or bool(np.mean(errors) <= PROFILES_MEAN and max(errors) <= PROFILES_WORST)
 
 
 def choose_cuts(stored: StoredGrid, camera: CalibratedCamera) -> Cuts:
-    """Cut of the voxels that footprints pixel by pixel need: the cheapest one near the finest, in a few voxels."""
+    """Choose the cheapest cut of a voxel whose footprints pixel by pixel are near those of the finest cut."""
     voxels = draw_seen(stored, camera)
     if not len(voxels):
         return WHOLE
-    model, pack = ray_models(camera, stored.centres_mm(voxels), stored.grid.voxel_mm), pack_camera(camera)
-    finest = blocks_of(pack, [model], "pixels", (0, 0), CUTS[-1])
+    model, packed = ray_models(camera, stored.centres_mm(voxels), stored.grid.voxel_mm), PackedCamera.of(camera)
+    finest = blocks_of(packed, [model], "pixels", cuts=CUTS[-1])
     for cuts in CUTS[:-1]:
-        blocks = blocks_of(pack, [model], "pixels", (0, 0), cuts)
-        if np.mean([_difference(blocks, finest, voxel) for voxel in range(len(model))]) <= CUT_NEAR:
+        blocks = blocks_of(packed, [model], "pixels", cuts=cuts)
+        if np.mean([_difference(blocks, finest, voxel) for voxel in range(len(model))]) <= CUT_ERROR:
             break
     else:
         cuts = CUTS[-1]
     if cuts != WHOLE:
-        text = "%s: voxels lie aslant to the microlenses: footprints of %d x %d x %d parts along x, y, z are added"
+        text = "%s: voxels lie oblique to the microlenses: footprints of %d x %d x %d parts along x, y, z are added"
         log.info(text, camera.name, *cuts)
     return cuts
 
@@ -119,3 +154,40 @@ def _difference(blocks: Blocks, others: Blocks, voxel: int) -> float:
     return float(np.linalg.norm(difference) / max(np.linalg.norm(light), np.finfo(float).tiny))
 
 
+def warn_of_errors(counted: CountedVoxels, form: str, errors: Sequence[float], *, requested: bool) -> None:
+    """Warn if no voxel could be compared, or if the weights' error exceeds the aim; name the likely cause.
+
+    `requested` says that the user requested the form, so that no counted rays chose it.
+    """
+    camera = counted.camera
+    if not errors:
+        warn(log, Warning(code=Code.WEIGHTS_UNCHECKED, subject=camera.name))
+    elif np.mean(errors) > AIM_MEAN or max(errors) > AIM_WORST:
+        bent, wide = _bent(camera, counted.centres_mm), _wide(camera, counted)
+        if form == "profiles" and requested:
+            cause = "profiles suit straight rays and upright arrays; set compute.weights_form to 'auto'"
+        elif bent > BENT:
+            cause = "aberrations beyond the second order in the pupil point; weights follow rays up to that order"
+        elif wide > WIDE:
+            cause = "voxels larger than microlenses; lower volume.voxel_mm"
+        else:
+            cause = "not known; neither aberrations nor the voxels' size explain it"
+        figures = {"form": form, "mean": float(np.mean(errors)), "worst": max(errors), "cause": cause}
+        figures |= {"aim_mean": AIM_MEAN, "aim_worst": AIM_WORST, "bent_pitch": bent, "wide_pitch": wide}
+        warn(log, Warning(code=Code.WEIGHTS_DIFFER, subject=camera.name, figures=figures))
+
+
+def _bent(camera: CalibratedCamera, centres_mm: np.ndarray) -> float:
+    """Largest departure of rays from a polynomial of second order in the pupil point [microlens pitch]."""
+    third, second = (fit_rays(camera, centres_mm, degree=degree) for degree in (3, 2))
+    third[..., : second.shape[-1]] -= second
+    angle = np.arange(0, 2 * np.pi, np.pi / 8)
+    u, v = camera.optics.pupil_radius_mm * np.array([np.cos(angle), np.sin(angle)])
+    rays = third @ np.stack([u**a * v**b for a, b in POWERS])
+    return float(np.hypot(rays[:, 0], rays[:, 1]).max() / camera.lattice.pitch_mm)
+
+
+def _wide(camera: CalibratedCamera, counted: CountedVoxels) -> float:
+    """Longest projected edge of a counted voxel on the microlens array [microlens pitch]."""
+    edges = ray_models(camera, counted.centres_mm, counted.stored.grid.voxel_mm)[:, 12:18].reshape(-1, 2)
+    return float(np.hypot(*edges.T).max() / camera.lattice.pitch_mm)

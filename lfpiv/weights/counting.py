@@ -1,18 +1,49 @@
-"""Rays traced from voxels and counted per pixel (Eq. 10)."""
+"""Weights by counting rays (Eq. 10): weight = rays that reach a pixel / rays traced from the voxel.
 
-VOXELS = 6
-"""Voxels counted per camera."""
-POOLS = 1 << 12, 1 << 18
-"""Random voxels among which those that the camera sees are looked for; the more where the fewer hold too few."""
-POINTS, SAMPLES = 16, 36
-"""Object points per voxel edge and pupil points per axis of each of two counts: 4e6 rays per voxel, 0.3 to 0.5 % noise,
-known from the two and subtracted. Where a voxel is in focus its points alone decide; with 8 and 100 it was 1 to 2 %."""
+Object points in a voxel and points in the pupil are stratified samples. `count_voxels` traces and counts them. A whole
+grid of counts becomes the operator's `Blocks` (`count_blocks`). A few counted voxels, `CountedVoxels`, measure the
+error of integrated weights.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lfpiv.lightfield.microimage_layout import plain
+from lfpiv.warn import Code, Warning, warn
+from lfpiv.weights.blocks import PackedCamera, require_numbers
+from lfpiv.weights.ray_fit import fit_rays
+from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels import runtime
+from lfpiv_kernels.rays.count import count_rays
+from lfpiv_kernels.reconstruction.projector import Blocks
+from lfpiv_kernels.weights.ray_model import LANES, LEVELS
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
+
+log = logging.getLogger(__name__)
+
+COUNT_POINTS = 8
+"""Object points along each edge of a voxel: 512 per voxel. The paper has 500."""
 COUNT_SAMPLES = 36
-"""Pupil points per axis when every voxel is counted, about 1,000 per object point."""
+"""Pupil points along each axis when every voxel of a grid is counted: about 1,000 rays per object point."""
 COUNT_CHUNK = 64
-"""Voxels counted at once: each has a window of the sensor."""
+"""Number of voxels counted at once. Each needs a window of the sensor in memory."""
 COUNT_TALLEST = 128
-"""Rows of a block of counts at most."""
+"""Largest height of a block of counts [row]."""
+VOXELS = 6
+"""Number of voxels per camera that are compared with integrated weights."""
+POOLS = 1 << 12, 1 << 18
+"""Sizes of the random pools from which these voxels are drawn. The larger pool is used if the camera sees too few of
+the smaller one."""
+POINTS, SAMPLES = 16, 36
+"""Object points along each voxel edge and pupil points along each axis in a comparison: 4e6 rays per voxel, counted
+twice."""
 
 
 def count_voxels(
@@ -35,9 +66,9 @@ def count_voxels(
     voxel_mm : float
         Voxel edge [mm].
     samples : int
-        Pupil points per axis.
+        Pupil points along each axis.
     points : int
-        Object points per voxel edge.
+        Object points along each voxel edge.
     seed : int
         Seed of the positions inside the strata.
 
@@ -52,12 +83,12 @@ def count_voxels(
     """
     runtime.device()
     rng = np.random.default_rng(seed)
-    pack, optics = pack_camera(camera), camera.optics
+    packed, optics = PackedCamera.of(camera), camera.optics
     strata = np.stack(np.meshgrid(*[np.arange(points)] * 3, indexing="ij"), -1).reshape(-1, 3)
     inside = (strata + rng.random((len(centres_mm), len(strata), 3))) / points - 0.5
     objects = (np.asarray(centres_mm)[:, None] + inside * voxel_mm).reshape(-1, 3)
     rays = fit_rays(camera, objects, degree=3)
-    # the window: where the rays of a voxel meet the array, one lens and one microimage around it
+    # window: where a voxel's rays meet the array, widened by one lens and one microimage
     radius = optics.pupil_radius_mm
     corner = rays.reshape(len(centres_mm), len(strata), 2, -1)
     spread = np.abs(corner[..., 1]) * radius + np.abs(corner[..., 2]) * radius
@@ -73,8 +104,8 @@ def count_voxels(
         rng.random((len(objects), 2)).astype(np.float32),
         np.repeat(np.arange(len(centres_mm), dtype=np.int32), len(strata)),
         first_pixel,
-        pack.camera,
-        pack.lattice,
+        packed.camera,
+        packed.lattice,
         hexagonal=camera.lattice.layout == "hexagonal",
         samples=samples,
         shape=(int(rows), int(columns)),
@@ -82,8 +113,22 @@ def count_voxels(
     return count, total, first_pixel
 
 
+def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
+    """Add one voxel's stored weights to a sensor image, in place."""
+    ray, weight = blocks.entries(voxel)
+    share = blocks.microimages.share[ray]
+    lit = share > 0
+    np.add.at(image.ravel(), blocks.microimages.pixel[ray[lit]], weight[lit] * share[lit])
+
+
+# -- a few voxels, to compare integrated weights with
+
+
 class CountedVoxels:
-    """A few random voxels that a camera sees, counted twice with independent rays; none where it sees none."""
+    """A few random voxels that a camera sees, counted twice with independent rays.
+
+    The difference of the two counts gives their noise. There are no voxels if the camera sees none.
+    """
 
     def __init__(self, stored: StoredGrid, camera: CalibratedCamera, seed: int = 0):
         self.stored, self.camera = stored, camera
@@ -108,12 +153,12 @@ class CountedVoxels:
             window = self._halves[number // 2, number % 2, row : row + share.shape[0], column : column + share.shape[1]]
             window[:] = share
         for half, start in zip(self._halves, self._corner, strict=True):
-            half *= _cut(camera.gain, start, half.shape[1:])
+            half *= _window(camera.gain, start, half.shape[1:])
 
     def errors(self, blocks: Blocks, voxels: Sequence[int] | None = None) -> list[float]:
-        """Relative L2 difference of stored weights from the counts, their noise subtracted; voxels seen only.
+        """Return the relative L2 difference of blocks from the counts, one per voxel, the counts' noise subtracted.
 
-        `voxels` are the indices of the counted voxels in `blocks`; default: those of the grid.
+        `voxels` are the indices of the counted voxels in `blocks`; default: their stored indices in the grid.
         """
         errors = []
         columns = blocks.microimages.sensor_shape[1]
@@ -138,53 +183,9 @@ class CountedVoxels:
             errors.append(float(np.sqrt(max(error, 0.0)) / light))
         return errors
 
-    def errors_of_form(self, form: str, cuts: Cuts = WHOLE) -> list[float]:
-        """Errors of the footprint in a form, of the counted voxels alone."""
-        if not len(self.voxels):
-            return []
-        model = ray_models(self.camera, self.centres_mm, self.stored.grid.voxel_mm)
-        blocks = blocks_of(pack_camera(self.camera), [model], form, (0, 0), cuts)
-        return self.errors(blocks, range(len(model)))
-
-    def warn(self, form: str, errors: Sequence[float], *, asked: bool) -> None:
-        """Warn where the weights of a form were compared with nothing, or are further from the counts than aimed at.
-
-        `asked` tells whether the user asked for the form.
-        """
-        name = self.camera.name
-        if not errors:
-            warn(log, Warning(code=Code.WEIGHTS_UNCHECKED, subject=name))
-        elif np.mean(errors) > AIM_MEAN or max(errors) > AIM_WORST:
-            bent, wide = self._bent(), self._wide()
-            if form == "profiles" and asked:
-                cause = "profiles suit straight rays and upright arrays; set compute.weights_form to 'auto'"
-            elif bent > BENT:
-                cause = "aberrations beyond the second order in the pupil point, which weights follow"
-            elif wide > WIDE:
-                cause = "voxels larger than microlenses; lower volume.voxel_mm"
-            else:
-                cause = "not known; neither aberrations nor the voxels' size explain it"
-            figures = {"form": form, "mean": float(np.mean(errors)), "worst": max(errors), "cause": cause}
-            figures |= {"aim_mean": AIM_MEAN, "aim_worst": AIM_WORST, "bent_pitch": bent, "wide_pitch": wide}
-            warn(log, Warning(code=Code.WEIGHTS_DIFFER, subject=name, figures=figures))
-
-    def _bent(self) -> float:
-        """Furthest that rays depart from their model, second order in the pupil point [microlens pitch]."""
-        third, second = (fit_rays(self.camera, self.centres_mm, degree=degree) for degree in (3, 2))
-        third[..., : second.shape[-1]] -= second
-        angle = np.arange(0, 2 * np.pi, np.pi / 8)
-        u, v = self.camera.optics.pupil_radius_mm * np.array([np.cos(angle), np.sin(angle)])
-        rays = third @ np.stack([u**a * v**b for a, b in POWERS])
-        return float(np.hypot(rays[:, 0], rays[:, 1]).max() / self.camera.lattice.pitch_mm)
-
-    def _wide(self) -> float:
-        """Longest edge of a voxel on the array [microlens pitch]."""
-        edges = ray_models(self.camera, self.centres_mm, self.stored.grid.voxel_mm)[:, 12:18].reshape(-1, 2)
-        return float(np.hypot(*edges.T).max() / self.camera.lattice.pitch_mm)
-
 
 def draw_seen(stored: StoredGrid, camera: CalibratedCamera, seed: int = 0) -> np.ndarray:
-    """Draw random voxels whose chief rays meet the sensor, `VOXELS` or as many as are found; stored indices, sorted."""
+    """Draw `VOXELS` random voxels whose chief rays meet the sensor, or as many as are found. Return sorted indices."""
     rng, size = np.random.default_rng(seed), stored.grid.size
     half_mm = np.array(camera.optics.sensor_shape[::-1]) / 2 * camera.optics.pixel_mm
     for pool in POOLS:
@@ -196,38 +197,34 @@ def draw_seen(stored: StoredGrid, camera: CalibratedCamera, seed: int = 0) -> np
     return np.sort(seen[:VOXELS])
 
 
-def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
-    """Add one voxel's stored weights to a sensor image, in place."""
-    ray, weight = blocks.entries(voxel)
-    share = blocks.microimages.share[ray]
-    lit = share > 0
-    np.add.at(image.ravel(), blocks.microimages.pixel[ray[lit]], weight[lit] * share[lit])
+def _overlap(shape: tuple[int, ...], window: tuple[int, ...], corner: np.ndarray) -> tuple[tuple[slice, ...], ...]:
+    """Return the overlap of an image and a window whose first pixel is `corner` (column, row): slices of both."""
+    column, row = (int(c) for c in corner)
+    rows = slice(max(row, 0), max(min(row + window[0], shape[0]), max(row, 0)))
+    columns = slice(max(column, 0), max(min(column + window[1], shape[1]), max(column, 0)))
+    within = slice(rows.start - row, rows.stop - row), slice(columns.start - column, columns.stop - column)
+    return (rows, columns), within
 
 
 def add_window(image: np.ndarray, window: np.ndarray, corner: np.ndarray) -> None:
     """Add a window whose first pixel is `corner` (column, row) to a sensor image, in place."""
-    column, row = (int(c) for c in corner)
-    rows = slice(max(row, 0), min(row + window.shape[0], image.shape[0]))
-    columns = slice(max(column, 0), min(column + window.shape[1], image.shape[1]))
-    if rows.start < rows.stop and columns.start < columns.stop:
-        image[rows, columns] += window[
-            rows.start - row : rows.stop - row, columns.start - column : columns.stop - column
-        ]
+    on_sensor, in_window = _overlap(image.shape, window.shape, corner)
+    image[on_sensor] += window[in_window]
 
 
-def _cut(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Cut a window out of a sensor image, zero outside it."""
+def _window(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Cut a window out of a sensor image; zero outside it."""
     out = np.zeros(shape, image.dtype)
-    column, row = (int(c) for c in corner)
-    rows = slice(max(row, 0), min(row + shape[0], image.shape[0]))
-    columns = slice(max(column, 0), min(column + shape[1], image.shape[1]))
-    if rows.start < rows.stop and columns.start < columns.stop:
-        out[rows.start - row : rows.stop - row, columns.start - column : columns.stop - column] = image[rows, columns]
+    on_sensor, in_window = _overlap(image.shape, shape, corner)
+    out[in_window] = image[on_sensor]
     return out
 
 
-def count_blocks(stored: StoredGrid, camera: CalibratedCamera, progress: Progress) -> Blocks:
-    """Count the rays of every voxel and pack the counts into blocks."""
+# -- all voxels of a grid
+
+
+def count_blocks(stored: StoredGrid, camera: CalibratedCamera) -> Blocks:
+    """Count the rays of every voxel of a grid and pack the counts into blocks. Warn that this takes long."""
     rays, size = plain(camera.optics.sensor_shape), stored.grid.size
     warn(log, Warning(code=Code.COUNT_SLOW, subject=camera.name, figures={"voxels": size}))
     parts = []
@@ -237,7 +234,6 @@ def count_blocks(stored: StoredGrid, camera: CalibratedCamera, progress: Progres
             camera, stored.centres_mm(np.arange(first, last)), stored.grid.voxel_mm, samples=COUNT_SAMPLES, seed=first
         )
         parts.append(_pack_windows(counts / total[:, None, None], corner, camera.optics.sensor_shape, rays.edge))
-        progress(last / size)
     blocks, rows, ray, height, value, scale = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     require_numbers(blocks.sum(dtype=np.int64), stored.grid.shape)
     return Blocks(
@@ -258,26 +254,25 @@ def _pack_windows(
 ) -> tuple[np.ndarray, ...]:
     """Pack windows of weights, shape (voxel, rows, columns), into blocks of one column of tiles each.
 
-    Returns blocks and rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
+    Returns the number of blocks and of rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
     """
-    lanes = LANES
     row = corner[:, 1, None] + np.arange(windows.shape[1])
     column = corner[:, 0, None] + np.arange(windows.shape[2])
     seen = ((row >= 0) & (row < sensor_shape[0]))[:, :, None] & ((column >= 0) & (column < sensor_shape[1]))[:, None]
     windows = np.where(seen, windows, 0.0)
-    windows = np.pad(windows, ((0, 0), (0, 0), (0, -windows.shape[2] % lanes)))
-    tiles = windows.reshape(*windows.shape[:2], -1, lanes).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
+    windows = np.pad(windows, ((0, 0), (0, 0), (0, -windows.shape[2] % LANES)))
+    tiles = windows.reshape(*windows.shape[:2], -1, LANES).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
     scale = tiles.max((1, 2, 3)) / LEVELS
     lit = tiles.any(-1)
     place = np.arange(lit.shape[2]) % COUNT_TALLEST
     starts = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (1, 0)))[:, :, :-1] & (place > 0)))
     ends = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (0, 1)))[:, :, 1:] & (place < COUNT_TALLEST - 1)))
     voxel, tile, first = starts.T
-    # a tile may begin left of the sensor: its block's pixel then lies at the end of the row above, where weights are 0
-    pixel = (corner[voxel, 1] + first) * stride + corner[voxel, 0] + tile * lanes
+    # a tile that begins left of the sensor starts at the end of the row above, with weights of 0 there
+    pixel = (corner[voxel, 1] + first) * stride + corner[voxel, 0] + tile * LANES
     unit = np.where(scale > 0, scale, 1.0)
     value = np.rint(tiles[lit] / unit[np.nonzero(lit)[0], None]).astype(np.uint8)
-    shift = np.maximum(-pixel, 0)  # above the sensor's first pixel: move the block's lanes instead
+    shift = np.maximum(-pixel, 0)  # before the sensor's first pixel: move the block's lanes instead
     if shift.any():
         rows_of = np.repeat(shift, ends[:, 2] - first + 1)
         for amount in np.unique(rows_of[rows_of > 0]):

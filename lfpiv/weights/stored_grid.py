@@ -1,4 +1,8 @@
-"""Order in which the voxels of a grid are stored."""
+"""Order in which the voxels of a grid lie in memory.
+
+Weights and SMART work on flat arrays of voxels. Neighbours in memory share pixels if the axis that moves a voxel's
+image across the sensor's rows is the outermost one. `StoredGrid` picks that order and converts volumes to it and back.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StoredGrid:
-    """A grid whose voxels are stored in an order of its own, so that neighbours in memory share pixels."""
+    """A grid and the order of its axes in memory."""
 
     grid: Grid
     order: tuple[int, int, int]
@@ -25,7 +29,11 @@ class StoredGrid:
 
     @classmethod
     def for_cameras(cls, grid: Grid, cameras: Iterable[CalibratedCamera]) -> StoredGrid:
-        """Put the axis outermost that runs along the sensors' rows the most, then the one along their columns."""
+        """Choose the order by how far 1 mm along each axis moves a point's image.
+
+        The axis with the largest movement across the sensors' rows is the outermost one. Of the other two, the one with
+        the larger movement across the columns is the middle one.
+        """
         centre = [
             first + (n - 1) / 2 * grid.voxel_mm for first, n in zip(grid.first_centre_mm, grid.shape, strict=True)
         ]
@@ -45,22 +53,22 @@ class StoredGrid:
         return outer, middle, inner
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
-        """Centres (x, y, z) [mm] of voxels by their stored index, shape (voxel, 3)."""
+        """Return centres (x, y, z) [mm] of voxels by their stored index, shape (voxel, 3)."""
         return self.positions_mm(np.stack(np.unravel_index(index, self.shape), axis=1))
 
     def positions_mm(self, steps: np.ndarray) -> np.ndarray:
-        """Centres (x, y, z) [mm] of voxels by their indices along the stored axes, shape (voxel, 3)."""
+        """Return centres (x, y, z) [mm] of voxels by their indices along the stored axes, shape (voxel, 3)."""
         centres = np.empty((len(steps), 3))
         for column, axis in enumerate(self.order):
             centres[:, 2 - axis] = self.grid.first_centre_mm[axis] + steps[:, column] * self.grid.voxel_mm
         return centres
 
-    def place(self, voxel: tuple[int, int, int]) -> int:
+    def index(self, voxel: tuple[int, int, int]) -> int:
         """Return the stored index of voxel (iz, iy, ix)."""
         return int(np.ravel_multi_index([voxel[axis] for axis in self.order], self.shape))
 
     def store(self, volume: ArrayLike) -> np.ndarray:
-        """Voxels of a (z, y, x) volume in stored order, shape (voxel,), float32, contiguous.
+        """Flatten a (z, y, x) volume in stored order: shape (voxel,), float32, contiguous.
 
         Raises
         ------
@@ -73,5 +81,5 @@ class StoredGrid:
         return np.ascontiguousarray(array.transpose(self.order)).ravel()
 
     def restore(self, flat: np.ndarray) -> np.ndarray:
-        """Inverse of `store`: a C-contiguous (z, y, x) array."""
+        """Invert `store`: return a C-contiguous (z, y, x) array."""
         return np.ascontiguousarray(flat.reshape(self.shape).transpose(np.argsort(self.order)))

@@ -7,7 +7,7 @@ import pytest
 
 from lfpiv import reproduce
 from lfpiv.reproduce import bench, cameras, choices, lsi, lsi_twin, optics, sweeps
-from lfpiv.weights import choice as weightcheck
+from lfpiv.weights import counting
 
 SEED = 3
 PPM = 0.3
@@ -46,7 +46,7 @@ def tiny(tmp_path_factory):
         (choices, "CHOICES", {key: choices.CHOICES[key] for key in FEW}),
         (optics, "DEFAULT", pair),
         (optics, "OPTICS", {key: optics.OPTICS[key] for key in ("window",)}),
-        (weightcheck, "VOXELS", 1),  # the check by counted rays has tests of its own
+        (counting, "VOXELS", 1),  # the check by counted rays has tests of its own
     ):
         patch.setattr(module, name, value)
     out = tmp_path_factory.mktemp("beyond")
@@ -106,9 +106,9 @@ def test_choices_are_held_against_the_defaults(figures):
 
 def test_only_what_changes_the_volumes_is_reconstructed():
     every = choices.OPEN | choices.OWN
-    kept = {key for key, choice in every.items() if not weightcheck.reconstructs}
+    kept = {key for key, choice in every.items() if not choice.reconstructs}
     assert kept == {"power_1", "windows_8", "windows_16"}
-    assert all(weightcheck.like is None or weightcheck.like in every for choice in every.values())
+    assert all(choice.like is None or choice.like in every for choice in every.values())
 
 
 def test_cases_share_their_runs_and_the_page_tells_them_apart(tiny, figures):
