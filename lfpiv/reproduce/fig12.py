@@ -12,7 +12,8 @@ from lfpiv import metrics
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.metrics.particles import PEAK_SHARE
 from lfpiv.reconstruction.volume import reconstruct
-from lfpiv.reproduce import Progress, page, plots, rigs, store
+from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.reproduce.study import Progress
 from lfpiv.velocity.cross_correlation import emphasise, missing_smoothing
 from lfpiv.weights.operator import Weights
 

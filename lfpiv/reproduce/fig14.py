@@ -16,7 +16,8 @@ from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import AXES
 from lfpiv.metrics.vector_fields import BELOW_VOXEL
 from lfpiv.reconstruction.volume import reconstruct
-from lfpiv.reproduce import Progress, angles, page, plots, rigs, store
+from lfpiv.reproduce import angles, page, plots, rigs, store
+from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.flows import Ring
 from lfpiv.velocity import derived
 from lfpiv.velocity.cross_correlation import DEFAULT_WINDOWS, correlate

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
-from lfpiv.reproduce import Progress, page, plots
+from lfpiv.reproduce import page, plots
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.lsi_twin import (
     DEPTHS_D,
@@ -30,6 +30,7 @@ from lfpiv.reproduce.lsi_twin import (
 )
 from lfpiv.reproduce.planar_piv import require_openpiv
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, true_field
+from lfpiv.reproduce.study import Progress
 
 TITLE = "Figs. 20 to 22: low-swirl injector, light-field PIV against planar PIV"
 

@@ -13,9 +13,10 @@ import xarray as xr
 from lfpiv.calibration.coverage import warn_outside
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import Grid
-from lfpiv.reproduce import Progress, store
+from lfpiv.reproduce import store
 from lfpiv.reproduce.planar_piv import SheetCamera, correlate_frames, sheet_images
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, reconstruct_images, recorded_images, true_field, volume_grid
+from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.flows import SwirlingJet
 from lfpiv.simulation.scene import Noise
 from lfpiv.simulation.simulator import LEAST_INTENSITY

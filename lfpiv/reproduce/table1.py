@@ -17,8 +17,9 @@ from lfpiv.calibration.levenberg_marquardt import levenberg_marquardt
 from lfpiv.calibration.network import sigma_nor, train
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
 from lfpiv.calibration.virtual_samples import guide_between
-from lfpiv.reproduce import Progress, page, plots, store
+from lfpiv.reproduce import page, plots, store
 from lfpiv.reproduce.rigs import Rig, numerical_rig
+from lfpiv.reproduce.study import Progress
 from lfpiv.reproduce.trainers import bayesian_regularisation, gradient_descent
 from lfpiv.simulation.scene import true_mapping
 

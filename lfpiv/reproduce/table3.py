@@ -11,8 +11,9 @@ import numpy as np
 
 from lfpiv.calibration.board.board import BoardDots
 from lfpiv.calibration.network import train
-from lfpiv.reproduce import Progress, page
+from lfpiv.reproduce import page
 from lfpiv.reproduce.rigs import Rig, numerical_rig, volume_grid
+from lfpiv.reproduce.study import Progress
 from lfpiv.weights.operator import build_weights, compare_with_count
 from lfpiv_kernels import runtime
 

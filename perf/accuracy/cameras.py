@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import bench
 import numpy as np
 import xarray as xr
+from bench import Bench, Judged, Pair
 
-from lfpiv.reproduce import Progress, bench, page, plots, rigs
-from lfpiv.reproduce.bench import Bench, Judged, Pair
+from lfpiv.reproduce import page, plots, rigs
+from lfpiv.reproduce.study import Progress
 
 TITLE = "One, two and three cameras"
 

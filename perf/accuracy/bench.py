@@ -20,7 +20,8 @@ from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import AXES
-from lfpiv.reproduce import Progress, rigs, store
+from lfpiv.reproduce import rigs, store
+from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import FULL_SCALE, render_camera
 from lfpiv.velocity.cross_correlation import correlate

@@ -7,8 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lfpiv.reproduce import Progress, bench, page, plots
-from lfpiv.reproduce.bench import DEFAULT, Bench, Judged, Pair
+import bench
+from bench import DEFAULT, Bench, Judged, Pair
+
+from lfpiv.reproduce import page, plots
+from lfpiv.reproduce.study import Progress
 
 TITLE = "Noise and seeding"
 

@@ -7,12 +7,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import bench
 import numpy as np
 import xarray as xr
+from bench import DEFAULT, Bench, Judged
 
 from lfpiv.calibration.cameras import Calibration, thin_lens
-from lfpiv.reproduce import Progress, bench, page, plots, rigs
-from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
+from lfpiv.reproduce import page, plots, rigs
+from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.scene import Scene, true_mapping
 
 TITLE = "Real optics: where ray tracing fails and the network does not"

@@ -7,8 +7,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import bench
 import numpy as np
 import xarray as xr
+from bench import DEFAULT, Bench, Judged
 from numpy.typing import ArrayLike
 
 from lfpiv.calibration.cameras import Calibration, thin_lens
@@ -16,8 +18,8 @@ from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.motion import reconstruct_pair
-from lfpiv.reproduce import Progress, bench, page, plots, rigs, store
-from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
+from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.reproduce.study import Progress
 
 TITLE = "What each choice is worth"
 
