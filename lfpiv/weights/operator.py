@@ -205,8 +205,8 @@ class Weights:
         """
         if self._camera_sums is None:
             sums = np.zeros((len(self.cameras), self.grid.size), np.float32)
-            for own, (name, gain) in zip(sums, self.gains.items(), strict=True):
-                self.projector(name).back_project(gain, own)
+            for own, name in zip(sums, self.cameras, strict=True):
+                self.projector(name).back_project(self.gain(name), own)
             self._camera_sums = sums
             warn_seen_by_one(self.views, self.grid, len(self.cameras))
         return self._camera_sums
@@ -217,12 +217,9 @@ class Weights:
         total: np.ndarray = sum(self.camera_sums)
         return self.stored.restore(total)
 
-    @property
-    def gains(self) -> dict[str, np.ndarray]:
-        """Camera name -> white-image gain, shape (pixel,), float32."""
-        return {
-            name: np.ascontiguousarray(camera.gain, np.float32).reshape(-1) for name, camera in self.cameras.items()
-        }
+    def gain(self, name: str) -> np.ndarray:
+        """Return a camera's white-image gain, shape (pixel,), float32."""
+        return np.ascontiguousarray(self.cameras[name].gain, np.float32).reshape(-1)
 
     @property
     def views(self) -> np.ndarray:
@@ -235,7 +232,8 @@ class Weights:
     def even_light(self) -> dict[str, EvenLight]:
         """Camera name -> what it records of an evenly lit volume. Empty if the cameras share too little of it."""
         projectors = {name: self.projector(name) for name in self.cameras}
-        return project_even_light(projectors, self.gains, self.camera_sums)
+        gains = {name: self.gain(name) for name in self.cameras}
+        return project_even_light(projectors, gains, self.camera_sums)
 
     @property
     def affected_pixels(self) -> np.ndarray:
