@@ -661,7 +661,8 @@ def test_a_volume_tells_what_fewer_than_two_cameras_see(tmp_path, caplog):
     np.testing.assert_array_equal(weights.column_sum, weights.T(ones))
     alone = round(100 * (views < 2).mean())
     assert 30 < alone < 70 and f"{alone} % of the volume is seen by fewer than two cameras" in caplog.text
-    (said,) = coverage.sight_warnings(half_seen_rig(), grid)  # of a sample of eight planes each way, before any weights
+    (warned,) = coverage.sight_warnings(half_seen_rig(), grid)
+    said = warned.sentence  # of a sample of eight planes each way, before any weights
     assert re.match(r"about \d\d % of the volume is seen by fewer than two cameras; vectors there are not valid", said)
     assert abs(int(said.split()[1]) - alone) <= 2 * 100 / coverage.SAMPLES  # a plane at either end
 

@@ -24,6 +24,7 @@ from lfpiv_kernels import reference, runtime
 from lfpiv_kernels.rays import count as trace
 from lfpiv_kernels.rays.lattice import cell_frame, cell_rectangles, pack_lattice
 from lfpiv_kernels.reconstruction import projector as project
+from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.weights import footprint, footprint_source
 from lfpiv_kernels.weights import ray_model as raymodel
 
@@ -206,22 +207,27 @@ def test_rays_lie_where_their_lenses_put_them(layout, f_number):
 
 
 def test_a_pixel_knows_its_rays(small):
-    projector = small.projector("cam1")
-    rays, map = projector.blocks.microimages, projector.map.rays
-    projector.scatter(np.ones(small.grid.size, np.float32))
-    place = np.flatnonzero(projector.rays.numpy())
-    part = np.searchsorted(projector._places, place, side="right") - 1
-    ray = place - projector._places[part] + np.array([start for start, _ in projector._spans])[part]
+    """Light of the camera's rays in three parts of memory, of which neighbours overlap."""
+    rays = small.cameras["cam1"].microimages
+    third = rays.size // 3
+    starts, ends = np.array([0, third - 900, 2 * third - 900]), np.array([third, 2 * third, rays.size])
+    parts = np.concatenate([[0], np.cumsum(ends - starts)])
+    light = (np.random.default_rng(9).random(parts[-1]) < 0.2).astype(np.float32)
+    ray_map = RayMap(rays, light, parts, starts)
+    found, place = ray_map.rays, np.flatnonzero(light)
+    part = np.searchsorted(parts, place, side="right") - 1
+    ray = place - parts[part] + starts[part]
+    assert len(np.unique(ray)) < len(ray)
     lit = rays.share[ray] > 0
-    np.testing.assert_array_equal(map.dark.numpy(), place[~lit])
+    np.testing.assert_array_equal(found.dark.numpy(), place[~lit])
     pixel, first = np.unique(rays.pixel[ray[lit]], return_index=True)
-    np.testing.assert_array_equal(projector.map.pixel, pixel[np.argsort(first)])
-    counts = np.diff(map.first.numpy())
-    assert map.first.numpy()[0] == 0 and counts.min() > 0
-    order = np.lexsort((map.place.numpy(), np.repeat(projector.map.pixel, counts)))
+    np.testing.assert_array_equal(ray_map.pixel, pixel[np.argsort(first)])
+    counts = np.diff(found.first.numpy())
+    assert found.first.numpy()[0] == 0 and counts.min() > 0
+    order = np.lexsort((found.place.numpy(), np.repeat(ray_map.pixel, counts)))
     expected = np.lexsort((place[lit], rays.pixel[ray[lit]]))
-    np.testing.assert_array_equal(map.place.numpy()[order], place[lit][expected])
-    np.testing.assert_array_equal(map.share.numpy()[order], rays.share[ray[lit]][expected])
+    np.testing.assert_array_equal(found.place.numpy()[order], place[lit][expected])
+    np.testing.assert_array_equal(found.share.numpy()[order], rays.share[ray[lit]][expected])
 
 
 @pytest.mark.parametrize("form", footprint.FORMS)
