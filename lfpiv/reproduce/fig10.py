@@ -1,4 +1,4 @@
-"""Fig. 10: the weights of one voxel by the network and by direct ray tracing, both against a converged count."""
+"""Fig. 10: compare the weights of one voxel by the network and by direct ray tracing with converged counts of rays."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ TITLE = "Fig. 10: weights of one voxel"
 VOXEL_AT_MM = (0.0, 0.0, 2.0)
 """Centre (x, y, z) of the voxel."""
 COUNTS = {"small": 16, "paper": 64}
-"""Independent counts whose mean is the converged one, of 8 million rays each; their scatter tells its noise."""
+"""Number of independent counts, of 8 million rays each. Their mean is the converged count, their scatter its noise."""
 BATCH = 4
 """Counts traced at once."""
 PAPER_SSIM = 0.94
 
 CAPTION = (
-    f"Weights of the voxel at {VOXEL_AT_MM} mm on the lit part of each sensor: by the network, by DRT, their difference "
-    "on the same scale, and DRT's difference from counted rays."
+    f"Weights of the voxel at {VOXEL_AT_MM} mm on the lit part of each sensor: by the network, by DRT, their "
+    "difference on the same scale, and DRT's difference from counted rays."
 )
 NOTES = (
     "The paper does not state its SSIM settings. Over the whole sensor nearly all pixels are dark in both images and "

@@ -1,4 +1,4 @@
-"""What a reproduction shows: ``reproduce.json``, PNGs and a self-contained page; and the form of a case's result."""
+"""Write the results of a study: ``reproduce.json``, PNGs, and a self-contained page."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def result(
     tables: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Put a case's result into its form.
+    """Return a case's result in the form that the page shows.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def write(out: Path, settings: Mapping[str, Any], title: str, about: str, keys: 
 
 
 ROUNDING = 1e-12
-"""Figures below this are zero but for rounding."""
+"""Magnitude below which a number is shown as 0."""
 
 # -- the page ----------------------------------------------------------------------------------------------------------
 
@@ -165,9 +165,9 @@ TERMS = {
     "error of vectors": "Mean length of the difference from the true displacement, in voxels, all vectors; along x, y, "
     "z its mean absolute components. z is the depth axis between the cameras.",
     "took": "Of the run that finished the case; what an earlier, interrupted one had done is not in it.",
-    "goal": "What this software set out to reach; where there is none, the figure is told for itself.",
+    "goal": "What this software set out to reach; where there is none, there is only the figure.",
 }
-"""Words of the page, explained on it."""
+"""Explanations of the words on the page."""
 
 
 def _page(out: Path, content: Mapping[str, Any], title: str, about: str, keys: Sequence[str]) -> str:

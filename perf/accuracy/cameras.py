@@ -37,12 +37,12 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
     for done, (ppm, name) in enumerate(todo):
         progress(f"{NAMES[name]}, {ppm:g} ppm", done / len(todo))
         pair = Pair(ppm=ppm)
-        told: dict[str, float] = {}
+        signal: dict[str, float] = {}
         if name == "truth":
             volumes = own.true_volumes(pair)
         else:
-            volumes, told = own.volumes(bench.run_name(pair, name), pair=pair, cameras=SETS[name])
-        judged[name, ppm] = own.judge(volumes, told, pair=pair)
+            volumes, signal = own.volumes(bench.run_name(pair, name), pair=pair, cameras=SETS[name])
+        judged[name, ppm] = own.judge(volumes, signal, pair=pair)
         if ppm == ppms[0]:
             shown[name] = volumes[0]
     progress("cameras", 1.0)

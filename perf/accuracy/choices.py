@@ -274,15 +274,17 @@ def _table(
 
 def _verdict(choices: Mapping[str, Choice], gaps: Mapping[str, tuple[float, float]], default: Judged) -> str:
     """Say which choices differ from the defaults by more than chance."""
-    told = {key: gap for key, (gap, error) in gaps.items() if abs(gap) > max(SURE * error, WORTH * default.error.mean)}
-    better = [choices[key].label for key, gap in told.items() if gap < 0]
+    notable = {
+        key: gap for key, (gap, error) in gaps.items() if abs(gap) > max(SURE * error, WORTH * default.error.mean)
+    }
+    better = [choices[key].label for key, gap in notable.items() if gap < 0]
     share = ", ".join(
         f"{choices[key].label} ({100 * gaps[key][0] / default.error.mean:+.0f} %)"
         for key in sorted(gaps, key=lambda key: -gaps[key][0])[:3]
     )
     text = (
-        f"Beyond {SURE:g} standard errors and {100 * WORTH:g} % of the error, {len(told) - len(better)} of {len(gaps)} "
-        f"choices are worse than the defaults; better: {'; '.join(better) or 'none'}."
+        f"Beyond {SURE:g} standard errors and {100 * WORTH:g} % of the error, {len(notable) - len(better)} of "
+        f"{len(gaps)} choices are worse than the defaults; better: {'; '.join(better) or 'none'}."
     )
     return f"{text} Those that cost most: {share}."
 
