@@ -84,24 +84,22 @@ class SmartSolver:
         count = settings.iterations if iterations is None else iterations
         recordings = record(self.weights, images, floor=floor, floor_share=settings.floor_share)
         sieve = Sieve(self._sieve_voxel(images), stored.shape)
-        equations = ImageEquations([self._equation(name, one) for name, one in recordings.items()])
+        cameras = [self._equation(name, one) for name, one in recordings.items()]
+        norm = _norm(cameras)
+        equations = ImageEquations(cameras)
         gains = (np.float32(one.camera_gain) for one in recordings.values())
         column_sum = sum(gain * own for gain, own in zip(gains, self.weights.camera_sums, strict=True))
         lit = column_sum > LEAST_COLUMN_SUM * column_sum.max()
         if first is None:
-            guess = multiplicative_guess(equations.cameras, [one.peak for one in recordings.values()], column_sum, lit)
+            guess = multiplicative_guess(cameras, [one.peak for one in recordings.values()], column_sum, lit)
         else:
             guess = checked_guess(first, stored) * lit
         if settings.active_share > 0:
             guess[guess < settings.active_share * guess.max()] = 0.0
         momentum = Momentum(guess) if settings.accelerate else None
-        states = iterate(
-            equations,
-            State(guess, momentum, self._steps(column_sum, lit, sieve)),
-            sieve,
-            iterations=count,
-            smooth=Smoothing(settings.smoothing_voxel, stored.shape, lit),
-        )
+        state = State(guess, momentum, self._steps(column_sum, lit, sieve))
+        smooth = Smoothing(settings.smoothing_voxel, stored.shape, lit)
+        states = iterate(equations, state, sieve, iterations=count, smooth=smooth)
         history, stop = _History(settings, count), None
         with equations.locked():
             for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
@@ -114,7 +112,6 @@ class SmartSolver:
         if stop is SmartStop.DIVERGED:
             log.warning("SMART: %s", stop.value)
         last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
-        norm = _norm(equations.cameras)
         return Reconstruction(
             grid=self.weights.grid,
             volume=stored.restore(volume),
@@ -156,7 +153,8 @@ class SmartSolver:
         """Return the steps of an iteration, the fastest first. Sharpened steps come with a sieve and momentum."""
 
         def quotient(numerator: float, denominator: np.ndarray, where: np.ndarray) -> np.ndarray:
-            return np.divide(numerator, denominator, out=np.zeros_like(column_sum), where=where)
+            result: np.ndarray = np.divide(numerator, denominator, out=np.zeros_like(column_sum), where=where)
+            return result
 
         relaxation = self.settings.relaxation
         if self.settings.normalisation == "column":

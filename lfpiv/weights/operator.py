@@ -171,7 +171,7 @@ class Weights:
             self._projectors[name] = Projector(count_blocks(self.stored, self.cameras[name]))
         return self._projectors[name]
 
-    # -- what is known of it ---------------------------------------------------------------------------------------
+    # -- properties of the weights -----------------------------------------------------------------------------------
 
     @property
     def grid(self) -> Grid:
