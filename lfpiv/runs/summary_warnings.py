@@ -9,7 +9,7 @@ from typing import Any
 from lfpiv.calibration.camera import Calibration
 from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.geometry.grid import Grid
-from lfpiv.reconstruction.volume import Stop
+from lfpiv.reconstruction.result import SmartStop
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import Code, Warning, gather
 
@@ -39,8 +39,8 @@ def pair_warnings(pairs: Sequence[Mapping[str, Any]]) -> list[Warning]:
     found = []
     for pair in pairs:
         of_pair, motion = (pair["pair"],), pair.get("motion")
-        if Stop.DIVERGED.value in pair.get("stop", {}).values():
-            found.append(Warning(code=Code.DIVERGED, pairs=of_pair, figures={"verdict": Stop.DIVERGED.value}))
+        if SmartStop.DIVERGED.value in pair.get("stop", {}).values():
+            found.append(Warning(code=Code.DIVERGED, pairs=of_pair, figures={"verdict": SmartStop.DIVERGED.value}))
         if motion is not None and not motion["followed"]:
             shares = motion["valid_fraction"]
             figures = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion["verdict"]}
