@@ -91,7 +91,7 @@ class MotionField:
         """Positions of the vectors along each axis [voxel]."""
         nz, ny, nx = volume.shape
         displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], axis=-1).astype(float)
-        self.midway = Predictor(displacement, self.nodes, (nz, ny, nx))
+        self.midway = Predictor.between(self.nodes, displacement, (nz, ny, nx))
         """Displacement of what is at a control point midway in time."""
         trust = vectors["valid"].values.astype(float)
         for axis, (nodes, count) in enumerate(zip(self.nodes, volume.shape, strict=True)):
