@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import json
 import logging
 import string
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 NAMED_PAIRS = 5
@@ -229,7 +230,9 @@ class Warning:
 
     def to_json(self) -> dict[str, Any]:
         """Return what a file stores."""
-        return {"code": self.code.value, "subject": self.subject, "figures": dict(self.figures)}
+        figures = {name: asdict(value) if isinstance(value, Span) else value for name, value in self.figures.items()}
+        stored = {"code": self.code.value, "subject": self.subject, "figures": figures}
+        return stored | {"pairs": list(self.pairs)} if self.pairs else stored
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
@@ -240,12 +243,15 @@ class Warning:
             subject = stored["camera"] + (f", frame {stored['frame']}" if stored["frame"] else "")
             figure = {_FINDING_FIGURES[stored["what"]]: stored["value"], "ratio": 4.0}
             return cls(code=Code(stored["what"]), subject=subject, figures=figure)
-        code = stored["code"]
+        code, pairs = stored["code"], tuple(stored.get("pairs", ()))
         if code not in {known.value for known in Code}:
-            figures = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
-            text = f"{code} ({figures})" if figures else str(code)
-            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text})
-        return cls(code=Code(code), subject=stored["subject"], figures=stored["figures"])
+            values = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
+            text = f"{code} ({values})" if values else str(code)
+            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text}, pairs=pairs)
+        figures = {
+            name: Span(**value) if isinstance(value, dict) else value for name, value in stored["figures"].items()
+        }
+        return cls(code=Code(code), subject=stored["subject"], figures=figures, pairs=pairs)
 
 
 @dataclass(frozen=True)
@@ -266,6 +272,16 @@ class _Words(string.Formatter):
         if format_spec.startswith("percent"):
             return f"{100 * value:.{format_spec[7:] or 0}f}"
         return str(super().format_field(value, format_spec))
+
+
+def to_text(warnings: Iterable[Warning]) -> str:
+    """Return the JSON text that an attribute of a file stores."""
+    return json.dumps([warning.to_json() for warning in warnings])
+
+
+def from_text(text: str) -> tuple[Warning, ...]:
+    """Read the JSON text that an attribute of a file stores."""
+    return tuple(Warning.from_json(stored) for stored in json.loads(text))
 
 
 def gather(warnings: Iterable[Warning]) -> list[Warning]:
@@ -309,9 +325,25 @@ def warn(log: logging.Logger, warning: Warning) -> None:
         found.append(warning)
 
 
+@dataclass(frozen=True)
+class FirstOfEachCode:
+    """Log for the warnings of many pairs: the first warning of each code only. The summary names all pairs."""
+
+    log: logging.Logger
+    logged: set[Code] = field(default_factory=set)
+    """Codes that were logged; grows with each call."""
+
+    def __call__(self, warnings: Iterable[Warning]) -> None:
+        """Log the warnings whose codes are new."""
+        new = [warning for warning in warnings if warning.code not in self.logged]
+        for warning in gather(new):
+            self.log.warning("%s", warning.sentence)
+        self.logged.update(warning.code for warning in new)
+
+
 @contextlib.contextmanager
 def collected() -> Iterator[list[Warning]]:
-    """Collect the warnings of a block in a list, whatever the log level. A block inside another keeps its own."""
+    """Collect the warnings of a block in a list, at any log level. A block inside another one has its own list."""
     found: list[Warning] = []
     token = _collected.set(found)
     try:
