@@ -1,14 +1,14 @@
-"""Read the particle images of one frame: light without background, its noise, and warnings about the images.
+"""Read particle images: light without background, its noise, and warnings about the images.
 
 `frame_light` takes the calibrated cameras and their dark images, and returns everything that is known about the images
-of a frame before they are reconstructed.
+of one frame before they are reconstructed. `pair_light` does so for both frames of a pair and compares them.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +36,7 @@ class FrameLight:
     fingerprints: Mapping[str, bytes]
     """Hash of the recorded pixels."""
     warnings: tuple[Warning, ...]
-    """Warnings about single images."""
+    """Warnings about the images; those about both frames of a pair are with the first frame."""
     seconds: float
     """Time that reading and checking took [s]."""
 
@@ -92,3 +92,30 @@ def frame_light(
         warnings=(*warnings, *image_checks.signal_warnings(structure, frame)),
         seconds=time.perf_counter() - start,
     )
+
+
+def pair_light(
+    experiment: Experiment,
+    cameras: Mapping[str, CalibratedCamera],
+    darks: Mapping[str, np.ndarray | None],
+    pair: int,
+) -> tuple[FrameLight, FrameLight]:
+    """Read and check the images of both frames of a pair; the parameters are those of `frame_light`.
+
+    Raises
+    ------
+    InputError
+        As `frame_light`, and if two images are the same, pixel by pixel.
+    """
+    first, second = (frame_light(experiment, cameras, darks, pair, frame) for frame in experiment.frames)
+    image_checks.require_different(
+        (f"{name}, pair {pair}, frame {one.frame}", fingerprint)
+        for one in (first, second)
+        for name, fingerprint in one.fingerprints.items()
+    )
+    uneven = [
+        warning
+        for name in cameras
+        for warning in image_checks.uneven_warnings(first.images[name], second.images[name], name)
+    ]
+    return replace(first, warnings=(*first.warnings, *uneven)), second

@@ -27,9 +27,9 @@ from lfpiv.reconstruction.motion import Motion, reconstruct_pair, unshared_quali
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
 from lfpiv.runs import pair_figures
-from lfpiv.runs.frame_light import FrameLight, frame_light
+from lfpiv.runs.frame_light import FrameLight, pair_light
 from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.warn import FirstOfEachCode, Warning
+from lfpiv.warn import FirstOfEachCode
 
 if TYPE_CHECKING:
     from lfpiv.weights.operator import Weights
@@ -115,20 +115,21 @@ class PairWork:
                 f"{files.volumes[0]}: expected the two volumes of pair {files.pair} made with the present "
                 "settings, found none. Run `lfpiv reconstruct` first."
             )
-        cameras = self.weights.cameras
-        first, second = (
-            frame_light(self.experiment, cameras, self.darks, files.pair, frame) for frame in self.experiment.frames
-        )
-        warnings = _of_each_frame(files.pair, first, second)
-        self.log_first(warning.of_pair(files.pair) for found in warnings for warning in found)
+        light = pair_light(self.experiment, self.weights.cameras, self.darks, files.pair)
+        self.log_first(warning.of_pair(files.pair) for frame in light for warning in frame.warnings)
         start = time.perf_counter()
-        volumes = _reconstruct_frames(self.experiment, self.weights, (first, second), files.pair, progress)
+        volumes = _reconstruct_frames(self.experiment, self.weights, light, files.pair, progress)
         seconds = (time.perf_counter() - start) / 2
-        a, b = (
-            FrameRecord(frame=one.frame, structure=one.structure, warnings=found, seconds=seconds + one.seconds)
-            for one, found in zip((first, second), warnings, strict=True)
+        first, second = (
+            FrameRecord(
+                frame=frame.frame,
+                structure=frame.structure,
+                warnings=frame.warnings,
+                seconds=seconds + frame.seconds,
+            )
+            for frame in light
         )
-        return PairVolumes(volumes=volumes, records=(a, b))
+        return PairVolumes(volumes=volumes, records=(first, second))
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment, start = self.experiment, time.perf_counter()
@@ -150,29 +151,8 @@ class PairWork:
         log.info("pair %d: %.0f %% of the vectors valid", files.pair, 100 * figures.valid_fraction)
 
 
-def _of_each_frame(pair: int, first: FrameLight, second: FrameLight) -> tuple[tuple[Warning, ...], tuple[Warning, ...]]:
-    """Compare the images of both frames and return the warnings of each; warnings about both are with the first.
-
-    Raises
-    ------
-    InputError
-        If two images are the same, pixel by pixel.
-    """
-    image_checks.require_different(
-        (f"{name}, pair {pair}, frame {one.frame}", fingerprint)
-        for one in (first, second)
-        for name, fingerprint in one.fingerprints.items()
-    )
-    uneven = (
-        warning
-        for name in first.images
-        for warning in image_checks.uneven_warnings(first.images[name], second.images[name], name)
-    )
-    return (*first.warnings, *uneven), second.warnings
-
-
 def _reconstruct_frames(
-    experiment: Experiment, weights: Weights, frames: tuple[FrameLight, FrameLight], pair: int, progress: StepProgress
+    experiment: Experiment, weights: Weights, light: tuple[FrameLight, FrameLight], pair: int, progress: StepProgress
 ) -> tuple[xr.DataArray, xr.DataArray]:
     """Reconstruct both volumes.
 
@@ -182,8 +162,8 @@ def _reconstruct_frames(
     try:
         first, second = reconstruct_pair(
             weights,
-            [frame.images for frame in frames],
-            floor=[frame.noise for frame in frames],
+            [frame.images for frame in light],
+            floor=[frame.noise for frame in light],
             correlation=windows.model_dump(),
             progress=progress,
             **experiment.smart.model_dump(),
@@ -211,5 +191,5 @@ def _without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset
         return vectors
     valid = xr.zeros_like(vectors["valid"])  # keeps its attributes
     names = [name for name in vectors.data_vars if str(name).startswith("uncertainty")]
-    uncertainty = {name: vectors[name].where(valid) for name in names}
-    return vectors.assign(valid=valid, **uncertainty).assign_attrs(verdict=NO_PARTICLES, valid_fraction=0.0)
+    changed = {"valid": valid, **{str(name): vectors[name].where(valid) for name in names}}
+    return vectors.assign(changed).assign_attrs(verdict=NO_PARTICLES, valid_fraction=0.0)

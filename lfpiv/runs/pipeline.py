@@ -202,15 +202,15 @@ def _process(current: Run, calibration: Calibration, checked: _Checked, keep_vol
     if isinstance(workers, Plan) and workers.workers == 1:
         return Invocation(outcomes=_sequential(current, work, todo), weights=figures)
     if isinstance(workers, Plan):
-        count, threads, device = workers.workers, workers.threads, current.device.kind
+        used = Workers(count=workers.workers, threads=workers.threads)
     else:
-        count, threads, device = None, current.experiment.compute.threads, current.device_request
-    shared = worker.share(work, device, threads)
+        used = Workers(count=None, threads=current.experiment.compute.threads)
+    device = current.device.kind if isinstance(workers, Plan) else current.device_request
+    shared = worker.share(work, device, used.threads)
     del work, weights  # the workers map them from files; the memory may not have room for both
     outcomes = _collect(current, dispatch.parallel(shared, todo, workers, current.step(PAIRS)))
     peak_mib = max(outcome.peak_memory_mib for outcome in outcomes)
-    used = Workers(count=count, threads=threads, peak_memory_mib=peak_mib or None)
-    return Invocation(outcomes=outcomes, weights=figures, workers=used)
+    return Invocation(outcomes=outcomes, weights=figures, workers=replace(used, peak_memory_mib=peak_mib or None))
 
 
 def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:

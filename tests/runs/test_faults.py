@@ -316,7 +316,7 @@ def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatc
         images[0].unlink(missing_ok=True)
         return read(*arguments)
 
-    monkeypatch.setattr("lfpiv.runs.pair.frame_light", late)
+    monkeypatch.setattr("lfpiv.runs.frame_light.frame_light", late)
     assert commands.call(["run", str(experiment), "--out", str(out)]) == 3
     written, said = capfd.readouterr()
     failed = {item["pair"]: item["reason"] for item in json.loads((out / "summary.json").read_text())["failed"]}
