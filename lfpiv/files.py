@@ -1,4 +1,4 @@
-"""Write files whole or not at all: each is written under a temporary name and renamed. Convert values to JSON."""
+"""Write files atomically: each is written under a temporary name and renamed. Convert values to JSON."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(content: bytes | memoryview, path: Path) -> None:
-    """Write a file, whole or not at all. HDF5 files too: HDF5 itself crashes the process if the disk becomes full."""
+    """Write a file atomically. HDF5 files too: HDF5 itself crashes the process if the disk becomes full."""
     with replacing(path) as scratch:
         scratch.write_bytes(content)
 
 
 def write_text(text: str, path: Path) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically."""
     with replacing(path) as scratch:
         scratch.write_text(text, "utf-8")
 
 
 def write_json(value: Any, path: Path) -> None:
-    """Write a JSON file, whole or not at all; NaN and infinity become null."""
+    """Write a JSON file atomically; NaN and infinity become null."""
     write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n", path)
 
 

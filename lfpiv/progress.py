@@ -12,7 +12,7 @@ StepProgress = Callable[[float], None]
 
 
 def ignore_progress(step: str, fraction: float) -> None:
-    """Do nothing: the progress of a run that nobody watches."""
+    """Do nothing; the default progress of a run."""
 
 
 def part_of(progress: StepProgress, first: float, last: float) -> StepProgress:

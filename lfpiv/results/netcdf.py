@@ -151,7 +151,7 @@ def check_vectors(vectors: xr.Dataset) -> None:
 def write_vectors(
     vectors: xr.Dataset, path: Path, *, attributes: Mapping[str, Any], reconstruction: xr.Dataset | None = None
 ) -> None:
-    """Write the vectors of one pair as NetCDF4, whole or not at all.
+    """Write the vectors of one pair as NetCDF4, atomically.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def read_reconstruction(path: Path) -> xr.Dataset | None:
 
 
 def write_volume(volume: xr.DataArray, path: Path, *, attributes: Mapping[str, Any]) -> None:
-    """Write one volume (z, y, x) [counts] as NetCDF4, whole or not at all."""
+    """Write one volume (z, y, x) [counts] as NetCDF4, atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _write({"": _packed(volume.rename("intensity").to_dataset(), {**attributes, "versions": versions()})}, path)
 
@@ -232,7 +232,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
 
 
 def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, Any] | None = None) -> None:
-    """Write a dataset of any form as NetCDF4, whole or not at all; attributes of other types become JSON.
+    """Write a dataset of any form as NetCDF4, atomically; attributes of other types become JSON.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Files of one pair in an output folder: two volumes and the vectors, each with the stamp of what it depends on.
 
-`PairFiles` says whether they still fit the experiment, reads them and writes them. `PairVolumes` holds two volumes and
-what is known about the images they were made from.
+`PairFiles` checks whether they still fit the experiment, reads and writes them. `PairVolumes` holds two volumes and
+the figures and warnings of the images they were made from.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lfpiv.warn import Warning
 
 @dataclass(frozen=True, kw_only=True)
 class FrameRecord:
-    """What is known about one frame of a pair beside its volume."""
+    """Figures and warnings of the images of one frame, stored with its volume."""
 
     frame: str
     """Name of the frame in the experiment."""
@@ -117,7 +117,7 @@ class PairFiles:
         return PairVolumes(volumes=(first, second), records=(a, b))
 
     def write_volumes(self, pair: PairVolumes) -> None:
-        """Write both volumes with their records, each file whole or not at all."""
+        """Write both volumes with their records, each file atomically."""
         for volume, record, path in zip(pair.volumes, pair.records, self.volumes, strict=True):
             attributes = {
                 **self.stamps.volumes.attributes,
@@ -132,7 +132,7 @@ class PairFiles:
                 path.with_suffix(RETIRED).unlink(missing_ok=True)
 
     def write_vectors(self, vectors: xr.Dataset, condensed: xr.Dataset, attributes: Mapping[str, Any]) -> None:
-        """Write the vectors with the condensed volumes beside them, whole or not at all."""
+        """Write the vectors and the condensed volumes into one file, atomically."""
         marks = {**self.stamps.vectors.attributes, "pair": self.pair, **attributes}
         with writing(self.vectors):
             netcdf.write_vectors(vectors, self.vectors, attributes=marks, reconstruction=condensed)

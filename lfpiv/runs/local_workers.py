@@ -177,7 +177,7 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 def _kill(cluster: Any) -> None:
-    """Kill the workers at once. Their files appear whole or not at all, so nothing is damaged."""
+    """Kill the workers at once. They write files atomically, so no file is damaged."""
     for nanny in list(cluster.workers.values()):
         with contextlib.suppress(Exception):
             nanny.auto_restart = False

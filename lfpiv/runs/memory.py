@@ -42,7 +42,7 @@ OWN_GROUPS = Path("/proc/self/cgroup")
 
 
 def least_bytes(experiment: Experiment) -> int:
-    """Estimate the least memory a run of the experiment takes [byte], from the volume and the sensors alone."""
+    """Estimate the least memory a run of the experiment takes [byte], from the volume and the sensors only."""
     cameras = len(experiment.cameras)
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
     voxel_bytes = BYTES_PER_VOXEL + BYTES_PER_VOXEL_AND_CAMERA * cameras

@@ -151,7 +151,7 @@ def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tu
 
 
 def _write(calibration: Calibration, path: Path, attributes: Mapping[str, Any]) -> None:
-    """Write a calibration with attributes, whole or not at all."""
+    """Write a calibration with attributes, atomically."""
     import h5py
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk

@@ -80,7 +80,7 @@ def build(
 ) -> dict[str, Any]:
     """Build the summary of everything in a folder.
 
-    ``timings_s`` is what the results in the folder took, also if an earlier invocation made them. ``warnings`` are
+    ``timings_s`` is the time that the results took, also those of earlier invocations. ``warnings`` are
     sentences for people. ``warning_records`` are the same warnings, in the same order, with code and figures.
 
     Parameters
