@@ -298,7 +298,7 @@ def test_a_run_tells_which_pairs_followed_the_motion(small_run, tmp_path, monkey
     assert [pair["followed"] for pair in told] == [True, False]
     assert told[0]["valid_fraction"] == [calls[0].attrs["valid_fraction"]] and told[1]["valid_fraction"] == [0.1]
     warnings = [text for text in summary["warnings"] if text.startswith("pair")]
-    assert warnings == [f"pair 1, motion pass 1: 10 % valid; {verdicts[1]}"]
+    assert warnings == [f"pair 1: motion pass 1: 10 % valid; {verdicts[1]}"]
     page = html.unescape((out / "report.html").read_text("utf-8"))
     assert "the motion was followed in 1 pair of 2" in page and warnings[0] in page
 
