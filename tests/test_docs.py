@@ -7,7 +7,6 @@ import importlib
 import importlib.resources
 import importlib.util
 import logging
-import pkgutil
 import re
 import shlex
 import shutil
@@ -30,7 +29,21 @@ from lfpiv.simulation.scene import Scene, open_scene
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
+NOTEBOOK = {page.name: page for page in sorted((DOCS / "notebook").glob("*.md"))}
 SCRIPTS = sorted((DOCS / "gallery").glob("plot_*.py"))
+SOURCES = {
+    package: {path.relative_to(ROOT): path.read_text("utf-8") for path in sorted((ROOT / package).rglob("*.py"))}
+    for package in ("lfpiv", "lfpiv_kernels")
+}
+MODULES = {
+    ".".join(path.with_suffix("").parts).removesuffix(".__init__"): text
+    for package in SOURCES.values()
+    for path, text in package.items()
+}
+"""Source of each module by its dotted name."""
+
+FILES = ("py", "md", "h", "toml", "h5", "json", "html")
+"""Endings of file names, which look like attributes of modules."""
 
 LONG = ("demo", "reproduce", "simulate")
 """Commands that are checked to be understood, and not run: each has tests of its own."""
@@ -275,13 +288,94 @@ def test_scripts_use_names_that_exist():
                 assert hasattr(lfpiv, node.attr), f"{script.name}: lfpiv.{node.attr}"
 
 
+def prose(text):
+    """Text of a page without its fenced blocks."""
+    return re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def resolves(name):
+    """Whether a dotted name is a module or an attribute of one; fields without a default count."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        if ".".join(parts[:length]) in MODULES:
+            break
+    else:
+        return False
+    found = importlib.import_module(".".join(parts[:length]))
+    for part in parts[length:]:
+        fields = {**getattr(found, "model_fields", {}), **getattr(found, "__dataclass_fields__", {})}
+        if not hasattr(found, part):
+            return part in fields
+        found = getattr(found, part)
+    return True
+
+
+def docstrings(text):
+    """Docstrings of a module, its classes and functions, and the texts below its constants."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            yield node.value.value
+
+
+def test_dotted_names_in_pages_and_docstrings_exist():
+    texts = {page.name: page.read_text("utf-8") for page in (*PAGES.values(), *NOTEBOOK.values(), *SCRIPTS)}
+    texts |= {name: "\n".join(docstrings(text)) for name, text in MODULES.items()}
+    wrong = [
+        f"{place}: {name}"
+        for place, text in texts.items()
+        for name in re.findall(r"`[~!]?(lfpiv(?:_kernels)?(?:\.\w+)+)[`(]", text)
+        if not resolves(name)
+    ]
+    assert not wrong
+
+
+def test_names_of_modules_and_their_constants_exist():
+    """`module.name` in short, and the constants in the notebook, which says why they have their values."""
+    texts = {name: prose(page.read_text("utf-8")) for name, page in {**PAGES, **NOTEBOOK}.items()}
+    texts |= {name: "\n".join(docstrings(text)) for name, text in MODULES.items()}
+    keys = {
+        ".".join((*path[-1:], key))
+        for file in (ExperimentTable, Scene)
+        for path, model in models(file)
+        for key in model.model_fields
+    }
+    everything = "\n".join(MODULES.values())
+    wrong = []
+    for place, text in texts.items():
+        for short, rest in re.findall(r"`([a-z_]+)\.(\w+)`", text):
+            same = [name for name in MODULES if name.rpartition(".")[2] == short and "." in name]
+            if same and f"{short}.{rest}" not in keys and rest not in FILES:
+                if not any(resolves(f"{name}.{rest}") for name in same):
+                    wrong.append(f"{place}: {short}.{rest}")
+        if place in NOTEBOOK:
+            for constant in re.findall(r"`(_?[A-Z][A-Z_0-9]{2,})`", text):
+                if not re.search(rf"^ *{constant}\b", everything, re.MULTILINE):
+                    wrong.append(f"{place}: {constant}")
+    assert not wrong
+
+
+@pytest.mark.parametrize("name", [*PAGES, *NOTEBOOK])
+def test_named_source_files_exist(name):
+    """Paths start at the root or, in short, inside `lfpiv`; a bare name lies beside the path before it in the line."""
+    folders = (ROOT, ROOT / "lfpiv", DOCS)
+    for line in prose({**PAGES, **NOTEBOOK}[name].read_text("utf-8")).split("\n"):
+        for path in re.findall(r"`([\w./]+\.(?:py|h)|(?:lfpiv\w*|tests|perf|docs)/[\w/]*)`", line):
+            found = [folder / path for folder in folders if (folder / path).exists()]
+            assert found, path
+            folders = (*folders[:3], found[0].parent)
+        folders = folders[:3]
+
+
+def test_each_page_of_the_notebook_has_one_title_of_one_form():
+    for name, page in NOTEBOOK.items():
+        titles = re.findall(r"^# (.+)$", prose(page.read_text("utf-8")), re.MULTILINE)
+        assert len(titles) == 1, name
+        assert titles == ["Notebook"] if name == "index.md" else titles[0].startswith("Notebook: "), name
+
+
 def with_examples():
     """Modules whose docstrings hold examples."""
-    for package in ("lfpiv", "lfpiv_kernels"):
-        for module in pkgutil.walk_packages([str(ROOT / package)], f"{package}."):
-            source = Path(importlib.util.find_spec(module.name).origin)
-            if ">>> " in source.read_text("utf-8"):
-                yield module.name
+    return (name for name, text in MODULES.items() if ">>> " in text)
 
 
 @pytest.mark.parametrize("name", [*with_examples()])
