@@ -42,7 +42,7 @@ MODULES = {
 }
 """Source of each module by its dotted name."""
 
-FILES = ("py", "md", "h", "toml", "h5", "json", "html")
+FILES = ("py", "md", "h", "toml", "h5", "json", "html", "nc", "pvd")
 """Endings of file names, which look like attributes of modules."""
 
 LONG = ("demo", "reproduce", "simulate")
@@ -339,7 +339,8 @@ def test_names_of_modules_and_their_constants_exist():
         for path, model in models(file)
         for key in model.model_fields
     }
-    everything = "\n".join(MODULES.values())
+    headers = (path.read_text("utf-8") for path in (ROOT / "lfpiv_kernels" / "native").glob("*.h"))
+    everything = "\n".join((*MODULES.values(), *headers))
     wrong = []
     for place, text in texts.items():
         for short, rest in re.findall(r"`([a-z_]+)\.(\w+)`", text):
@@ -349,7 +350,7 @@ def test_names_of_modules_and_their_constants_exist():
                     wrong.append(f"{place}: {short}.{rest}")
         if place in NOTEBOOK:
             for constant in re.findall(r"`(_?[A-Z][A-Z_0-9]{2,})`", text):
-                if not re.search(rf"^ *{constant}\b", everything, re.MULTILINE):
+                if not re.search(rf"\b{constant}\b", everything):
                     wrong.append(f"{place}: {constant}")
     assert not wrong
 

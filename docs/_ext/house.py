@@ -1,6 +1,7 @@
 """Picture of the packages and what they import, made from the imports of the code when the pages are built.
 
-`rooms` and `arrows` need no Sphinx; `setup` registers the directive ``{house}``.
+`svg` needs no Sphinx; `setup` registers the directive ``{house}``. Long arrows pass between the boxes of the floors that
+they cross: each takes a narrow place there (layered drawing of Sugiyama, Tagawa and Toda, 1981).
 """
 
 from __future__ import annotations
@@ -8,19 +9,31 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator, Mapping
 from html import escape
+from importlib.util import find_spec
+from itertools import combinations, pairwise
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-GROUND = ("errors", "files", "geometry", "version", "warn")
+ROOT = Path(find_spec("lfpiv").origin).parents[1]
+"""Folder of the packages: these pages are also built from a copy that lies elsewhere."""
+GROUND = ("errors", "files", "geometry", "progress", "version", "warn")
 """Rooms of the ground floor that every room imports: drawn as one box."""
 FACES = ("__init__", "__main__", "derived", "statistics")
 """Files that only hand public names on: not drawn."""
-WIDTH, BOX_WIDTH, BOX_HEIGHT, STOREY = 760, 138, 44, 84
-"""Sizes of the picture, of a box, and distance of floors [pixel]."""
+BOX_WIDTH, GROUND_WIDTH, BOX_HEIGHT, STOREY = 128, 290, 44, 92
+"""Widths of a room's box and of the ground's, their height, and the distance of floors [pixel]."""
+LANE, GAP = 6, 22
+"""Width of an arrow that passes a floor, and least distance of neighbours [pixel]."""
+LEAST_WIDTH = 620
+"""Width of the picture on narrow screens, where it can be moved sideways [pixel]."""
+SWEEPS = 24
+"""Passes over the floors, down and up, that sort and place their boxes."""
+
+Spot = str | tuple[str, str, int]
+"""A room, or where an arrow from one room to another passes a floor."""
 
 
 def rooms() -> dict[str, int]:
-    """Lines of Python in each room: the folders of ``lfpiv``, its ground, and ``lfpiv_kernels``."""
+    """Count the lines of Python in each room: the folders of ``lfpiv``, its ground, and ``lfpiv_kernels``."""
     lines: dict[str, int] = {}
     for path, room in _files():
         lines[room] = lines.get(room, 0) + len(path.read_text("utf-8").splitlines())
@@ -28,7 +41,7 @@ def rooms() -> dict[str, int]:
 
 
 def arrows() -> dict[str, set[str]]:
-    """Rooms that each room imports."""
+    """Find the rooms that each room imports."""
     found: dict[str, set[str]] = {room: set() for room in rooms()}
     for path, room in _files():
         for name in _imported(ast.parse(path.read_text("utf-8"))):
@@ -40,7 +53,7 @@ def arrows() -> dict[str, set[str]]:
 
 
 def floors(found: Mapping[str, set[str]]) -> dict[str, int]:
-    """Floor of each room: one above the highest room that it imports; 1 is the ground."""
+    """Return the floor of each room: one above the highest room that it imports; 1 is the ground."""
     height: dict[str, int] = {}
     while len(height) < len(found):
         ready = [room for room, others in found.items() if room not in height and others <= set(height)]
@@ -54,25 +67,29 @@ def svg() -> str:
     """Draw the rooms on their floors. An arrow that follows from others is left out."""
     found, lines = arrows(), rooms()
     height = floors(found)
-    top = max(height.values())
-    place: dict[str, tuple[float, float]] = {}
-    for floor in range(1, top + 1):
-        row = sorted((room for room in found if height[room] == floor), key=lambda room: _order(room, found, place))
-        for number, room in enumerate(row):
-            x = WIDTH * (number + 0.5) / len(row) if len(row) > 1 else WIDTH / 2
-            place[room] = (x, (top - floor) * STOREY + BOX_HEIGHT / 2 + 4)
-    parts = []
-    for room, others in found.items():
-        for other in sorted(others):
-            if not any(_reaches(found, between, other) for between in others - {other}):
-                parts.append(_line(place[room], place[other]))
-    for room, (x, y) in place.items():
-        title = f"{', '.join(GROUND)}" if room == "ground" else room
-        parts.append(_box(x, y, title, lines[room], wide=room == "ground"))
+    ways = [
+        [start, *((start, end, floor) for floor in range(height[start] - 1, height[end], -1)), end]
+        for start, others in found.items()
+        for end in sorted(others)
+        if not any(_reaches(found, between, end) for between in others - {end})
+    ]
+    rows = _sorted_rows(height, ways)
+    across = _places(rows, ways)
+    top = len(rows)
+    place = {
+        spot: (across[spot], (top - floor) * STOREY + BOX_HEIGHT / 2 + 4)
+        for floor, row in enumerate(rows, start=1)
+        for spot in row
+    }
+    parts = [_line([place[spot] for spot in way]) for way in ways]
+    parts += [_box(*place[room], ", ".join(GROUND) if room == "ground" else room, lines[room]) for room in found]
+    left = min(across[spot] - _width(spot) / 2 for spot in across) - 4
+    wide = max(across[spot] + _width(spot) / 2 for spot in across) + 4 - left
     tall = (top - 1) * STOREY + BOX_HEIGHT + 8
     return (
-        f'<svg class="house" viewBox="0 0 {WIDTH} {tall}" role="img" aria-label="Packages and their imports" '
-        f'style="max-width:100%;height:auto" font-family="sans-serif" font-size="13">{"".join(parts)}</svg>'
+        f'<div style="overflow-x:auto"><svg class="house" viewBox="{left:.0f} 0 {wide:.0f} {tall}" role="img" '
+        f'aria-label="Packages and their imports" style="width:100%;min-width:{LEAST_WIDTH}px;max-width:{wide:.0f}px;height:auto" '
+        f'font-family="sans-serif" font-size="13">{"".join(parts)}</svg></div>'
     )
 
 
@@ -102,25 +119,94 @@ def _reaches(found: Mapping[str, set[str]], start: str, end: str) -> bool:
     return end in found[start] or any(_reaches(found, other, end) for other in found[start])
 
 
-def _order(room: str, found: Mapping[str, set[str]], place: Mapping[str, tuple[float, float]]) -> tuple[float, str]:
-    """Sort rooms of a floor by the mean position of what they import, so that few arrows cross."""
-    below = [place[other][0] for other in found[room] if other in place]
-    return (sum(below) / len(below) if below else 0.0, room)
+def _sorted_rows(height: Mapping[str, int], ways: list[list[Spot]]) -> list[list[Spot]]:
+    """Sort the spots of each floor, the ground first, by the mean place of their neighbours, so that few arrows cross."""
+    rows: list[list[Spot]] = [
+        [room for room in sorted(height) if height[room] == floor + 1] for floor in range(max(height.values()))
+    ]
+    for way in ways:
+        for spot in way[1:-1]:
+            rows[spot[2] - 1].append(spot)
+    best, fewest = [list(row) for row in rows], _crossings(rows, ways)
+    for sweep in range(SWEEPS):
+        down = sweep % 2 == 0
+        for row in reversed(rows[:-1]) if down else rows[1:]:
+            rank = {spot: number / len(other) for other in rows for number, spot in enumerate(other)}
+            row.sort(key=lambda spot: _mean([rank[near] for near in _neighbours(spot, ways, above=down)], rank[spot]))
+        if (count := _crossings(rows, ways)) < fewest:
+            best, fewest = [list(row) for row in rows], count
+    return best
 
 
-def _line(start: tuple[float, float], end: tuple[float, float]) -> str:
-    (x0, y0), (x1, y1) = start, end
-    y0, y1 = y0 + BOX_HEIGHT / 2, y1 - BOX_HEIGHT / 2
-    bend = (y1 - y0) / 2
-    return (
-        f'<path d="M{x0:.0f} {y0:.0f} C{x0:.0f} {y0 + bend:.0f} {x1:.0f} {y1 - bend:.0f} {x1:.0f} {y1 - 5:.0f}" '
-        'fill="none" stroke="currentColor" stroke-opacity=".45"/>'
-        f'<path d="M{x1 - 3:.0f} {y1 - 6:.0f} L{x1 + 3:.0f} {y1 - 6:.0f} L{x1:.0f} {y1:.0f} Z" fill="currentColor"/>'
+def _crossings(rows: list[list[Spot]], ways: list[list[Spot]]) -> int:
+    rank = {spot: number for row in rows for number, spot in enumerate(row)}
+    floor = {spot: number for number, row in enumerate(rows) for spot in row}
+    steps = {step for way in ways for step in pairwise(way)}
+    return sum(
+        floor[a] == floor[c] and (rank[a] - rank[c]) * (rank[b] - rank[d]) < 0
+        for (a, b), (c, d) in combinations(steps, 2)
     )
 
 
-def _box(x: float, y: float, title: str, lines: int, *, wide: bool) -> str:
-    half = 1.6 * BOX_WIDTH / 2 if wide else BOX_WIDTH / 2
+def _neighbours(spot: Spot, ways: list[list[Spot]], *, above: bool) -> list[Spot]:
+    steps = [step for way in ways for step in pairwise(way)]
+    return [a for a, b in steps if b == spot] if above else [b for a, b in steps if a == spot]
+
+
+def _mean(values: list[float], otherwise: float) -> float:
+    return sum(values) / len(values) if values else otherwise
+
+
+def _places(rows: list[list[Spot]], ways: list[list[Spot]]) -> dict[Spot, float]:
+    """Place the spots of each floor near the mean of their neighbours, in order and without overlap [pixel]."""
+    across = {spot: BOX_WIDTH * (number - len(row) / 2) for row in rows for number, spot in enumerate(row)}
+    for sweep in range(SWEEPS):
+        for row in reversed(rows) if sweep % 2 == 0 else rows:
+            wanted = [
+                _mean(
+                    [across[near] for above in (True, False) for near in _neighbours(spot, ways, above=above)],
+                    across[spot],
+                )
+                for spot in row
+            ]
+            across |= zip(row, _apart(wanted, [_width(spot) for spot in row]), strict=True)
+    return across
+
+
+def _apart(wanted: list[float], widths: list[float]) -> list[float]:
+    """Move places as little as possible (least squares) until boxes of these widths do not overlap."""
+    offsets = [sum(widths[:i]) + i * GAP + widths[i] / 2 for i in range(len(widths))]
+    blocks: list[list[float]] = []
+    for value in (place - offset for place, offset in zip(wanted, offsets, strict=True)):
+        blocks.append([value])
+        while len(blocks) > 1 and _mean(blocks[-2], 0) > _mean(blocks[-1], 0):
+            blocks[-2:] = [blocks[-2] + blocks[-1]]
+    starts = [_mean(block, 0) for block in blocks for _ in block]
+    return [start + offset for start, offset in zip(starts, offsets, strict=True)]
+
+
+def _width(spot: Spot) -> float:
+    return LANE if isinstance(spot, tuple) else GROUND_WIDTH if spot == "ground" else BOX_WIDTH
+
+
+def _line(spots: list[tuple[float, float]]) -> str:
+    """Draw an arrow that passes the floors between its ends upright."""
+    half = BOX_HEIGHT / 2
+    path, last = "", len(spots) - 2
+    for number, ((x0, y0), (x1, y1)) in enumerate(pairwise(spots)):
+        start, end = y0 + half, y1 - half - (5 if number == last else 0)
+        bend = (end - start) / 2
+        path += f"{'L' if number else 'M'}{x0:.0f} {start:.0f} "
+        path += f"C{x0:.0f} {start + bend:.0f} {x1:.0f} {end - bend:.0f} {x1:.0f} {end:.0f} "
+    x, y = spots[-1][0], spots[-1][1] - half
+    return (
+        f'<path d="{path}" fill="none" stroke="currentColor" stroke-opacity=".45"/>'
+        f'<path d="M{x - 3:.0f} {y - 6:.0f} L{x + 3:.0f} {y - 6:.0f} L{x:.0f} {y:.0f} Z" fill="currentColor"/>'
+    )
+
+
+def _box(x: float, y: float, title: str, lines: int) -> str:
+    half = (GROUND_WIDTH if "," in title else BOX_WIDTH) / 2
     return (
         f'<rect x="{x - half:.0f}" y="{y - BOX_HEIGHT / 2:.0f}" width="{2 * half:.0f}" height="{BOX_HEIGHT}" rx="5" '
         'fill="var(--color-background-secondary, #f4f6f8)" stroke="currentColor" stroke-opacity=".6"/>'
