@@ -1,7 +1,7 @@
 """Picture of the packages and what they import, made from the imports of the code when the pages are built.
 
-`svg` needs no Sphinx; `setup` registers the directive ``{house}``. Long arrows pass between the boxes of the floors that
-they cross: each takes a narrow place there (layered drawing of Sugiyama, Tagawa and Toda, 1981).
+`svg` needs no Sphinx; `setup` registers the directive ``{house}``. Long arrows pass between the boxes of the floors
+that they cross: each takes a narrow place there (layered drawing of Sugiyama, Tagawa and Toda, 1981).
 """
 
 from __future__ import annotations
@@ -86,9 +86,10 @@ def svg() -> str:
     left = min(across[spot] - _width(spot) / 2 for spot in across) - 4
     wide = max(across[spot] + _width(spot) / 2 for spot in across) + 4 - left
     tall = (top - 1) * STOREY + BOX_HEIGHT + 8
+    size = f"width:100%;min-width:{LEAST_WIDTH}px;max-width:{wide:.0f}px;height:auto"
     return (
         f'<div style="overflow-x:auto"><svg class="house" viewBox="{left:.0f} 0 {wide:.0f} {tall}" role="img" '
-        f'aria-label="Packages and their imports" style="width:100%;min-width:{LEAST_WIDTH}px;max-width:{wide:.0f}px;height:auto" '
+        f'aria-label="Packages and their imports" style="{size}" '
         f'font-family="sans-serif" font-size="13">{"".join(parts)}</svg></div>'
     )
 
@@ -120,7 +121,7 @@ def _reaches(found: Mapping[str, set[str]], start: str, end: str) -> bool:
 
 
 def _sorted_rows(height: Mapping[str, int], ways: list[list[Spot]]) -> list[list[Spot]]:
-    """Sort the spots of each floor, the ground first, by the mean place of their neighbours, so that few arrows cross."""
+    """Sort the spots of each floor, ground first, by the mean place of their neighbours, so that few arrows cross."""
     rows: list[list[Spot]] = [
         [room for room in sorted(height) if height[room] == floor + 1] for floor in range(max(height.values()))
     ]
