@@ -367,6 +367,13 @@ def test_named_source_files_exist(name):
         folders = folders[:3]
 
 
+def test_sections_of_the_method_name_modules_that_exist():
+    heads = re.findall(r"^## .*\((.+)\)$", PAGES["method.md"].read_text("utf-8"), re.MULTILINE)
+    named = [name.replace("/", ".") for head in heads for name in re.findall(r"`([^`]+)`", head)]
+    assert named
+    assert [name for name in named if not {f"lfpiv.{name}", f"lfpiv_kernels.{name}"} & set(MODULES)] == []
+
+
 def test_each_page_of_the_notebook_has_one_title_of_one_form():
     for name, page in NOTEBOOK.items():
         titles = re.findall(r"^# (.+)$", prose(page.read_text("utf-8")), re.MULTILINE)

@@ -60,7 +60,7 @@ def of_scene(scene: Any) -> dict[str, tuple[float, ...]]:
 
 
 def differences(text: str, scene: Any, summary: Mapping[str, Any]) -> list[str]:
-    """List the figures of the tutorial that differ from a run of the demonstration (`summary`, of `lfpiv.cli.demo.run`).
+    """List figures of the tutorial that differ from a run of the demonstration (`summary`, of `lfpiv.cli.demo.run`).
 
     The time it takes is quoted too, and not compared: no two machines agree.
     """
