@@ -15,7 +15,7 @@ from scipy import ndimage
 from support import report_run
 
 import lfpiv
-from lfpiv.report import calibration, fields, flow_panels, markup, overview, vectors, volumes
+from lfpiv.report import calibration, fields, markup, overview, vectors, volumes
 from lfpiv.report import pairs as pairs_section
 from lfpiv.report.dot_map import dot_map
 from lfpiv.report.fields import (
@@ -251,14 +251,12 @@ def test_a_dot_in_the_wrong_place_shows_where_it_is(reported):
 def test_arrows_have_the_scale_that_is_stated(monkeypatch):
     """The longest arrow drawn is as long as the scale in the title says of its speed; a field at rest has no scale."""
     paths, titles = [], []
-    draw, style = flow_panels.arrows, flow_panels.style
-    monkeypatch.setattr(flow_panels, "arrows", lambda *parts: paths.append(draw(*parts)) or paths[-1])
-    monkeypatch.setattr(
-        flow_panels, "style", lambda axes, **names: titles.append(names["title"]) or style(axes, **names)
-    )
+    draw, style = vectors.arrows, vectors.style
+    monkeypatch.setattr(vectors, "arrows", lambda *parts: paths.append(draw(*parts)) or paths[-1])
+    monkeypatch.setattr(vectors, "style", lambda axes, **names: titles.append(names["title"]) or style(axes, **names))
     moving = report_run.field(0)
     moving["valid"][:] = True
-    assert len(flow_panels.slices(moving)) == 5
+    assert len(vectors.slices(moving)) == 5
     length, speed = map(float, re.search(r"an arrow of (\S+) mm is (\S+) m/s", titles[0]).groups())
     shafts = paths[0].vertices.reshape(-1, 5, 2)
     longest = np.linalg.norm(shafts[:, 1] - shafts[:, 0], axis=1).max()
@@ -266,8 +264,8 @@ def test_arrows_have_the_scale_that_is_stated(monkeypatch):
     assert longest / fastest == pytest.approx(length / speed, rel=0.05)  # the title rounds to two digits
     still = moving.assign({name: 0 * moving[name] for name in "uvw"})
     titles.clear()
-    assert flow_panels.slices(still, most=1) and "m/s" not in titles[0]
-    assert [flow_panels.round_below(value) for value in (0.0, 0.0199, 1.0, 7e3, np.nan)] == [0, 0.01, 1, 5000, 0]
+    assert vectors.slices(still, most=1) and "m/s" not in titles[0]
+    assert [vectors.round_below(value) for value in (0.0, 0.0199, 1.0, 7e3, np.nan)] == [0, 0.01, 1, 5000, 0]
 
 
 def test_the_brightness_outside_the_light_sheet_tells_the_level_of_ghosts(reported, text):
