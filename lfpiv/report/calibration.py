@@ -1,9 +1,8 @@
-"""The report's section on the calibration: figures of each camera, its microimages, its board, its mapping."""
+"""Write the report's section on the calibration: figures, microimages, board images and mapping of each camera."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,16 +17,17 @@ from lfpiv.report import markup
 from lfpiv.report.dot_map import DotMap, dot_map, dot_outlines_px, rms_by
 from lfpiv.report.lens_map import LensMap, lattice_px, lens_map
 from lfpiv.report.markup import number
+from lfpiv.report.summary import CameraFigures
 from lfpiv.report.svg import INK, SERIES, arrows, colour_bar, new_panel, spread_ticks, style, to_svg
 
 PERCENTILES = (50, 75, 90, 95, 99)
-"""Percentiles of the errors of held-out labels."""
+"""Percentiles of the errors of held-out labels in the table [%]."""
 CROP_LENSES = 7
-"""Microimages along the edge of a crop of the white image."""
+"""Number of microimages along the edge of a crop of the white image."""
 PHOTO_WIDTH = 640
-"""Most pixels along an edge of a photograph: twice what a panel shows."""
+"""Largest edge of a board image in the page [pixel], twice the width of a panel."""
 BINS = 50
-"""Bins of a histogram of errors."""
+"""Number of bins of a histogram of errors."""
 
 _ROWS = (
     ("error on held-out dots, σ_nor (Eq. 8) [pitch]", "sigma_nor_test", 4),
@@ -45,27 +45,27 @@ _ROWS = (
 )
 
 
-def section(experiment: Experiment, calibration: Calibration, summary: Mapping[str, Any]) -> str:
-    """Write the section on the calibration.
+def section(experiment: Experiment, calibration: Calibration, figures: Mapping[str, CameraFigures]) -> str:
+    """Return the section on the calibration, as HTML.
 
     Parameters
     ----------
     experiment : Experiment
-        Its white and board images are shown.
+        Source of the white and board images.
     calibration : Calibration
-        The calibration that was used.
-    summary : dict
-        The content of ``summary.json``.
+        Calibration of the run.
+    figures : dict
+        Camera -> figures of its calibration.
     """
-    reports = summary["calibration"]
+    values = {key: [getattr(camera, key) for camera in figures.values()] for _, key, _ in _ROWS}
     rows = [
-        [title, *(number(report.get(key), digits) for report in reports.values())]
+        [title, *(number(value, digits) for value in values[key])]
         for title, key, digits in _ROWS
-        if any(report.get(key) is not None for report in reports.values())
+        if any(value is not None for value in values[key])
     ]
     parts = [
         '<h2 id="calibration">Calibration</h2>',
-        markup.table(["camera", *reports], rows, caption="Figures of the calibration by camera"),
+        markup.table(["camera", *figures], rows, caption="Figures of the calibration by camera"),
         markup.paragraph("A pitch is the distance between microlenses; errors in pitches lie on the microlens array."),
     ]
     for setup in experiment.cameras:
@@ -80,6 +80,7 @@ def section(experiment: Experiment, calibration: Calibration, summary: Mapping[s
 
 
 def _lens_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedCamera) -> str:
+    """Draw how the microimages of a camera fit their lattice; tabulate the cells of the sensor."""
     white, optics = experiment.white(setup.name), setup.optics
     found = lens_map(white, experiment.dark(setup.name), optics, camera.lattice)
     edge = crop_edge(white.shape, optics)
@@ -113,7 +114,7 @@ def _lens_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedC
 
 
 def _worst_corner(found: LensMap, shape: tuple[int, int], edge: int) -> tuple[tuple[int, int], str]:
-    """Corner of the sensor whose cell is farthest off the lattice: its first row and column, and its name."""
+    """Find the corner with the largest rms distance from the lattice; return the crop's (row, column) and a name."""
     places = {
         "top left": (0, 0, 0, 0),
         "top right": (0, -1, 0, shape[1] - edge),
@@ -126,7 +127,7 @@ def _worst_corner(found: LensMap, shape: tuple[int, int], edge: int) -> tuple[tu
 
 
 def _board_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedCamera, found: DotMap | None) -> str:
-    """First, middle and last plane by depth; figures of all planes."""
+    """Draw the first, middle and last plane by depth; tabulate all planes."""
     board = experiment.board
     per_plane = board.dots[0] * board.dots[1]
     order = np.argsort(board.planes_mm)
@@ -146,6 +147,7 @@ def _board_figure(experiment: Experiment, setup: CameraSetup, camera: Calibrated
 
 
 def _plane_table(experiment: Experiment, camera: CalibratedCamera, found: DotMap, order: np.ndarray) -> str:
+    """Tabulate counts and errors of the dots, by plane of the board."""
     board, dots = experiment.board, found.dots
     plane_of = found.number // (board.dots[0] * board.dots[1])
     rows = []
@@ -176,6 +178,7 @@ def _plane_table(experiment: Experiment, camera: CalibratedCamera, found: DotMap
 
 
 def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: DotMap) -> str:
+    """Draw the errors of the mapping at the dots and of the held-out labels; tabulate the worst."""
     board, grid = experiment.board, experiment.grid
     shown = [mapping_field(found, board.dots, grid, depth=depth) for depth in (False, True)]
     numbers = markup.table(
@@ -204,6 +207,7 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
 
 
 def _worst_dots(found: DotMap, most: int = 15) -> list[list[str]]:
+    """Return table rows of the dots with the largest error."""
     worst = np.argsort(-found.error, kind="stable")[:most]
     return [
         [
@@ -217,7 +221,7 @@ def _worst_dots(found: DotMap, most: int = 15) -> list[list[str]]:
 
 
 def lens_residuals(found: LensMap, shape: tuple[int, int]) -> str:
-    """Map of the distances of microimages from their lattice over the sensor; arrows are the mean of each cell."""
+    """Draw the distance of microimages from their lattice over the sensor: rms as colour, mean as arrows."""
     rows, columns = shape
     figure, (axes,) = new_panel(2.5 if columns >= rows else 3.4)
     extent = (-0.5, columns - 0.5, rows - 0.5, -0.5)
@@ -239,7 +243,7 @@ def lens_residuals(found: LensMap, shape: tuple[int, int]) -> str:
 
 
 def white_crop(white: np.ndarray, optics: Optics, lattice: LensLattice, corner: tuple[int, int], title: str) -> str:
-    """Part of the white image from (row, column) on, with the fitted centres of the microimages."""
+    """Draw the part of the white image that starts at `corner` (row, column), with the fitted microimage centres."""
     size = crop_edge(white.shape, optics)
     row, column = corner
     crop = white[row : row + size, column : column + size]
@@ -256,12 +260,12 @@ def white_crop(white: np.ndarray, optics: Optics, lattice: LensLattice, corner: 
 
 
 def crop_edge(shape: tuple[int, int], optics: Optics) -> int:
-    """Edge of a crop of the white image [pixel]."""
+    """Return the edge of a crop of the white image [pixel]."""
     return int(min(*shape, np.ceil(CROP_LENSES * optics.microimage_pitch_px)))
 
 
 def board_photo(image: np.ndarray, outlines_px: np.ndarray, measured: np.ndarray, title: str) -> str:
-    """Raw board image with the outline of each dot's light; dashed where a dot was not measured."""
+    """Draw a raw board image with the outline of each dot's light, dashed for dots that were not measured."""
     rows, columns = image.shape
     low, high = np.zeros(2), np.array([columns, rows]) - 1.0
     if len(outlines_px):
@@ -289,7 +293,7 @@ def board_photo(image: np.ndarray, outlines_px: np.ndarray, measured: np.ndarray
 
 
 def mapping_field(dots: DotMap, board_dots: tuple[int, int], grid: Grid, *, depth: bool) -> str:
-    """Error of the mapping at the dots over the field (x, y), or over x and the depth z; rms over the third axis."""
+    """Draw the error of the mapping at the dots over x and y, or over x and z: rms over the third axis."""
     nx, per_plane = board_dots[0], board_dots[0] * board_dots[1]
     plane, place = np.divmod(dots.number, per_plane)
     key = np.stack([plane, place % nx], axis=1) if depth else place[:, None]
@@ -326,7 +330,7 @@ def mapping_field(dots: DotMap, board_dots: tuple[int, int], grid: Grid, *, dept
 
 
 def error_histogram(errors_pitch: np.ndarray) -> str:
-    """Histogram of the errors of held-out labels [microlens pitch]."""
+    """Draw a histogram of the errors of held-out labels [microlens pitch]."""
     figure, (axes,) = new_panel(2.8)
     largest = max(float(np.percentile(errors_pitch, 99.5)), 1e-9)
     axes.hist(errors_pitch, np.linspace(0, largest, BINS + 1), color=SERIES[0], alpha=0.8)
@@ -344,7 +348,7 @@ def error_histogram(errors_pitch: np.ndarray) -> str:
 
 
 def _centres_inside(optics: Optics, lattice: LensLattice, extent: tuple[float, float, float, float]) -> np.ndarray:
-    """Centres (column, row) [pixel] of the microimages in a part of the sensor (left, right, bottom, top)."""
+    """Return the microimage centres (column, row) [pixel] in a part of the sensor (left, right, bottom, top)."""
     left, right, bottom, top = extent
     origin, basis = lattice_px(optics, lattice)
     corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom]])

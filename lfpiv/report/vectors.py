@@ -1,4 +1,7 @@
-"""The report's section on the vectors: slices with a slider, a view in space, displacements; stills stand in."""
+"""Write the report's section on the vectors: slices with a slider, a view in space, histograms of displacements.
+
+The scripts in ``static`` draw the interactive views. Still panels drawn here replace them without scripts and in print.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,7 @@ from lfpiv.report.svg import (
     TEXT_POINT,
     WIDTH_INCH,
     arrows,
+    cell_edges,
     colour_bar,
     new_panel,
     spread_ticks,
@@ -31,16 +35,16 @@ from lfpiv.report.svg import (
 )
 
 MOST_SLICES = 6
-"""Depths shown of a vector volume."""
+"""Largest number of slices of a vector field."""
 MOST_ARROWS = 24
-"""Arrows along an axis of a slice; more are thinned out."""
+"""Largest number of arrows along an axis of a slice; more are thinned out."""
 MOST_IN_SPACE = 500
-"""Arrows of the view in space."""
+"""Largest number of arrows of the view in space."""
 ARROW_TINTS = ("#101418", "#9aa0a6")
-"""Measured and replaced vectors, on the colours of a slice."""
+"""Colours of measured and of replaced vectors in a slice."""
 
 COMPONENTS = {"x": "u", "y": "v", "z": "w"}
-"""Axis -> the velocity along it."""
+"""Axis -> name of the velocity component along it."""
 
 _DEPTH_TITLES = (
     "z [mm]",
@@ -55,7 +59,7 @@ _DEPTH_TITLES = (
 
 
 def section(vectors: Mapping[int, Path]) -> str:
-    """Write the section on the vectors, the data of its views included.
+    """Return the section on the vectors, as HTML, with the data of its views.
 
     Parameters
     ----------
@@ -67,12 +71,13 @@ def section(vectors: Mapping[int, Path]) -> str:
     found = survey(vectors)
     pair, first = next(iter(found.shown.items()))
     data, thinning = embed(found, {pair: f"pair {pair}" for pair in found.shown})
-    parts = ['<h2 id="vectors">Vectors</h2>', markup.paragraph(_what_is_here(found, len(vectors), thinning, first))]
-    parts += [_slices(pair, first), _space(pair, first), _displacements(pair, first), data]
+    parts = ['<h2 id="vectors">Vectors</h2>', markup.paragraph(_overview(found, len(vectors), thinning, first))]
+    parts += [_slice_view(pair, first), _space_view(pair, first), _displacements(pair, first), data]
     return "\n".join(parts)
 
 
-def _what_is_here(found: Survey, pairs: int, thinning: int, first: xr.Dataset) -> str:
+def _overview(found: Survey, pairs: int, thinning: int, first: xr.Dataset) -> str:
+    """State how many vectors a pair has, and which of them the page holds."""
     nz, ny, nx = first["u"].shape
     text = f"{nx} × {ny} × {nz} vectors (x, y, z) per pair."
     if len(found.shown) < pairs:
@@ -84,7 +89,8 @@ def _what_is_here(found: Survey, pairs: int, thinning: int, first: xr.Dataset) -
     return text
 
 
-def _slices(pair: int, first: xr.Dataset) -> str:
+def _slice_view(pair: int, first: xr.Dataset) -> str:
+    """Return the view with a slider, its still panels, and a table by depth."""
     still = markup.figure(
         [*slices(first), *slices(first, normal="y", most=1)],
         f"Pair {pair}: velocity at several depths, and in the middle from the side. Arrows show the components in the "
@@ -114,7 +120,7 @@ validation. Point at a vector, or move over them with the arrow keys, to read it
 
 
 def _depth_rows(vectors: xr.Dataset) -> list[list[str]]:
-    """Figures of the valid vectors at each depth; the script writes the same for other fields."""
+    """Return rows of figures of the valid vectors at each depth. ``slices.js`` writes the same for other fields."""
     rows = []
     for k, depth in enumerate(vectors["z"].values):
         slab = vectors.isel(z=k)
@@ -130,7 +136,8 @@ def _depth_rows(vectors: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-def _space(pair: int, first: xr.Dataset) -> str:
+def _space_view(pair: int, first: xr.Dataset) -> str:
+    """Return the view in space and its still panel."""
     still = markup.figure(
         [in_space(first)], f"Pair {pair}: the valid vectors, coloured by speed, seen from obliquely above."
     )
@@ -155,6 +162,7 @@ to zoom once the view is chosen by a click, a tap or the Tab key; arrow keys tur
 
 
 def _displacements(pair: int, first: xr.Dataset) -> str:
+    """Draw and tabulate histograms of the displacements."""
     shown, tables = [], []
     for axis in "xyz":
         panel, counts, edges = displacement_histogram(first, axis)
@@ -174,16 +182,16 @@ def _displacements(pair: int, first: xr.Dataset) -> str:
 
 
 def slices(vectors: xr.Dataset, normal: str = "z", most: int = MOST_SLICES) -> list[str]:
-    """Slices of a vector volume, one panel each: arrows for components in the slice, colour for the one across it.
+    """Draw slices of a vector field, one panel each: in-plane components as arrows, the normal one as colour.
 
     Parameters
     ----------
     vectors : Dataset
-        Dims z, y, x; replaced vectors (not ``valid``) are drawn pale.
+        Vectors over z, y, x. Replaced vectors (not ``valid``) are drawn pale.
     normal : {"z", "y"}
-        Axis across the slices.
+        Axis normal to the slices.
     most : int
-        Largest number of slices, spread evenly; one is taken from the middle.
+        Largest number of slices, evenly spread. A single slice lies in the middle.
     """
     across, up = ("x", "y") if normal == "z" else ("x", "z")
     count = vectors.sizes[normal]
@@ -199,7 +207,8 @@ def slices(vectors: xr.Dataset, normal: str = "z", most: int = MOST_SLICES) -> l
 
 
 def _slice(slab: xr.Dataset, normal: str, across: str, up: str, limit: float, longest: float) -> str:
-    edges = [_edges(slab[axis].values) for axis in (across, up)]
+    """Draw one slice. Colours end at `limit` [m/s]; the in-plane speed `longest` [m/s] scales the arrows."""
+    edges = [cell_edges(slab[axis].values) for axis in (across, up)]
     spans = [high - low for low, high in edges]
     key = round_below(longest)
     figure, (axes,) = new_panel(float(np.clip(2.8 * spans[1] / spans[0], 0.5, 3.4)) + 1.35)
@@ -236,12 +245,12 @@ def _slice(slab: xr.Dataset, normal: str, across: str, up: str, limit: float, lo
 
 
 def arrow_scale(longest: float, apart: float) -> float:
-    """Length [mm] of an arrow per velocity [m/s]: the longest reaches 1.3 times the distance of the arrows."""
+    """Return the length of an arrow per velocity [mm / (m/s)]: the longest arrow spans 1.3 times the arrow spacing."""
     return 1.3 * apart / longest if longest > 0 else 0.0
 
 
 def in_space(vectors: xr.Dataset) -> str:
-    """View of the valid vectors in space, coloured by speed."""
+    """Draw the valid vectors in space, coloured by speed."""
     step = 1
     while np.prod([-(-vectors.sizes[axis] // step) for axis in "zyx"]) > MOST_IN_SPACE:
         step += 1
@@ -253,7 +262,7 @@ def in_space(vectors: xr.Dataset) -> str:
     figure = Figure(figsize=(WIDTH_INCH, 3.4))
     FigureCanvasSVG(figure)
     figure.patch.set_alpha(0)
-    axes: Any = figure.add_axes((0.0, 0.15, 0.82, 0.85), projection="3d")  # matplotlib does not type axes in space
+    axes: Any = figure.add_axes((0.0, 0.15, 0.82, 0.85), projection="3d")  # matplotlib has no types for 3D axes
     axes.patch.set_alpha(0)
     longest = float(speed[good].max(initial=0.0))
     apart = step * min((_spacing(vectors[axis].values) for axis in "zyx" if vectors.sizes[axis] > 1), default=1.0)
@@ -280,7 +289,7 @@ def in_space(vectors: xr.Dataset) -> str:
 
 
 def displacement_histogram(vectors: xr.Dataset, axis: str) -> tuple[str, np.ndarray, np.ndarray]:
-    """Histogram of the valid displacements along an axis [voxel]: the panel, counts and edges."""
+    """Draw a histogram of the valid displacements along an axis [voxel]; return the panel, counts and edges."""
     values = vectors[f"displacement_{axis}"].values[vectors["valid"].values]
     values = values[np.isfinite(values)]
     counts, edges = np.histogram(values, int(np.clip(np.sqrt(values.size), 8, 60)))
@@ -292,18 +301,13 @@ def displacement_histogram(vectors: xr.Dataset, axis: str) -> tuple[str, np.ndar
 
 
 def round_below(value: float) -> float:
-    """Largest of 1, 2, 5, 10, ... times a power of ten up to a value; 0 where there is none."""
+    """Return the largest 1, 2 or 5 times a power of ten that does not exceed a value; 0 for no positive value."""
     if not (np.isfinite(value) and value > 0):
         return 0.0
     power = 10.0 ** np.floor(np.log10(value))
     return float(max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))
 
 
-def _edges(positions: np.ndarray) -> tuple[float, float]:
-    """Outer edges of evenly spaced cells around positions."""
-    half = _spacing(positions) / 2
-    return float(positions[0]) - half, float(positions[-1]) + half
-
-
 def _spacing(positions: np.ndarray) -> float:
+    """Return the spacing of positions; 1 for a single one."""
     return float(np.median(np.diff(positions))) if positions.size > 1 else 1.0
