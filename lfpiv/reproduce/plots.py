@@ -1,4 +1,4 @@
-"""How the figures of a reproduction look: one size of type, one set of colours, written by rename."""
+"""Style of the figures: one type size, one set of colours, files written whole or not at all."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NAMES = {
     "no_sieve": "network, no sieve",
     "truth": "true particles",
 }
-"""What is reconstructed with, and how figures and tables call it."""
+"""Names of the mappings in figures and tables."""
 
 
 def figure(width: float, height: float) -> Figure:

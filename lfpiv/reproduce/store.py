@@ -1,4 +1,4 @@
-"""Finished parts of a reproduction on disk: each appears under its name by rename only, and is not computed twice."""
+"""Keep finished parts of a study on disk, so that none is computed twice. Files are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def open_folder(out: Path, settings: Mapping[str, Any]) -> None:
 
 
 def kept(path: Path, settings: Mapping[str, Any], compute: Callable[[], Any]) -> Any:
-    """Return the JSON-able value of `compute`, from the file where it was computed with the same settings before.
+    """Return the JSON-able value of `compute`, from its file where the file has the same settings.
 
     Parameters
     ----------
