@@ -106,7 +106,7 @@ def _lens_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedC
     caption = (
         f"Microlens array of {setup.name}: {found.measured:,} microimages lie {found.total_rms_px:.3f} px (rms) off "
         f"the lattice; {found.left_out:,} were left out as dark or far off. Arrows are the mean of a cell, measured "
-        "minus lattice: where they follow a pattern, the lattice is wrong; at random, they are noise. Crosses should "
+        "minus lattice: a pattern means a wrong lattice, random directions mean noise. Crosses should "
         "sit in the middle of every microimage."
     )
     table = markup.table(titles, rows, caption=f"Microimages of {setup.name} off the lattice, by cell of the sensor")
@@ -199,9 +199,9 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
     rms = float(np.sqrt((found.error**2).mean()))
     caption = (
         f"Mapping of {camera.name} against its dots, over the field and over the depth: for each dot the mean over its "
-        f"rays, {rms:.4f} pitch (rms of {len(found.number):,} dots), rms over the third axis. What a dot's own place "
-        "errs by is part of it. The dashed frame is the volume: where it holds no dots, nothing is known of the "
-        "mapping. Held-out labels are single rays of dots that the training did not see."
+        f"rays, {rms:.4f} pitch (rms of {len(found.number):,} dots), rms over the third axis. Position errors of the dots "
+        "are included. The dashed frame is the volume: where it holds no dots, the mapping is not checked. "
+        "Held-out labels are single rays of dots that the training did not see."
     )
     return markup.figure(shown, caption, numbers)
 

@@ -156,7 +156,7 @@ def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
         for name, values in {**{name: thin[name] for name in "uvw"}, **derivatives}.items():
             values = values.isel(cut) if name in derivatives else values
             stored, scale = quantise(values.values)
-            entry["values"][name] = {"at": len(block), "scale": scale}
+            entry["values"][name] = {"offset": len(block), "scale": scale}
             block += stored.tobytes()
         entry["valid"] = len(block)
         block += thin["valid"].values.astype("<i2").tobytes()

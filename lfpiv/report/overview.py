@@ -134,7 +134,7 @@ def _motion(summary: Summary) -> str:
     followed = sum(pair.motion.followed for pair in summary.pairs)
     return (
         f"{passes}: the motion was followed in {markup.count(followed, 'pair')} of {len(summary.pairs):,}; the "
-        "uncertainty is that of each frame's volume by itself"
+        "uncertainty is that of volumes reconstructed frame by frame"
     )
 
 
@@ -176,12 +176,12 @@ def _agreement(weights: WeightFigures) -> str:
 def timings(summary: Summary) -> str:
     """Tabulate the time of each stage; list what was reused, and the peak memory."""
     names = {
-        "calibration": "calibration, network training included",
-        "network_training": "of it network training",
+        "calibration": "calibration, including network training",
+        "network_training": "network training alone",
         "weights": "weights",
         "reconstruction": "reconstruction, all volumes",
         "correlation": "correlation, all pairs",
-        "total": "this invocation, until the report",
+        "total": "this run, until the report",
     }
     rows = [[text, number(summary.timings_s.get(key), 1)] for key, text in names.items()]
     reused = ""
@@ -189,7 +189,7 @@ def timings(summary: Summary) -> str:
         named = ", ".join(summary.reused[:WARNINGS_SHOWN])
         left = len(summary.reused) - WARNINGS_SHOWN
         more = f" and {left:,} more" if left > 0 else ""
-        reused = markup.paragraph(f"Kept from an earlier invocation: {named}{more}.", "quiet")
+        reused = markup.paragraph(f"Reused from an earlier run: {named}{more}.", "quiet")
     memory = markup.paragraph(f"Peak memory: {number(summary.peak_memory_mib, 0)} MiB.")
     table = markup.table(["stage", "time [s]"], rows, caption="Time of each stage")
     return f'<h2 id="time">Time and memory</h2>{table}{memory}{reused}'

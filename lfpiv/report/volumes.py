@@ -122,7 +122,7 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
         panel, table = _residuals(histories)
         shown.append(panel)
         tables.append(table)
-        captions.append("What the projections of the volume leave unexplained of the images, per iteration of SMART.")
+        captions.append("Part of the images that the projections of the volume do not explain, per iteration of SMART.")
     if "profile_z" in first:
         profile = first["profile_z"].isel(frame=0).values
         sheet = find_sheet(first["z"].values, profile)
@@ -150,7 +150,7 @@ def _judgement(profile: np.ndarray, sheet: LightSheet | None) -> str:
     return (
         f"The light sheet (shaded) lies between z = {number(sheet.low_mm, 2)} and {number(sheet.high_mm, 2)} mm; all "
         f"light outside it is ghosts. The volume is {number(sheet.ratio, 1)} times as bright inside as outside, "
-        f"{verdict}; {ENOUGH:g} is the least that is commonly asked for."
+        f"{verdict}; a ratio of {ENOUGH:g} or more is commonly required."
     )
 
 
@@ -254,12 +254,12 @@ def _images(pairs: Sequence[PairFigures]) -> str:
         )
         rows.append([camera, number(structure, 2), number(gain, 2), percent(outside)])
     text = (
-        "Medians over the images. Light of near pixels correlates by 0.2 or more where particles are clear of the "
-        "noise. Brightness is relative to the brightest camera. Light beside the volume falls where no voxel is seen: "
+        "Medians over the images. Near pixels correlate by 0.2 or more where particles stand out from the noise. "
+        "Brightness is relative to the brightest camera. Light beside the volume is light of pixels that see no voxel: "
         "the light sheet is wider than the volume, or there are reflections."
     )
     titles = ["camera", "correlation of near pixels", "brightness", "light beside the volume"]
-    return markup.paragraph(text) + markup.table(titles, rows, caption="What the images show by themselves")
+    return markup.paragraph(text) + markup.table(titles, rows, caption="Quality of the images of each camera")
 
 
 def _stops(pairs: Sequence[PairFigures]) -> list[list[str]]:

@@ -155,7 +155,7 @@ def test_fields_are_stored_to_a_65000th_of_their_range(text):
         expected = {name: truth[name].values for name in "uvw"}
         expected["vorticity"] = np.full(truth["u"].shape, 2 * report_run.OMEGA * (1 + 0.1 * number))
         for name, values in expected.items():
-            stored = np.frombuffer(block, "<i2", values.size, entry["values"][name]["at"])
+            stored = np.frombuffer(block, "<i2", values.size, entry["values"][name]["offset"])
             scale = entry["values"][name]["scale"]
             assert (stored != NO_NUMBER).all()
             np.testing.assert_allclose(
