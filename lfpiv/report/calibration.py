@@ -199,8 +199,8 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
     rms = float(np.sqrt((found.error**2).mean()))
     caption = (
         f"Mapping of {camera.name} against its dots, over the field and over the depth: for each dot the mean over its "
-        f"rays, {rms:.4f} pitch (rms of {len(found.number):,} dots), rms over the third axis. Position errors of the dots "
-        "are included. The dashed frame is the volume: where it holds no dots, the mapping is not checked. "
+        f"rays, {rms:.4f} pitch (rms of {len(found.number):,} dots), rms over the third axis. Position errors of the "
+        "dots are included. The dashed frame is the volume: where it holds no dots, the mapping is not checked. "
         "Held-out labels are single rays of dots that the training did not see."
     )
     return markup.figure(shown, caption, numbers)
