@@ -58,7 +58,7 @@ def make_run(folder: Path) -> Run:
         particles={"count": 4, "pairs": PAIRS, "sigma_mm": 0.05},
         displacement_mm=(0.05, 0.0, 0.0),
         dt_s=DT_S,
-        network={"hidden": (6,), "epochs": 20},
+        network={"hidden": (6,), "epochs": 20, "estimator": "gaussian"},
     )
     experiment = lfpiv.open_experiment(simulate(scene, folder / "data"))
     calibration = lfpiv.calibrate(experiment)
