@@ -84,6 +84,7 @@ def reader(place, monkeypatch):
     logging.root.setLevel(level)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n, page in PAGES.items() if any(b[0] == "python" for b in blocks(page))])
 def test_the_python_of_a_page_runs_from_top_to_bottom(reader, name):
     module = type(sys)("snippets")  # dataclasses look their module up
@@ -97,6 +98,7 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(reader, name):
         del sys.modules["snippets"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n, page in PAGES.items() if any(commands_of(page))])
 def test_commands_are_understood_and_quick_ones_succeed(reader, name, capfd):
     known = typer.main.get_command(commands.app).commands

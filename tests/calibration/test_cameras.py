@@ -385,6 +385,7 @@ def test_wrong_arguments_are_named(rig, tmp_path):
         lfpiv.load_calibration(tmp_path / "damaged.h5")
 
 
+@pytest.mark.slow
 @pytest.mark.sample_data
 def test_the_sample_experiment_reaches_the_projects_figures(sample_data, tmp_path, device):
     """The main job on the sample data: mapping against the true rays, vectors against the true flow."""

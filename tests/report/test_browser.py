@@ -11,7 +11,7 @@ from support import report_run
 
 from lfpiv.report import markup
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 LAPTOP, PHONE = (1366, 768), (390, 844)
 PATIENCE_S = 90
@@ -197,7 +197,8 @@ def test_a_vector_can_be_read_by_keys(tab):
 def test_numbers_read_as_in_the_tables(tab):
     tab.open()
     values = [0, 2443.2, -0.012345, 1.5e-7, 123456789.0, 999.6, 0.00009996, 1e6, -3.0]
-    assert tab.js("return arguments[0].map((value) => significant(value))", values) == [*map(markup.significant, values)]
+    shown = tab.js("return arguments[0].map((value) => significant(value))", values)
+    assert shown == [*map(markup.significant, values)]
 
 
 def test_the_view_in_space_draws_turns_and_fits_every_page(tab):
