@@ -1,26 +1,22 @@
-"""Symmetric deformation of two volumes by a displacement field: cubic B-spline interpolation in Warp.
+"""Symmetric deformation of two volumes by a displacement field d, by cubic B-spline interpolation.
 
-The first volume is sampled at ``x - d/2``, the second at ``x + d/2``, so that particles displaced by d meet at x.
+The first volume is sampled at ``x - d/2``, the second at ``x + d/2``, so particles displaced by d meet at x. The
+positions x lie a quarter of a voxel beside the voxels, where the interpolation errors of the two volumes cancel.
 
-Interpolation moves a particle a little towards or away from the nearest voxel, by an error E sin(2 pi p) of the
-sampling phase p. With x on the voxels the phases are -d/2 and d/2, the two errors add up to 2 E sin(pi d), and no
-iteration removes that bias (0.017 voxel for cubic splines and particles of 0.7 voxel standard deviation). With x a
-quarter of a voxel beside them the phases are 1/4 -+ d/2, both errors are E cos(pi d), and the bias is gone.
+Notes
+-----
+Interpolation moves a particle towards or away from the nearest voxel by an error E sin(2 pi p) of the sampling phase p.
+With x on the voxels the phases are -d/2 and d/2 and the two errors add up to 2 E sin(pi d), a bias that no iteration
+removes. With x a quarter of a voxel beside them the phases are 1/4 -+ d/2, and both errors are E cos(pi d).
 """
 
 import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from lfpiv_kernels import runtime
+from lfpiv_kernels import native, runtime
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 4,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
-)
+wp.set_module_options(native.options("deform.h", contract="fast", unroll=4))
 
 OFFSET = 0.25
 """Distance of the sampled positions x from the voxels, along each axis [voxel]."""
@@ -28,57 +24,13 @@ MARGIN = 6
 """Voxels of zeros around a volume before the spline's prefilter: samples fall smoothly to 0 outside the volume."""
 
 
-_SAMPLE = """
-#if defined(__CUDA_ARCH__)
-    struct V {
-        float x[4];
-        __device__ V operator*(const V& o) const { V r; for (int k = 0; k < 4; ++k) r.x[k] = x[k] * o.x[k]; return r; }
-        __device__ V operator+(const V& o) const { V r; for (int k = 0; k < 4; ++k) r.x[k] = x[k] + o.x[k]; return r; }
-        __device__ float operator[](int k) const { return x[k]; }
-    };
-    auto load = [](const float* p) { return V{p[0], p[1], p[2], p[3]}; };
-#else
-    typedef float V __attribute__((vector_size(16)));
-    typedef float U __attribute__((vector_size(16), aligned(4)));
-    auto load = [](const float* p) { return (V)*(const U*)p; };
-#endif
-    auto all = [](float v) { return V{v, v, v, v}; };
-    // four neighbouring B-splines at fraction t behind the second one's node, as polynomials in t
-    const V c0 = {1.0f / 6, 4.0f / 6, 1.0f / 6, 0}, c1 = {-0.5f, 0, 0.5f, 0}, c2 = {0.5f, -1, 0.5f, 0};
-    const V c3 = {-1.0f / 6, 0.5f, -0.5f, 1.0f / 6};
-    auto place = [&](float position, int count, V& weight) {  // first of four coefficients, kept inside the array
-        int cell = (int)floorf(position) - 1;
-        cell = cell < 0 ? 0 : cell > count - 4 ? count - 4 : cell;
-        float t = position - (float)(cell + 1);
-        t = t < 0.0f ? 0.0f : t > 1.0f ? 1.0f : t;
-        weight = c0 + all(t) * (c1 + all(t) * (c2 + all(t) * c3));
-        return cell;
-    };
-    V wz, wy, wx;
-    const int cz = place(z, shape[0], wz), cy = place(y, shape[1], wy), cx = place(x, shape[2], wx);
-    const int pitch = shape[2];
-    const float* from = coefficients.data + ((int64_t)cz * shape[1] + cy) * pitch + cx;
-    V total = all(0.0f);
-    #pragma unroll
-    for (int i = 0; i < 4; ++i, from += (int64_t)shape[1] * pitch) {
-        const V near = all(wy[0]) * load(from) + all(wy[1]) * load(from + pitch);
-        const V far = all(wy[2]) * load(from + 2 * pitch) + all(wy[3]) * load(from + 3 * pitch);
-        total = total + all(wz[i]) * (near + far);
-    }
-    total = total * wx;
-    return (total[0] + total[1]) + (total[2] + total[3]);
-"""
-
-
-@wp.func_native(_SAMPLE)
-def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: float, x: float) -> float:
-    """Value of the spline at a position given in coefficients; the nearest edge outside the array."""
-    ...
+@wp.func_native("return lfpiv::sample_spline(coefficients.data, shape, z, y, x);")
+def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: float, x: float) -> float: ...
 
 
 @wp.func
 def _between(field: wp.array3d(dtype=wp.vec3), iz: int, iy: int, ix: int, tz: float, ty: float):
-    """Displacement at a control point along x, interpolated between four along z and y."""
+    """Interpolate the displacement at a control point along x between four along z and y."""
     near = (1.0 - ty) * field[iz, iy, ix] + ty * field[iz, iy + 1, ix]
     far = (1.0 - ty) * field[iz + 1, iy, ix] + ty * field[iz + 1, iy + 1, ix]
     return (1.0 - tz) * near + tz * far
@@ -128,7 +80,7 @@ def _deform_pair(
 
 
 def spline_coefficients(volume: np.ndarray) -> np.ndarray:
-    """Cubic B-spline coefficients of a volume that is 0 outside.
+    """Return the cubic B-spline coefficients of a volume that is 0 outside.
 
     Parameters
     ----------
@@ -144,14 +96,14 @@ def spline_coefficients(volume: np.ndarray) -> np.ndarray:
 def deform_pair(
     first: np.ndarray, second: np.ndarray, field: np.ndarray, spacing: tuple[float, float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the first volume at ``x - d(x)/2`` and the second at ``x + d(x)/2``, x being `OFFSET` beside the voxels.
+    """Sample the first volume at ``x - d(x)/2`` and the second at ``x + d(x)/2``.
 
     Parameters
     ----------
     first, second : ndarray, float32
         `spline_coefficients` of both volumes.
     field : ndarray, shape (n_z, n_y, n_x, 3), float32
-        Displacement d, order (z, y, x) [voxel], on a control grid of at least 2 points per axis; linear between them.
+        Displacement d, order (z, y, x) [voxel], at control points, at least 2 per axis; linear between them.
     spacing : tuple of float
         Distance of the control points, order (z, y, x) [voxel]; the first lies on voxel (0, 0, 0).
 

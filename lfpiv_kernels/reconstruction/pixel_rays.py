@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.native import read_native
 from lfpiv_kernels.weights.microimages import Microimages
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -41,107 +42,20 @@ class Rays:
 
 # `for_pixels(work)` calls work(first pixel, number) for a run's pixels: on the CPU for all at once, so that its vectors
 # are full; on a GPU for each, and so that neighbouring threads have neighbouring pixels.
-RAYS = (
-    f"    const int RUN = {RUN};"
-    + """
-    const int pixels = map.pixel.shape[0];
-#if defined(__CUDA_ARCH__)
-    const int WIDTH = 1, begin = run, step = map.runs;
-#else
-    const int WIDTH = RUN, begin = run * RUN, step = RUN;
-#endif
-    const int* const first = map.first.data;
-    const int* const place = map.place.data;
-    const float* const share = map.share.data;
-    auto collect = [&](const float* rays, int pixel) {
-        float light = 0.0f;
-        for (int n = first[pixel]; n < first[pixel + 1]; ++n) light += share[n] * rays[place[n]];
-        return light;
-    };
-    auto spread = [&](float light, int pixel, float* rays) {
-        for (int n = first[pixel]; n < first[pixel + 1]; ++n) rays[place[n]] = share[n] * light;
-    };
-    auto darken = [&](float* rays) {
-        const long long darks = map.dark.shape[0];
-        const int last = (int)(darks * (run + 1) / map.runs);
-        for (int n = (int)(darks * run / map.runs); n < last; ++n) rays[map.dark.data[n]] = 0.0f;
-    };
-    auto for_pixels = [&](auto work) {
-        for (int done = 0, pixel = begin; done < RUN && pixel < pixels; done += WIDTH, pixel += step)
-            work(pixel, pixels - pixel < WIDTH ? pixels - pixel : WIDTH);
-    };
-"""
-)
+RAYS = f"    const int RUN = {RUN};" + read_native("pixel_rays_rays.inc")
 
-_COLLECT = (
-    RAYS
-    + """
-    for_pixels([&](int start, int count) {
-        for (int k = start; k < start + count; ++k) image_out.data[map.pixel.data[k]] = collect(rays.data, k);
-    });
-"""
-)
+_COLLECT = RAYS + read_native("pixel_rays_collect.inc")
 
-_SPREAD = (
-    RAYS
-    + """
-    for_pixels([&](int start, int count) {
-        for (int k = start; k < start + count; ++k) spread(image.data[map.pixel.data[k]], k, rays_out.data);
-    });
-    darken(rays_out.data);
-"""
-)
+_SPREAD = RAYS + read_native("pixel_rays_spread.inc")
 
 
 # Two sweeps over the lit rays: the first numbers the pixels that see them, as they come, and counts their rays,
 # the second puts each pixel's rays side by side. One thread's work, bound by memory.
-_LIGHT = """
-    auto for_places = [&](auto lit_place, auto dark_place) {
-        for (int part = 0; part + 1 < parts.shape[0]; ++part) {
-            const int shift = starts.data[part] - parts.data[part];
-            for (int place = parts.data[part]; place < parts.data[part + 1]; ++place) {
-                if (light.data[place] == 0.0f) continue;
-                const int ray = place + shift;
-                if (share.data[ray] > 0.0f) lit_place(place, ray);
-                else dark_place(place);
-            }
-        }
-    };
-"""
+_LIGHT = read_native("pixel_rays_light.inc")
 
-_NUMBER = (
-    _LIGHT
-    + """
-    int pixels = 0, rays = 0, darks = 0;
-    for_places(
-        [&](int, int ray) {
-            int& number = number_out.data[pixel.data[ray]];
-            if (!number) {
-                pixel_out.data[pixels] = pixel.data[ray];
-                number = ++pixels;
-            }
-            ++first_out.data[number + 1];
-            ++rays;
-        },
-        [&](int) { ++darks; });
-    for (int k = 2; k < pixels + 2; ++k) first_out.data[k] += first_out.data[k - 1];
-    count_out.data[0] = pixels, count_out.data[1] = rays, count_out.data[2] = darks;
-"""
-)
+_NUMBER = _LIGHT + read_native("pixel_rays_number.inc")
 
-_SORT = (
-    _LIGHT
-    + """
-    int darks = 0;
-    for_places(
-        [&](int place, int ray) {
-            const int n = first_out.data[number.data[pixel.data[ray]]]++;
-            place_out.data[n] = place;
-            share_out.data[n] = share.data[ray];
-        },
-        [&](int place) { dark_out.data[darks++] = place; });
-"""
-)
+_SORT = _LIGHT + read_native("pixel_rays_sort.inc")
 
 
 @wp.func_native(_COLLECT)

@@ -17,13 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
-from lfpiv_kernels.reconstruction.projector_source import GATHER, SCATTER
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import LANES
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+wp.set_module_options(native.options("projector.h"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,35 +94,12 @@ class Matrix:
     profiles: bool
 
 
-@wp.func_native(GATHER)
-def _gather(
-    first: int,
-    last: int,
-    first_value: wp.int64,
-    ray: wp.array(dtype=int),
-    height: wp.array(dtype=wp.uint8),
-    width: wp.array(dtype=wp.uint8),
-    levels_in: wp.array(dtype=wp.uint8),
-    stride: int,
-    profiles: bool,
-    rays: wp.array(dtype=float),
-) -> float: ...
+@wp.func_native("return lfpiv::gather(lfpiv::blocks_of(matrix, voxel), rays.data);")
+def _gather(matrix: Matrix, voxel: int, rays: wp.array(dtype=float)) -> float: ...
 
 
-@wp.func_native(SCATTER)
-def _scatter(
-    first: int,
-    last: int,
-    first_value: wp.int64,
-    ray: wp.array(dtype=int),
-    height: wp.array(dtype=wp.uint8),
-    width: wp.array(dtype=wp.uint8),
-    levels_in: wp.array(dtype=wp.uint8),
-    stride: int,
-    profiles: bool,
-    intensity: float,
-    rays_out: wp.array(dtype=float),
-): ...
+@wp.func_native("lfpiv::scatter(lfpiv::blocks_of(matrix, voxel), intensity, rays_out.data);")
+def _scatter(matrix: Matrix, voxel: int, intensity: float, rays_out: wp.array(dtype=float)): ...
 
 
 @wp.kernel
@@ -139,11 +115,7 @@ def _back_project(
     voxel = first_voxel + wp.tid()
     if active[voxel] == 0.0:
         return
-    total = _gather(
-        matrix.first_block[voxel], matrix.first_block[voxel + 1], matrix.first_value[voxel],
-        matrix.ray, matrix.height, matrix.width, matrix.level, matrix.stride, matrix.profiles, rays,
-    )  # fmt: skip
-    volume_out[voxel] = volume_out[voxel] + matrix.scale[voxel] * total
+    volume_out[voxel] = volume_out[voxel] + matrix.scale[voxel] * _gather(matrix, voxel, rays)
 
 
 @wp.kernel
@@ -158,10 +130,7 @@ def _project(
     voxel = first_voxel + wp.tid()
     intensity = volume[voxel] * matrix.scale[voxel]
     if intensity != 0.0:
-        _scatter(
-            matrix.first_block[voxel], matrix.first_block[voxel + 1], matrix.first_value[voxel],
-            matrix.ray, matrix.height, matrix.width, matrix.level, matrix.stride, matrix.profiles, intensity, rays_out,
-        )  # fmt: skip
+        _scatter(matrix, voxel, intensity, rays_out)
 
 
 @wp.func

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.native import read_native
 from lfpiv_kernels.reconstruction.pixel_rays import RAYS, Rays
 from lfpiv_kernels.reconstruction.projector import Projector
 
@@ -22,44 +23,7 @@ SMALLEST = float(np.finfo(np.float32).tiny)
 # P is the projection and I the image, both plus the floor. log(I / P) is 2 artanh(t) + exponent * log(2) with the
 # quotient brought to 0.7 ... 1.4 by a power of 2, t at most 0.172. Where that power is 1, t and the pixel's misfit
 # come from the difference I - P, whose digits the quotient would lose: near its minimum a misfit is made of these.
-_COMPARE = (
-    RAYS
-    + """
-    const float infinite = (float)INFINITY;
-    double squares = 0.0, divergence = 0.0;
-    for_pixels([&](int start, int count) {
-        float model[WIDTH], square[WIDTH], term[WIDTH];
-        for (int k = 0; k < count; ++k) model[k] = collect(rays_out.data, start + k);
-        const float* const counts = image.data + start;
-        const float* const factor = gain.data + start;
-        for (int k = 0; k < count; ++k) {
-            const float light = factor[k] * model[k], difference = counts[k] - light, below = light + floor;
-            const float excess = difference / below, quotient = (counts[k] + floor) / below;
-            union { float value; int bits; } mantissa;
-            mantissa.value = quotient;
-            const int exponent = (mantissa.bits - 0x3f3504f3) >> 23;
-            mantissa.bits -= exponent << 23;
-            const float t = (exponent ? mantissa.value - 1.0f : excess) / (mantissa.value + 1.0f), t2 = t * t;
-            const float rest = t * t2 * (0.6666667f + t2 * (0.4f + t2 * (0.2857143f + t2 * 0.2222222f)));
-            float logarithm = 0.6931472f * (float)exponent + (2.0f * t + rest);
-            logarithm = quotient > 0.0f ? logarithm : -infinite;
-            logarithm = below > 0.0f ? logarithm : 0.0f;
-            const float other = difference - below * logarithm;
-            term[k] = (exponent || !(below > 0.0f)) ? other : below * (excess * t - rest);
-            square[k] = difference * difference;
-            model[k] = factor[k] > 0.0f ? factor[k] * logarithm : 0.0f;
-        }
-        for (int k = 0; k < count; ++k) {
-            squares += (double)square[k];
-            divergence += (double)term[k];
-        }
-        for (int k = 0; k < count; ++k) spread(model[k], start + k, rays_out.data);
-    });
-    darken(rays_out.data);
-    squares_out.data[run] = squares;
-    divergence_out.data[run] = divergence;
-"""
-)
+_COMPARE = RAYS + read_native("update_compare.inc")
 
 
 @wp.func_native(_COMPARE)

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.native import read_native
 from lfpiv_kernels.weights.footprint_source import LAYER_FALL, LAYERS, SIDE_LAYERS
 from lfpiv_kernels.weights.ray_model import LANES
 
@@ -50,44 +51,7 @@ class Microimages:
 
 _LAY_OUT = (
     f"const int LAYERS = {LAYERS}, SIDE_LAYERS = {SIDE_LAYERS}; const double LAYER_FALL = {LAYER_FALL};"
-    + """
-    auto most = [](float a, float b) { return a > b ? a : b; };
-    auto ramp = [](float x) { return x > 0.0f ? x * x : 0.0f; };
-    // most pixels lie clear of the pupil's edge, by more than half their diagonal
-    const float clear = 0.75f, inner = most(radius - clear, 0.0f), outer = radius + clear;
-    // fraction of the unit pixel at an offset from the pupil's centre inside it: its edge is straight within a pixel
-    auto disc_fraction = [&](float x, float y) {
-        const float square = x * x + y * y;
-        if (square < inner * inner || square > outer * outer) return square < radius * radius ? 1.0f : 0.0f;
-        const float distance = (float)sqrt((double)x * x + (double)y * y), outside = distance - radius;
-        const float normal_x = most(fabsf(x) / most(distance, 1e-6f), 1e-3f);
-        const float normal_y = most(fabsf(y) / most(distance, 1e-6f), 1e-3f);
-        const float reach = -(outside + curvature);
-        const float half_sum = (normal_x + normal_y) / 2.0f, half_gap = (normal_x - normal_y) / 2.0f;
-        const float share = ramp(reach + half_sum) - ramp(reach + half_gap) - ramp(reach - half_gap)
-            + ramp(reach - half_sum);
-        const float fraction = most(share / (2.0f * normal_x * normal_y), 0.0f);
-        return fraction < 1.0f ? fraction : 1.0f;
-    };
-    const int row_of_lenses = lens / lenses;
-    const int first_column = corner.data[2 * lens], first_row = corner.data[2 * lens + 1];
-    const double middle_x = centre.data[2 * lens], middle_y = centre.data[2 * lens + 1];
-    const int64_t layer_rays = (int64_t)lenses * edge * edge;
-    int64_t ray = layer_rays * LAYERS * row_of_lenses + (int64_t)(lens - row_of_lenses * lenses) * edge * edge;
-    for (int row = first_row; row < first_row + edge; ++row) {
-        for (int column = first_column; column < first_column + edge; ++column, ++ray) {
-            const bool seen = column >= 0 && column < columns && row >= 0 && row < rows;
-            const float inside = seen
-                ? disc_fraction((float)(column + 0.5 - middle_x), (float)(row + 0.5 - middle_y)) : 0.0f;
-            for (int layer = 0; layer < LAYERS; ++layer) {
-                // the middle of the part inside lies (1 - inside) / 2 inwards of the pixel's
-                const float fall = (float)(LAYER_FALL * (layer - SIDE_LAYERS));
-                share_out.data[ray + layer * layer_rays] = inside * (1.0f + fall * (1.0f - inside) / 2.0f);
-                pixel_out.data[ray + layer * layer_rays] = seen ? row * columns + column : -1;
-            }
-        }
-    }
-"""
+    + read_native("microimages_lay_out.inc")
 )
 
 

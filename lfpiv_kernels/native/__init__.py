@@ -1,0 +1,79 @@
+"""C++ headers of the Warp kernels, which lie beside this file, and the options that compile a module with them.
+
+A kernel module names its header in ``wp.set_module_options(native.options("projector.h"))``; its ``wp.func_native``
+functions then call the header's functions in one line. Constants that C++ and Python share are written in the header.
+"""
+
+import re
+from pathlib import Path
+
+import warp as wp
+
+FOLDER = Path(__file__).resolve().parent
+"""Where the headers lie."""
+
+
+def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dict[str, object]:
+    """Return the options of a Warp module whose native functions call a header.
+
+    Parameters
+    ----------
+    header : str
+        Name of the header. The module is compiled anew where it or a header that it includes has changed.
+    contract : {"fast", "off"}, optional
+        Whether the CPU's compiler fuses multiplications and additions across statements, or never; None: within
+        one expression.
+    unroll : int
+        Warp's limit for loops that it unrolls.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such header.
+    """
+    include = f'#include "{header}"'
+    chosen: dict[str, object] = {
+        "enable_backward": False,
+        "max_unroll": unroll,
+        "extra_build_options": wp.ModuleBuildOptions(
+            extra_cpu_include_dirs=[FOLDER],
+            extra_cuda_include_dirs=[FOLDER],
+            extra_cpu_preamble=include,
+            extra_cuda_preamble=include,
+            extra_build_dependencies=_included(header),
+        ),
+    }
+    if contract:
+        chosen["cpu_compiler_flags"] = f"{wp.config.cpu_compiler_flags} -ffp-contract={contract}"
+    return chosen
+
+
+def constant(header: str, name: str) -> int | float:
+    """Return the value of ``constexpr int NAME`` or ``constexpr float NAME`` of a header.
+
+    Raises
+    ------
+    ValueError
+        If the header has no such constant, or not as a plain number.
+    """
+    text = (FOLDER / header).read_text(encoding="utf-8")
+    found = re.search(rf"^constexpr (int|float|double) {name} = ([-+.\deE]+)f?;", text, re.MULTILINE)
+    if not found:
+        raise ValueError(f"{header}: expected 'constexpr int {name} = <number>;' or the same with float, found none.")
+    kind, value = found.groups()
+    return int(value) if kind == "int" else float(value)
+
+
+def _included(header: str) -> list[Path]:
+    """Paths of a header and of all headers that it includes, directly or not."""
+    paths = [FOLDER / header]
+    for path in paths:  # which grows
+        for name in re.findall(r'^#include "(.+)"', path.read_text(encoding="utf-8"), re.MULTILINE):
+            if FOLDER / name not in paths:
+                paths.append(FOLDER / name)
+    return paths
+
+
+def read_native(name: str) -> str:
+    """Return the text of a source file of this folder, after an empty line."""
+    return "\n" + (FOLDER / name).read_text(encoding="utf-8")

@@ -1,0 +1,95 @@
+"""The C++ headers of the kernels: format, warnings of the compiler, constants, and when a module is compiled anew."""
+
+import importlib
+import pkgutil
+import re
+import shutil
+import subprocess
+
+import pytest
+import warp as wp
+
+import lfpiv_kernels
+from lfpiv_kernels import native, runtime
+
+HEADERS = sorted(native.FOLDER.glob("*.h"))
+
+
+def warp_modules() -> list[str]:
+    """Names of the kernel modules that include a header."""
+    names = [found.name for found in pkgutil.walk_packages(lfpiv_kernels.__path__, "lfpiv_kernels.")]
+    modules = {name: importlib.import_module(name) for name in names}
+    return [name for name, module in modules.items() if "wp" in vars(module) and included(name)]
+
+
+def included(module: str) -> str:
+    """Return the C++ that a module puts before its kernels."""
+    build = wp.get_module(module).options["extra_build_options"]
+    return build.extra_cpu_preamble if build else ""
+
+
+@pytest.fixture
+def changed_options():
+    """Change a module's options for one test."""
+    changed = []
+
+    def change(module, options):
+        before = dict(wp.get_module(module).options)
+        changed.append((module, {name: before[name] for name in options}))
+        wp.set_module_options(options, importlib.import_module(module))
+
+    yield change
+    for module, options in changed:
+        wp.set_module_options(options, importlib.import_module(module))
+
+
+@pytest.mark.skipif(shutil.which("clang-format") is None, reason="clang-format is not installed")
+@pytest.mark.parametrize("header", HEADERS, ids=lambda path: path.name)
+def test_headers_are_formatted(header):
+    done = subprocess.run(["clang-format", "--dry-run", "--Werror", header], stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_header_is_compiled_by_a_module():
+    compiled = {path.name for name in warp_modules() for path in build_dependencies(name)}
+    assert compiled == {path.name for path in HEADERS}
+
+
+def build_dependencies(module):
+    return wp.get_module(module).options["extra_build_options"].extra_build_dependencies
+
+
+@pytest.mark.parametrize("module", warp_modules())
+def test_compiler_has_no_warnings(module, changed_options, capfd, tmp_path):
+    """Those that Warp's own compiler gives by default, anywhere, and all others in the headers."""
+    runtime.start("cpu")
+    flags = wp.get_module(module).options["cpu_compiler_flags"] or wp.config.cpu_compiler_flags
+    wp.compile_aot_module(importlib.import_module(module), device="cpu", module_dir=tmp_path / "plain")
+    assert capfd.readouterr().err == ""
+    changed_options(module, {"cpu_compiler_flags": f"{flags} -Wall -Wextra", "optimization_level": 0})
+    wp.compile_aot_module(importlib.import_module(module), device="cpu", module_dir=tmp_path / "strict")
+    found = re.findall(rf"^{native.FOLDER}.*warning: .*$", capfd.readouterr().err, re.MULTILINE)
+    assert found == []
+
+
+def test_a_changed_header_changes_the_module(changed_options, tmp_path, monkeypatch):
+    """The change may be in a header that the module's own header includes."""
+    module = "lfpiv_kernels.reconstruction.projector"
+    shutil.copytree(native.FOLDER, tmp_path / "native")
+    monkeypatch.setattr(native, "FOLDER", tmp_path / "native")
+
+    def hashed():
+        changed_options(module, native.options("projector.h"))
+        return wp.get_module(module).hash_module()
+
+    first = hashed()
+    assert hashed() == first
+    simd = tmp_path / "native" / "simd.h"
+    simd.write_text(simd.read_text() + "// changed\n")
+    assert hashed() != first
+
+
+def test_constants_are_read_from_headers():
+    assert native.constant("projector.h", "BLOCK_WIDTH") == 8
+    with pytest.raises(ValueError, match=r"projector.h: expected 'constexpr int NO_SUCH = <number>;'"):
+        native.constant("projector.h", "NO_SUCH")
