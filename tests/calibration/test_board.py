@@ -275,6 +275,7 @@ def test_labels_follow_the_true_rays(name):
     assert abs(dots.response_share - share) < SHARE_ERROR
 
 
+@pytest.mark.slow
 def test_gaussian_fits_are_biased_to_lens_centres_and_the_integral_is_not():
     """The reason for the better estimator; Gaussian fits keep to the figures measured on other renderings."""
     scene = replace(SCENES["hexagonal, steep"], layout="square")
@@ -478,6 +479,7 @@ def test_bad_boards_are_refused():
         measure_board(empty, decoder, scene.board, nominal_angle_deg=20, estimator="centroid")
 
 
+@pytest.mark.slow
 @pytest.mark.sample_data
 @pytest.mark.parametrize("number", [0, 1])
 def test_labels_of_the_sample_experiment(sample_data, number):

@@ -197,6 +197,7 @@ def spoiled(experiment, folder, images):
     return lfpiv.open_experiment(folder / experiment.path.name)
 
 
+@pytest.mark.slow
 def test_planes_without_dots_are_named_and_left_out(rig, tmp_path, caplog):
     experiment, spec, _ = rig
     rng = np.random.default_rng(0)
@@ -233,6 +234,7 @@ def test_saturated_dots_are_left_out_with_a_dark_image_too(rig, tmp_path):
     assert any(warning.code is Code.BOARD_SATURATED for warning in camera.warnings)
 
 
+@pytest.mark.slow
 def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(rig, tmp_path):
     experiment, spec, _ = rig
     copy = experiment.board_image("only", 2).astype(np.uint16)
