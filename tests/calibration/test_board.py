@@ -248,6 +248,7 @@ def label_sub_lens(scene, dots):
     return (dots.array_mm - lattice.centres_mm(lattice.nearest(dots.array_mm))) / lattice.pitch_mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_labels_follow_the_true_rays(name):
     scene = SCENES[name]
@@ -292,6 +293,7 @@ def test_gaussian_fits_are_biased_to_lens_centres_and_the_integral_is_not():
     assert mean["lens_integral"] < mean["gaussian"] / 4
 
 
+@pytest.mark.slow
 def test_dots_outside_the_field_are_missing_and_overlapping_ones_are_not_biased():
     """Planes far from focus: the light of neighbouring dots overlaps on the sensor, and the board leaves the field."""
     scene = replace(SCENES["square, rolled camera, wrong angle"], planes_mm=(-4.5, 0.0, 4.5), missing=(), false_mm=())

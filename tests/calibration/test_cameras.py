@@ -167,6 +167,7 @@ def test_a_wrongly_named_dot_is_left_out(rig):
     assert (agreeing_dots(dots, departure, 0.1) == ~wrong).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", ["planes", "angle"])
 def test_a_board_that_no_such_camera_can_see_is_refused(rig, mistake):
     experiment, _, _ = rig
@@ -216,6 +217,7 @@ def some_planes(experiment, *planes_mm):
     return dataclasses.replace(experiment, board=experiment.board.model_copy(update={"planes_mm": planes_mm}))
 
 
+@pytest.mark.slow
 def test_saturated_dots_are_left_out_with_a_dark_image_too(rig, tmp_path):
     """Dots five times too bright; less a dark image, the pixels at the range's end are no longer all alike."""
     experiment, spec, _ = rig

@@ -373,6 +373,7 @@ def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(sm
     assert same_vectors(small_run.out, out) == PAIRS and not list(out.rglob("*.outdated"))
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_does_not_end_at_the_first_damaged_pair(small_run, tmp_path, capfd, no_report):
     """Stopped after pair 0; pair 1 is damaged, and its volumes are not needed where its images are gone."""
     experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
