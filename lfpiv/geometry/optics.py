@@ -75,7 +75,7 @@ class Optics:
         return np.asarray(position_mm, float) / self.pixel_mm + np.array([columns, rows]) / 2 - 0.5
 
 
-def pair(values: ArrayLike) -> tuple[float, float]:
+def float_pair(values: ArrayLike) -> tuple[float, float]:
     """Return two numbers as a tuple of Python floats."""
     first, second = np.asarray(values, float).tolist()
     return first, second

@@ -12,7 +12,7 @@ from matplotlib.patches import PathPatch, Polygon, Rectangle
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.geometry.grid import Grid
-from lfpiv.geometry.optics import LensLattice, Optics, pair
+from lfpiv.geometry.optics import LensLattice, Optics, float_pair
 from lfpiv.report import markup
 from lfpiv.report.dot_map import DotMap, dot_map, dot_outlines_px, rms_by
 from lfpiv.report.lens_map import LensMap, lattice_px, lens_map
@@ -313,7 +313,7 @@ def mapping_field(dots: DotMap, board_dots: tuple[int, int], grid: Grid, *, dept
     )
     low, high = ([grid.axis_mm(axis)[end] for axis in (2, 2 - up)] for end in (0, -1))
     corner, size = np.array(low) - grid.voxel_mm / 2, np.array(high) - np.array(low) + grid.voxel_mm
-    axes.add_patch(Rectangle(pair(corner), *size, fill=False, edgecolor=INK, linestyle="--", linewidth=1))
+    axes.add_patch(Rectangle(float_pair(corner), *size, fill=False, edgecolor=INK, linestyle="--", linewidth=1))
     axes.margins(0.08)
     axes.autoscale_view()
     name = "yz"[depth]

@@ -147,7 +147,8 @@ def read(path: Path) -> dict[str, Any]:
 def _report(camera: CalibratedCamera, grid: Grid) -> dict[str, Any]:
     """Figures of a camera's calibration, and of the network's part in it over the volume."""
     texts = [warning.sentence for warning in camera.warnings]
-    return dict(camera.report) | {"warnings": texts, "network_correction_pitch": network_correction(camera, grid)}
+    figures = {} if camera.report is None else camera.report.to_json()
+    return figures | {"warnings": texts, "network_correction_pitch": network_correction(camera, grid)}
 
 
 def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:

@@ -10,7 +10,7 @@ from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, 
 
 import lfpiv
 from lfpiv.lightfield.decoder import disc_fraction
-from lfpiv.lightfield.microimage_layout import lay_out, microimage_centres
+from lfpiv.lightfield.microimage_layout import microimage_centres, microimages_of
 from lfpiv.warn import collected
 from lfpiv.weights import blocks as weightblocks
 from lfpiv.weights import choice as weightcheck
@@ -183,7 +183,7 @@ def test_ray_models_of_a_grid_are_those_of_its_voxels(waves, step, monkeypatch):
 def test_rays_lie_where_their_lenses_put_them(layout, f_number):
     eye, lenses = replace(optics(90, 130, layout), f_number=f_number), lattice(layout, roll_deg=2.0)
     radius = eye.pupil_radius_mm * eye.sensor_per_pupil / eye.pixel_mm
-    rays = lay_out(eye, lenses)
+    rays = microimages_of(eye, lenses)
     first, centre = microimage_centres(eye, lenses, radius + 1)
     assert tuple(first) == rays.first_lens
     step = np.arange(rays.edge)
