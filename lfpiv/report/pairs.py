@@ -98,7 +98,7 @@ def section(pairs: Sequence[PairFigures], failures: Sequence[Failure]) -> str:
     caption = "Each pair's figures over its valid vectors."
     if not single:
         caption = (
-            f"Each pair's figures over its valid vectors; {groups.pairs.max()} neighbouring pairs are put together: "
+            f"Each pair's figures over its valid vectors; {groups.pairs.max()} neighbouring pairs are merged: "
             "lines are their mean, bands reach from the lowest to the highest. summary.json holds every pair."
         )
     if failed:
