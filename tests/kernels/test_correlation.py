@@ -141,6 +141,7 @@ def test_spectra_of_blocks_and_surroundings_give_their_correlation(edge, search)
     np.testing.assert_allclose(found, np.correlate(around, block, "valid"), atol=TOLERANCE_SUM)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
 @pytest.mark.parametrize(
     "module",

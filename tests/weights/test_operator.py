@@ -128,6 +128,7 @@ def test_footprint_kernel_equals_its_twin(name, form):
     assert np.linalg.norm(image - twin) <= TOLERANCE_EDGE * np.linalg.norm(twin)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "cuts"), [("any angle", (2, 1, 1)), ("hexagonal 15", (1, 1, 2))])
 def test_footprints_of_parts_equal_the_twins_of_smaller_voxels(name, cuts):
     coarse = replace(RIGS[name].optics, pixel_mm=0.011, sensor_shape=(200, 240))  # the twin takes its time
@@ -434,6 +435,7 @@ def test_memory_estimate_holds_before_building():
     assert estimate_memory(rig, huge) > estimate  # and nothing of that size was allocated
 
 
+@pytest.mark.slow
 def test_form_follows_the_optics_and_the_limit_is_kept():
     grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
     cameras = {"straight": RIGS["misaligned"], "bent": IdealCamera("bent", rotation(-45), coma=0.02)}
@@ -458,6 +460,7 @@ def test_a_voxel_is_cut_only_along_edges_that_matter():
         assert "".join(axis for axis, parts in zip("xyz", cuts, strict=True) if parts > 1) == cut, pose
 
 
+@pytest.mark.slow
 def test_profiles_stay_where_pixels_are_hardly_nearer_and_a_warning_says_why():
     grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
     rig = IdealRig({"spherical": Spherical("spherical", rotation(45)), "rolled": RIGS["rolled 40"]})
