@@ -12,13 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.native import read_native
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.weights.microimages import Microimages
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+wp.set_module_options(native.options("pixel_rays.h"))
 
-RUN = 64
+RUN = native.constant("pixel_rays.h", "RUN")
 """Pixels that a thread goes through."""
 
 
@@ -40,29 +39,11 @@ class Rays:
     """Threads that go through all pixels."""
 
 
-# `for_pixels(work)` calls work(first pixel, number) for a run's pixels: on the CPU for all at once, so that its vectors
-# are full; on a GPU for each, and so that neighbouring threads have neighbouring pixels.
-RAYS = f"    const int RUN = {RUN};" + read_native("pixel_rays_rays.inc")
-
-_COLLECT = RAYS + read_native("pixel_rays_collect.inc")
-
-_SPREAD = RAYS + read_native("pixel_rays_spread.inc")
-
-
-# Two sweeps over the lit rays: the first numbers the pixels that see them, as they come, and counts their rays,
-# the second puts each pixel's rays side by side. One thread's work, bound by memory.
-_LIGHT = read_native("pixel_rays_light.inc")
-
-_NUMBER = _LIGHT + read_native("pixel_rays_number.inc")
-
-_SORT = _LIGHT + read_native("pixel_rays_sort.inc")
-
-
-@wp.func_native(_COLLECT)
+@wp.func_native("lfpiv::collect(lfpiv::pixel_run(map, run), rays.data, image_out.data);")
 def _collect_run(run: int, map: Rays, rays: wp.array(dtype=float), image_out: wp.array(dtype=float)): ...
 
 
-@wp.func_native(_SPREAD)
+@wp.func_native("lfpiv::spread(lfpiv::pixel_run(map, run), image.data, rays_out.data);")
 def _spread_run(run: int, map: Rays, image: wp.array(dtype=float), rays_out: wp.array(dtype=float)): ...
 
 
@@ -90,7 +71,12 @@ def _spread(
     _spread_run(first_run + wp.tid(), map, image, rays_out)
 
 
-@wp.func_native(_NUMBER)
+@wp.func_native("""
+    lfpiv::number_pixels(
+        {light.data, parts.data, (int)parts.shape[0], starts.data, pixel.data, share.data},
+        number_out.data, pixel_out.data, first_out.data, count_out.data
+    );
+""")
 def _number(
     light: wp.array(dtype=float),
     parts: wp.array(dtype=int),
@@ -104,7 +90,12 @@ def _number(
 ): ...
 
 
-@wp.func_native(_SORT)
+@wp.func_native("""
+    lfpiv::sort_rays(
+        {light.data, parts.data, (int)parts.shape[0], starts.data, pixel.data, share.data},
+        number.data, first_out.data, place_out.data, share_out.data, dark_out.data
+    );
+""")
 def _sort(
     light: wp.array(dtype=float),
     parts: wp.array(dtype=int),

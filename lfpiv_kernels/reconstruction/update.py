@@ -5,12 +5,11 @@ import sys
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.native import read_native
-from lfpiv_kernels.reconstruction.pixel_rays import RAYS, Rays
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.reconstruction.pixel_rays import Rays
 from lfpiv_kernels.reconstruction.projector import Projector
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+wp.set_module_options(native.options("update.h"))
 
 LEAST_RUNS, LEAST_VOXELS = 256, 16384
 """Least work of a chunk: below, the launch takes longer."""
@@ -20,13 +19,11 @@ SMALLEST = float(np.finfo(np.float32).tiny)
 """Least light of an active voxel under momentum: below, float32 is slow, and a zero would never come back."""
 
 
-# P is the projection and I the image, both plus the floor. log(I / P) is 2 artanh(t) + exponent * log(2) with the
-# quotient brought to 0.7 ... 1.4 by a power of 2, t at most 0.172. Where that power is 1, t and the pixel's misfit
-# come from the difference I - P, whose digits the quotient would lose: near its minimum a misfit is made of these.
-_COMPARE = RAYS + read_native("update_compare.inc")
-
-
-@wp.func_native(_COMPARE)
+@wp.func_native("""
+    lfpiv::compare(
+        lfpiv::pixel_run(map, run), image.data, gain.data, floor, rays_out.data, squares_out.data, divergence_out.data
+    );
+""")
 def _compare_run(
     run: int,
     map: Rays,

@@ -9,18 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.native import read_native
-from lfpiv_kernels.weights.footprint_source import LAYER_FALL, LAYERS, SIDE_LAYERS
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.weights.ray_model import LANES
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=off",  # rounds as NumPy does
-    }
-)
+wp.set_module_options(native.options("microimages.h", contract="off"))  # rounds as NumPy does
+
+LAYERS = native.constant("microimages.h", "LAYERS")
+"""Versions of each microimage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,14 +44,12 @@ class Microimages:
         return len(self.pixel)
 
 
-_LAY_OUT = (
-    f"const int LAYERS = {LAYERS}, SIDE_LAYERS = {SIDE_LAYERS}; const double LAYER_FALL = {LAYER_FALL};"
-    + read_native("microimages_lay_out.inc")
-)
-
-
-@wp.func_native(_LAY_OUT)
-def _lay_out_lens(
+@wp.func_native("""
+    lfpiv::write_lens_rays(
+        {centre.data, corner.data, lenses, edge, columns, rows, radius, curvature}, lens, pixel_out.data, share_out.data
+    );
+""")
+def _write_lens_rays(
     lens: int,
     centre: wp.array(dtype=wp.float64),
     corner: wp.array(dtype=int),
@@ -88,7 +81,7 @@ def _lay_out(
     share_out: wp.array(dtype=float),
 ):
     lens = first_lens + wp.tid()
-    _lay_out_lens(lens, centre, corner, lenses, edge, columns, rows, radius, curvature, pixel_out, share_out)
+    _write_lens_rays(lens, centre, corner, lenses, edge, columns, rows, radius, curvature, pixel_out, share_out)
 
 
 def lay_out(first_lens, centre, radius, edge, sensor_shape):
