@@ -9,7 +9,7 @@ import numpy as np
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv_kernels.weights import microimages
 from lfpiv_kernels.weights.microimages import Microimages
-from lfpiv_kernels.weights.ray_model import LANES
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 
 def microimage_edge(optics: Optics) -> int:
@@ -67,14 +67,14 @@ def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
 
 
 def plain(sensor_shape: tuple[int, int]) -> Microimages:
-    """Every pixel as one ray, in rows padded by LANES: for weights that were counted pixel by pixel."""
+    """Every pixel as one ray, in rows padded by BLOCK_WIDTH: for weights that were counted pixel by pixel."""
     rows, columns = sensor_shape
-    pixel = np.full((rows, columns + LANES), -1, np.int32)
+    pixel = np.full((rows, columns + BLOCK_WIDTH), -1, np.int32)
     pixel[:, :columns] = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     return Microimages(
         first_lens=(0, 0),
         corner=np.zeros((1, 1, 2), np.int32),
-        edge=columns + LANES,
+        edge=columns + BLOCK_WIDTH,
         pixel=pixel.ravel(),
         share=(pixel.ravel() >= 0).astype(np.float32),
         sensor_shape=(rows, columns),

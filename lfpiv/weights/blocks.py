@@ -21,7 +21,7 @@ from lfpiv_kernels.rays.count import count_rays
 from lfpiv_kernels.rays.lattice import Lattice, cell_frame, cell_steps, pack_lattice
 from lfpiv_kernels.reconstruction.projector import Blocks
 from lfpiv_kernels.weights import footprint
-from lfpiv_kernels.weights.ray_model import LANES, LEVELS
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -250,7 +250,7 @@ def blocks_of(
         Parts of the voxels, where the form is "pixels".
     """
     footprints = pack.footprints(form, cuts)
-    blocks, values = (int(1.02 * count) + LANES for count in expected)
+    blocks, values = (int(1.02 * count) + BLOCK_WIDTH for count in expected)
     ray, height, width = (_Growing(dtype, blocks) for dtype in (np.int32, np.uint8, np.uint8))
     value = _Growing(np.uint8, values)
     counts, scales = [], []
@@ -261,7 +261,7 @@ def blocks_of(
             footprints.write(ray.take(some), height.take(some), width.take(some), room, scale)
             counts.append(count)
             scales.append(scale)
-    value.take(LANES)[:] = 0
+    value.take(BLOCK_WIDTH)[:] = 0
     first_block, first_value = (
         np.concatenate([[0], *(count[k] for count in counts)]).cumsum(dtype=np.int64) for k in range(2)
     )

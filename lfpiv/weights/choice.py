@@ -24,7 +24,7 @@ from lfpiv.weights.blocks import (
 from lfpiv.weights.ray_fit import fit_rays, ray_models
 from lfpiv_kernels.rays.count import POWERS
 from lfpiv_kernels.reconstruction.projector import Blocks
-from lfpiv_kernels.weights.ray_model import LANES, LEVELS
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -305,11 +305,11 @@ def count_blocks(stored: StoredGrid, camera: CalibratedCamera, progress: Progres
     return Blocks(
         form="pixels",
         first_block=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
-        first_value=np.concatenate([[0], LANES * np.cumsum(rows)]).astype(np.int64),
+        first_value=np.concatenate([[0], BLOCK_WIDTH * np.cumsum(rows)]).astype(np.int64),
         ray=ray,
         height=height,
-        width=np.full(len(ray), LANES, np.uint8),
-        value=np.append(value, np.zeros(LANES, np.uint8)),
+        width=np.full(len(ray), BLOCK_WIDTH, np.uint8),
+        value=np.append(value, np.zeros(BLOCK_WIDTH, np.uint8)),
         scale=scale,
         microimages=rays,
     )
@@ -322,7 +322,7 @@ def _pack_windows(
 
     Returns blocks and rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
     """
-    lanes = LANES
+    lanes = BLOCK_WIDTH
     row = corner[:, 1, None] + np.arange(windows.shape[1])
     column = corner[:, 0, None] + np.arange(windows.shape[2])
     seen = ((row >= 0) & (row < sensor_shape[0]))[:, :, None] & ((column >= 0) & (column < sensor_shape[1]))[:, None]

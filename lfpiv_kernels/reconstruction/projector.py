@@ -1,6 +1,6 @@
 """Warp: forward projection and its adjoint on weights stored as 8-bit blocks of rays.
 
-A block is at most LANES rays wide, so that its row is one vector, and some rows high. It holds one value per ray, or a
+A block is at most BLOCK_WIDTH rays wide, so that its row is one vector, and some rows high. It holds one value per ray, or a
 profile along the columns and one along the rows, whose products are the values. The backward pass gathers per voxel.
 The forward pass scatters: on the CPU every part of the voxels adds into rays of its own, which each pixel sums in a
 fixed order; on CUDA it adds atomically. The innermost loops are C++: as Warp's vectors they take two to three times as
@@ -20,7 +20,7 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.weights.microimages import Microimages
-from lfpiv_kernels.weights.ray_model import LANES
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 wp.set_module_options(native.options("projector.h"))
 
@@ -45,9 +45,9 @@ class Blocks:
     height: np.ndarray
     """Rows of rays of each block, shape (block,), uint8."""
     width: np.ndarray
-    """Rays in a row of each block, at most LANES, shape (block,), uint8."""
+    """Rays in a row of each block, at most BLOCK_WIDTH, shape (block,), uint8."""
     value: np.ndarray
-    """Weights in levels, shape (value + LANES,), uint8: a vector may be read past the last one."""
+    """Weights in levels, shape (value + BLOCK_WIDTH,), uint8: a vector may be read past the last one."""
     scale: np.ndarray
     """Weight of one level, shape (voxel,), float32."""
     microimages: Microimages
@@ -246,7 +246,7 @@ class Projector:
                 spans.append((0, 0))
                 continue
             first, last, tall = self.blocks.ray[a:b].min(), self.blocks.ray[a:b].max(), self.blocks.height[a:b].max()
-            spans.append((int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + LANES, rays.size)))
+            spans.append((int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + BLOCK_WIDTH, rays.size)))
         return spans
 
     def _map_rays(self):

@@ -18,7 +18,7 @@ Two forms of the same integral: "pixels" follows the slopes and the offset pixel
 linear and without cross terms under a lens, so that a square cell's weights are the product of a profile along the
 columns and one along the rows (rank 1), a third of the memory. Pixels may add up the footprints of parts of the voxel,
 cut along x, y, z: what is not independent within a part, its fourth-order moments, falls with the fourth power of its
-size. It takes time for every part, and no more memory. Blocks are at most LANES pixels wide, one vector load,
+size. It takes time for every part, and no more memory. Blocks are at most BLOCK_WIDTH pixels wide, one vector load,
 and end where the weights round to zero or the pupil ends. The computation is C++ on vectors of lenses and of pixels
 (``raymodel``): Taichi's loops took four times as long. Twin: ``reference.footprint``; source: ``footprint_source``.
 """
@@ -29,18 +29,15 @@ import sys
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.weights.footprint_source import FILL, MEASURE, MOST_PARTS, PACK
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.weights.ray_model import GEOMETRY_SIZE, Camera
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
-)
+wp.set_module_options(native.options("footprint.h", contract="fast"))
 
+TALLEST = native.constant("footprint.h", "TALLEST")
+"""Rows of a block at most."""
+MOST_PARTS = native.constant("footprint.h", "MOST_PARTS")
+"""Parts of a voxel at most."""
 FORMS = ("profiles", "pixels")
 """Rank-1 blocks, or one value per ray."""
 CHUNKS = 16
@@ -55,136 +52,106 @@ def pack_camera(*, sensor_per_pupil, pixel_mm, sensor_shape, pupil_radius_mm, ed
     return Camera(sensor_per_pupil, pixel_mm, columns / 2, rows / 2, pupil_radius_mm, columns, rows, edge)
 
 
-@wp.func_native(MEASURE)
-def _measure(
-    model: wp.array(dtype=float),
-    geometry: wp.array(dtype=float),
-    lenses: wp.vec4i,
-    corners: wp.array(dtype=int),
-    profiles: bool,
-    cuts: wp.vec3i,
-    voxel: int,
-    blocks_out: wp.array(dtype=int),
-    bytes_out: wp.array(dtype=int),
-): ...
+@wp.struct
+class Inputs:
+    """What the kernels read, the same for all voxels."""
+
+    model: wp.array(dtype=float)
+    """Ray models, (voxel, MODEL_SIZE), flat."""
+    geometry: wp.array(dtype=float)
+    """The camera's, (GEOMETRY_SIZE,)."""
+    lenses: wp.vec4i
+    """First i and j, lenses along i and j."""
+    corners: wp.array(dtype=int)
+    """First pixel (column, row) of each lens's block, (lens along j, lens along i, 2), flat."""
+    cuts: wp.vec3i
+    """Parts of a voxel along x, y, z."""
+    profiles: bool
 
 
-@wp.func_native(FILL)
+@wp.struct
+class Outline:
+    """Outline of a lens's cell, from ``lattice.cell_steps``."""
+
+    extent: wp.array(dtype=float)
+    """Half extents along a and b, (step, 2), flat."""
+    steps: int
+    square: bool
+
+
+@wp.struct
+class BlockArrays:
+    """Blocks of voxels on the device, and where each voxel's begin."""
+
+    first_block: wp.array(dtype=int)
+    first_value: wp.array(dtype=int)
+    ray: wp.array(dtype=int)
+    height: wp.array(dtype=wp.uint8)
+    width: wp.array(dtype=wp.uint8)
+    value: wp.array(dtype=wp.uint8)
+
+
+@wp.func_native("lfpiv::measure(lfpiv::weight_inputs(inputs), voxel, blocks_out.data, bytes_out.data);")
+def _measure(inputs: Inputs, voxel: int, blocks_out: wp.array(dtype=int), bytes_out: wp.array(dtype=int)): ...
+
+
+@wp.func_native("""
+    lfpiv::fill(
+        lfpiv::weight_inputs(inputs), {outline.extent.data, outline.steps, outline.square}, voxel,
+        lfpiv::block_arrays(blocks_out), scale_out.data, counts_out.data, bytes_out.data
+    );
+""")
 def _fill(
-    model: wp.array(dtype=float),
-    geometry: wp.array(dtype=float),
-    lenses: wp.vec4i,
-    corners: wp.array(dtype=int),
-    outline: wp.array(dtype=float),
-    steps: int,
-    square: bool,
-    profiles: bool,
-    cuts: wp.vec3i,
+    inputs: Inputs,
+    outline: Outline,
     voxel: int,
-    first_block: wp.array(dtype=int),
-    first_value: wp.array(dtype=int),
-    ray_out: wp.array(dtype=int),
-    height_out: wp.array(dtype=wp.uint8),
-    width_out: wp.array(dtype=wp.uint8),
-    value_out: wp.array(dtype=wp.uint8),
+    blocks_out: BlockArrays,
     scale_out: wp.array(dtype=float),
-    blocks_out: wp.array(dtype=int),
+    counts_out: wp.array(dtype=int),
     bytes_out: wp.array(dtype=int),
 ): ...
 
 
-@wp.func_native(PACK)
-def _pack(
-    from_block: int,
-    to_block: int,
-    blocks: int,
-    from_value: int,
-    to_value: int,
-    values: int,
-    ray: wp.array(dtype=int),
-    height: wp.array(dtype=wp.uint8),
-    width: wp.array(dtype=wp.uint8),
-    value: wp.array(dtype=wp.uint8),
-    ray_out: wp.array(dtype=int),
-    height_out: wp.array(dtype=wp.uint8),
-    width_out: wp.array(dtype=wp.uint8),
-    value_out: wp.array(dtype=wp.uint8),
-): ...
+@wp.func_native("lfpiv::pack(lfpiv::block_arrays(blocks), lfpiv::block_arrays(packed_out), voxel);")
+def _pack(blocks: BlockArrays, voxel: int, packed_out: BlockArrays): ...
 
 
 @wp.kernel
 def _measure_blocks(
     # in
     first_voxel: int,
-    model: wp.array(dtype=float),  # (voxel, MODEL_SIZE), flat
-    geometry: wp.array(dtype=float),
-    lenses: wp.vec4i,
-    corners: wp.array(dtype=int),  # (lens along j, lens along i, 2), flat
-    profiles: bool,
-    cuts: wp.vec3i,
+    inputs: Inputs,
     # out
-    blocks_out: wp.array(dtype=int),
+    blocks_out: wp.array(dtype=int),  # blocks and values that each voxel needs at most
     bytes_out: wp.array(dtype=int),
 ):
-    voxel = first_voxel + wp.tid()
-    _measure(model, geometry, lenses, corners, profiles, cuts, voxel, blocks_out, bytes_out)
+    _measure(inputs, first_voxel + wp.tid(), blocks_out, bytes_out)
 
 
 @wp.kernel
 def _fill_blocks(
     # in
     first_voxel: int,
-    model: wp.array(dtype=float),
-    geometry: wp.array(dtype=float),
-    lenses: wp.vec4i,
-    corners: wp.array(dtype=int),
-    outline: wp.array(dtype=float),  # of a lens's cell, (step, 2), flat
-    steps: int,
-    square: bool,
-    profiles: bool,
-    cuts: wp.vec3i,  # parts of a voxel along x, y, z
-    first_block: wp.array(dtype=int),  # room for each voxel's blocks and values, (voxel + 1,)
-    first_value: wp.array(dtype=int),
+    inputs: Inputs,
+    outline: Outline,
     # out
-    ray_out: wp.array(dtype=int),
-    height_out: wp.array(dtype=wp.uint8),
-    width_out: wp.array(dtype=wp.uint8),
-    value_out: wp.array(dtype=wp.uint8),
+    blocks_out: BlockArrays,
     scale_out: wp.array(dtype=float),
-    blocks_out: wp.array(dtype=int),  # blocks and values of each voxel
+    counts_out: wp.array(dtype=int),  # blocks and values of each voxel
     bytes_out: wp.array(dtype=int),
 ):
-    voxel = first_voxel + wp.tid()
-    _fill(
-        model, geometry, lenses, corners, outline, steps, square, profiles, cuts, voxel,
-        first_block, first_value, ray_out, height_out, width_out, value_out, scale_out, blocks_out, bytes_out,
-    )  # fmt: skip
+    _fill(inputs, outline, first_voxel + wp.tid(), blocks_out, scale_out, counts_out, bytes_out)
 
 
 @wp.kernel
 def _pack_blocks(
     # in
     first_voxel: int,
-    first_block: wp.array(dtype=int),
-    first_value: wp.array(dtype=int),
-    packed_block: wp.array(dtype=int),  # where each voxel's blocks and values go, (voxel + 1,)
-    packed_value: wp.array(dtype=int),
-    ray: wp.array(dtype=int),
-    height: wp.array(dtype=wp.uint8),
-    width: wp.array(dtype=wp.uint8),
-    value: wp.array(dtype=wp.uint8),
+    blocks: BlockArrays,
     # out
-    ray_out: wp.array(dtype=int),
-    height_out: wp.array(dtype=wp.uint8),
-    width_out: wp.array(dtype=wp.uint8),
-    value_out: wp.array(dtype=wp.uint8),
+    packed_out: BlockArrays,  # without gaps
 ):
-    voxel = first_voxel + wp.tid()
-    _pack(
-        first_block[voxel], packed_block[voxel], packed_block[voxel + 1] - packed_block[voxel],
-        first_value[voxel], packed_value[voxel], packed_value[voxel + 1] - packed_value[voxel],
-        ray, height, width, value, ray_out, height_out, width_out, value_out,
-    )  # fmt: skip
+    _pack(blocks, first_voxel + wp.tid(), packed_out)
 
 
 class Footprints:
@@ -222,14 +189,15 @@ class Footprints:
         )
         assert geometry.shape == (GEOMETRY_SIZE,)
         rows, columns = microimages.corner.shape[:2]
-        self._rays = [
-            self._put(geometry),
-            wp.vec4i(*microimages.first_lens, columns, rows),
-            self._put(microimages.corner.ravel()),
-        ]
-        self._cell = [self._put(np.ravel(outline)), len(outline), len(outline) == 1]
-        self._profiles = form == "profiles"
-        self._cuts = wp.vec3i(*cuts)
+        self._inputs = Inputs()
+        self._inputs.geometry = self._put(geometry)
+        self._inputs.lenses = wp.vec4i(*microimages.first_lens, columns, rows)
+        self._inputs.corners = self._put(microimages.corner.ravel())
+        self._inputs.cuts = wp.vec3i(*cuts)
+        self._inputs.profiles = form == "profiles"
+        self._outline = Outline()
+        self._outline.extent, self._outline.steps = self._put(np.ravel(outline)), len(outline)
+        self._outline.square = len(outline) == 1
         self._scratch: dict[str, wp.array] = {}
         wp.load_module(sys.modules[__name__], device=self._device.warp)  # before threads use it
 
@@ -248,30 +216,32 @@ class Footprints:
         """
         model = np.ascontiguousarray(model, np.float32)
         room = [wp.empty(len(model), dtype=int, device=self._device.warp) for _ in range(2)]
-        self._launch(
-            _measure_blocks, len(model), [self._put(model.ravel()), *self._rays, self._profiles, self._cuts], room
-        )
+        self._launch(_measure_blocks, len(model), [self._inputs_of(model)], room)
         blocks, values = (most.numpy() for most in room)
         edges = np.flatnonzero(np.diff(np.cumsum(values, dtype=np.int64) // SCRATCH_BYTES)) + 1
         for first, last in zip([0, *edges], [*edges, len(model)], strict=True):
             yield self._fill(model[first:last], blocks[first:last], values[first:last])
 
+    def _inputs_of(self, model):
+        self._inputs.model = self._put(model.ravel())
+        return self._inputs
+
     def _fill(self, model, most_blocks, most_values):
         room = [_starts(most) for most in (most_blocks, most_values)]
-        self._room = [self._put(starts) for starts in room]
-        self._blocks = [
+        self._blocks = self._arrays(
+            *room,
             self._memory("ray", room[0][-1], int),
             self._memory("height", room[0][-1], wp.uint8),
             self._memory("width", room[0][-1], wp.uint8),
             self._memory("value", room[1][-1], wp.uint8),
-        ]
+        )
         self._scale = self._memory("scale", len(model), float)
         counts = [wp.empty(len(model), dtype=int, device=self._device.warp) for _ in range(2)]
         self._launch(
             _fill_blocks,
             len(model),
-            [self._put(model.ravel()), *self._rays, *self._cell, self._profiles, self._cuts, *self._room],
-            [*self._blocks, self._scale, *counts],
+            [self._inputs_of(model), self._outline],
+            [self._blocks, self._scale, *counts],
         )
         self._counts = [count.numpy() for count in counts]
         return self._counts
@@ -284,13 +254,19 @@ class Footprints:
         ray, height, width, value, scale : ndarray
             As in ``project.Blocks``, of these voxels alone.
         """
-        packed = [self._put(_starts(count)) for count in self._counts]
         arrays = [self._put(array) for array in (ray, height, width, value)]
-        self._launch(_pack_blocks, len(scale), [*self._room, *packed, *self._blocks], arrays)
+        packed = self._arrays(*(_starts(count) for count in self._counts), *arrays)
+        self._launch(_pack_blocks, len(scale), [self._blocks], [packed])
         scale[:] = self._scale.numpy()[: len(scale)]
         if self._device.kind == "cuda":
             for array, filled in zip((ray, height, width, value), arrays, strict=True):
                 array[:] = filled.numpy()
+
+    def _arrays(self, first_block, first_value, ray, height, width, value):
+        blocks = BlockArrays()
+        blocks.first_block, blocks.first_value = self._put(first_block), self._put(first_value)
+        blocks.ray, blocks.height, blocks.width, blocks.value = ray, height, width, value
+        return blocks
 
     def _put(self, array):
         return wp.array(array, device=self._device.warp, copy=False)

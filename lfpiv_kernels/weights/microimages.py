@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.weights.ray_model import LANES
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 wp.set_module_options(native.options("microimages.h", contract="off"))  # rounds as NumPy does
 
@@ -111,7 +111,7 @@ def lay_out(first_lens, centre, radius, edge, sensor_shape):
     wp.load_module(sys.modules[__name__], device="cpu")  # before threads use it
     corner = np.floor(centre - radius).astype(np.int32)
     count = LAYERS * centre[..., 0].size * edge**2
-    pixel, share = np.empty(count + LANES, np.int32), np.empty(count + LANES, np.float32)
+    pixel, share = np.empty(count + BLOCK_WIDTH, np.int32), np.empty(count + BLOCK_WIDTH, np.float32)
     pixel[count:], share[count:] = -1, 0.0
     rows, columns = sensor_shape
     inputs = [
