@@ -60,7 +60,7 @@ def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
     """
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
     first, centre = microimage_centres(optics, lattice, radius + 1)
-    rays: Microimages = microimages.lay_out(
+    rays: Microimages = microimages.lens_rays(
         (int(first[0]), int(first[1])), centre, radius, microimage_edge(optics), optics.sensor_shape
     )
     return rays

@@ -21,7 +21,7 @@ from lfpiv_kernels.rays.count import count_rays
 from lfpiv_kernels.rays.lattice import Lattice, cell_frame, cell_steps, pack_lattice
 from lfpiv_kernels.reconstruction.projector import Blocks
 from lfpiv_kernels.weights import footprint
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS, Camera, pack_optics
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -111,7 +111,7 @@ class CameraKernels:
     """One camera's constants as the kernels take them."""
 
     setup: CalibratedCamera
-    camera: footprint.Camera
+    camera: Camera
     lattice: Lattice
     cell_mm: float
     frame: np.ndarray
@@ -141,7 +141,7 @@ def pack_camera(camera: CalibratedCamera) -> CameraKernels:
         cell = lattice.pitch_mm / math.sqrt(3)
     return CameraKernels(
         setup=camera,
-        camera=footprint.pack_camera(
+        camera=pack_optics(
             sensor_per_pupil=optics.sensor_per_pupil,
             pixel_mm=optics.pixel_mm,
             sensor_shape=optics.sensor_shape,

@@ -48,6 +48,13 @@ struct MicroimageLayout {
     float curvature;       // how far the mean curvature moves the pupil's edge within a pixel [pixel]
 };
 
+/// Return the layout from Warp's struct.
+template <class Layout>
+LFPIV_INLINE MicroimageLayout microimage_layout(const Layout& layout) {
+    return {layout.centre.data, layout.corner.data, layout.lenses, layout.edge,
+            layout.columns,     layout.rows,        layout.radius, layout.curvature};
+}
+
 /// Write the sensor pixel and the share of every ray of one lens, in all layers.
 LFPIV_INLINE void write_lens_rays(const MicroimageLayout& layout, int lens, int* pixel_out, float* share_out) {
     const int edge = layout.edge, columns = layout.columns, rows = layout.rows, lenses = layout.lenses;

@@ -106,6 +106,13 @@ struct PlacedRays {
     }
 };
 
+/// Return the rays from Warp's struct.
+template <class Placed>
+LFPIV_INLINE PlacedRays placed_rays(const Placed& placed) {
+    return {placed.light.data,  placed.parts.data, (int)placed.parts.shape[0],
+            placed.starts.data, placed.pixel.data, placed.share.data};
+}
+
 /// Number the pixels that see light in the order of their first rays, and count their rays.
 /// `number_out` and `first_out` must hold zeros.
 LFPIV_INLINE void number_pixels(const PlacedRays& placed, int* number_out, int* pixel_out, int* first_out,

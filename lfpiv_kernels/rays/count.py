@@ -9,7 +9,7 @@ import taichi as ti
 
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
-from lfpiv_kernels.weights.footprint import Camera
+from lfpiv_kernels.weights.ray_model import Camera
 
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 """Exponents of u and v in the polynomial's terms."""
@@ -73,7 +73,7 @@ def count_rays(rays, shift, window, first_pixel, camera, lattice, *, hexagonal, 
     first_pixel : ndarray, shape (window, 2), int32
         (column, row) of each window's first pixel on the sensor. Rays outside a window are traced but not counted.
     camera, lattice
-        From `footprint.pack_camera` and `lattice.pack_lattice`.
+        From ``ray_model.pack_optics`` and `lattice.pack_lattice`.
     hexagonal : bool
         Layout of the array.
     samples : int

@@ -1,4 +1,4 @@
-"""Sizes of a voxel's ray model and of a camera's geometry as the kernels of weights take them; see ``ray_model.h``."""
+"""A voxel's ray model and a camera's geometry as the kernels of weights take them; see ``ray_model.h``."""
 
 import taichi as ti
 
@@ -18,3 +18,9 @@ Camera = ti.types.vector(8, ti.f32)
 GEOMETRY_SIZE = native.constant("ray_model.h", "GEOMETRY_SIZE")
 """Floats of a camera's geometry: `Camera`, ``lattice.Lattice``, half extent of a lens's cell along s and t [mm], and
 the matrix ``lattice.cell_frame``, row by row."""
+
+
+def pack_optics(*, sensor_per_pupil, pixel_mm, sensor_shape, pupil_radius_mm, edge=0):
+    """Return a camera's optics as the kernels of weights and of ``rays.count`` take them."""
+    rows, columns = sensor_shape
+    return Camera(sensor_per_pupil, pixel_mm, columns / 2, rows / 2, pupil_radius_mm, columns, rows, edge)
