@@ -24,6 +24,7 @@ extensions = [
     "numpydoc",
     "sphinx_gallery.gen_gallery",
     "demonstration",
+    "house",
     "tables",
     "mathml",
 ]

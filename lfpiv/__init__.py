@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.version import __version__ as __version__
 
 if TYPE_CHECKING:  # what the names below stand for
+    from lfpiv import derived as derived
     from lfpiv import metrics as metrics
+    from lfpiv import statistics as statistics
     from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
     from lfpiv.errors import InputError
     from lfpiv.experiment.experiment import Experiment, open_experiment
-    from lfpiv.geometry.optics import Grid, LensLattice, Optics
+    from lfpiv.geometry.grid import Grid
+    from lfpiv.geometry.optics import LensLattice, Optics
     from lfpiv.lightfield.lens_array import LensArray, find_lens_array
     from lfpiv.reconstruction.motion import reconstruct_pair
     from lfpiv.reconstruction.volume import reconstruct
@@ -24,15 +27,13 @@ if TYPE_CHECKING:  # what the names below stand for
     from lfpiv.results.reader import open_results
     from lfpiv.runs.pipeline import run
     from lfpiv.selfcalibration.movements import self_calibrate
-    from lfpiv.velocity import derived as derived
-    from lfpiv.velocity import statistics as statistics
     from lfpiv.velocity.cross_correlation import correlate
     from lfpiv.weights.operator import build_weights
 
 _MODULES = {
     "Calibration": "lfpiv.calibration.cameras",
     "Experiment": "lfpiv.experiment.experiment",
-    "Grid": "lfpiv.geometry.optics",
+    "Grid": "lfpiv.geometry.grid",
     "InputError": "lfpiv.errors",
     "LensArray": "lfpiv.lightfield.lens_array",
     "LensLattice": "lfpiv.geometry.optics",

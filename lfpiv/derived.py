@@ -1,7 +1,5 @@
-"""Fields computed from velocity vectors: public name of `lfpiv.velocity.derived`."""
+"""Fields computed from velocity vectors: gradient, vorticity, divergence, Q criterion, strain rate."""
 
-import sys
+from lfpiv.velocity.derived import divergence, q_criterion, strain_rate, velocity_gradient, vorticity
 
-from lfpiv.velocity import derived
-
-sys.modules[__name__] = derived
+__all__ = ["divergence", "q_criterion", "strain_rate", "velocity_gradient", "vorticity"]

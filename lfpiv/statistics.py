@@ -1,7 +1,5 @@
-"""Means and fluctuations over pairs: public name of `lfpiv.velocity.statistics`."""
+"""Means and fluctuations over the pairs of a run, with standard errors."""
 
-import sys
+from lfpiv.velocity.statistics import mean, reynolds_stresses, rms, standard_error, turbulent_kinetic_energy
 
-from lfpiv.velocity import statistics
-
-sys.modules[__name__] = statistics
+__all__ = ["mean", "reynolds_stresses", "rms", "standard_error", "turbulent_kinetic_energy"]

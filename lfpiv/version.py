@@ -1,3 +1,19 @@
-"""Version of the package."""
+"""Version of the package, and versions of what its numbers depend on."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import platform
 
 __version__ = "0.1.0"
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package, of Python and of the libraries its numbers depend on."""
+    names = ("numpy", "scipy", "taichi", "warp-lang", "xarray", "opencv-python-headless", "scikit-learn")
+    found = {"lfpiv": __version__, "python": platform.python_version()}
+    for name in names:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found

@@ -1,32 +1,320 @@
-"""Warnings that outlive the log: said by the logger, and kept by whoever collects them, whatever the logger's level."""
+"""Warnings of a run: one value from where a doubt arises to the log, the summary, the report and the exit status.
+
+A `Warning` holds a code, a subject and figures. Files store these three. `Warning.sentence` makes the text where people
+read it, so that a reworded sentence does not break older files.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import enum
 import logging
-from collections.abc import Iterator
+import string
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-_collected: ContextVar[list[str] | None] = ContextVar("collected", default=None)
+NAMED_PAIRS = 5
+"""Largest number of pairs that a sentence names one by one."""
 
 
-def warn(log: logging.Logger, text: str, *values: Any) -> None:
-    """Log a warning, and keep its text, once, where somebody collects; `values` are filled in as `logging` does."""
-    log.warning(text, *values)
-    texts = _collected.get()
-    if texts is not None:
-        said = text % values if values else text
-        if said not in texts:
-            texts.append(said)
+class Code(enum.Enum):
+    """Kind of a warning; the value is stored in files and never changes."""
+
+    # images of a pair
+    MISPLACED = "misplaced"
+    SATURATED = "saturated"
+    UNEVEN = "uneven"
+    DIM = "dim"
+    EMPTY = "empty"
+    # white image and microlens array
+    APERTURE = "aperture"
+    WHITE_SATURATED = "white_saturated"
+    LENSES_UNLIT = "lenses_unlit"
+    LENSES_DISTORTED = "lenses_distorted"
+    LENSES_IRREGULAR = "lenses_irregular"
+    # board and mapping
+    BOARD_SATURATED = "board_saturated"
+    BOARD_MISPLACED = "board_misplaced"
+    BOARD_RENAMED = "board_renamed"
+    BOARD_EDGE_UNSEEN = "board_edge_unseen"
+    DOT_WIDTH = "dot_width"
+    DOTS_MISSING = "dots_missing"
+    PLANE_EMPTY = "plane_empty"
+    PLANE_LEFT_OUT = "plane_left_out"
+    TURNED = "turned"
+    MAGNIFIED = "magnified"
+    FEW_LABELS = "few_labels"
+    MAPPING_ERROR = "mapping_error"
+    # cameras and volume
+    OUTSIDE_CALIBRATION = "outside_calibration"
+    OUTSIDE_SIGHT = "outside_sight"
+    SEEN_BY_ONE = "seen_by_one"
+    ONE_CAMERA = "one_camera"
+    APART = "apart"
+    NOTHING_IN_COMMON = "nothing_in_common"
+    # weights
+    WEIGHTS_UNCHECKED = "weights_unchecked"
+    WEIGHTS_DIFFER = "weights_differ"
+    COUNT_SLOW = "count_slow"
+    # volumes and vectors
+    DIVERGED = "diverged"
+    MOTION_LOST = "motion_lost"
+    FEW_VALID = "few_valid"
+    # the run
+    FEWER_WORKERS = "fewer_workers"
+    ONE_GPU = "one_gpu"
+    NO_LOCKS = "no_locks"
+    OTHER = "other"
+    """A code that this version does not know, or a sentence stored by version 0.1.0."""
+
+
+SENTENCES: Mapping[Code, str] = {
+    Code.MISPLACED: (
+        "light falls between the microimages of the white image. Is it of the same camera, focus, zoom and aperture, "
+        "and are f_number and microlens_focal_length_mm right?"
+    ),
+    Code.SATURATED: (
+        "{share:percent} % of the bright pixels are saturated; clipped particles make ghosts, lower the laser's power"
+        " or the camera's gain"
+    ),
+    Code.UNEVEN: (
+        "{parts:.0f} of 9 parts of the sensor are {ratio:g} times and more as bright in one frame as in the other; "
+        "check the laser's pulses and the shutter"
+    ),
+    Code.DIM: (
+        "particles hardly rise above the noise (light of near pixels correlates by {structure:.2f}; clear images give"
+        " 0.2 or more): displacements are drawn towards zero. More light, more particles or larger windows help"
+    ),
+    Code.EMPTY: (
+        "no particles, only noise in the image (light of near pixels correlates by {structure:.3f}; clear images give"
+        " 0.2 or more): check laser, trigger and file. Vectors of such a pair do not count where fewer than two "
+        "cameras saw particles; otherwise they are not to be trusted"
+    ),
+    Code.APERTURE: (
+        "the microimages are {seen_px:.1f} px wide, not {stated_px:.1f} px as f_number = {f_number:g} and "
+        "microlens_focal_length_mm = {microlens_focal_length_mm:g} have it; f_number = {fitting:.3g} would fit. Check"
+        " both, and the aperture of all images."
+    ),
+    Code.WHITE_SATURATED: (
+        "{share:percent} % of the white image's bright pixels are saturated, so their response is not known; expose "
+        "it to two thirds of the range."
+    ),
+    Code.LENSES_UNLIT: "lens array: only {lit} of {count} microimages are lit; the others are extrapolated.",
+    Code.LENSES_DISTORTED: (
+        "lens array: the microimages leave their lattice by a smooth distortion of {rms_px:.3f} px rms, "
+        "{largest_px:.3f} px at most; centres follow the lattice."
+    ),
+    Code.LENSES_IRREGULAR: "microimages lie {rms_px:.2f} px (rms) off a regular lattice; check the white image.",
+    Code.BOARD_SATURATED: (
+        "{share:percent} % of the bright pixels of {path} are saturated and left out, so the dots are known less "
+        "well; expose the board to two thirds of the range."
+    ),
+    Code.BOARD_MISPLACED: (
+        "{path}: light falls between the microimages of the white image. Is it of the same camera, focus, zoom and "
+        "aperture, and are f_number and microlens_focal_length_mm right?"
+    ),
+    Code.BOARD_RENAMED: "the board's dots were renamed by {columns} columns and {rows} rows to match its outline",
+    Code.BOARD_EDGE_UNSEEN: (
+        "no edge of the board is in view along {axis} ({count} dots, {stated} stated): they are named right only "
+        "where the camera's axis meets the board within half a spacing ({half_spacing_mm:g} mm) of its middle"
+    ),
+    Code.DOT_WIDTH: "the board's dots look {seen_mm:.3g} mm wide, not {stated_mm:.3g} mm",
+    Code.DOTS_MISSING: (
+        "only {found} of {expected} board dots in the field were found; check focus, exposure and the planes listed "
+        "in the report.{hint}"
+    ),
+    Code.PLANE_EMPTY: (
+        "no dot was found in plane {plane} of the board (z = {z_mm:g} mm), {path}: look at the image; the calibration"
+        " goes without it."
+    ),
+    Code.PLANE_LEFT_OUT: (
+        "{left_out} of {seen} dots of plane {plane} of the board (z = {z_mm:g} mm) do not fit the others and are left"
+        " out: check that place in board.planes_mm, and {path}."
+    ),
+    Code.TURNED: (
+        "by the board's dots the camera stands {turn_deg:.0f} degrees from where nominal_angle_deg = {nominal_deg:g} "
+        "has it. Are its pictures turned by 90 degrees? Then x and y are."
+    ),
+    Code.MAGNIFIED: (
+        "the board's dots are magnified {magnification:.3f} times, not {stated:g} times as stated. Check "
+        "magnification, and board.spacing_mm and board.planes_mm: all lengths and velocities depend on those two."
+    ),
+    Code.FEW_LABELS: (
+        "{dots} dots tell the network {values} values for its {parameters} parameters, so it can be wrong between the"
+        " dots; use more dots or planes, or fewer nodes (network.hidden)."
+    ),
+    Code.MAPPING_ERROR: (
+        "the mapping is {sigma_nor:.3f} pitch off on held-out dots (sigma_nor), {usual:g} and less is usual; use more"
+        " dots or planes, and check the board's images."
+    ),
+    Code.OUTSIDE_CALIBRATION: (
+        "{share:percent} % of the volume lies outside the calibrated region ({region} mm), by up to {distance_mm:.2f}"
+        " mm: {advice}."
+    ),
+    Code.OUTSIDE_SIGHT: "sees only about {share:percent} % of the volume",
+    Code.SEEN_BY_ONE: (
+        "about {share:percent} % of the volume is seen by fewer than two cameras; vectors there are not valid: {where}"
+    ),
+    Code.ONE_CAMERA: (
+        "one camera hardly sees depth: w and displacement_z are not to be trusted, nor is their validation"
+    ),
+    Code.APART: (
+        "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: a camera moved since the board was "
+        "recorded; {advice}."
+    ),
+    Code.NOTHING_IN_COMMON: (
+        "{names} show no particles in common within {search} voxels: a camera moved by more, their images are of "
+        "different instants, or show very few particles."
+    ),
+    Code.WEIGHTS_UNCHECKED: (
+        "sees none of the voxels drawn at random to check its weights against counted rays: they are unchecked. Check"
+        " the volume's place and size against what the camera sees"
+    ),
+    Code.WEIGHTS_DIFFER: (
+        "weights as {form} differ from counted rays by {mean:percent1} % (worst voxel {worst:percent1} %), aimed at "
+        "are {aim_mean:percent} % ({aim_worst:percent1} %). Cause: {cause} (rays depart from second order by "
+        "{bent_pitch:.2f}, a voxel's edge is {wide_pitch:.1f} microlens pitch)"
+    ),
+    Code.COUNT_SLOW: "counting rays for {voxels} voxels; 'footprint' is about a thousand times faster",
+    Code.DIVERGED: "SMART: {verdict}",
+    Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
+    Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
+    Code.FEWER_WORKERS: (
+        "{fits} {noun} instead of {planned}: beside {weights_gib:.1f} GiB of weights each takes {each_gib:.1f} GiB of"
+        " memory"
+    ),
+    Code.ONE_GPU: (
+        "one of {gpus} GPUs is used: several processes need the package `distributed`. Install it: pip install "
+        "'lfpiv[distributed]'"
+    ),
+    Code.NO_LOCKS: "this file system knows no locks: start no second run on this folder",
+    Code.OTHER: "{text}",
+}
+"""Sentence of each code, with its figures in braces. Shares have the format `percent` or `percent1`."""
+
+
+_FINDING_FIGURES = {
+    "misplaced": "gap_light",
+    "saturated": "share",
+    "uneven": "parts",
+    "dim": "structure",
+    "empty": "structure",
+}  # names of the one figure that version 0.1.0 stored with a finding
+
+
+@dataclass(frozen=True, kw_only=True)
+class Warning:
+    """One doubt about a result."""
+
+    code: Code
+    subject: str = ""
+    """What it concerns, such as a camera, or "left, frame a"; empty for the run as a whole."""
+    figures: Mapping[str, object] = field(default_factory=dict)
+    """Numbers and names that the sentence shows."""
+    pairs: tuple[int, ...] = ()
+    """Numbers of the pairs it concerns; empty where it concerns no pair in particular."""
+
+    @property
+    def sentence(self) -> str:
+        """Sentence for people: subject, pairs and text."""
+        heads = [part for part in (self.subject, name_pairs(self.pairs)) if part]
+        text = _Words().vformat(SENTENCES[self.code], (), self.figures)
+        return f"{', '.join(heads)}: {text}" if heads else text
+
+    def of_pair(self, pair: int) -> Warning:
+        """Return the same warning about one pair."""
+        return replace(self, pairs=(pair,))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a file stores."""
+        return {"code": self.code.value, "subject": self.subject, "figures": dict(self.figures)}
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
+        """Read what a file stores; sentences and findings of version 0.1.0 too."""
+        if isinstance(stored, str):
+            return cls(code=Code.OTHER, figures={"text": stored})
+        if "what" in stored:
+            subject = stored["camera"] + (f", frame {stored['frame']}" if stored["frame"] else "")
+            figure = {_FINDING_FIGURES[stored["what"]]: stored["value"], "ratio": 4.0}
+            return cls(code=Code(stored["what"]), subject=subject, figures=figure)
+        code = stored["code"]
+        if code not in {known.value for known in Code}:
+            figures = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
+            text = f"{code} ({figures})" if figures else str(code)
+            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text})
+        return cls(code=Code(code), subject=stored["subject"], figures=stored["figures"])
+
+
+@dataclass(frozen=True)
+class Span:
+    """Range of a figure over several pairs."""
+
+    low: float
+    high: float
+
+
+class _Words(string.Formatter):
+    """Fill figures into a sentence: a span as "low to high", a share in percent."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, Span):
+            low, high = (self.format_field(end, format_spec) for end in (value.low, value.high))
+            return low if low == high else f"{low} to {high}"
+        if format_spec.startswith("percent"):
+            return f"{100 * value:.{format_spec[7:] or 0}f}"
+        return str(super().format_field(value, format_spec))
+
+
+def gather(warnings: Iterable[Warning]) -> list[Warning]:
+    """Merge warnings of equal code and subject: their pairs in one, their figures as ranges. Sorted by code."""
+    groups: dict[tuple[Code, str, tuple[str, ...]], list[Warning]] = {}
+    for warning in warnings:
+        names = tuple(str(value) for value in warning.figures.values() if isinstance(value, str))
+        groups.setdefault((warning.code, warning.subject, names), []).append(warning)
+    order = list(Code)
+    return [_merged(group) for _, group in sorted(groups.items(), key=lambda item: order.index(item[0][0]))]
+
+
+def _merged(group: Sequence[Warning]) -> Warning:
+    first = group[0]
+    figures: dict[str, object] = {}
+    for name, value in first.figures.items():
+        values = [warning.figures[name] for warning in group]
+        numbers = [number for number in values if isinstance(number, (int, float))]
+        figures[name] = Span(min(numbers), max(numbers)) if len(numbers) == len(group) > 1 else value
+    pairs = dict.fromkeys(pair for warning in group for pair in warning.pairs)
+    return replace(first, figures=figures, pairs=tuple(pairs))
+
+
+def name_pairs(pairs: Sequence[int]) -> str:
+    """Name some pairs, and say how many there are where they are many; empty for none."""
+    if not pairs:
+        return ""
+    names = ", ".join(map(str, pairs[:NAMED_PAIRS]))
+    more = f" and {len(pairs) - NAMED_PAIRS} more" if len(pairs) > NAMED_PAIRS else ""
+    return f"pair{'s' if len(pairs) > 1 else ''} {names}{more}"
+
+
+_collected: ContextVar[list[Warning] | None] = ContextVar("collected", default=None)
+
+
+def warn(log: logging.Logger, warning: Warning) -> None:
+    """Log a warning, and hand it to the innermost `collected` block, once."""
+    log.warning("%s", warning.sentence)
+    found = _collected.get()
+    if found is not None and warning not in found:
+        found.append(warning)
 
 
 @contextlib.contextmanager
-def collected() -> Iterator[list[str]]:
-    """Collect the warnings of a block in a list; a block inside another keeps its own to itself."""
-    texts: list[str] = []
-    token = _collected.set(texts)
+def collected() -> Iterator[list[Warning]]:
+    """Collect the warnings of a block in a list, whatever the log level. A block inside another keeps its own."""
+    found: list[Warning] = []
+    token = _collected.set(found)
     try:
-        yield texts
+        yield found
     finally:
         _collected.reset(token)

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 import lfpiv
 from lfpiv.calibration.network import train
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.weights.blocks import COUNT_POINTS
 from lfpiv.weights.operator import COUNT_SAMPLES_ONE, compare_with_count
 from lfpiv_kernels import runtime

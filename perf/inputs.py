@@ -14,7 +14,8 @@ from scipy import sparse
 from lfpiv.calibration.cameras import CalibratedCamera, Calibration
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.thin_lens_model import thin_lens_model
-from lfpiv.geometry.optics import Grid, LensLattice, Optics
+from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.optics import LensLattice, Optics
 
 
 class _Camera(CalibratedCamera):

@@ -159,18 +159,19 @@ def serve(name: str) -> None:
 def compare(name: str, base: Path, device: str) -> None:
     """Print the ratio of this checkout to another, from interleaved samples of three processes: theirs, ours, theirs.
 
-    How far the two processes of one checkout differ, block by block, is the band inside which a ratio says nothing.
+    Each checkout runs its own ``perf/cases.py``, so that modules may have moved. The band inside which a ratio means
+    nothing is the difference between the two processes of one checkout, block by block.
     """
     with contextlib.ExitStack() as stack:
         sides = []
         for tree in (base, ROOT, base):
-            command = [sys.executable, __file__, "--serve", name, "--device", device]
+            command = [sys.executable, str(tree / "perf" / "run.py"), "--serve", name, "--device", device]
             environment = os.environ | {"PYTHONPATH": str(tree)}
             side = subprocess.Popen(command, env=environment, stdin=-1, stdout=-1, text=True)
             stack.callback(side.kill)
-            told = next((line.split(maxsplit=1)[1].strip() for line in side.stdout if line.startswith("READY")), None)
-            if told != str(tree.resolve()):
-                print(json.dumps({"case": name, "metric": "wrong", "value": f"{tree}: no right result from {told}"}))
+            ready = next((line.split(maxsplit=1)[1].strip() for line in side.stdout if line.startswith("READY")), None)
+            if ready != str(tree.resolve()):
+                print(json.dumps({"case": name, "metric": "wrong", "value": f"{tree}: no right result from {ready}"}))
                 return
             sides.append(side)
         times = np.empty((ROUNDS, 3, 2))

@@ -133,7 +133,7 @@ def test_correlation_and_deformation_launch_once_per_slab(device, launches, chun
     rng = np.random.default_rng(0)
     first, second = rng.random((2, 40, 40, 40), np.float32)
     arguments = {"window": (16,) * 3, "step": (8,) * 3, "search": (4,) * 3}
-    correlate.correlate_windows(first, second, method="direct", **arguments)
+    correlate.correlate_windows(first, second, **arguments)
     launched = Counter(launches)
     per_volume = {"_split", "_sum_planes", "_window_statistics", "_transform_planes"}
     assert set(launched) <= per_volume | {"_correlate_blocks", "_correlate_spectra", "_find_peaks"}

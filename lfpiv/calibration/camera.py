@@ -19,6 +19,7 @@ from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LensLattice, Optics, pair
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.microimage_layout import lay_out
+from lfpiv.warn import Warning
 from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.weights.microimages import Microimages
 
@@ -42,6 +43,8 @@ class CalibratedCamera:
     """Corners (x, y, z) of the box that the board's dots spanned [mm], shape (2, 3); None for DRT."""
     report: dict[str, Any] = field(default_factory=dict)
     """Figures of quality, JSON-able: sigma_nor_test, dots_found, dots_expected, lens_array_rms_px, ..."""
+    warnings: tuple[Warning, ...] = ()
+    """Doubts about the calibration."""
     dots: BoardDots | None = None
     """The labels the network was trained on."""
     test_errors: np.ndarray | None = None
@@ -181,6 +184,7 @@ def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:
     for name, value in vars(camera.lattice).items():
         group.attrs[f"lattice.{name}"] = value
     group.attrs["report"] = json.dumps(camera.report)
+    group.attrs["warnings"] = json.dumps([warning.to_json() for warning in camera.warnings])
     if camera.region_mm is not None:
         group["region_mm"] = camera.region_mm
     if camera.test_errors is not None:
@@ -221,6 +225,8 @@ def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
             key: value.item() for key, value in part.attrs.items()
         }
 
+    report = json.loads(group.attrs["report"])
+    warnings = json.loads(group.attrs["warnings"]) if "warnings" in group.attrs else report.pop("warnings", [])
     return CalibratedCamera(
         name=name,
         optics=optics,
@@ -229,7 +235,8 @@ def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
         network=Network.from_arrays(arrays("network")) if "network" in group else None,
         baseline=ThinLensModel.from_arrays(arrays("baseline")) if "baseline" in group else None,
         region_mm=group["region_mm"][()] if "region_mm" in group else None,
-        report=json.loads(group.attrs["report"]),
+        report=report,
+        warnings=tuple(Warning.from_json(stored) for stored in warnings),
         dots=BoardDots(**arrays("dots")) if "dots" in group else None,
         test_errors=group["test_errors"][()] if "test_errors" in group else None,
     )

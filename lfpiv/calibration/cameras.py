@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from lfpiv import warn
 from lfpiv.calibration import checks
 from lfpiv.calibration.board.board import DotBoard, Planes, agreeing_dots, measure_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration, load_calibration
@@ -18,11 +18,12 @@ from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
 from lfpiv.calibration.virtual_samples import guide_between
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment
-from lfpiv.geometry.optics import Grid, LensLattice
+from lfpiv.geometry.optics import LensLattice
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.lens_array import find_lens_array
+from lfpiv.warn import collected
 
-__all__ = ["CalibratedCamera", "Calibration", "calibrate", "load_calibration", "thin_lens", "warn_outside"]
+__all__ = ["CalibratedCamera", "Calibration", "calibrate", "load_calibration", "thin_lens"]
 
 log = logging.getLogger(__name__)
 
@@ -64,10 +65,10 @@ def calibrate(experiment: Experiment, progress: Progress | None = None) -> Calib
             if progress is not None:
                 progress((number + fraction) / len(experiment.cameras))
 
-        with warn.collected() as texts:
+        with collected() as warnings:
             camera = _calibrate_camera(experiment, setup, step)
-        camera.report["warnings"] += [f"{setup.name}: {text}" for text in texts]  # logged where they arose
-        cameras[setup.name] = camera
+        named = (replace(warning, subject=setup.name) for warning in warnings)
+        cameras[setup.name] = replace(camera, warnings=tuple(named))
     return Calibration(cameras)
 
 
@@ -92,7 +93,8 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
         raise ValueError(f"angle_error_deg: expected a finite angle [degree], got {angle_error_deg}.")
     cameras = {}
     for setup in experiment.cameras:
-        lattice, decoder, report = _decode(experiment, setup)
+        with collected() as warnings:
+            lattice, decoder, report = _decode(experiment, setup)
         angle = setup.nominal_angle_deg
         cameras[setup.name] = CalibratedCamera(
             name=setup.name,
@@ -103,44 +105,9 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
                 setup.optics, angle + np.copysign(angle_error_deg, angle) if angle else angle_error_deg
             ),
             report=report,
+            warnings=tuple(replace(warning, subject=setup.name) for warning in warnings),
         )
     return Calibration(cameras)
-
-
-def warn_outside(calibration: Calibration, grid: Grid) -> None:
-    """Log a warning for every camera whose calibrated region does not hold all voxels of a grid."""
-    for text in outside_warnings(calibration, grid):
-        log.warning("%s", text)
-
-
-def outside_warnings(calibration: Calibration, grid: Grid) -> list[str]:
-    """Say of every camera whose calibrated region does not hold all voxels of a grid how much lies outside.
-
-    The region is the box that the board's dots spanned, widened by half a voxel.
-    """
-    texts = []
-    for camera in calibration.cameras.values():
-        if camera.region_mm is None:
-            continue
-        inside, distance = 1.0, 0.0
-        for axis in range(3):
-            centres = grid.axis_mm(2 - axis)
-            low, high = camera.region_mm[:, axis]
-            over = np.maximum(np.maximum(low - centres, centres - high) - grid.voxel_mm / 2, 0.0)
-            inside *= float((over <= 1e-9).mean())
-            distance = float(np.hypot(distance, over.max()))
-        if inside == 1:
-            continue
-        low, high = camera.region_mm
-        box = ", ".join(f"{name} {a:g} to {b:g}" for name, a, b in zip("xyz", low, high, strict=True))
-        mend = "shrink the volume or use a larger board or more planes"
-        if camera.baseline is None:
-            mend += ', or set network.baseline = "thin_lens": a network alone extrapolates badly'
-        texts.append(
-            f"{camera.name}: {100 * (1 - inside):.0f} % of the volume lies outside the calibrated region ({box} mm), "
-            f"by up to {distance:.2f} mm: {mend}."
-        )
-    return texts
 
 
 def _decode(experiment: Experiment, setup: CameraSetup) -> tuple[LensLattice, LightFieldDecoder, dict[str, Any]]:
@@ -157,9 +124,8 @@ def _decode(experiment: Experiment, setup: CameraSetup) -> tuple[LensLattice, Li
         "lens_array_pitch_px": float(array.pitch_px),
         "lens_array_rotation_deg": float(array.rotation_deg),
         "lenses": len(array.centres_px),
-        "warnings": [],
     }
-    checks.check_white(setup, white, dark, decoder, report)
+    checks.check_white(setup, white, dark, decoder)
     return lattice, decoder, report
 
 
@@ -168,7 +134,7 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
     step(0.15)
     board, settings, dark = experiment.board, experiment.network, experiment.dark(setup.name)
     images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
-    checks.check_light(experiment, setup, decoder, images, dark, report)
+    checks.check_light(experiment, setup, decoder, images, dark)
     step(0.2)
     try:
         dots = measure_board(
@@ -191,7 +157,7 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
         ) from None
     except ValueError as error:
         raise InputError(f"{experiment.path}: board.images of camera {setup.name!r}: {error}") from None
-    checks.check_planes(experiment, setup, dots, report)
+    checks.check_planes(experiment, setup, dots)
     step(0.75)
 
     points, pupil, array = dots.points_mm, dots.pupil_mm, dots.array_mm
@@ -208,7 +174,7 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
                 "board.planes_mm."
             )
         missed = float(np.median(np.linalg.norm(array - fitted(points, pupil), axis=1))) / pitch
-        checks.compare_with_nominal(setup, fitted, missed, report)
+        nominal = checks.compare_with_nominal(setup, fitted, missed)
         keep = agreeing_dots(dots, array - fitted(points, pupil), pitch)
         baseline = fitted if settings.baseline == "thin_lens" else None
         target = array if baseline is None else array - baseline(points, pupil)
@@ -231,8 +197,10 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
     step(0.95)
     found, expected = int(dots.found.sum()), int(dots.expected.sum())
     left_out = np.bincount(np.unique(dots.dot[~keep]) // math.prod(board.dots), minlength=len(images)) + dots.rejected
-    checks.check_left_out(experiment, setup, dots, left_out, report)
+    checks.check_left_out(experiment, setup, dots, left_out)
     report |= {
+        "turn_from_nominal_deg": nominal.turn_deg,
+        "magnification": nominal.magnification,
         "sigma_nor_test": training.sigma_nor,
         "dots_found": found,
         "dots_expected": expected,
@@ -261,7 +229,7 @@ def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress
         test_errors=training.test_errors,
     )
     training_dots = len(np.unique(dots.dot[keep][training.training_index]))
-    checks.warn(camera, settings.estimator, training_dots)
+    checks.check_mapping(camera, settings.estimator, training_dots)
     log.info(
         "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots", setup.name, found, expected, training.sigma_nor
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,7 +22,6 @@ from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.image_checks import (
     APERTURE,
     GAP_LIGHT,
-    MISPLACED,
     NO_PLACE,
     OTHER_APERTURE,
     SATURATED,
@@ -32,6 +31,7 @@ from lfpiv.lightfield.image_checks import (
     saturated_share,
     stated_px,
 )
+from lfpiv.warn import SENTENCES, Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
@@ -52,62 +52,65 @@ FEWEST_PLANES = 2
 """Planes of the board a calibration needs: one alone does not tell the camera's depth."""
 
 
-def check_white(
-    setup: CameraSetup,
-    white: np.ndarray,
-    dark: np.ndarray | None,
-    decoder: LightFieldDecoder,
-    report: dict[str, Any],
-) -> None:
-    """Hold the white image against the stated aperture, and look for saturation.
+def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, decoder: LightFieldDecoder) -> None:
+    """Compare the microimages of the white image with the stated aperture, and warn of saturation.
 
-    Where the stated aperture is larger than the true one, all light falls where some is expected, and nothing else
-    would tell.
+    With a stated aperture larger than the true one all light falls where some is expected; no other check finds that.
+
+    Raises
+    ------
+    InputError
+        If the microimages cannot be those of the stated optics.
     """
-    told, stated = microimage_px(white, dark, decoder), stated_px(setup.optics)
-    off = 0.0 if told is None else max(told / stated, stated / told) - 1
-    if told is not None and off > APERTURE:
+    seen, stated = microimage_px(white, dark, decoder), stated_px(setup.optics)
+    off = 0.0 if seen is None else max(seen / stated, stated / seen) - 1
+    if seen is not None and off > APERTURE:
         optics = setup.optics
-        text = (
-            f"the microimages are {told:.1f} px wide, not {stated:.1f} px as f_number = {optics.f_number:g} and "
-            f"microlens_focal_length_mm = {optics.microlens_focal_length_mm:g} have it; f_number = "
-            f"{optics.f_number * stated / told:.3g} would fit. Check both, and the aperture of all images."
-        )
+        figures = {
+            "seen_px": seen,
+            "stated_px": stated,
+            "f_number": optics.f_number,
+            "microlens_focal_length_mm": optics.microlens_focal_length_mm,
+            "fitting": optics.f_number * stated / seen,
+        }
+        warning = Warning(code=Code.APERTURE, figures=figures)
         if off > OTHER_APERTURE:
-            raise InputError(f"{setup.white_path}: white_image of camera {setup.name!r}: {text}")
-        report["warnings"].append(f"{setup.name}: {text}")
+            raise InputError(f"{setup.white_path}: white_image of camera {setup.name!r}: {warning.sentence}")
+        warn(log, replace(warning, subject=setup.name))
     share = saturated_share(white)
     if share > SATURATED:
-        report["warnings"].append(
-            f"{setup.name}: {100 * share:.0f} % of the white image's bright pixels are saturated, so their response is "
-            "not known; expose it to two thirds of the range."
-        )
+        warn(log, Warning(code=Code.WHITE_SATURATED, subject=setup.name, figures={"share": share}))
 
 
-def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, missed: float, report: dict[str, Any]) -> None:
-    """Warn of a camera that the dots see elsewhere, or magnifying otherwise, than the experiment file says.
+@dataclass(frozen=True, kw_only=True)
+class NominalDifference:
+    """Pose and magnification of a camera, as the board's dots show them, against the stated ones."""
 
-    Both are measured to a fraction of a degree and of a percent, and no result depends on what is stated. But they tell
-    what nothing else does: pictures turned on their side, a wrong spacing of the dots or of the planes. Where the thin
-    lens misses the dots' rays by more than `EXPLAINED`, as behind a tilted window, its magnification means nothing.
+    turn_deg: float
+    """Rotation from the stated pose [degree]."""
+    magnification: float
+    """Magnification of the board's middle."""
+
+
+def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, missed: float) -> NominalDifference:
+    """Warn of a camera that the dots see in another pose, or magnifying otherwise, than the experiment file states.
+
+    No result depends on the stated values. But a difference shows images turned on their side, or a wrong spacing of the
+    dots or planes, which no other check finds. Where the thin lens misses the dots' rays by more than `EXPLAINED`, as
+    behind a tilted window, its magnification is not compared.
     """
     nominal = thin_lens_model(setup.optics, setup.nominal_angle_deg)
     turn = Rotation.from_matrix(fitted.rotation @ nominal.rotation.T).magnitude() * 180 / math.pi
-    depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the board's middle, where the axes are said to meet
+    depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the board's middle
     magnification = fitted.image_distance_mm / (fitted.object_distance_mm - depth)
     ratio = magnification * nominal.object_distance_mm / nominal.image_distance_mm
-    report |= {"turn_from_nominal_deg": float(turn), "magnification": float(magnification)}
     if turn > TURN_DEG:
-        report["warnings"].append(
-            f"{setup.name}: by the board's dots the camera stands {turn:.0f} degrees from where nominal_angle_deg = "
-            f"{setup.nominal_angle_deg:g} has it. Are its pictures turned by 90 degrees? Then x and y are."
-        )
+        figures = {"turn_deg": float(turn), "nominal_deg": setup.nominal_angle_deg}
+        warn(log, Warning(code=Code.TURNED, subject=setup.name, figures=figures))
     if missed < EXPLAINED and not 1 / (1 + MAGNIFICATION) < ratio < 1 + MAGNIFICATION:
-        report["warnings"].append(
-            f"{setup.name}: the board's dots are magnified {magnification:.3f} times, not "
-            f"{abs(setup.optics.magnification):g} times as stated. Check magnification, and board.spacing_mm and "
-            "board.planes_mm: all lengths and velocities depend on those two."
-        )
+        figures = {"magnification": float(magnification), "stated": abs(setup.optics.magnification)}
+        warn(log, Warning(code=Code.MAGNIFIED, subject=setup.name, figures=figures))
+    return NominalDifference(turn_deg=float(turn), magnification=float(magnification))
 
 
 def check_light(
@@ -116,9 +119,8 @@ def check_light(
     decoder: LightFieldDecoder,
     images: Sequence[np.ndarray],
     dark: np.ndarray | None,
-    report: dict[str, Any],
 ) -> None:
-    """Refuse, or warn of, board images that are copies, saturated, or do not belong to the white image."""
+    """Refuse board images that are copies or belong to another white image; warn of saturated and doubtful ones."""
     paths = [experiment.board_path(setup.name, plane) for plane in range(len(images))]
     first: dict[bytes, int] = {}
     saturated = np.zeros(len(images))
@@ -132,19 +134,19 @@ def check_light(
         saturated[plane] = saturated_share(image)
     worst = int(saturated.argmax())
     if saturated[worst] > SATURATED:
-        report["warnings"].append(
-            f"{setup.name}: {100 * saturated[worst]:.0f} % of the bright pixels of {paths[worst]} are saturated and "
-            "left out, so the dots are known less well; expose the board to two thirds of the range."
-        )
+        figures = {"share": float(saturated[worst]), "path": str(paths[worst])}
+        warn(log, Warning(code=Code.BOARD_SATURATED, subject=setup.name, figures=figures))
     plane = len(images) // 2
     light = gap_light(images[plane] if dark is None else images[plane] - dark, decoder)
     if light > NO_PLACE:
-        raise InputError(f"{paths[plane]}: board.images of camera {setup.name!r}: {MISPLACED} Are these board images?")
+        raise InputError(
+            f"{paths[plane]}: board.images of camera {setup.name!r}: {SENTENCES[Code.MISPLACED]} Are these board images?"
+        )
     if light > GAP_LIGHT:
-        report["warnings"].append(f"{setup.name}: {paths[plane]}: {MISPLACED}")
+        warn(log, Warning(code=Code.BOARD_MISPLACED, subject=setup.name, figures={"path": str(paths[plane])}))
 
 
-def check_planes(experiment: Experiment, setup: CameraSetup, dots: BoardDots, report: dict[str, Any]) -> None:
+def check_planes(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> None:
     """Refuse a board seen in fewer than two planes; warn of each plane in which no dot was found, by file."""
     planes = experiment.board.planes_mm
     empty = [plane for plane in range(len(planes)) if dots.found[plane] == 0]
@@ -155,54 +157,43 @@ def check_planes(experiment: Experiment, setup: CameraSetup, dots: BoardDots, re
             f"more, found them in {shown} of {len(planes)}. Look at {experiment.board_path(setup.name, empty[0])}."
         )
     for plane in empty:
-        report["warnings"].append(
-            f"{setup.name}: no dot was found in plane {plane} of the board (z = {planes[plane]:g} mm), "
-            f"{experiment.board_path(setup.name, plane)}: look at the image; the calibration goes without it."
-        )
+        path = str(experiment.board_path(setup.name, plane))
+        figures = {"plane": plane, "z_mm": planes[plane], "path": path}
+        warn(log, Warning(code=Code.PLANE_EMPTY, subject=setup.name, figures=figures))
 
 
-def check_left_out(
-    experiment: Experiment, setup: CameraSetup, dots: BoardDots, left_out: np.ndarray, report: dict[str, Any]
-) -> None:
+def check_left_out(experiment: Experiment, setup: CameraSetup, dots: BoardDots, left_out: np.ndarray) -> None:
     """Warn of each plane of which most dots do not fit the others: wrongly placed, or another plane's image."""
     seen = dots.found + dots.rejected
     bad = np.flatnonzero((seen > 0) & (left_out >= REJECTED * seen))
-    if len(bad) > len(seen) / 2:  # then it is not the planes: see `warn`
+    if len(bad) > len(seen) / 2:  # most planes: the cause is not a plane, see `check_mapping`
         return
-    for plane in bad:
-        report["warnings"].append(
-            f"{setup.name}: {left_out[plane]} of {seen[plane]} dots of plane {plane} of the board (z = "
-            f"{experiment.board.planes_mm[plane]:g} mm) do not fit the others and are left out: check that place in "
-            f"board.planes_mm, and {experiment.board_path(setup.name, int(plane))}."
-        )
+    for plane in map(int, bad):
+        figures = {
+            "left_out": int(left_out[plane]),
+            "seen": int(seen[plane]),
+            "plane": plane,
+            "z_mm": experiment.board.planes_mm[plane],
+            "path": str(experiment.board_path(setup.name, plane)),
+        }
+        warn(log, Warning(code=Code.PLANE_LEFT_OUT, subject=setup.name, figures=figures))
 
 
-def warn(camera: CalibratedCamera, estimator: str, training_dots: int) -> None:
-    """Put what a user must know into the report's warnings, and log it."""
-    report, warnings, sigma_nor = camera.report, camera.report["warnings"], SIGMA_NOR[estimator]
+def check_mapping(camera: CalibratedCamera, estimator: str, training_dots: int) -> None:
+    """Warn of few dots, an irregular lens array, and a mapping that misses the held-out dots."""
+    report, sigma_nor = camera.report, SIGMA_NOR[estimator]
+
+    def doubt(code: Code, **figures: float | str) -> None:
+        warn(log, Warning(code=code, subject=camera.name, figures=figures))
+
     if report["dots_found"] < 0.9 * report["dots_expected"]:
-        warnings.append(
-            f"{camera.name}: only {report['dots_found']} of {report['dots_expected']} board dots in the field were "
-            "found; check focus, exposure and the planes listed in the report."
-            + (few_pixels(camera.optics) if estimator == "lens_integral" else "")
-        )
+        hint = few_pixels(camera.optics) if estimator == "lens_integral" else ""
+        doubt(Code.DOTS_MISSING, found=report["dots_found"], expected=report["dots_expected"], hint=hint)
     if report["lens_array_rms_px"] > 0.25:
-        warnings.append(
-            f"{camera.name}: microimages lie {report['lens_array_rms_px']:.2f} px (rms) off a regular lattice; check "
-            "the white image."
-        )
+        doubt(Code.LENSES_IRREGULAR, rms_px=report["lens_array_rms_px"])
     if camera.network is not None:
         values, parameters = VALUES_PER_DOT * training_dots, sum(layer.size for layer in camera.network.layers())
         if values < parameters:
-            warnings.append(
-                f"{camera.name}: {training_dots} dots tell the network {values} values for its {parameters} "
-                "parameters, so it can be wrong between the dots; use more dots or planes, or fewer nodes "
-                "(network.hidden)."
-            )
+            doubt(Code.FEW_LABELS, dots=training_dots, values=values, parameters=parameters)
     if not report["sigma_nor_test"] <= sigma_nor:
-        warnings.append(
-            f"{camera.name}: the mapping is {report['sigma_nor_test']:.3f} pitch off on held-out dots (sigma_nor), "
-            f"{sigma_nor:g} and less is usual; use more dots or planes, and check the board's images."
-        )
-    for text in warnings:
-        log.warning("%s", text)
+        doubt(Code.MAPPING_ERROR, sigma_nor=report["sigma_nor_test"], usual=sigma_nor)

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lfpiv.results import netcdf
 from lfpiv.runs import memory
+from lfpiv.version import versions
 from lfpiv_kernels import runtime
 
 TOLERANCE_MAPPING = 1e-4
@@ -32,7 +32,7 @@ def examine(device: str = "auto") -> Iterator[tuple[str, str, bool]]:
         Device to test.
     """
     yield "system", f"{platform.system()} {platform.release()}, {platform.machine()}", True
-    for name, version in netcdf.versions().items():
+    for name, version in versions().items():
         yield name, version, True
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     yield "CPU cores", str(cores), True

@@ -48,7 +48,7 @@ class Voice:
     def answer(self, result: Any, tell: Callable[[], None]) -> None:
         """Give a command's result: as JSON, as text by `tell`, or not at all."""
         if self.json:
-            from lfpiv.results.netcdf import plain
+            from lfpiv.files import plain
 
             print(json.dumps(plain(result), indent=2, allow_nan=False))
         elif not self.quiet:

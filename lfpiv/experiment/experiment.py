@@ -26,7 +26,8 @@ from lfpiv.experiment.settings import (
     Volume,
 )
 from lfpiv.experiment.toml import read_toml
-from lfpiv.geometry.optics import Grid, Optics
+from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.optics import Optics
 
 DECODED_PIXELS = 100_000_000
 """Particle images decoded before the work starts [pixel], in order; the others are checked by header and length."""

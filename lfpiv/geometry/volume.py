@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import numbers
+from typing import TypeGuard
+
 import numpy as np
 import xarray as xr
 
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import AXES, Grid
 
-_DIMS = ("z", "y", "x")
 _SPACING_TOLERANCE = 1e-3  # unevenness of coordinates written as float32 decimals, relative to the spacing
 
 
@@ -41,7 +44,7 @@ def checked_volume(volume: xr.DataArray | np.ndarray, grid: Grid | None, name: s
 
 def in_order(volume: xr.DataArray | np.ndarray, name: str) -> xr.DataArray | np.ndarray:
     """Return a volume as it is, or raise ValueError where its named dimensions are in another order than (z, y, x)."""
-    if isinstance(volume, xr.DataArray) and volume.dims != _DIMS:
+    if isinstance(volume, xr.DataArray) and volume.dims != AXES:
         raise ValueError(
             f"{name}: expected dims (z, y, x), got ({', '.join(map(str, volume.dims))}). Use .transpose('z', 'y', 'x')."
         )
@@ -50,12 +53,12 @@ def in_order(volume: xr.DataArray | np.ndarray, name: str) -> xr.DataArray | np.
 
 def _grid_of(volume: xr.DataArray, name: str) -> Grid:
     """Grid of a DataArray with coordinates in mm."""
-    if volume.dims != _DIMS or any(axis not in volume.coords for axis in _DIMS):
+    if volume.dims != AXES or any(axis not in volume.coords for axis in AXES):
         raise ValueError(
             f"{name}: expected dims (z, y, x) with coordinates [mm], got {dict(volume.sizes)} with coordinates "
             f"{list(volume.coords)}."
         )
-    axes = [np.asarray(volume[axis], float) for axis in _DIMS]
+    axes = [np.asarray(volume[axis], float) for axis in AXES]
     steps = np.concatenate([np.diff(axis) for axis in axes])
     voxel_mm = float(np.median(steps)) if len(steps) else float(volume.attrs.get("voxel_mm", 1.0))
     if not voxel_mm > 0 or (np.abs(steps - voxel_mm) > _SPACING_TOLERANCE * voxel_mm).any():
@@ -71,3 +74,12 @@ def voxel_place(points_mm: np.ndarray, grid: Grid) -> np.ndarray:
     """Points (x, y, z) [mm] as fractional voxel indices (z, y, x)."""
     place: np.ndarray = (points_mm[:, ::-1] - np.asarray(grid.first_centre_mm)) / grid.voxel_mm
     return place
+
+
+VIEWS = "views"
+"""Coordinate of a volume: how many cameras see each voxel. Volumes without it are seen by two or by the only one."""
+
+
+def is_finite(value: object) -> TypeGuard[float]:
+    """Whether a value is a finite real number."""
+    return isinstance(value, numbers.Real) and math.isfinite(value)

@@ -6,11 +6,8 @@ brighter than the sensor's range all give volumes and vectors that agree with th
 
 from __future__ import annotations
 
-import collections
-import enum
 import hashlib
 from collections.abc import Iterable, Mapping
-from typing import TypedDict
 
 import numpy as np
 from scipy import ndimage
@@ -19,6 +16,7 @@ from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.particle_signal import EMPTY, NOISE
+from lfpiv.warn import Code, Warning
 
 GAP_LIGHT = 0.1
 """Light between the microimages, over that inside them, above which an image hardly belongs to the white image and the
@@ -35,12 +33,6 @@ SATURATED = 0.02
 """Of the pixels brighter than half the sensor's range, the part at its end above which an image is saturated."""
 UNEVEN = 4.0
 """Ratio of the light in a part of the sensor, between the frames of a pair, that no flow explains."""
-
-MISPLACED = (
-    "light falls between the microimages of the white image. Is it of the same camera, focus, zoom and aperture, and "
-    "are f_number and microlens_focal_length_mm right?"
-)
-"""What such light means."""
 
 _BAND_ROWS = 512  # looked at, over the whole width: enough pixels, and quick on the largest sensors
 _CORE_COVERAGE = 0.99  # pixels wholly inside a microimage
@@ -186,32 +178,10 @@ def dark_blocks(first: np.ndarray, second: np.ndarray) -> int:
     return int(np.count_nonzero((high > _LIT_SHARE * high.sum()) & (high > UNEVEN * low)))
 
 
-class Finding(TypedDict):
-    """What is suspicious about the images of a pair, in the form in which it is stored with the results."""
-
-    what: str
-    """A `Fault` by its value."""
-    camera: str
-    frame: str
-    """Empty where both frames are meant."""
-    value: float
-    """How much of it: what the function of that name returned."""
-
-
-class Fault(enum.Enum):
-    """Kinds of findings; what each means for a reader, `lfpiv.runs.summary_warnings` words."""
-
-    MISPLACED = "misplaced"
-    SATURATED = "saturated"
-    UNEVEN = "uneven"
-    DIM = "dim"
-    EMPTY = "empty"
-
-
-def frame_findings(
+def image_warnings(
     raw: np.ndarray, light: np.ndarray, decoder: LightFieldDecoder, camera: str, frame: str
-) -> list[Finding]:
-    """Look at one image: misplaced or saturated light.
+) -> list[Warning]:
+    """Warn of misplaced or saturated light in one image.
 
     Parameters
     ----------
@@ -222,36 +192,39 @@ def frame_findings(
     camera, frame : str
         Their names.
     """
-    looks = (
-        (Fault.MISPLACED, gap_light(light, decoder), GAP_LIGHT),
-        (Fault.SATURATED, saturated_share(raw), SATURATED),
-    )
-    return [_finding(fault, camera, frame, value) for fault, value, limit in looks if value > limit]
-
-
-def camera_findings(first: np.ndarray, second: np.ndarray, camera: str) -> list[Finding]:
-    """Compare the light of both frames of a camera, images of shape (rows, columns) [counts]."""
-    dark = dark_blocks(first, second)
-    return [_finding(Fault.UNEVEN, camera, "", dark)] if dark else []
-
-
-def structure_findings(shown: Mapping[str, float], frame: str) -> list[Finding]:
-    """Judge the structure of a frame's images, by camera: particles, hardly any, or nothing but noise."""
+    subject = f"{camera}, frame {frame}"
     found = []
-    for camera, value in shown.items():
-        if value < NOISE:
-            found.append(_finding(Fault.EMPTY if value < EMPTY else Fault.DIM, camera, frame, value))
+    if (between := gap_light(light, decoder)) > GAP_LIGHT:
+        found.append(Warning(code=Code.MISPLACED, subject=subject, figures={"gap_light": between}))
+    if (share := saturated_share(raw)) > SATURATED:
+        found.append(Warning(code=Code.SATURATED, subject=subject, figures={"share": share}))
     return found
 
 
-def unmeasured(findings: Iterable[Finding], cameras: int) -> bool:
-    """Whether the findings on a pair say that in some frame fewer than two of several cameras saw particles."""
-    empty = collections.Counter(finding["frame"] for finding in findings if finding["what"] == Fault.EMPTY.value)
-    return bool(empty) and cameras - max(empty.values()) < min(cameras, 2)
+def uneven_warnings(first: np.ndarray, second: np.ndarray, camera: str) -> list[Warning]:
+    """Warn where the light of a camera's two frames differs, images of shape (rows, columns) [counts]."""
+    parts = dark_blocks(first, second)
+    figures = {"parts": parts, "ratio": UNEVEN}
+    return [Warning(code=Code.UNEVEN, subject=camera, figures=figures)] if parts else []
 
 
-def _finding(fault: Fault, camera: str, frame: str, value: float) -> Finding:
-    return {"what": fault.value, "camera": camera, "frame": frame, "value": float(value)}
+def signal_warnings(structure: Mapping[str, float], frame: str) -> list[Warning]:
+    """Warn of images of a frame that show few particles or none, by their structure per camera."""
+    return [
+        Warning(
+            code=Code.EMPTY if value < EMPTY else Code.DIM,
+            subject=f"{camera}, frame {frame}",
+            figures={"structure": max(float(value), 0.0)},
+        )
+        for camera, value in structure.items()
+        if value < NOISE
+    ]
+
+
+def unmeasured(frames: Iterable[Iterable[Warning]], cameras: int) -> bool:
+    """Whether in some frame of a pair fewer than two of several cameras saw particles, by the warnings per frame."""
+    empty = [sum(warning.code is Code.EMPTY for warning in warnings) for warnings in frames]
+    return any(empty) and cameras - max(empty) < min(cameras, 2)
 
 
 def require_different(images: Iterable[tuple[str, bytes]]) -> None:

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv import warn
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LAYOUTS, LensLattice, Optics, pair
 from lfpiv.lightfield.lens_basis import cell_angle_deg, find_basis, find_phase, indices_inside, lattice_pitch
 from lfpiv.lightfield.microimage_fit import BLUR_REACH_PX, cut_patches, measure, robust_fit
+from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
@@ -235,8 +235,7 @@ def _fit_lattice(
         shift, lit, _ = measure(cut_patches(image, centres, half), centres, basis, microimage)
         centres = centres + shift
     if lit.mean() < 0.5:
-        text = "lens array: only %d of %d microimages are lit; the others are extrapolated."
-        warn.warn(log, text, lit.sum(), len(lit))
+        warn(log, Warning(code=Code.LENSES_UNLIT, figures={"lit": int(lit.sum()), "count": len(lit)}))
     index, centres = index[lit], centres[lit]
     origin, basis, kept = _robust_lattice(index, centres, origin, basis)
     residual = centres - origin - index @ basis
@@ -285,10 +284,5 @@ def _warn_of_distortion(places: np.ndarray, residual: np.ndarray) -> None:
     rms, rest = (math.sqrt((part**2).sum(1).mean()) for part in (smooth, residual - smooth))
     chance = rest * math.sqrt(terms.shape[1] / len(places))
     if rms > max(DISTORTION_PX, 3 * chance):
-        warn.warn(
-            log,
-            "lens array: the microimages leave their lattice by a smooth distortion of %.3f px rms, %.3f px at most; "
-            "centres follow the lattice.",
-            rms,
-            np.hypot(*smooth.T).max(),
-        )
+        figures = {"rms_px": rms, "largest_px": float(np.hypot(*smooth.T).max())}
+        warn(log, Warning(code=Code.LENSES_DISTORTED, figures=figures))

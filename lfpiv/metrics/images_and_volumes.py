@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from skimage.metrics import structural_similarity
 
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import checked_volume
 
 SSIM_SIGMA = 1.5

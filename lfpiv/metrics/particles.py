@@ -13,7 +13,7 @@ import xarray as xr
 from scipy import ndimage, sparse, special
 from scipy.spatial import cKDTree
 
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import checked_points, checked_volume, voxel_place
 
 PEAK_SHARE = 0.1
@@ -141,7 +141,7 @@ def truth_volume(
         np.add.at(volume, (flat + indices[2][:, None, None, :]).ravel(), blobs.ravel())
     return xr.DataArray(
         volume.reshape(grid.shape).astype(np.float32),
-        dims=("z", "y", "x"),
+        dims=AXES,
         coords={name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")},
         name="intensity",
         attrs={"long_name": "light of the true particles", "sigma_voxel": sigma_voxel, "voxel_mm": grid.voxel_mm},

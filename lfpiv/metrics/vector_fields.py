@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import AXES
+
 PERCENTILES = (50, 75, 90, 95, 99)
 """Percentiles of the displacement error that are reported."""
 BELOW_VOXEL = 0.43
 """The paper's bound of Fig. 14(b): it reports the part of the vectors whose error is smaller [voxel]."""
 
-_DIMS = ("z", "y", "x")
 _POSITION_TOLERANCE_MM = 1e-4  # coordinates of two vector fields that count as the same
 
 
@@ -74,7 +75,7 @@ def displacement_difference(
     if fields[0].shape != fields[1].shape:
         raise ValueError(f"truth: expected the shape of the vectors, {fields[0].shape}, got {fields[1].shape}.")
     if isinstance(vectors, xr.Dataset) and isinstance(truth, xr.Dataset):
-        for axis in _DIMS:
+        for axis in AXES:
             if np.abs(vectors[axis].values - truth[axis].values).max() > _POSITION_TOLERANCE_MM:
                 raise ValueError(f"truth: expected the window centres of the vectors, got others along {axis}.")
     counted = np.ones(fields[0].shape[:3], bool) if where is None else np.asarray(where)
@@ -151,7 +152,7 @@ def _displacement(vectors: xr.Dataset | np.ndarray, name: str) -> np.ndarray:
         raise ValueError(
             f"{name}: expected displacement_x, _y and _z as `correlate` gives them, found no {missing[0]}."
         )
-    return np.stack([vectors[f"displacement_{axis}"].transpose(*_DIMS).values for axis in "xyz"], -1).astype(float)
+    return np.stack([vectors[f"displacement_{axis}"].transpose(*AXES).values for axis in "xyz"], -1).astype(float)
 
 
 def _checked_field(field: np.ndarray, name: str) -> np.ndarray:

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lfpiv.velocity.volume_pair import is_finite
+from lfpiv.geometry.volume import is_finite
 from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)

@@ -11,11 +11,11 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from lfpiv.geometry.volume import in_order
+from lfpiv.geometry.grid import AXES
+from lfpiv.geometry.volume import VIEWS, in_order, is_finite
 from lfpiv.reconstruction.particle_size import matching_sieve
 from lfpiv.reconstruction.recording import Recording, record
 from lfpiv.reconstruction.smart import View, gaussian, iterate, kept, sharpen
-from lfpiv.velocity.volume_pair import VIEWS, is_finite
 from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
@@ -205,10 +205,10 @@ def reconstruct(
     coordinates: dict[str, Any] = {name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")}
     if len(weights.cameras) > 1 and weights.views.min() < 2:
         about = {"units": "1", "long_name": "number of cameras that see the voxel"}
-        coordinates[VIEWS] = (("z", "y", "x"), weights.views, about)
+        coordinates[VIEWS] = (AXES, weights.views, about)
     return xr.DataArray(
         weights.stored.restore(volume),
-        dims=("z", "y", "x"),
+        dims=AXES,
         coords=coordinates,
         name="intensity",
         attrs={

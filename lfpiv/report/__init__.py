@@ -14,11 +14,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lfpiv import files
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.report import calibration as calibration_section
 from lfpiv.report import markup, overview, pairs, volumes
 from lfpiv.report import vectors as vector_section
-from lfpiv.results import netcdf
 
 if TYPE_CHECKING:
     from lfpiv.calibration.cameras import Calibration
@@ -71,7 +71,7 @@ def write_report(
         *sections.values(),
     ]
     scripts = "\n".join(_asset(name) for name in _SCRIPTS)
-    netcdf.write_text(
+    files.write_text(
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f"<title>{markup.escape(experiment.name)}: light-field PIV</title>"
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

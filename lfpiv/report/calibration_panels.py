@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.patches import PathPatch, Polygon, Rectangle
 
-from lfpiv.geometry.optics import Grid, LensLattice, Optics, pair
+from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.optics import LensLattice, Optics, pair
 from lfpiv.report.dot_map import DotMap, rms_by
 from lfpiv.report.lens_map import LensMap, lattice_px
 from lfpiv.report.svg import INK, SERIES, arrows, colour_bar, new_panel, spread_ticks, style, to_svg

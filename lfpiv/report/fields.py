@@ -21,6 +21,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
+from lfpiv.geometry.grid import AXES
 from lfpiv.results import netcdf
 from lfpiv.velocity import derived
 
@@ -114,9 +115,9 @@ def evenly(items: Sequence[int], most: int) -> list[int]:
 
 
 def _like(first: xr.Dataset, velocity: np.ndarray, valid: np.ndarray) -> xr.Dataset:
-    variables = {name: (("z", "y", "x"), part, {"units": "m/s"}) for name, part in zip("uvw", velocity, strict=True)}
+    variables = {name: (AXES, part, {"units": "m/s"}) for name, part in zip("uvw", velocity, strict=True)}
     coordinates = {axis: first[axis].variable for axis in "zyx"}
-    return xr.Dataset({**variables, "valid": (("z", "y", "x"), valid)}, coordinates)
+    return xr.Dataset({**variables, "valid": (AXES, valid)}, coordinates)
 
 
 # What the scripts read -----------------------------------------------------------------------------------------------

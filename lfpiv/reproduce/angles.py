@@ -1,4 +1,4 @@
-"""How wrong the angles that direct ray tracing is given may be: what Fig. 14 of the paper shows for one error."""
+"""Errors of vectors where direct ray tracing is given wrong camera angles: Fig. 14 of the paper for more errors."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ LABELS = {
     "rolled": "cameras rolled against each other",
 }
 SIZES_DEG = (0, *rigs.ANGLE_ERRORS_DEG)
-"""Errors of the angles that are compared; 0 is the right angles."""
+"""Errors of the angles [degree]; 0 means right angles."""
 Errors = Mapping[str, Sequence[float]]
 """Mean errors [voxel] by kind of the angles' error, one for each of `SIZES_DEG`."""
 
 
 def by_kind(errors: Mapping[str, float]) -> Errors:
-    """Sort mean errors [voxel] by what `rigs.TURNED_DEG` calls them."""
+    """Group mean errors [voxel] by the kinds of `rigs.TURNED_DEG`."""
     return {
         kind: [errors["drt"], *(errors[f"drt_{kind}_{size}deg"] for size in rigs.ANGLE_ERRORS_DEG)] for kind in LABELS
     }
@@ -53,7 +53,7 @@ def reached(errors: Sequence[float], contrast: float) -> float | None:
 
 
 def describe(errors: Errors, stretch_voxel: float, contrast: float, goal: float, ppm: float) -> str:
-    """Say what errors of the angles do to the vectors, beside what the paper found."""
+    """Describe the effect of wrong angles on the vectors, beside the paper's finding."""
     factors = 100 * (stretch(1.0) - 1)
     text = (
         "DRT off by 1 degree: both separation angles overestimated, +46 and -46 degrees (Eqs. 11 and 12). Two cameras "
@@ -73,7 +73,7 @@ def describe(errors: Errors, stretch_voxel: float, contrast: float, goal: float,
 
 
 def table(errors: Errors, ppm: float) -> dict[str, Any]:
-    """Mean errors, a row per size."""
+    """Return a table of mean errors, one row per size."""
     return {
         "caption": f"Mean error [voxel] against the true particles' correlation at {ppm} ppm where direct ray tracing "
         "is given wrong angles. Rolled: half of it each.",

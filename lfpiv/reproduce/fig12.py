@@ -1,8 +1,9 @@
-"""Figs. 11 and 12: how well random particles are reconstructed, by the network's weights and by ray tracing's."""
+"""Figs. 11 and 12: quality of random particles reconstructed with the network's weights and with ray tracing's."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from lfpiv import metrics
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.metrics.particles import PEAK_SHARE
 from lfpiv.reconstruction.volume import reconstruct
-from lfpiv.reproduce import Progress, page, plots, rigs, store
+from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.reproduce.study import Progress
 from lfpiv.velocity.cross_correlation import emphasise, missing_smoothing
 from lfpiv.weights.operator import Weights
 
@@ -28,9 +30,9 @@ GOAL_Q = 0.80
 POINTS_PPM = {"small": (0.1, 0.5, 1.0), "paper": PPM["paper"]}
 """Seeding at which points are reconstructed too, by the network."""
 TRUTH_PPM = 0.5
-"""Seeding at which SMART is also started from the true particles: whether the images could tell ghosts at all."""
+"""Seeding at which SMART also starts from the true particles, to see whether the images distinguish ghosts at all."""
 DARK_SHARE = 1e-3
-"""Brightness it starts with where there is no particle, as a part of the brightest voxel."""
+"""First guess of that run in voxels without a particle, as a share of the brightest voxel."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "blobs": {},
     "points": {},
@@ -45,138 +47,157 @@ VARIANTS: dict[str, dict[str, Any]] = {
     },
     "no_sieve": {"sieve_voxel": 0.0},
 }
-"""SMART settings of each kind of run that differ from this software's own. "paper": the paper's number of iterations
-and relaxation; "no_sieve": voxels of any brightness, not Gaussians of the size that the images tell; both by the
-network. Particles are blobs, but points in "points"."""
+"""SMART settings of each kind of run that differ from the defaults. "paper" has the paper's number of iterations and
+relaxation. "no_sieve" reconstructs voxels instead of Gaussians of the particles' size. Particles are blobs, in "points"
+they are points."""
 CORRELATED_VOXEL = Correlation().smoothing_voxel
-"""What volumes are smoothed by before they are correlated, less what their sieve did already; Q is reported of such
-volumes as well [voxel]."""
+"""Smoothing before the correlation, the sieve's included [voxel]. Q is reported of volumes smoothed like this too."""
+
+
+FIGURES = (
+    (
+        "fig12.png",
+        "R_acc (Eq. 13), R_g (Eq. 14) and Q against seeding. The paper's mean Q over 0.1 to 1 ppm is 0.75.",
+    ),
+    (
+        "fig11.png",
+        f"Fig. 11: particles at {SCATTER_PPM} ppm: true ones, and those found in the volumes; ghosts, with no true "
+        "particle within a voxel, are marked. Below, a slice of 1 mm about y = 0.",
+    ),
+)
+TABLES = {
+    f"Gaussian particles, sigma {rigs.BLOB_VOXEL} voxel": MAPPINGS,
+    f"The same with the paper's SMART: {VARIANTS['paper']['iterations']} iterations, no momentum": ("paper",),
+    "The same without a sieve, in voxels of any brightness: what is missing is what the particles' size, which the "
+    "images tell, is worth": ("no_sieve",),
+    "Point particles, Q against the same blobs": ("points",),
+}
+"""Caption of each table, and the groups of runs in it."""
+NOTES = (
+    f"A peak counts as a particle above {PEAK_SHARE:g} of the median brightness found at the true particles; the paper "
+    "does not state its threshold, on which R_acc and R_g depend.",
+    "Points are far smaller than a voxel: pixels of a voxel's footprint that a point leaves dark hold its brightness "
+    "down, and their Q is compared with blobs that they are not.",
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One volume to reconstruct and judge."""
+
+    mapping: str
+    """One of `MAPPINGS`."""
+    ppm: float
+    """Seeding [particles per microlens]."""
+    kind: str
+    """Key of `VARIANTS`."""
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Reconstruct and judge; see the package for the arguments."""
+    """Reconstruct and judge; see `lfpiv.reproduce.study` for the arguments."""
     rig = rigs.numerical_rig(work.parent / "rig", scale, seed, progress)
     size, ppms = SIZE_MM[scale], PPM[scale]
     grid = rigs.volume_grid(size)
-    smart = Smart()
     settings = {
         "scale": scale,
         "seed": seed,
         "size_mm": size,
-        "smart": smart.model_dump(),
+        "smart": Smart().model_dump(),
         "correlated_voxel": CORRELATED_VOXEL,
     }
-    todo = [(mapping, ppm, "blobs") for mapping in MAPPINGS for ppm in ppms]
-    todo += [("network", ppm, kind) for ppm in ppms for kind in ("paper", "no_sieve")]
-    todo += [("network", TRUTH_PPM, "from_truth")]
-    todo += [("network", ppm, "points") for ppm in POINTS_PPM[scale]]
     built: dict[str, Weights] = {}
-    rows = []
-    for done, (mapping, ppm, kind) in enumerate(sorted(todo)):
-        step = _part(progress, "reconstruction", done, len(todo))
-        draw = [seed, 12, round(1000 * ppm)]
-        positions = rigs.random_particles(size, ppm, draw)
+    runs, found = [], {}
+    jobs = _jobs(scale)
+    for done, job in enumerate(jobs):
 
-        def compute(
-            mapping: str = mapping,
-            ppm: float = ppm,
-            kind: str = kind,
-            step: Callable[[float], None] = step,
-            draw: list[int] = draw,
-            positions: np.ndarray = positions,
-        ) -> dict[str, Any]:
-            if mapping not in built:
+        def compute(job: Job = job, done: int = done) -> dict[str, Any]:
+            if job.mapping not in built:
                 built.clear()  # one set of weights at a time: memory
-                built[mapping] = rig.weights(grid, mapping)
-            images = rigs.particle_images(rig, positions, draw, blob_voxel=0.0 if kind == "points" else rigs.BLOB_VOXEL)
-            chosen = Smart.model_validate({**smart.model_dump(), **VARIANTS[kind]})
-            return _judge(built[mapping], images, positions, chosen, kind == "from_truth", step)
+                built[job.mapping] = rig.weights(grid, job.mapping)
+            blob = 0.0 if job.kind == "points" else rigs.BLOB_VOXEL
+            positions = _positions(size, job.ppm, seed)
+            images = rigs.particle_images(rig, positions, _stream(job.ppm, seed), blob_voxel=blob)
+            smart = Smart.model_validate({**Smart().model_dump(), **VARIANTS[job.kind]})
+            step = _part(progress, "reconstruction", done, len(jobs))
+            return _judge(built[job.mapping], images, positions, smart, job.kind == "from_truth", step)
 
-        name = f"{kind}_{mapping}_{ppm:.2f}"
         figures = store.kept_arrays(
-            work / f"{name}.npz", {**settings, "ppm": ppm, "kind": kind, **VARIANTS[kind]}, compute
+            work / f"{job.kind}_{job.mapping}_{job.ppm:.2f}.npz",
+            {**settings, "ppm": job.ppm, "kind": job.kind, **VARIANTS[job.kind]},
+            compute,
         )
         scalars = {key: value.tolist() for key, value in figures.items() if key not in ("found_mm", "peaks")}
-        rows.append({"mapping": mapping, "ppm": ppm, "particles": kind, **scalars})
-        if (mapping, kind, ppm) == ("network", "blobs", SCATTER_PPM):
-            network_found = figures["found_mm"]
-        if (mapping, kind, ppm) == ("drt", "blobs", SCATTER_PPM):
-            drt_found = figures["found_mm"]
-
-    true_mm = rigs.random_particles(size, SCATTER_PPM, [seed, 12, round(1000 * SCATTER_PPM)])
-    _draw_scatter({"truth": true_mm, "network": network_found, "drt": drt_found}, true_mm, size, work / "fig11.png")
-    blobs = {
-        mapping: [r for r in rows if r["mapping"] == mapping and r["particles"] == "blobs"] for mapping in MAPPINGS
+        runs.append({"mapping": job.mapping, "ppm": job.ppm, "particles": job.kind, **scalars})
+        found[job] = figures["found_mm"]
+    true_mm = _positions(size, SCATTER_PPM, seed)
+    shown = {mapping: found[Job(mapping, SCATTER_PPM, "blobs")] for mapping in MAPPINGS}
+    _draw_scatter({"truth": true_mm, **shown}, true_mm, size, work / "fig11.png")
+    groups = {
+        mapping: [r for r in runs if (r["mapping"], r["particles"]) == (mapping, "blobs")] for mapping in MAPPINGS
     }
-    points, paper, no_sieve, from_truth = (
-        [r for r in rows if r["particles"] == kind] for kind in ("points", "paper", "no_sieve", "from_truth")
+    groups |= {kind: [r for r in runs if r["particles"] == kind] for kind in VARIANTS if kind != "blobs"}
+    _draw_curves({name: groups[name] for name in (*MAPPINGS, "no_sieve")}, work / "fig12.png")
+    mapping_error = rigs.mapping_errors_pitch(rig, grid, seed)
+    return _result(groups, {"ppm": ppms, "size_mm": size, "mapping_error_pitch": mapping_error, "runs": runs})
+
+
+def _jobs(scale: str) -> list[Job]:
+    """Return all volumes of a scale, those with the same weights side by side."""
+    jobs = [Job(mapping, ppm, "blobs") for mapping in MAPPINGS for ppm in PPM[scale]]
+    jobs += [Job("network", ppm, kind) for ppm in PPM[scale] for kind in ("paper", "no_sieve")]
+    jobs += [Job("network", TRUTH_PPM, "from_truth")]
+    jobs += [Job("network", ppm, "points") for ppm in POINTS_PPM[scale]]
+    return sorted(jobs, key=lambda job: (job.mapping, job.ppm, job.kind))
+
+
+def _stream(ppm: float, seed: int) -> list[int]:
+    """Seed of the random numbers of one seeding."""
+    return [seed, 12, round(1000 * ppm)]
+
+
+def _positions(size: tuple[float, float, float], ppm: float, seed: int) -> np.ndarray:
+    return rigs.random_particles(size, ppm, _stream(ppm, seed))
+
+
+def _result(groups: Mapping[str, Sequence[Mapping[str, Any]]], setup: Mapping[str, Any]) -> dict[str, Any]:
+    """Put the runs, grouped by mapping or kind, into the form of the page."""
+    q_mean = {mapping: _mean(groups[mapping]) for mapping in MAPPINGS}
+    accuracy, ghost_ratio, q_as_correlated = (
+        {mapping: _mean(groups[mapping], key) for mapping in MAPPINGS}
+        for key in ("accuracy", "ghost_ratio", "q_as_correlated")
     )
-    _draw_curves({**blobs, "no_sieve": no_sieve}, work / "fig12.png")
-
-    def mean(mapping: str, key: str) -> float:
-        return _mean(blobs[mapping], key)
-
-    q_mean = {mapping: mean(mapping, "q") for mapping in MAPPINGS}
+    q_paper, q_no_sieve = _mean(groups["paper"]), _mean(groups["no_sieve"])
+    smoothed = f"volumes as correlated: smoothed by {CORRELATED_VOXEL:g} voxel less their sieve"
     return page.result(
         {
             "q_mean": q_mean,
-            "accuracy_mean": {mapping: mean(mapping, "accuracy") for mapping in MAPPINGS},
-            "ghost_ratio_mean": {mapping: mean(mapping, "ghost_ratio") for mapping in MAPPINGS},
-            "q_mean_paper_settings": _mean(paper),
-            "q_mean_no_sieve": _mean(no_sieve),
-            "q_mean_as_correlated": {mapping: mean(mapping, "q_as_correlated") for mapping in MAPPINGS},
-            "ppm": ppms,
-            "size_mm": size,
+            "accuracy_mean": accuracy,
+            "ghost_ratio_mean": ghost_ratio,
+            "q_mean_paper_settings": q_paper,
+            "q_mean_no_sieve": q_no_sieve,
+            "q_mean_as_correlated": q_as_correlated,
             "blob_sigma_voxel": rigs.BLOB_VOXEL,
-            "smart": smart.model_dump(),
-            "mapping_error_pitch": rigs.mapping_errors_pitch(rig, grid, seed),
-            "runs": rows,
+            "smart": Smart().model_dump(),
+            **setup,
         },
         comparison=[
             page.compare("mean Q, network", q_mean["network"], paper=PAPER_Q, at_least=GOAL_Q),
             page.compare("mean Q, DRT", q_mean["drt"], paper="similar"),
-            page.compare("mean Q, network, the paper's SMART: 10 iterations", _mean(paper), paper=PAPER_Q),
-            page.compare(
-                f"mean Q, network, volumes as correlated: smoothed by {CORRELATED_VOXEL:g} voxel less their sieve",
-                mean("network", "q_as_correlated"),
-            ),
-            page.compare("mean Q, network, no sieve: voxels of any brightness", _mean(no_sieve)),
-            page.compare("mean R_acc, network", mean("network", "accuracy")),
-            page.compare("mean R_acc, DRT", mean("drt", "accuracy")),
-            page.compare("mean R_g, network", mean("network", "ghost_ratio")),
-            page.compare("mean R_g, DRT", mean("drt", "ghost_ratio")),
+            page.compare("mean Q, network, the paper's SMART: 10 iterations", q_paper, paper=PAPER_Q),
+            page.compare(f"mean Q, network, {smoothed}", q_as_correlated["network"]),
+            page.compare("mean Q, network, no sieve: voxels of any brightness", q_no_sieve),
+            page.compare("mean R_acc, network", accuracy["network"]),
+            page.compare("mean R_acc, DRT", accuracy["drt"]),
+            page.compare("mean R_g, network", ghost_ratio["network"]),
+            page.compare("mean R_g, DRT", ghost_ratio["drt"]),
         ],
-        figures=[
-            (
-                "fig12.png",
-                "R_acc (Eq. 13), R_g (Eq. 14) and Q against seeding. The paper's mean Q over 0.1 to 1 ppm is 0.75.",
-            ),
-            (
-                "fig11.png",
-                f"Fig. 11: particles at {SCATTER_PPM} ppm: true ones, and those found in the volumes; ghosts, with no "
-                "true particle within a voxel, are marked. Below, a slice of 1 mm about y = 0.",
-            ),
-        ],
-        tables=[
-            _table(f"Gaussian particles, sigma {rigs.BLOB_VOXEL} voxel", [*blobs["network"], *blobs["drt"]]),
-            _table(
-                f"The same with the paper's SMART: {VARIANTS['paper']['iterations']} iterations, no momentum", paper
-            ),
-            _table(
-                "The same without a sieve, in voxels of any brightness: what is missing is what the particles' size, "
-                "which the images tell, is worth",
-                no_sieve,
-            ),
-            _table("Point particles, Q against the same blobs", points),
-        ],
+        figures=FIGURES,
+        tables=[_table(caption, [row for name in names for row in groups[name]]) for caption, names in TABLES.items()],
         notes=[
             "ppm: particles per microlens of the volume's x-y face.",
-            f"SMART as this software runs it by default: at most {smart.iterations} iterations.",
-            f"A peak counts as a particle above {PEAK_SHARE:g} of the median brightness found at the true particles; "
-            "the paper does not tell its threshold, on which R_acc and R_g depend.",
-            "Points are far smaller than a voxel: pixels of a voxel's footprint that a point leaves dark hold its "
-            "brightness down, and their Q is held against blobs that they are not.",
-            _verdict(q_mean["network"], blobs["network"], no_sieve, from_truth[0]),
+            f"SMART as this software runs it by default: at most {Smart().iterations} iterations.",
+            *NOTES,
+            _verdict(q_mean["network"], groups["network"], groups["no_sieve"], groups["from_truth"][0]),
         ],
     )
 
@@ -241,7 +262,7 @@ def _verdict(
     no_sieve: Sequence[Mapping[str, Any]],
     from_truth: Mapping[str, Any],
 ) -> str:
-    """Say whether the goal for Q is reached, and what the run from the true particles tells of the reason."""
+    """Describe whether Q reaches its goal, and compare with the run that starts from the true particles."""
     ours = next(row for row in no_sieve if row["ppm"] == from_truth["ppm"])
     return (
         f"Mean Q of the network is {q_mean:.3f}, {min(r['q'] for r in rows):.2f} to {max(r['q'] for r in rows):.2f}, "

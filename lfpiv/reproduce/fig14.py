@@ -1,8 +1,9 @@
-"""Figs. 13 and 14: a ring vortex measured through the network's weights, and through direct ray tracing's."""
+"""Figs. 13 and 14: measure a ring vortex with the network's weights and with direct ray tracing's."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,11 @@ from skimage.measure import marching_cubes
 
 from lfpiv import metrics
 from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.geometry.grid import AXES
 from lfpiv.metrics.vector_fields import BELOW_VOXEL
 from lfpiv.reconstruction.volume import reconstruct
-from lfpiv.reproduce import Progress, angles, page, plots, rigs, store
+from lfpiv.reproduce import angles, page, plots, rigs, store
+from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.flows import Ring
 from lfpiv.velocity import derived
 from lfpiv.velocity.cross_correlation import DEFAULT_WINDOWS, correlate
@@ -33,19 +36,44 @@ SHOWN_PPM = 0.5
 ISO_VORTICITY = 0.12
 """Fig. 13's surface [voxel/voxel]."""
 SCHEDULES: dict[str, tuple[int, ...]] = {"default": DEFAULT_WINDOWS, "8": (24, 16, 8, 8)}
-"""Windows of the passes [voxel]: this software's own, and some that end with the paper's 8 x 8 x 8."""
+"""Windows of the passes [voxel]: the defaults, and windows that end with the paper's 8 x 8 x 8."""
 PAPER_MEAN = {"network": 0.35, "drt": 0.36, "drt_plus_1deg": 0.71}
 PAPER_BELOW = {"network": 0.756, "drt": None, "drt_plus_1deg": 0.643}
 WIDTHS = {"truth": 1.2, "network": 4.0, "drt": 1.2, "drt_plus_1deg": 1.2}
-"""Widths of lines [point]: the network's shows beneath DRT's where they coincide."""
+"""Widths of lines [point]. The network's line is wide, so that it shows beneath DRT's."""
 GOAL_MEAN, GOAL_BELOW, GOAL_CONTRAST = 0.30, 0.80, 1.5
 
+FIGURES = (
+    (
+        "fig14.png",
+        "Left: mean displacement error against the correlation of the true particles; solid with this software's "
+        "windows, dotted with last windows of 8 voxels, thin horizontal lines the paper's means. Middle: against the "
+        f"analytic flow. Right: distribution of the error at {SHOWN_PPM} ppm; the line marks 0.43 voxel.",
+    ),
+    (
+        "fig14_angles.png",
+        "Mean error against the correlation of the true particles where direct ray tracing is given wrong angles, at "
+        f"{SHOWN_PPM} ppm with this software's windows; the paper shows 1 degree of the first kind.",
+    ),
+    (
+        "fig13.png",
+        f"Fig. 13: surface of vorticity {ISO_VORTICITY} voxel/voxel at {SHOWN_PPM} ppm, coloured by the displacement "
+        "along depth [voxel], with vectors in the plane y = 0; last windows of 8 voxels, as in the paper.",
+    ),
+)
+NOTES = (
+    "Vectors: all, those replaced by the validation included. The correlation of the true particles uses the same "
+    'windows and settings; where windows hold few particles it has errors of its own, see "true particles" against the '
+    "analytic flow.",
+    f"Windows of this software: {', '.join(map(str, DEFAULT_WINDOWS))} voxels; the paper's have 8 x 8 x 8.",
+)
+
 Fields = dict[str, np.ndarray]
-"""Both schedules' vectors of a volume pair, and its Q: what `_pack` makes."""
+"""Vectors of a volume pair with both schedules, and its Q, as `_pack` makes them."""
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Reconstruct, correlate and judge; see the package for the arguments."""
+    """Reconstruct, correlate and judge; see `lfpiv.reproduce.study` for the arguments."""
     rig = rigs.numerical_rig(work.parent / "rig", scale, seed, progress)
     size, ppms = SIZE_MM[scale], PPM[scale]
     grid, flow = rigs.volume_grid(size), rigs.ring(size)
@@ -98,7 +126,13 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
             done += 1
     for path in work.glob("images_*.npz"):  # large, and no longer needed: all vectors are there
         path.unlink()
-    return _result(fields, ppms, size, flow, rigs.mapping_errors_pitch(rig, grid, seed), correlation, smart, work)
+    setup = {
+        "size_mm": size,
+        "smart": smart.model_dump(),
+        "correlation": {**correlation, "windows": SCHEDULES},
+        "mapping_error_pitch": rigs.mapping_errors_pitch(rig, grid, seed),
+    }
+    return _result(fields, ppms, flow, setup, work)
 
 
 def _images(
@@ -131,136 +165,129 @@ def _analytic(packed: Fields, name: str, flow: Callable[[np.ndarray], np.ndarray
 def _result(
     fields: Mapping[tuple[str, float], Fields],
     ppms: tuple[float, ...],
-    size: tuple[float, float, float],
     flow: Ring,
-    mapping_error: Mapping[str, float],
-    correlation: Mapping[str, Any],
-    smart: Smart,
+    setup: Mapping[str, Any],
     work: Path,
 ) -> dict[str, Any]:
-    runs = []
-    for (mapping, ppm), packed in fields.items():
-        for name in SCHEDULES:
-            field = packed[f"{name}_field"]
-            analytic = metrics.displacement_error(field, _analytic(packed, name, flow))
-            row: dict[str, Any] = {
-                "mapping": mapping,
-                "ppm": ppm,
-                "windows": name,
-                "valid": float(packed[f"{name}_valid"].mean()),
-                "vectors": analytic.count,
-                "error_analytic_voxel": analytic.mean,
-                "error_analytic_axes_voxel": analytic.mean_absolute,
-            }
-            if mapping != "truth":
-                error = metrics.displacement_error(field, fields["truth", ppm][f"{name}_field"])
-                row |= {
-                    "error_voxel": error.mean,
-                    "below_043": error.below,
-                    "error_axes_voxel": error.mean_absolute,
-                    "q": packed["q"].mean(),
-                }
-            runs.append(row)
-
-    def pick(key: str, mapping: str, windows: str = "default") -> list[float]:
-        return [r[key] for r in runs if (r["mapping"], r["windows"]) == (mapping, windows)]
-
-    mean = {mapping: float(np.mean(pick("error_voxel", mapping))) for mapping in MAPPINGS}
-    mean_8 = {mapping: float(np.mean(pick("error_voxel", mapping, "8"))) for mapping in MAPPINGS}
-    exact = {m: float(np.mean(pick("error_analytic_voxel", m))) for m in ("truth", *MAPPINGS)}
-    shown = ppms.index(SHOWN_PPM)
-    below = {mapping: pick("below_043", mapping)[shown] for mapping in MAPPINGS}
-    below_8 = {mapping: pick("below_043", mapping, "8")[shown] for mapping in MAPPINGS}
-    _draw_errors(runs, fields, ppms, work / "fig14.png")
+    """Judge all vectors, draw them, and put the figures into the form of the page."""
+    judged = Judged([row for key, packed in fields.items() for row in _rows(key, packed, fields, flow)], ppms)
+    _draw_errors(judged.runs, fields, ppms, work / "fig14.png")
     _draw_vorticity({m: fields[m, SHOWN_PPM] for m in ("truth", *MAPPINGS)}, work / "fig13.png")
-    contrast = mean["drt_plus_1deg"] / mean["drt"]
+    by_angle = angles.by_kind({m: judged.shown("error_voxel", m) for m in ("drt", "drt_plus_1deg", *TURNED)})
+    angles.draw(by_angle, judged.shown("error_voxel", "network"), SHOWN_PPM, work / "fig14_angles.png")
+    stretched = _stretch_error(fields["truth", SHOWN_PPM], flow)
+    peak = flow.peak_mm / rigs.VOXEL_MM
+    return page.result(
+        {
+            "error_mean_voxel": judged.means("error_voxel"),
+            "below_043": {mapping: judged.shown("below_043", mapping) for mapping in MAPPINGS},
+            "contrast": judged.contrast,
+            "angle_error_deg": list(angles.SIZES_DEG),
+            "error_voxel_by_angle_error": by_angle,
+            "stretch_error_voxel": stretched,
+            "error_mean_voxel_windows_8": judged.means("error_voxel", "8"),
+            "below_043_windows_8": {mapping: judged.shown("below_043", mapping, "8") for mapping in MAPPINGS},
+            "error_analytic_voxel": judged.means("error_analytic_voxel", mappings=("truth", *MAPPINGS)),
+            "ppm": ppms,
+            "flow": flow.model_dump(),
+            **setup,
+            "runs": judged.runs,
+        },
+        comparison=_comparison(judged),
+        figures=FIGURES,
+        tables=[*(_table(name, judged.runs) for name in SCHEDULES), angles.table(by_angle, SHOWN_PPM)],
+        notes=[
+            f"The ring's core line has a radius of {flow.radius_mm:g} mm; displacements reach {peak:.2f} voxel at "
+            f"{flow.core_mm:.2g} mm from it and follow (r / l) exp(1 - r / l), r the distance from that line.",
+            *NOTES,
+            angles.describe(by_angle, stretched, judged.contrast, GOAL_CONTRAST, SHOWN_PPM),
+        ],
+    )
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Errors of all vector fields."""
+
+    runs: list[dict[str, Any]]
+    """One entry per mapping, seeding and schedule of windows: `_rows`."""
+    ppms: tuple[float, ...]
+    """Seeding of the mappings."""
+
+    def pick(self, key: str, mapping: str, windows: str = "default") -> list[float]:
+        """Return a figure of one mapping and schedule for each seeding."""
+        return [run[key] for run in self.runs if (run["mapping"], run["windows"]) == (mapping, windows)]
+
+    def means(self, key: str, windows: str = "default", mappings: Sequence[str] = MAPPINGS) -> dict[str, float]:
+        """Return the mean of a figure over the seeding, by mapping."""
+        return {mapping: float(np.mean(self.pick(key, mapping, windows))) for mapping in mappings}
+
+    def shown(self, key: str, mapping: str, windows: str = "default") -> float:
+        """Return a figure at `SHOWN_PPM`, the only seeding of the mappings in `TURNED`."""
+        values = self.pick(key, mapping, windows)
+        return values[self.ppms.index(SHOWN_PPM) if len(values) > 1 else 0]
+
+    @property
+    def contrast(self) -> float:
+        """Mean error with the angle off by 1 degree, over that with the right angle."""
+        means = self.means("error_voxel")
+        return means["drt_plus_1deg"] / means["drt"]
+
+
+def _rows(
+    key: tuple[str, float], packed: Fields, fields: Mapping[tuple[str, float], Fields], flow: Ring
+) -> Iterator[dict[str, Any]]:
+    """Compare one mapping's vectors, for each schedule, with the flow and with the true particles' correlation."""
+    mapping, ppm = key
+    for name in SCHEDULES:
+        field = packed[f"{name}_field"]
+        analytic = metrics.displacement_error(field, _analytic(packed, name, flow))
+        row: dict[str, Any] = {
+            "mapping": mapping,
+            "ppm": ppm,
+            "windows": name,
+            "valid": float(packed[f"{name}_valid"].mean()),
+            "vectors": analytic.count,
+            "error_analytic_voxel": analytic.mean,
+            "error_analytic_axes_voxel": analytic.mean_absolute,
+        }
+        if mapping != "truth":
+            error = metrics.displacement_error(field, fields["truth", ppm][f"{name}_field"])
+            row |= {
+                "error_voxel": error.mean,
+                "below_043": error.below,
+                "error_axes_voxel": error.mean_absolute,
+                "q": packed["q"].mean(),
+            }
+        yield row
+
+
+def _comparison(judged: Judged) -> list[dict[str, Any]]:
+    """Put ours beside the paper's."""
+    mean, mean_8 = judged.means("error_voxel"), judged.means("error_voxel", "8")
+    exact = judged.means("error_analytic_voxel", mappings=("truth", *MAPPINGS))
     rows = [
         page.compare("mean error, network", mean["network"], paper=0.35, at_most=GOAL_MEAN, unit="voxel"),
         page.compare("mean error, DRT", mean["drt"], paper=0.36, unit="voxel"),
         page.compare("mean error, DRT, angle off by 1 degree", mean["drt_plus_1deg"], paper=0.71, unit="voxel"),
         page.compare(
-            "DRT off by 1 degree against DRT, ratio of mean errors", contrast, paper=1.97, at_least=GOAL_CONTRAST
+            "DRT off by 1 degree against DRT, ratio of mean errors",
+            judged.contrast,
+            paper=1.97,
+            at_least=GOAL_CONTRAST,
         ),
     ]
-    rows += [
-        page.compare(
-            f"vectors with an error below 0.43 voxel at {SHOWN_PPM} ppm, {plots.NAMES[mapping]}",
-            below[mapping],
-            paper=PAPER_BELOW[mapping],
-            at_least=GOAL_BELOW if mapping == "network" else None,
-        )
-        for mapping in MAPPINGS
-    ]
-    rows += [
-        page.compare(
-            f"mean error, {plots.NAMES[mapping]}, last windows of 8 voxels",
-            mean_8[mapping],
-            paper=PAPER_MEAN[mapping],
-            unit="voxel",
-        )
-        for mapping in MAPPINGS
-    ]
-    turned = {m: pick("error_voxel", m)[0] for m in TURNED}
-    turned |= {m: pick("error_voxel", m)[shown] for m in ("drt", "drt_plus_1deg")}
-    by_angle = angles.by_kind(turned)
-    angles.draw(by_angle, pick("error_voxel", "network")[shown], SHOWN_PPM, work / "fig14_angles.png")
-    stretched = _stretch_error(fields["truth", SHOWN_PPM], flow)
-    rows += [
-        page.compare(f"mean error against the analytic flow, {plots.NAMES[mapping]}", exact[mapping], unit="voxel")
-        for mapping in ("truth", *MAPPINGS)
-    ]
-    peak = flow.peak_mm / rigs.VOXEL_MM
-    return page.result(
-        {
-            "error_mean_voxel": mean,
-            "below_043": below,
-            "contrast": contrast,
-            "angle_error_deg": list(angles.SIZES_DEG),
-            "error_voxel_by_angle_error": by_angle,
-            "stretch_error_voxel": stretched,
-            "error_mean_voxel_windows_8": mean_8,
-            "below_043_windows_8": below_8,
-            "error_analytic_voxel": exact,
-            "ppm": ppms,
-            "size_mm": size,
-            "flow": flow.model_dump(),
-            "smart": smart.model_dump(),
-            "correlation": {**correlation, "windows": SCHEDULES},
-            "mapping_error_pitch": mapping_error,
-            "runs": runs,
-        },
-        comparison=rows,
-        figures=[
-            (
-                "fig14.png",
-                "Left: mean displacement error against the correlation of the true particles; solid with this "
-                "software's windows, dotted with last windows of 8 voxels, thin horizontal lines "
-                "the paper's means. Middle: against the analytic flow. Right: "
-                f"distribution of the error at {SHOWN_PPM} ppm; the line marks 0.43 voxel.",
-            ),
-            (
-                "fig14_angles.png",
-                "Mean error against the correlation of the true particles where direct ray tracing is given wrong "
-                f"angles, at {SHOWN_PPM} ppm with this software's windows; the paper shows 1 degree of the first kind.",
-            ),
-            (
-                "fig13.png",
-                f"Fig. 13: surface of vorticity {ISO_VORTICITY} voxel/voxel at {SHOWN_PPM} ppm, coloured by the "
-                "displacement along depth [voxel], with vectors in the plane y = 0; last windows of 8 voxels, as "
-                "in the paper.",
-            ),
-        ],
-        tables=[*(_table(name, runs) for name in SCHEDULES), angles.table(by_angle, SHOWN_PPM)],
-        notes=[
-            f"The ring's core line has a radius of {flow.radius_mm:g} mm; displacements reach {peak:.2f} voxel at "
-            f"{flow.core_mm:.2g} mm from it and follow (r / l) exp(1 - r / l), r the distance from that line.",
-            "Vectors: all, those replaced by the validation included. The correlation of the true particles uses the "
-            'same windows and settings; where windows hold few particles it has errors of its own, see "true '
-            'particles" against the analytic flow.',
-            f"Windows of this software: {', '.join(map(str, DEFAULT_WINDOWS))} voxels; the paper's have 8 x 8 x 8.",
-            angles.describe(by_angle, stretched, contrast, GOAL_CONTRAST, SHOWN_PPM),
-        ],
-    )
+    for mapping in MAPPINGS:
+        what = f"vectors with an error below 0.43 voxel at {SHOWN_PPM} ppm, {plots.NAMES[mapping]}"
+        goal = GOAL_BELOW if mapping == "network" else None
+        below = judged.shown("below_043", mapping)
+        rows.append(page.compare(what, below, paper=PAPER_BELOW[mapping], at_least=goal))
+    for mapping in MAPPINGS:
+        what = f"mean error, {plots.NAMES[mapping]}, last windows of 8 voxels"
+        rows.append(page.compare(what, mean_8[mapping], paper=PAPER_MEAN[mapping], unit="voxel"))
+    for mapping, value in exact.items():
+        rows.append(page.compare(f"mean error against the analytic flow, {plots.NAMES[mapping]}", value, unit="voxel"))
+    return rows
 
 
 def _stretch_error(packed: Fields, flow: Ring) -> float:
@@ -353,7 +380,7 @@ def _draw_surface(axes: Any, packed: Fields, largest: float) -> None:
     field = packed["8_field"].astype(float)
     positions = [packed[f"8_{axis}"] for axis in "zyx"]
     coords = dict(zip("zyx", positions, strict=True))
-    velocity = {name: (("z", "y", "x"), field[..., k] * rigs.VOXEL_MM * 1e-3) for k, name in enumerate("uvw")}
+    velocity = {name: (AXES, field[..., k] * rigs.VOXEL_MM * 1e-3) for k, name in enumerate("uvw")}
     curl = derived.vorticity(xr.Dataset(velocity, coords))  # dt = 1 s: voxel per voxel
     magnitude = curl["vorticity_magnitude"].values
     step = [float(p[1] - p[0]) for p in positions]

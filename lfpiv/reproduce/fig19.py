@@ -13,41 +13,41 @@ from scipy import ndimage
 
 from lfpiv import metrics
 from lfpiv.experiment.settings import Smart
-from lfpiv.geometry.optics import Grid
-from lfpiv.reproduce import Progress, page, plots, store
+from lfpiv.geometry.grid import Grid
+from lfpiv.reproduce import page, plots, store
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.rigs import Rig, reconstruct_images
+from lfpiv.reproduce.study import Progress
 
 TITLE = "Figs. 18 and 19: board dots reconstructed at every plane"
 
 PAPER_LATERAL_MM, PAPER_DEPTH_MM = 0.08, 0.25
 VOXEL_SHARE = 0.6
-"""Voxel edge over the dots' diameter. In voxels as large as a dot, where it meets the corner of eight of them, dots
-between the true planes explain the images better than the true ones."""
+"""Voxel edge over the dots' diameter."""
 ITERATIONS = 10
 """SMART iterations, as in the paper."""
 DEPTH_MM = 1.2
-"""Half depth of each plane's volume [mm]: two cameras 40 degrees apart see dots 0.5 mm apart cross at 0.69 mm before
-and behind the board too, and these ghosts are in the volume."""
+"""Half depth of each plane's volume [mm]. Rays of two cameras 40 degrees apart to dots 0.5 mm apart also cross 0.69 mm
+before and behind the board, so the volume contains these ghosts."""
 MARGIN_MM = 0.3
 """Volume beyond the outermost dots [mm]."""
 OFF_CENTRE_VOXEL = 0.4
 """Volumes are placed at random by up to this much along each axis, so that dots lie anywhere in a voxel."""
 OFF_CENTRE_DEPTH_MM = 0.3
-"""The same along depth [mm]: a volume's middle must not tell where its dots are."""
+"""The same along depth [mm]. The middle of a volume must not give away the depth of its dots."""
 GATE = 0.3
-"""Dots are looked for within this much of their place on the board along x and y [spacing], which names them; and half
-the width of the window that gives their centre."""
+"""Largest distance along x and y of a dot from its place on the board, and half width of the window of its centroid
+[spacing]."""
 NEAR = 3.0
-"""Half depth, in dot diameters, of the light that gives a dot's centre."""
+"""Half depth of the window of a dot's centroid [dot diameter]."""
 STEPS = 10
-"""Steps of that window towards the centroid of its light."""
+"""Number of times that window is centred on its centroid."""
 LEAST_SHARE = 0.2
-"""A dot has at least this part of the light of the plane's median dot."""
+"""Least light of a dot, as a share of the plane's median dot."""
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Reconstruct every plane of the board; see the package for the arguments. Both scales have all 13 planes."""
+    """Reconstruct all planes of the board; see `lfpiv.reproduce.study` for the arguments. Both scales have 13."""
     rig = experimental_rig(work.parent / "experimental_rig", scale, seed, progress)
     planes = range(len(rig.experiment.board.planes_mm))
     return compute(rig, planes, work, seed=seed, progress=progress)
@@ -70,22 +70,26 @@ def compute(rig: Rig, planes: Sequence[int], work: Path, *, seed: int, progress:
         )
         found.append(kept["positions_mm"])
     progress("planes", 1.0)
-    positions = np.array(found)
-    planes_mm = [board.planes_mm[plane] for plane in planes]
+    positions, planes_mm = np.array(found), [board.planes_mm[plane] for plane in planes]
     error = metrics.dot_error(positions, board.spacing_mm, planes_mm)
-    expected = positions.shape[0] * positions.shape[1] * positions.shape[2]
-    columns, rows = (np.arange(n) - (n - 1) / 2 for n in board.dots)
-    place = np.stack(np.broadcast_arrays(columns * board.spacing_mm, rows[:, None] * board.spacing_mm), axis=-1)
-    absolute = positions - np.concatenate(
-        [
-            np.broadcast_to(place, (*positions.shape[:3], 2)),
-            np.broadcast_to(np.reshape(planes_mm, (-1, 1, 1, 1)), (*positions.shape[:3], 1)),
-        ],
-        axis=-1,
-    )
     _draw_dots(positions, planes_mm, work / "fig18.png")
     _draw_errors(error, planes_mm, work / "fig19.png")
-    rms = np.sqrt(np.nanmean(absolute**2, axis=(0, 1, 2)))
+    return _result(positions, planes_mm, error, rig)
+
+
+def _true_positions(rig: Rig, planes_mm: Sequence[float]) -> np.ndarray:
+    """Places of the dots on the board (plane, row, column, 3) [mm]."""
+    board = rig.experiment.board
+    columns, rows = ((np.arange(n) - (n - 1) / 2) * board.spacing_mm for n in board.dots)
+    z, y, x = np.meshgrid(planes_mm, rows, columns, indexing="ij")
+    return np.stack([x, y, z], axis=-1)
+
+
+def _result(positions: np.ndarray, planes_mm: Sequence[float], error: metrics.DotError, rig: Rig) -> dict[str, Any]:
+    """Put the errors into the form of the page; `positions` of shape (plane, row, column, 3) [mm]."""
+    board = rig.experiment.board
+    expected = positions.shape[0] * positions.shape[1] * positions.shape[2]
+    rms = np.sqrt(np.nanmean((positions - _true_positions(rig, planes_mm)) ** 2, axis=(0, 1, 2)))
     return page.result(
         {
             "lateral_mm": error.lateral_mean_mm,
@@ -168,7 +172,9 @@ def locate_dots(volume: xr.DataArray, dots: tuple[int, int], spacing_mm: float, 
     z, y, x = (volume[axis].values for axis in "zyx")
     values = np.asarray(volume.values, float)
     smooth = ndimage.gaussian_filter(values, diameter_mm / 2 / abs(x[1] - x[0]))
-    peaks = np.where(smooth == ndimage.maximum_filter(smooth, 3), smooth, 0.0)  # the flank of a ghost is no dot
+    peaks = np.where(
+        smooth == ndimage.maximum_filter(smooth, 3), smooth, 0.0
+    )  # only local maxima: the flank of a ghost is not a dot
     found = np.full((dots[1], dots[0], 3), np.nan)
     light = np.zeros((dots[1], dots[0]))
     half = np.array([GATE * spacing_mm, GATE * spacing_mm, NEAR * diameter_mm])
@@ -180,7 +186,7 @@ def locate_dots(volume: xr.DataArray, dots: tuple[int, int], spacing_mm: float, 
             continue
         top = np.unravel_index(peak.argmax(), peak.shape)
         centre = np.array([x[near_x][top[2]], y[near_y][top[1]], z[top[0]]])
-        for _ in range(STEPS):  # the window follows the centroid: one that stays would draw it to its own middle
+        for _ in range(STEPS):  # a fixed window would bias the centroid towards its middle
             inside = [np.abs(axis - at) <= edge for axis, at, edge in zip((x, y, z), centre, half, strict=True)]
             bright = values[np.ix_(*inside[::-1])]
             light[row, column] = bright.sum()

@@ -11,7 +11,7 @@ from lfpiv.reproduce.rigs import OPTICS, VOXEL_MM, Rig, calibrated_rig
 from lfpiv.simulation.scene import Scene
 
 SENSOR_PX = {"small": (1728, 2208), "paper": (2208, 2752)}
-"""Rows and columns; at "small" the sensor is cut to what sees the smaller volume."""
+"""Rows and columns. At "small" the sensor is just large enough for the smaller volume."""
 PLANES_MM = tuple(np.arange(-6.0, 6.5, 1.0).tolist())
 """Depths of the board, 1 mm apart."""
 MISALIGNMENTS = (
@@ -32,7 +32,7 @@ MISALIGNMENTS = (
         "true_array_offset_mm": (-0.033, 0.027),
     },
 )
-"""What nobody measures on a bench: how the two cameras truly stand, and the arrays on their sensors."""
+"""True poses of the two cameras and of their microlens arrays. The calibration does not know them."""
 
 
 def experimental_scene(scale: str, seed: int) -> Scene:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
-from lfpiv.reproduce import Progress, page, plots
+from lfpiv.reproduce import page, plots
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.lsi_twin import (
     DEPTHS_D,
@@ -30,11 +30,25 @@ from lfpiv.reproduce.lsi_twin import (
 )
 from lfpiv.reproduce.planar_piv import require_openpiv
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, true_field
+from lfpiv.reproduce.study import Progress
 
 TITLE = "Figs. 20 to 22: low-swirl injector, light-field PIV against planar PIV"
 
 PAPER_ERROR = {"u": 0.0905, "v": 0.0989}
 NAMES = {"u": "radial velocity u", "v": "axial velocity v"}
+
+FIGURES = (
+    (
+        "fig22.png",
+        f"Mean velocity along the injector's axis at x/D = {PROFILE_D:g} in three depths: light-field PIV, planar PIV "
+        "and the true flow of the recorded instants, at points and averaged over the light field's windows.",
+    ),
+    (
+        "fig20_21.png",
+        "Mean velocity in three depths by planar PIV (top) and light-field PIV (bottom); colours: axial velocity, "
+        "arrows: in-plane velocity. The box is the light field's volume.",
+    ),
+)
 
 SIZES = {
     "small": Sizes(
@@ -57,7 +71,7 @@ SIZES = {
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Record and measure the injector's flow both ways; see the package for the arguments."""
+    """Record and measure the injector's flow both ways; see `lfpiv.reproduce.study` for the arguments."""
     require_openpiv()
     rig = experimental_rig(work.parent / "experimental_rig", scale, seed, progress)
     return compute(rig, SIZES[scale], work, seed=seed, progress=progress)
@@ -114,8 +128,8 @@ def sample_profiles(twin: Twin, volume: LightField, planar: Sequence[Sheet]) -> 
 def _along(twin: Twin, axes_mm: list[np.ndarray], field: np.ndarray) -> np.ndarray:
     """Field (z, y, x, ...) along the profiles, shape (plane, y, ...): linear in x, a cubic spline along depth.
 
-    A plane may lie midway between two layers of windows: their mean, the linear one, would be that of a window half as
-    deep again.
+    A plane may lie midway between two layers of windows. Their mean, which linear interpolation gives, is that of a
+    window 1.5 times as deep.
     """
     z_mm, _, x_mm = axes_mm
     line = RegularGridInterpolator((x_mm,), np.moveaxis(field, 2, 0))([[twin.profile_x_mm]])[0]
@@ -131,7 +145,7 @@ def relative_error(values: np.ndarray, reference: np.ndarray) -> float:
 
 
 class ByPairs(TypedDict):
-    """What `error_by_pairs` returns."""
+    """Errors by the number of averaged pairs."""
 
     pairs: list[int]
     error: list[list[float]]
@@ -139,7 +153,7 @@ class ByPairs(TypedDict):
 
 
 def error_by_pairs(twin: Twin, volume: LightField, reference: np.ndarray) -> ByPairs:
-    """Error of the profiles' average over more and more pairs, against the truth in the same windows.
+    """Compare the profiles averaged over more and more pairs with the truth in the same windows.
 
     Parameters
     ----------
@@ -153,8 +167,8 @@ def error_by_pairs(twin: Twin, volume: LightField, reference: np.ndarray) -> ByP
     Returns
     -------
     ByPairs
-        ``pairs``; for each ``error``, mean distance of the average of the first pairs, for (u, v); ``chance``: what
-        their scatter from pair to pair lets expect, sqrt(2 / pi) of the standard error, were there no bias.
+        ``pairs``; for each ``error``, the mean distance of the average of the first pairs, for (u, v); ``chance``, the
+        error without bias that the scatter between pairs leads to, sqrt(2 / pi) of the standard error.
     """
     scale = 1 / 1000 / twin.dt_s / np.abs(reference).mean(axis=(0, 1))
     each = np.moveaxis(volume["departures_mm"][..., :2], 0, -2)
@@ -169,42 +183,53 @@ def error_by_pairs(twin: Twin, volume: LightField, reference: np.ndarray) -> ByP
     }
 
 
+COMPARED = {
+    "planar": ("light_field", "planar", "light field against planar PIV"),
+    "planar_windows": (
+        "light_field",
+        "planar_windows",
+        "light field against planar PIV averaged over the light field's windows",
+    ),
+    "truth": ("light_field", "recorded", "light field against the truth of its instants"),
+    "truth_windows": (
+        "light_field",
+        "windows",
+        "light field against the same averaged over its windows: the measurement",
+    ),
+    "smoothing": ("windows", "recorded", "that average against the truth at points: what the windows smooth away"),
+    "smoothing_mean": (
+        "mean_windows",
+        "mean",
+        "the same of the mean flow, without turbulence: what stays with any number",
+    ),
+    "mean_flow": ("light_field", "mean", "light field against the mean flow"),
+    "planar_truth": ("planar", "mean", "planar PIV against the truth"),
+    "sampling": ("recorded", "mean", "mean of the light field's instants against the mean flow: turbulence left"),
+}
+"""Profiles compared: key of the error -> the profile, its reference, and the words for both."""
+
+Errors = Mapping[str, Mapping[str, float]]
+"""Relative errors by component and key of `COMPARED`."""
+
+
 def _result(
     twin: Twin, volume: LightField, planar: Sequence[Sheet], profiles: Mapping[str, np.ndarray], work: Path
 ) -> dict[str, Any]:
-    sizes = twin.sizes
-    pairs = {
-        "planar": ("light_field", "planar"),
-        "planar_windows": ("light_field", "planar_windows"),
-        "truth_windows": ("light_field", "windows"),
-        "smoothing": ("windows", "recorded"),
-        "smoothing_mean": ("mean_windows", "mean"),
-        "truth": ("light_field", "recorded"),
-        "mean_flow": ("light_field", "mean"),
-        "planar_truth": ("planar", "recorded" if sizes.same_instants else "mean"),
-        "sampling": ("recorded", "mean"),
-    }
-    errors = {
-        name: {
-            against: relative_error(profiles[first][..., number], profiles[second][..., number])
-            for against, (first, second) in pairs.items()
-        }
-        for number, name in enumerate("uv")
-    }
+    """Compare and draw the profiles, and put the figures into the form of the page."""
+    errors = _errors(profiles, same_instants=twin.sizes.same_instants)
     off = volume["displacement_mm"] - volume["truth_mm"]
     voxel = [float(np.nanmean(np.abs(off[..., axis]))) / VOXEL_MM for axis in range(3)]
+    by_pairs = error_by_pairs(twin, volume, profiles["recorded"])
     _draw_profiles(twin, profiles, work / "fig22.png")
     _draw_planes(twin, volume, planar, work / "fig20_21.png")
-    measured: dict[str, float] = {f"error_{name}": errors[name]["planar"] for name in "uv"}
-    by_pairs = error_by_pairs(twin, volume, profiles["recorded"])
-    measured |= {f"error_{name}_{key}": errors[name][key] for name in "uv" for key in pairs if key != "planar"}
-    instants = "the same instants" if sizes.same_instants else "other instants"
+    measured = {f"error_{name}": errors[name]["planar"] for name in "uv"}
+    measured |= {f"error_{name}_{key}": errors[name][key] for name in "uv" for key in COMPARED if key != "planar"}
     return page.result(
         {
             **measured,
             "swirl_number": twin.mean.swirl_number,
-            "pairs": sizes.pairs,
-            "planar_pairs": sizes.planar_pairs,
+            "pairs": twin.sizes.pairs,
+            "planar_pairs": twin.sizes.planar_pairs,
             "valid": volume["valid"],
             "planar_valid": [plane["valid"] for plane in planar],
             "error_by_pairs": by_pairs,
@@ -212,102 +237,93 @@ def _result(
             "profiles_m_s": profiles,
             "depths_mm": twin.depths_mm,
         },
-        comparison=[
-            row
-            for name in "uv"
-            for row in (
-                page.compare(
-                    f"{NAMES[name]}, light field against planar PIV",
-                    errors[name]["planar"],
-                    paper=PAPER_ERROR[name],
-                    at_most=0.05,
-                ),
-                page.compare(
-                    f"{NAMES[name]}, light field against planar PIV averaged over the light field's windows",
-                    errors[name]["planar_windows"],
-                ),
-                page.compare(
-                    f"{NAMES[name]}, light field against the true flow recorded", errors[name]["truth"], at_most=0.05
-                ),
-                page.compare(
-                    f"{NAMES[name]}, light field against the same averaged over its windows",
-                    errors[name]["truth_windows"],
-                ),
-                page.compare(f"{NAMES[name]}, planar PIV against the true flow", errors[name]["planar_truth"]),
-            )
-        ],
-        figures=[
-            (
-                "fig22.png",
-                f"Mean velocity along the injector's axis at x/D = {PROFILE_D:g} in three depths: light-field PIV, "
-                "planar PIV and the true flow of the recorded instants, at points and averaged over the light field's "
-                "windows.",
-            ),
-            (
-                "fig20_21.png",
-                "Mean velocity in three depths by planar PIV (top) and light-field PIV (bottom); colours: axial "
-                "velocity, arrows: in-plane velocity. The box is the light field's volume.",
-            ),
-        ],
-        tables=[
-            {
-                "caption": "Relative errors of the profiles: mean difference over mean magnitude, all depths together",
-                "columns": ["", *(NAMES[name] for name in "uv")],
-                "rows": [
-                    [what, *(errors[n][key] for n in "uv")]
-                    for key, what in {
-                        "planar": "light field against planar PIV",
-                        "planar_windows": "light field against planar PIV averaged over the light field's windows",
-                        "truth": "light field against the truth of its instants",
-                        "truth_windows": "light field against the same averaged over its windows: the measurement",
-                        "smoothing": "that average against the truth at points: what the windows smooth away",
-                        "smoothing_mean": "the same of the mean flow, without turbulence: what stays with any number",
-                        "mean_flow": "light field against the mean flow",
-                        "planar_truth": "planar PIV against the truth",
-                        "sampling": "mean of the light field's instants against the mean flow: turbulence left",
-                    }.items()
-                ],
-            },
-            {
-                "caption": "Light field against the truth in its windows by the number of pairs averaged; by chance: "
-                "what the scatter from pair to pair would leave if there were no bias",
-                "columns": ["pairs", "u", "u by chance", "v", "v by chance"],
-                "rows": [
-                    [count, error[0], chance[0], error[1], chance[1]]
-                    for count, error, chance in zip(
-                        by_pairs["pairs"], by_pairs["error"], by_pairs["chance"], strict=True
-                    )
-                ],
-            },
-        ],
+        comparison=[row for name in "uv" for row in _comparison(NAMES[name], errors[name], PAPER_ERROR[name])],
+        figures=FIGURES,
+        tables=_tables(errors, by_pairs),
         notes=[
-            f"The flow is the library's swirling jet with the paper's swirl number ({twin.mean.swirl_number:g}), bulk "
-            f"velocity and size, with homogeneous turbulence of {100 * TURBULENCE_SHARE:.0f} % of the bulk velocity, "
-            "another realisation for every pair. It is a model of the injector, not its measured flow.",
-            f"{sizes.pairs} pairs of {PARTICLES_PER_MICROLENS:g} particles per microlens (5 um, with camera noise), "
-            f"{ITERATIONS} SMART iterations, last window {WINDOWS[-1]} voxels. Planar PIV: {sizes.planar_pairs} pairs "
-            f"at each depth, {instants}, a light sheet 1 mm thick, OpenPIV with a last window of 32 pixels.",
-            f"Mean error of the averaged vectors over the volume, against the true flow in their windows: "
-            f"{voxel[0]:.3f}, {voxel[1]:.3f} and {voxel[2]:.3f} voxel along x, y and z; {100 * volume['valid']:.0f} % "
-            "of the vectors valid.",
-            "The relative error divides by the mean magnitude of the reference over the profiles: u is small, so that "
-            "the same error in voxels weighs more there.",
+            *_notes(twin, volume["valid"], voxel),
             _about_errors(twin, errors, by_pairs),
-            *(
-                [
-                    f"Cut at this scale: a volume of {' x '.join(f'{s:g}' for s in sizes.volume_mm)} mm around the "
-                    f"profiles instead of 13 x 10 x 12 mm, {sizes.pairs} pairs instead of 150 (planar: 600); both see "
-                    "the same instants, since so few would differ by their turbulence alone, by "
-                    f"{100 * errors['u']['sampling']:.1f} % of u and {100 * errors['v']['sampling']:.1f} % of v."
-                ]
-                if sizes.same_instants
-                else []
-            ),
+            *_about_scale(twin, errors),
         ],
     )
 
 
-def _about_errors(twin: Twin, errors: Mapping[str, Mapping[str, float]], by_pairs: ByPairs) -> str:
+def _errors(profiles: Mapping[str, np.ndarray], *, same_instants: bool) -> dict[str, dict[str, float]]:
+    """Compare the profiles of `COMPARED`; planar PIV of the same instants with their flow, not with the mean flow."""
+    pairs = {key: (first, second) for key, (first, second, _) in COMPARED.items()}
+    if same_instants:
+        pairs["planar_truth"] = ("planar", "recorded")
+    return {
+        name: {
+            key: relative_error(profiles[first][..., number], profiles[second][..., number])
+            for key, (first, second) in pairs.items()
+        }
+        for number, name in enumerate("uv")
+    }
+
+
+def _comparison(name: str, errors: Mapping[str, float], paper: float) -> list[dict[str, Any]]:
+    """Put the errors of one velocity component beside the paper's."""
+    return [
+        page.compare(f"{name}, light field against planar PIV", errors["planar"], paper=paper, at_most=0.05),
+        page.compare(
+            f"{name}, light field against planar PIV averaged over the light field's windows", errors["planar_windows"]
+        ),
+        page.compare(f"{name}, light field against the true flow recorded", errors["truth"], at_most=0.05),
+        page.compare(f"{name}, light field against the same averaged over its windows", errors["truth_windows"]),
+        page.compare(f"{name}, planar PIV against the true flow", errors["planar_truth"]),
+    ]
+
+
+def _tables(errors: Errors, by_pairs: ByPairs) -> list[dict[str, Any]]:
+    rows = zip(by_pairs["pairs"], by_pairs["error"], by_pairs["chance"], strict=True)
+    return [
+        {
+            "caption": "Relative errors of the profiles: mean difference over mean magnitude, all depths together",
+            "columns": ["", *(NAMES[name] for name in "uv")],
+            "rows": [[what, *(errors[n][key] for n in "uv")] for key, (_, _, what) in COMPARED.items()],
+        },
+        {
+            "caption": "Light field against the truth in its windows by the number of pairs averaged; by chance: what "
+            "the scatter from pair to pair would leave if there were no bias",
+            "columns": ["pairs", "u", "u by chance", "v", "v by chance"],
+            "rows": [[count, error[0], chance[0], error[1], chance[1]] for count, error, chance in rows],
+        },
+    ]
+
+
+def _notes(twin: Twin, valid: float, voxel: Sequence[float]) -> list[str]:
+    """Say what was recorded and how it was measured; `voxel` holds the mean errors along x, y, z."""
+    sizes = twin.sizes
+    instants = "the same instants" if sizes.same_instants else "other instants"
+    return [
+        f"The flow is the library's swirling jet with the paper's swirl number ({twin.mean.swirl_number:g}), bulk "
+        f"velocity and size, with homogeneous turbulence of {100 * TURBULENCE_SHARE:.0f} % of the bulk velocity, "
+        "another realisation for every pair. It is a model of the injector, not its measured flow.",
+        f"{sizes.pairs} pairs of {PARTICLES_PER_MICROLENS:g} particles per microlens (5 um, with camera noise), "
+        f"{ITERATIONS} SMART iterations, last window {WINDOWS[-1]} voxels. Planar PIV: {sizes.planar_pairs} pairs "
+        f"at each depth, {instants}, a light sheet 1 mm thick, OpenPIV with a last window of 32 pixels.",
+        f"Mean error of the averaged vectors over the volume, against the true flow in their windows: "
+        f"{voxel[0]:.3f}, {voxel[1]:.3f} and {voxel[2]:.3f} voxel along x, y and z; {100 * valid:.0f} % of the "
+        "vectors valid.",
+        "The relative error divides by the mean magnitude of the reference over the profiles: u is small, so that "
+        "the same error in voxels weighs more there.",
+    ]
+
+
+def _about_scale(twin: Twin, errors: Errors) -> list[str]:
+    """Say what the small scale leaves out."""
+    if not twin.sizes.same_instants:
+        return []
+    return [
+        f"Cut at this scale: a volume of {' x '.join(f'{s:g}' for s in twin.sizes.volume_mm)} mm around the profiles "
+        f"instead of 13 x 10 x 12 mm, {twin.sizes.pairs} pairs instead of 150 (planar: 600); both see the same "
+        "instants, since so few would differ by their turbulence alone, by "
+        f"{100 * errors['u']['sampling']:.1f} % of u and {100 * errors['v']['sampling']:.1f} % of v."
+    ]
+
+
+def _about_errors(twin: Twin, errors: Errors, by_pairs: ByPairs) -> str:
     """Say how much of the error is smoothing, chance and bias."""
     edge = " x ".join(f"{edge:g}" for edge in window_mm(twin))
     parts = []

@@ -1,4 +1,4 @@
-"""Digital twin of the low-swirl injector (section 5): its flow, recorded and measured by both kinds of PIV."""
+"""Simulate the low-swirl injector (section 5): its flow, recorded and measured by light-field and by planar PIV."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import Any, TypedDict
 import numpy as np
 import xarray as xr
 
-from lfpiv.calibration.cameras import warn_outside
+from lfpiv.calibration.coverage import warn_outside
 from lfpiv.experiment.settings import Correlation, Smart
-from lfpiv.geometry.optics import Grid
-from lfpiv.reproduce import Progress, store
+from lfpiv.geometry.grid import Grid
+from lfpiv.reproduce import store
 from lfpiv.reproduce.planar_piv import SheetCamera, correlate_frames, sheet_images
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, reconstruct_images, recorded_images, true_field, volume_grid
+from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.flows import SwirlingJet
 from lfpiv.simulation.scene import Noise
 from lfpiv.simulation.simulator import LEAST_INTENSITY
@@ -42,7 +43,7 @@ PLANAR_SHARE = 0.4
 TURBULENCE_SHARE, TURBULENCE_SCALE_MM = 0.1, 3.0
 """Turbulence: rms of a component over the bulk velocity, and integral scale; the perforated plate's holes are 2 mm."""
 PARTICLES_PER_MICROLENS = 0.5
-"""Seeding; the paper tells none."""
+"""Seeding. The paper does not state it."""
 PARTICLE_RADIUS_MM = 2.5e-3
 """Titanium dioxide of 5 um."""
 PARTICLE_RAYS = 32_768
@@ -59,7 +60,7 @@ PLANAR_MARGIN_MM = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """How much is recorded at a scale."""
+    """Sizes of the recording at one scale."""
 
     volume_mm: tuple[float, float, float]
     """Size (x, y, z) of the reconstructed volume."""
@@ -69,7 +70,7 @@ class Sizes:
     planar_pairs: int
     """Pairs of planar PIV at each depth."""
     same_instants: bool
-    """Planar PIV sees the same instants, as if recorded at once; else others, as in the paper."""
+    """Whether planar PIV records the same instants as the light field. The paper recorded others."""
     field_mm: tuple[tuple[float, float], tuple[float, float]] | None
     """Corners of planar PIV's field from axis and outlet; None: the volume's and a margin."""
 
@@ -83,7 +84,7 @@ class Twin:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What a pair's measurement depends on, beside the rig."""
+        """Flow and timing of the measurement."""
         return {
             "seed": self.seed,
             "sizes": vars(self.sizes) | {"pairs": None, "planar_pairs": None},
@@ -137,7 +138,7 @@ class LightField(TypedDict):
     truth_mm: np.ndarray
     """The true one over the windows, shape (z, y, x, 3)."""
     departures_mm: np.ndarray
-    """What each pair measured less its truth, shape (pair, z, y, x, 3); NaN where not valid."""
+    """Measured minus true displacement of each pair, shape (pair, z, y, x, 3); NaN where not valid."""
     valid: float
     """Part of the vectors."""
 
@@ -188,7 +189,7 @@ def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Progress) -> Li
 
         def measure(pair: int = pair) -> dict[str, np.ndarray]:
             nonlocal weights
-            if weights is None:  # once for all pairs, and not at all where these are done
+            if weights is None:  # built once, when the first pair is not finished
                 warn_outside(rig.calibration, grid)
                 weights = rig.weights(grid, "network")
             volumes = [

@@ -1,4 +1,4 @@
-"""What a reproduction shows: ``reproduce.json``, PNGs and a self-contained page; and the form of a case's result."""
+"""Write the results of a study: ``reproduce.json``, PNGs, and a self-contained page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lfpiv.results import netcdf
+from lfpiv import files
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ def result(
     tables: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Put a case's result into its form.
+    """Return a case's result in the form that the page shows.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def result(
     }
 
 
-def write(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
+def write(out: Path, settings: Mapping[str, Any], title: str, about: str, keys: Sequence[str]) -> dict[str, Any]:
     """Write ``reproduce.json``, the PNGs and ``index.html`` from all finished cases in a folder; return the JSON.
 
     Parameters
@@ -94,28 +94,30 @@ def write(out: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
         Folder of the reproduction; finished cases are ``work/<key>/result.json``.
     settings : mapping
         Scale, seed and version the cases were computed with; results of others are left out.
+    title, about : str
+        Heading of the page, and what it is about.
+    keys : sequence of str
+        Keys of all cases, in the page's order.
     """
-    from lfpiv.reproduce import CASES
-
     content: dict[str, Any] = dict(settings)
-    for key in CASES:
+    for key in keys:
         path = out / "work" / key / "result.json"
         if not path.exists():
             continue
         stored = json.loads(path.read_text("utf-8"))
-        if stored["settings"] != netcdf.plain(settings):
+        if stored["settings"] != files.plain(settings):
             continue
         content[key] = stored["value"]
         for figure in content[key]["figures"]:
             shutil.copyfile(path.parent / figure["file"], out / f".{figure['file']}")
             (out / f".{figure['file']}").replace(out / figure["file"])
-    netcdf.write_json(content, out / "reproduce.json")
-    netcdf.write_text(_page(out, content), out / "index.html")
+    files.write_json(content, out / "reproduce.json")
+    files.write_text(_page(out, content, title, about, keys), out / "index.html")
     return content
 
 
 ROUNDING = 1e-12
-"""Figures below this are zero but for rounding."""
+"""Magnitude below which a number is shown as 0."""
 
 # -- the page ----------------------------------------------------------------------------------------------------------
 
@@ -129,7 +131,6 @@ body { margin: 0 auto; padding: 1rem; max-width: 62rem; color: var(--ink); backg
   font: 1rem/1.5 system-ui, sans-serif; }
 h1 { font-size: 1.5rem; line-height: 1.25; margin: .5rem 0; }
 h2 { font-size: 1.2rem; margin: 2.2rem 0 .4rem; padding-top: .8rem; border-top: 1px solid var(--line); }
-h1.part { margin-top: 3rem; padding-top: 1rem; border-top: 3px solid var(--line); }
 p, li, figcaption, dd { max-width: 44rem; }
 .dim, figcaption, .caption { color: var(--dim); font-size: .9rem; }
 .caption { margin: 1.1rem 0 .2rem; }
@@ -164,21 +165,19 @@ TERMS = {
     "error of vectors": "Mean length of the difference from the true displacement, in voxels, all vectors; along x, y, "
     "z its mean absolute components. z is the depth axis between the cameras.",
     "took": "Of the run that finished the case; what an earlier, interrupted one had done is not in it.",
-    "goal": "What this software set out to reach; where there is none, the figure is told for itself.",
+    "goal": "What this software set out to reach; where there is none, there is only the figure.",
 }
-"""Words of the page, explained on it."""
+"""Explanations of the words on the page."""
 
 
-def _page(out: Path, content: Mapping[str, Any]) -> str:
-    from lfpiv.reproduce import BEYOND, CASES
-
-    present = [key for key in CASES if key in content]
+def _page(out: Path, content: Mapping[str, Any], title: str, about: str, keys: Sequence[str]) -> str:
+    present = [key for key in keys if key in content]
     rows = [{"case": key, **row} for key in present for row in content[key]["comparison"]]
     judged = [row["reached"] for row in rows if row["reached"] is not None]
-    missing = [key for key in CASES if key not in content]
+    missing = [key for key in keys if key not in content]
     parts = [
-        "<h1>The paper's tables and figures, reproduced</h1>",
-        f"<p>Weight estimation of multi-camera light-field PIV by a back-propagation network, computed by lfpiv "
+        f"<h1>{html.escape(title)}</h1>",
+        f"<p>{html.escape(about)}, computed by lfpiv "
         f"{html.escape(str(content['version']))} on simulated images: scale <b>{content['scale']}</b>, seed "
         f"{content['seed']}. {sum(judged)} of {len(judged)} goals reached. Images are simulated, cameras calibrated "
         "from them, volumes reconstructed and measured; the truth is known to the simulator alone. "
@@ -191,17 +190,11 @@ def _page(out: Path, content: Mapping[str, Any]) -> str:
     terms = "".join(f"<dt>{html.escape(word)}</dt><dd>{html.escape(text)}</dd>" for word, text in TERMS.items())
     parts.append(f"<details><summary>What the words mean</summary><dl>{terms}</dl></details>")
     parts += [_comparison([row for row in rows if row["goal"]], cases=True)] if judged else []
-    for number, key in enumerate(present):
-        if key in BEYOND and (number == 0 or present[number - 1] not in BEYOND):
-            parts.append(
-                "<h1 class='part'>Beyond the paper</h1><p>What the paper did not show, on rigs of the same main and "
-                "microlenses with smaller volumes and noisy images.</p>"
-            )
-        parts.append(_section(out, key, content[key]))
+    parts += [_section(out, key, content[key]) for key in present]
     return (
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>"
         "<meta name='viewport' content='width=device-width, initial-scale=1'>"
-        f"<title>lfpiv: the paper reproduced</title><style>{STYLE}</style></head><body>\n"
+        f"<title>lfpiv: {html.escape(title)}</title><style>{STYLE}</style></head><body>\n"
         + "\n".join(parts)
         + "\n</body></html>\n"
     )

@@ -107,7 +107,7 @@ def sheet_images(
     columns, rows = (round(n) for n in (high - low) / pixel)
     margin = 32 * pixel  # particles that move into the field
     size = np.array([*(high - low + 2 * margin), 6 * camera.sheet_mm])
-    # as many as fill a sheet of even light as thick as the Gaussian one is wide
+    # as many as an evenly lit sheet of the same thickness holds
     count = round(camera.particles_per_px * size[0] * size[1] / pixel**2 * size[2] / (2 * camera.sheet_mm))
     middle = np.array([*(low + high) / 2, plane_mm])
     position = middle + rng.uniform(-0.5, 0.5, (count, 3)) * size

@@ -1,4 +1,4 @@
-"""How the figures of a reproduction look: one size of type, one set of colours, written by rename."""
+"""Style of the figures: one type size, one set of colours, files written whole or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lfpiv.results import netcdf
+from lfpiv import files
 
 DPI = 150
 COLOURS = {
@@ -32,7 +32,7 @@ NAMES = {
     "no_sieve": "network, no sieve",
     "truth": "true particles",
 }
-"""What is reconstructed with, and how figures and tables call it."""
+"""Names of the mappings in figures and tables."""
 
 
 def figure(width: float, height: float) -> Figure:
@@ -81,4 +81,4 @@ def save(drawn: Figure, path: Path) -> None:
     """Write a figure as PNG by rename."""
     buffer = io.BytesIO()
     drawn.savefig(buffer, format="png", dpi=DPI)
-    netcdf.write_bytes(buffer.getvalue(), path)
+    files.write_bytes(buffer.getvalue(), path)

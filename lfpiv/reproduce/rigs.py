@@ -1,4 +1,4 @@
-"""Simulated rigs, calibrated once for the cases that share them, the paper's (Table 2) first; what they record."""
+"""Simulated rigs that several cases share, the paper's (Table 2) first. Each is calibrated once and records images."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from lfpiv import metrics
+from lfpiv import files, metrics
 from lfpiv.calibration.board.board import BoardDots
 from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.experiment import Experiment, open_experiment
 from lfpiv.experiment.settings import Smart
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.reconstruction.volume import reconstruct
-from lfpiv.results import netcdf
 from lfpiv.simulation.flows import Ring, window_mean
 from lfpiv.simulation.scene import Scene, true_mapping
 from lfpiv.simulation.simulator import expose, render_camera, simulate
@@ -50,9 +49,9 @@ ANGLE_ERRORS = {
     "turned": ((1.0, 0.0), (1.0, 0.0)),
     "rolled": ((0.0, 0.5), (0.0, -0.5)),
 }
-"""Errors (yaw, roll) of each camera's angle that direct ray tracing is given, per degree. "plus": both separation
-angles overestimated (Eqs. 11-12); "turned": the same error in the same sense; "rolled": the cameras are rolled about
-their axes, half a degree each."""
+"""Errors (yaw, roll) of each camera's angle in direct ray tracing, per degree. "plus": both separation angles are
+overestimated (Eqs. 11-12). "turned": both cameras have the same error in the same sense. "rolled": the cameras are
+rolled about their axes, half a degree each."""
 ANGLE_ERRORS_DEG = (1, 2, 4)
 """Sizes of these errors [degree]; the paper has 1."""
 TURNED_DEG = {"drt": ((0.0, 0.0), (0.0, 0.0))} | {
@@ -60,7 +59,7 @@ TURNED_DEG = {"drt": ((0.0, 0.0), (0.0, 0.0))} | {
     for kind, errors in ANGLE_ERRORS.items()
     for size in ANGLE_ERRORS_DEG
 }
-"""All of them by name: errors (yaw, roll) of each camera [degree]."""
+"""Errors (yaw, roll) of each camera by the name of the mapping [degree]."""
 BLOB_VOXEL = 0.7
 """Standard deviation of the particles, Gaussian blobs, in images and in the truth [voxel]."""
 FULL_SCALE = 4095
@@ -68,22 +67,21 @@ FULL_SCALE = 4095
 PARTICLE_COUNTS = 400.0
 """Level of a pixel lit by one particle in focus [count]: at 1 ppm the brightest pixels stay below full scale."""
 PARTICLE_RAYS = 32_768
-"""Rays per particle: a pixel of the some 1,500 that it lights receives about 20."""
+"""Rays per particle. It lights some 1,500 pixels, so a pixel receives about 20 rays."""
 DT_S = 1e-4
 """Time between the frames [s]; the figures are in voxels and do not depend on it."""
 RADIUS, CORE, PEAK = 0.25, 1 / 7, 0.3 / 14
-"""Of the paper's ring vortex: radius of the ring's core line, distance of the largest displacement from it, and that
-displacement, as parts of the volume's x edge: 3.5, 2 and 0.3 mm in the paper's volume of 14 mm, so that 0.12
-voxel/voxel makes a torus within the depth. A smaller volume has the same flow at its size, so gradients, in voxels per
-voxel, are the same."""
+"""Ring vortex of the paper, as shares of the volume's x edge: radius of the ring's core line, distance of the largest
+displacement from it, and that displacement; 3.5, 2 and 0.3 mm in the paper's volume of 14 mm. Gradients in voxel per
+voxel do not depend on the volume's size."""
 
 SENSOR_PX = {"small": 1900, "paper": 4000}
-"""Edge of the sensors [pixel]; "small" is cut to what sees the smaller volumes and the board."""
+"""Edge of the sensors [pixel]. At "small" the sensor is just large enough for the smaller volumes and the board."""
 DEPTHS_MM = {"small": tuple(range(-4, 5, 2)), "paper": tuple(range(-10, 11))}
 """Planes of the board."""
 DOTS = (7, 7)
 WHITE_RAYS = 64
-"""Rays per pixel of the white image: smooth to a percent at the edge of a microimage."""
+"""Rays per pixel of the white image."""
 
 
 @dataclass(frozen=True)
@@ -162,19 +160,19 @@ def numerical_scene(scale: str, seed: int) -> Scene:
 
 
 def numerical_rig(folder: Path, scale: str, seed: int, progress: Callable[[str, float], None]) -> Rig:
-    """Simulate the board of `numerical_scene` and calibrate from it; both are kept in `folder` and taken from there."""
+    """Simulate the board of `numerical_scene` and calibrate from it; keep both in `folder`."""
     return calibrated_rig(numerical_scene(scale, seed), folder, progress)
 
 
 def calibrated_rig(scene: Scene, folder: Path, progress: Callable[[str, float], None]) -> Rig:
-    """Simulate the board of a scene and calibrate from it; both are kept in `folder` while the scene stays the same."""
+    """Simulate the board of a scene and calibrate from it; keep both in `folder` while the scene stays the same."""
     runtime.device()
     path, marker = folder / "experiment" / "experiment.toml", folder / "scene.json"
-    content = netcdf.plain(scene.model_dump(mode="json"))
+    content = files.plain(scene.model_dump(mode="json"))
     if not marker.exists() or json.loads(marker.read_text("utf-8")) != content:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
-        netcdf.write_json(content, marker)
+        files.write_json(content, marker)
     if not path.exists():
         simulate(scene, path.parent, progress=lambda what, done, total: progress(what, done / total))
     experiment = open_experiment(path)
@@ -242,15 +240,15 @@ def recorded_images(
     positions_mm : ndarray, shape (n, 3)
         Particles (x, y, z) [mm].
     counts : ndarray, shape (n,)
-        Level of a pixel lit by each one alone and in focus [count].
+        Level of a pixel lit by one particle only, in focus [count].
     rays : ndarray
         From `render.ray_table`.
     size_mm : float
         Radius or standard deviation of the particles, as `rays` has it [mm].
     seed : list of int
-        Of the noise, together with the camera and
+        Seed of the noise, together with the camera's and the frame's number.
     frame : int
-        the number of the frame.
+        Number of the frame.
     cameras : sequence of str, optional
         Cameras that record; default: all.
     """

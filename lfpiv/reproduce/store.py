@@ -1,4 +1,4 @@
-"""Finished parts of a reproduction on disk: each appears under its name by rename only, and is not computed twice."""
+"""Keep finished parts of a study on disk, so that none is computed twice. Files are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lfpiv import files
 from lfpiv.errors import InputError
-from lfpiv.results import netcdf
 
 
 def open_folder(out: Path, settings: Mapping[str, Any]) -> None:
@@ -27,7 +27,7 @@ def open_folder(out: Path, settings: Mapping[str, Any]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         before = json.loads(path.read_text("utf-8")) if path.exists() else None
         if before is None:
-            netcdf.write_json(settings, path)
+            files.write_json(settings, path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{out}: the folder cannot be used ({reason}). Choose another one with --out.") from None
@@ -40,7 +40,7 @@ def open_folder(out: Path, settings: Mapping[str, Any]) -> None:
 
 
 def kept(path: Path, settings: Mapping[str, Any], compute: Callable[[], Any]) -> Any:
-    """Return the JSON-able value of `compute`, from the file where it was computed with the same settings before.
+    """Return the JSON-able value of `compute`, from its file where the file has the same settings.
 
     Parameters
     ----------
@@ -51,14 +51,14 @@ def kept(path: Path, settings: Mapping[str, Any], compute: Callable[[], Any]) ->
     compute : callable
         Called where there is no file, or one of other settings.
     """
-    settings = netcdf.plain(settings)
+    settings = files.plain(settings)
     if path.exists():
         content = json.loads(path.read_text("utf-8"))
         if content["settings"] == settings:
             return content["value"]
-    value = netcdf.plain(compute())
+    value = files.plain(compute())
     path.parent.mkdir(parents=True, exist_ok=True)
-    netcdf.write_json({"settings": settings, "value": value}, path)
+    files.write_json({"settings": settings, "value": value}, path)
     return value
 
 
@@ -66,7 +66,7 @@ def kept_arrays(
     path: Path, settings: Mapping[str, Any], compute: Callable[[], Mapping[str, ArrayLike]]
 ) -> dict[str, np.ndarray]:
     """Return the named arrays of `compute`, from the .npz file where they were computed with the same settings."""
-    text = json.dumps(netcdf.plain(settings), sort_keys=True)
+    text = json.dumps(files.plain(settings), sort_keys=True)
     if path.exists():
         with np.load(path, allow_pickle=False) as data:
             if str(data["settings"]) == text:
@@ -74,6 +74,6 @@ def kept_arrays(
     arrays = {name: np.asarray(value) for name, value in compute().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     named: dict[str, Any] = {"settings": text, **arrays}
-    with netcdf.replacing(path) as scratch, scratch.open("wb") as file:
+    with files.replacing(path) as scratch, scratch.open("wb") as file:
         np.savez_compressed(file, **named)
     return arrays

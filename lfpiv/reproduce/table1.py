@@ -17,8 +17,9 @@ from lfpiv.calibration.levenberg_marquardt import levenberg_marquardt
 from lfpiv.calibration.network import sigma_nor, train
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
 from lfpiv.calibration.virtual_samples import guide_between
-from lfpiv.reproduce import Progress, page, plots, store
+from lfpiv.reproduce import page, plots, store
 from lfpiv.reproduce.rigs import Rig, numerical_rig
+from lfpiv.reproduce.study import Progress
 from lfpiv.reproduce.trainers import bayesian_regularisation, gradient_descent
 from lfpiv.simulation.scene import true_mapping
 
@@ -42,23 +43,23 @@ PAPER_BEST = 0.038
 SHALLOW = ((20,), (10, 10))
 """Hidden layers of the networks that this software prefers."""
 ESTIMATORS = ("lens_integral", "gaussian")
-"""Dot centres: those used here, and the Gaussian fits of the paper."""
+"""Estimators of the dots: the default, and the Gaussian fits of the paper."""
 MUCH_WORSE = 1.2
-"""A deep network with more than this times the paper's error does worse than the paper says."""
+"""Ratio to the paper's error above which a deep network counts as worse than in the paper."""
 TRUE_RAYS = 20_000
-"""Rays held against the true ones."""
+"""Number of rays compared with the true ones."""
 PROBE_SEED = 11
-"""Number of the random stream of those rays; other cases draw from others."""
+"""Number of the random stream of those rays."""
 
 Fit = dict[str, Any]
-"""What `fit` tells of a network, or an entry of the shallow ones: JSON-able."""
+"""Result of `fit`, or entry of the shallow networks, JSON-able."""
 Deep = dict[str, dict[int, list[Fit]]]
 """Trainer -> hidden layers -> the cameras' fits."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """How much is trained at a scale."""
+    """Sizes of the training at one scale."""
 
     layers: tuple[int, ...]
     """Numbers of hidden layers."""
@@ -79,7 +80,7 @@ SIZES = {
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Train all networks; see the package for the arguments."""
+    """Train all networks; see `lfpiv.reproduce.study` for the arguments."""
     rig = numerical_rig(work.parent / "rig", scale, seed, progress)
     return compute(rig, SIZES[scale], work, seed=seed, progress=progress)
 
@@ -150,8 +151,8 @@ def fit(
     """Train one network on the labels of one camera: errors on held-out dots and against the true rays [pitch].
 
     Whole dots are held out, so the test part holds none that training saw. Where the thin lens is the baseline, labels
-    count by their standard errors and a polynomial guides the network between the dots, as in `lfpiv.calibrate`; the
-    paper's network takes all labels alike, and nothing else.
+    are weighted by their standard errors and a polynomial gives virtual samples between the dots, as in
+    `lfpiv.calibrate`. The paper's network has equal weights and no virtual samples.
     """
     camera = next(camera for camera in rig.scene.camera if camera.name == name)
     pitch = rig.calibration.cameras[name].lattice.pitch_mm
@@ -194,7 +195,7 @@ def fit(
 
 
 def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
-    """Label the board anew by the paper's estimator."""
+    """Label the board with the paper's estimator."""
     experiment, camera = rig.experiment, rig.calibration.cameras[name]
     board = experiment.board
     planes = range(len(board.planes_mm))
@@ -213,32 +214,141 @@ def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
     )
 
 
+def _both(fits: Sequence[Fit], key: str = "sigma_nor") -> list[float]:
+    """Return a figure of all cameras' networks."""
+    return [fit[key] for fit in fits]
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best networks of each kind, judged by their worse camera."""
+
+    deep: float
+    """sigma_nor of the best deep network [pitch]."""
+    deep_name: str
+    shallow: Fit
+    """Entry of the best shallow network on integrated dots."""
+    paper_like: Fit
+    """Entry of the shallow network without a baseline on the paper's labels."""
+
+    @classmethod
+    def of(cls, deep: Deep, shallow: Sequence[Fit]) -> Best:
+        """Choose the best networks."""
+        value, name = min(
+            (max(_both(fits)), f"{trainer}, {layers} hidden layers of {NODES}")
+            for trainer, rows in deep.items()
+            for layers, fits in rows.items()
+        )
+        integrated = (entry for entry in shallow if entry["estimator"] == "lens_integral")
+        return cls(
+            deep=value,
+            deep_name=name,
+            shallow=min(integrated, key=lambda entry: max(_both(entry["cameras"]))),
+            paper_like=next(e for e in shallow if (e["estimator"], e["baseline"]) == ("gaussian", "none")),
+        )
+
+    @property
+    def shallow_sigma_nor(self) -> float:
+        """sigma_nor of the best shallow network [pitch]."""
+        return max(_both(self.shallow["cameras"]))
+
+
 def _result(
     deep: Deep, shallow: Sequence[Fit], labels: Mapping[str, Mapping[str, BoardDots]], sizes: Sizes
 ) -> dict[str, Any]:
-    cameras = list(labels)
-
-    def both(fits: Sequence[Fit], key: str = "sigma_nor") -> list[float]:
-        return [fit[key] for fit in fits]
-
-    best = min(
-        (max(both(fits)), f"{trainer}, {layers} hidden layers of {NODES}")
-        for trainer, rows in deep.items()
-        for layers, fits in rows.items()
+    """Put the networks into the form of the page."""
+    best = Best.of(deep, shallow)
+    return page.result(
+        {
+            "sigma_nor": {trainer: {str(k): _both(fits) for k, fits in rows.items()} for trainer, rows in deep.items()},
+            "true_ray_error": {
+                trainer: {str(k): _both(fits, "true_ray_error") for k, fits in rows.items()}
+                for trainer, rows in deep.items()
+            },
+            "shallow": shallow,
+            "best": min(best.deep, best.shallow_sigma_nor),
+            "best_deep": best.deep,
+            "best_shallow": best.shallow_sigma_nor,
+            "networks": deep,
+        },
+        comparison=_comparison(best),
+        figures=[
+            (
+                "table1.png",
+                "Error by number of hidden layers, mean of the cameras: on held-out dots (solid) and against the true "
+                "rays (dashed); the paper's in grey.",
+            )
+        ],
+        tables=_tables(deep, shallow, list(labels)),
+        notes=[*_notes(deep, best), *_cut_notes(labels, sizes)],
     )
-    ours = min(
-        (entry for entry in shallow if entry["estimator"] == "lens_integral"), key=lambda e: max(both(e["cameras"]))
-    )
-    paper_like = next(e for e in shallow if (e["estimator"], e["baseline"]) == ("gaussian", "none"))
-    shallow_best = max(both(ours["cameras"]))
-    overall = min(best[0], shallow_best)
-    worse = [
-        f"{trainer} with {layers} layers ({max(both(fits)):.2g}, the paper {max(PAPER[trainer][layers]):.2g})"
-        for trainer, rows in deep.items()
-        for layers, fits in rows.items()
-        if layers in PAPER[trainer] and max(both(fits)) > MUCH_WORSE * max(PAPER[trainer][layers])
+
+
+def _comparison(best: Best) -> list[dict[str, Any]]:
+    """Put ours beside the paper's."""
+    name, unit = _describe(best.shallow), "pitch"
+    overall = min(best.deep, best.shallow_sigma_nor)
+    from_truth = max(_both(best.shallow["cameras"], "true_ray_error"))
+    alike = max(_both(best.paper_like["cameras"]))
+    return [
+        page.compare("sigma_nor, best network, worse camera", overall, paper=PAPER_BEST, at_most=0.03, unit=unit),
+        page.compare(
+            f"sigma_nor, best deep network ({best.deep_name})", best.deep, paper=PAPER_BEST, at_most=0.03, unit=unit
+        ),
+        page.compare(f"sigma_nor, shallow network ({name})", best.shallow_sigma_nor, at_most=0.03, unit=unit),
+        page.compare("its error against the true rays", from_truth, at_most=0.006, unit=unit),
+        page.compare(
+            "sigma_nor, shallow network without a baseline on the paper's labels", alike, paper=PAPER_BEST, unit=unit
+        ),
     ]
-    cut = [layers for layers in PAPER["LM"] if layers not in sizes.layers]
+
+
+def _tables(deep: Deep, shallow: Sequence[Fit], cameras: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the tables of deep networks, of their true errors, and of shallow networks."""
+
+    def beside_paper(trainer: str, layers: int, number: int, sigma_nor: float) -> str:
+        if layers not in PAPER[trainer] or number >= 2:
+            return f"{sigma_nor:.3g}"
+        return f"{sigma_nor:.3g} ({PAPER[trainer][layers][number]:g})"
+
+    columns = ["layers", *(f"{NAMES[trainer]}, {camera}" for trainer in deep for camera in cameras)]
+    depths = list(next(iter(deep.values())))
+    keys = ("sigma_nor", "true_ray_error", "samples", "epochs", "wall_s")
+    return [
+        {
+            "caption": f"sigma_nor [pitch], hidden layers of {NODES} nodes: ours, the paper's in brackets "
+            f"({', '.join(cameras)})",
+            "columns": columns,
+            "rows": [
+                [str(n)] + [beside_paper(t, n, k, fit["sigma_nor"]) for t in deep for k, fit in enumerate(deep[t][n])]
+                for n in depths
+            ],
+        },
+        {
+            "caption": "The same networks: error against the true rays [pitch] after so many epochs",
+            "columns": columns,
+            "rows": [
+                [str(n)] + [f"{fit['true_ray_error']:.3g} ({fit['epochs']})" for t in deep for fit in deep[t][n]]
+                for n in depths
+            ],
+        },
+        {
+            "caption": "Shallow networks, Levenberg-Marquardt, worse camera",
+            "columns": ["network", "sigma_nor", "against the true rays", "labels", "epochs", "training [s]"],
+            "rows": [[_describe(entry), *(max(_both(entry["cameras"], key)) for key in keys)] for entry in shallow],
+        },
+    ]
+
+
+def _notes(deep: Deep, best: Best) -> list[str]:
+    """Say how it was done, and which deep networks do worse than the paper states."""
+    labels_error, network_error = (max(_both(best.paper_like["cameras"], k)) for k in ("sigma_nor", "true_ray_error"))
+    worse = [
+        f"{trainer} with {layers} layers ({max(_both(fits)):.2g}, the paper {max(PAPER[trainer][layers]):.2g})"
+        for trainer, rows in deep.items()
+        for layers, fits in rows.items()
+        if layers in PAPER[trainer] and max(_both(fits)) > MUCH_WORSE * max(PAPER[trainer][layers])
+    ]
     notes = [
         "The paper's mapping of two cameras is two mappings that share no input but the point: here each camera has "
         "its own network, five inputs and two outputs. Hidden nodes are tanh: a logistic sigmoid with other weights.",
@@ -246,8 +356,8 @@ def _result(
         "random, so that every dot of its test part was also trained on. The true-ray error is the distance to the "
         f"simulator's own rays, {TRUE_RAYS} of them at random in the board's volume: no experiment can know it.",
         "Labels are fits of a dot integrated over microlenses and pixels. The Gaussian fits of the paper are off by a "
-        f"twentieth of a pitch, and then sigma_nor ({max(both(paper_like['cameras'])):.3f}) shows the labels' error "
-        f"and not the network's ({max(both(paper_like['cameras'], 'true_ray_error')):.3f} from the true rays).",
+        f"twentieth of a pitch, and then sigma_nor ({labels_error:.3f}) shows the labels' error and not the network's "
+        f"({network_error:.3f} from the true rays).",
         "GDM steps on batches of 64 samples and lowers its rate where it stalls: on all samples at once, one step an "
         "epoch, deep networks stay where they began.",
     ]
@@ -258,102 +368,27 @@ def _result(
         )
     else:
         notes.append("No deep network does worse than the paper says.")
-    if shallow_best < best[0]:
+    if best.shallow_sigma_nor < best.deep:
         notes.append(
-            f"The best shallow network ({_describe(ours)}) does better than any deep one, in seconds: the mapping is "
-            "smooth and needs no depth."
+            f"The best shallow network ({_describe(best.shallow)}) does better than any deep one, in seconds: the "
+            "mapping is smooth and needs no depth."
         )
-    if sizes.samples is not None or cut:
-        available = min(len(part["lens_integral"].dot) for part in labels.values())
-        taken = available if sizes.samples is None else min(sizes.samples, available)
-        notes.append(
-            f"Cut at this scale: deep networks see {taken} of {available} labels, at most {sizes.epochs} epochs (GDM "
-            f"{sizes.descent_epochs}) instead of 1000, and {', '.join(map(str, cut)) or 'no'} layers are left out. "
-            f"Networks of 30 layers have {sum(_parameters((NODES,) * 30))} parameters for "
-            f"{2 * round(0.7 * taken)} values; the deepest suffer most from the cut."
-        )
-    return page.result(
-        {
-            "sigma_nor": {trainer: {str(k): both(fits) for k, fits in rows.items()} for trainer, rows in deep.items()},
-            "true_ray_error": {
-                trainer: {str(k): both(fits, "true_ray_error") for k, fits in rows.items()}
-                for trainer, rows in deep.items()
-            },
-            "shallow": shallow,
-            "best": overall,
-            "best_deep": best[0],
-            "best_shallow": shallow_best,
-            "networks": deep,
-        },
-        comparison=[
-            page.compare(
-                "sigma_nor, best network, worse camera", overall, paper=PAPER_BEST, at_most=0.03, unit="pitch"
-            ),
-            page.compare(
-                f"sigma_nor, best deep network ({best[1]})", best[0], paper=PAPER_BEST, at_most=0.03, unit="pitch"
-            ),
-            page.compare(f"sigma_nor, shallow network ({_describe(ours)})", shallow_best, at_most=0.03, unit="pitch"),
-            page.compare(
-                "its error against the true rays",
-                max(both(ours["cameras"], "true_ray_error")),
-                at_most=0.006,
-                unit="pitch",
-            ),
-            page.compare(
-                "sigma_nor, shallow network without a baseline on the paper's labels",
-                max(both(paper_like["cameras"])),
-                paper=PAPER_BEST,
-                unit="pitch",
-            ),
-        ],
-        figures=[
-            (
-                "table1.png",
-                "Error by number of hidden layers, mean of the cameras: on held-out dots (solid) and against the true "
-                "rays (dashed); the paper's in grey.",
-            )
-        ],
-        tables=[
-            {
-                "caption": f"sigma_nor [pitch], hidden layers of {NODES} nodes: ours, the paper's in brackets "
-                f"({', '.join(cameras)})",
-                "columns": ["layers", *(f"{NAMES[t]}, {c}" for t in deep for c in cameras)],
-                "rows": [
-                    [str(layers)]
-                    + [
-                        f"{fit['sigma_nor']:.3g} ({PAPER[t][layers][number]:g})"
-                        if layers in PAPER[t] and number < 2
-                        else f"{fit['sigma_nor']:.3g}"
-                        for t in deep
-                        for number, fit in enumerate(deep[t][layers])
-                    ]
-                    for layers in sizes.layers
-                ],
-            },
-            {
-                "caption": "The same networks: error against the true rays [pitch] after so many epochs",
-                "columns": ["layers", *(f"{NAMES[t]}, {c}" for t in deep for c in cameras)],
-                "rows": [
-                    [str(layers)]
-                    + [f"{fit['true_ray_error']:.3g} ({fit['epochs']})" for t in deep for fit in deep[t][layers]]
-                    for layers in sizes.layers
-                ],
-            },
-            {
-                "caption": "Shallow networks, Levenberg-Marquardt, worse camera",
-                "columns": ["network", "sigma_nor", "against the true rays", "labels", "epochs", "training [s]"],
-                "rows": [
-                    [
-                        _describe(entry),
-                        *(max(both(entry["cameras"], key)) for key in ("sigma_nor", "true_ray_error")),
-                        *(max(both(entry["cameras"], key)) for key in ("samples", "epochs", "wall_s")),
-                    ]
-                    for entry in shallow
-                ],
-            },
-        ],
-        notes=notes,
-    )
+    return notes
+
+
+def _cut_notes(labels: Mapping[str, Mapping[str, BoardDots]], sizes: Sizes) -> list[str]:
+    """Say what a small scale leaves out."""
+    left_out = [layers for layers in PAPER["LM"] if layers not in sizes.layers]
+    if sizes.samples is None and not left_out:
+        return []
+    available = min(len(part["lens_integral"].dot) for part in labels.values())
+    taken = available if sizes.samples is None else min(sizes.samples, available)
+    return [
+        f"Cut at this scale: deep networks see {taken} of {available} labels, at most {sizes.epochs} epochs (GDM "
+        f"{sizes.descent_epochs}) instead of 1000, and {', '.join(map(str, left_out)) or 'no'} layers are left out. "
+        f"Networks of 30 layers have {sum(_parameters((NODES,) * 30))} parameters for {2 * round(0.7 * taken)} "
+        "values; the deepest suffer most from the cut."
+    ]
 
 
 def _describe(entry: Fit) -> str:

@@ -1,6 +1,6 @@
-"""The trainers of Table 1 that this software does not use itself: Bayesian regularisation, and descent with momentum.
+"""Train networks by the other trainers of Table 1: Bayesian regularisation, and gradient descent with momentum.
 
-Both have the form of `lfpiv.calibration.levenberg_marquardt`, so that `lfpiv.calibration.network.train` takes them as its `trainer`.
+Both have the signature of `levenberg_marquardt`, so that `lfpiv.calibration.network.train` takes them as its `trainer`.
 
 References
 ----------
@@ -21,17 +21,17 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
 from lfpiv.calibration.levenberg_marquardt import Fit, Samples, Stop, forward, normal_equations
 
 FIRST_DAMPING, LEAST_DAMPING, LAST_DAMPING = 5e-3, 1e-20, 1e10
-"""Damping of the first step, the smallest, and where a step is too short to matter: the values customary for [1]_."""
+"""Damping of the first step, smallest damping, and damping at which training stops: the customary values for [1]_."""
 MOMENTUM = 0.9
-"""Part of the last step that is taken again."""
+"""Momentum: share of the last step that is added to the next one."""
 BATCH = 64
-"""Samples whose mean gradient makes a step of descent."""
+"""Samples of a batch."""
 FIRST_RATE, LAST_RATE = 0.1, 1e-5
-"""Learning rate of the first step, of the mean squared error in scaled units, and the one at which descent ends."""
+"""First learning rate, for the mean squared error in scaled units, and rate at which training ends."""
 STALLED, SLOWER = 10, 0.5
 """Epochs without a lower validation error after which the rate falls, and its factor."""
 LONGEST_GRADIENT = 1.0
-"""Longer gradients are cut to this length: on the steep walls of a deep network's error a step would lead nowhere."""
+"""Largest length of a gradient. Longer ones are cut."""
 
 
 def bayesian_regularisation(
@@ -47,7 +47,7 @@ def bayesian_regularisation(
 
     E_D is the sum of squared errors, E_W that of the network's parameters. After each step alpha = gamma / 2 E_W and
     beta = (n - gamma) / 2 E_D, with gamma = p - alpha tr (beta J^T J + alpha I)^-1 the parameters that the data
-    determine. Nothing is held back against overfitting, so the last epoch counts: the validation part is only watched.
+    determine. The result is that of the last epoch. The validation part is only monitored.
 
     Parameters
     ----------
@@ -108,8 +108,8 @@ def gradient_descent(
 ) -> Fit:
     """Train by gradient descent with momentum ([3]_) on small batches of samples in random order.
 
-    The gradient of all samples at once, one step per epoch, leaves deep networks where they began after a thousand
-    epochs; batches make some hundred steps of an epoch. The rate is halved where the validation error stalls.
+    With the gradient of all samples, one step per epoch, deep networks hardly train in a thousand epochs. Batches give
+    some hundred steps per epoch. The rate is halved where the validation error stalls.
 
     Parameters
     ----------

@@ -21,10 +21,13 @@ from pyevtk.hl import imageToVTK
 from pyevtk.vtk import VtkGroup
 
 from lfpiv.errors import InputError
+from lfpiv.files import replacing, writing
+from lfpiv.geometry.grid import AXES
 from lfpiv.results import netcdf
-from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable, writing
+from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.reader import open_results
 from lfpiv.velocity import derived
+from lfpiv.version import versions
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +40,6 @@ FOLDER = "export"
 CSV_DIGITS = 9
 """Significant digits in text: as many as single precision can hold."""
 
-_AXES = ("z", "y", "x")
 _MM_PER_M = 1000.0
 
 
@@ -221,7 +223,7 @@ def _vector_arrays(vectors: xr.Dataset) -> dict[str, Any]:
         "velocity": tuple(vectors[name].values for name in "uvw"),
         "displacement": tuple(vectors[f"displacement_{axis}"].values for axis in "xyz"),
     }
-    if min(vectors.sizes[axis] for axis in _AXES) >= 3:
+    if min(vectors.sizes[axis] for axis in AXES) >= 3:
         curl = derived.vorticity(vectors)
         arrays["vorticity"] = tuple(curl[f"vorticity_{axis}"].values for axis in "xyz")
         arrays["q_criterion"] = derived.q_criterion(vectors).values
@@ -276,7 +278,7 @@ def _write_netcdf(
         }
         results = results.assign_coords(time=("pair", _times(results, interval_s), attributes))
     tick(0, 1)
-    netcdf.write_dataset(results, path, attributes={"versions": netcdf.versions()})
+    netcdf.write_dataset(results, path, attributes={"versions": versions()})
     tick(1, 1)
     return [path]
 
@@ -287,9 +289,9 @@ def _write_csv(results: xr.Dataset, target: Path, tick: Callable[[int, int], Non
         units = {name: vectors[name].attrs.get("units", "1") for name in vectors.variables}
         names = ["x", "y", "z", *vectors.data_vars]
         titles = [str(name) if units[name] == "1" else f"{name} [{units[name]}]" for name in names]
-        table = vectors.assign(valid=vectors["valid"].astype(np.uint8)).to_dataframe(dim_order=list(_AXES))
+        table = vectors.assign(valid=vectors["valid"].astype(np.uint8)).to_dataframe(dim_order=list(AXES))
         path = target / f"pair_{pair:04d}.csv"
-        with netcdf.replacing(path) as scratch:
+        with replacing(path) as scratch:
             table.reset_index().to_csv(
                 scratch, columns=names, header=titles, index=False, float_format=f"%.{CSV_DIGITS}g", encoding="utf-8"
             )

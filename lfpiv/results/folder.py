@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from lfpiv import warn
-from lfpiv.errors import InputError, StorageError
+from lfpiv.errors import InputError
+from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
@@ -24,8 +24,6 @@ FRAME_NAMES = "ab"
 
 RETIRED = ".outdated"
 """Suffix, in place of ``.nc``, of results of a pair that failed since its images changed."""
-
-MIB = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def _locked(path: Path) -> int | None:
             holder = os.pread(file, 1000, 0)
             os.close(file)
             if error.errno not in (errno.EAGAIN, errno.EACCES):
-                warn.warn(log, "%s: this file system knows no locks: start no second run on this folder", path.parent)
+                warn(log, Warning(code=Code.NO_LOCKS, subject=str(path.parent)))
                 return None
             raise InputError(
                 f"{path.parent}: expected a folder that no other run writes to, found it held by {_named(holder)}. "
@@ -140,24 +138,6 @@ def _named(holder: bytes) -> str:
 def retire(path: Path) -> Path:
     """Rename a result so that nobody takes it for one, and return its new path; the next success removes it."""
     return path.replace(path.with_suffix(RETIRED))
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn what goes wrong while a result is written into a StorageError that says how to go on."""
-    try:
-        yield
-    except StorageError:
-        raise
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        free = ""
-        with contextlib.suppress(OSError):
-            free = f", {shutil.disk_usage(path.parent).free / MIB:,.0f} MiB free there"
-        raise StorageError(
-            f"{path}: cannot be written: {reason}{free}. What is finished is kept and whole; mend that, and the same "
-            "command goes on from there."
-        ) from error
 
 
 def make_writable(path: Path) -> list[Path]:

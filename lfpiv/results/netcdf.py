@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import hashlib
-import importlib.metadata
 import io
 import json
-import math
 import os
-import platform
-import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +15,9 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.davis import split_frame
-from lfpiv.version import __version__
+from lfpiv.files import plain, replacing, write_bytes
+from lfpiv.geometry.grid import AXES
+from lfpiv.version import versions
 
 SCHEMA_VERSION = 3
 """Version of the form of the files; readers refuse newer ones. 2: the group has dimensions of its own; 3: it holds
@@ -48,8 +43,7 @@ precision, and so may be what a user computes from them."""
 RECONSTRUCTION = "reconstruction"
 """NetCDF group beside the vectors of a pair: projections, profiles and residuals of its two volumes."""
 
-_AXES = ("z", "y", "x")
-_GROUP_AXES = {axis: f"voxel_{axis}" for axis in _AXES}  # the group's axes in the file, where z, y, x are the vectors'
+_GROUP_AXES = {axis: f"voxel_{axis}" for axis in AXES}  # the group's axes in the file, where z, y, x are the vectors'
 _DESCRIPTIONS: dict[str, dict[str, Any]] = {
     "z": {"axis": "Z"},
     "y": {"axis": "Y"},
@@ -60,82 +54,6 @@ _DESCRIPTIONS: dict[str, dict[str, Any]] = {
         "flag_meanings": "replaced measured",
     },
 }  # attributes of the CF conventions, which plotting and geometry tools look for
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Give a scratch path in the folder of `path`; renamed to `path` at the end, removed on any failure.
-
-    The path is new each time, so that two processes may write one file; what a killed one leaves ends in ``.tmp``.
-    """
-    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        yield scratch
-        with scratch.open("rb") as file:
-            os.fsync(file.fileno())  # the name must not outlive a power failure without its bytes
-        os.replace(scratch, path)
-    finally:
-        scratch.unlink(missing_ok=True)
-
-
-def write_bytes(content: bytes | memoryview, path: Path) -> None:
-    """Write a file, whole or not at all; HDF5 files too: HDF5's own writing crashes the process on a full disk."""
-    with replacing(path) as scratch:
-        scratch.write_bytes(content)
-
-
-def write_text(text: str, path: Path) -> None:
-    """Write a text file, whole or not at all."""
-    with replacing(path) as scratch:
-        scratch.write_text(text, "utf-8")
-
-
-def write_json(value: Any, path: Path) -> None:
-    """Write a JSON file, whole or not at all; NaN and infinity become null."""
-    write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n", path)
-
-
-def plain(value: Any) -> Any:
-    """Turn arrays, NumPy numbers, tuples, paths and non-finite numbers into what JSON knows."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value
-
-
-def settings_hash(**parts: Any) -> str:
-    """Short hash of everything a result depends on; the order of keys does not matter."""
-    text = json.dumps(plain(parts), sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def content_hash(paths: Iterable[Path]) -> str:
-    """Hash of the bytes of several images, in order; a frame of a file that holds several counts, too."""
-    digest = hashlib.blake2b(digest_size=16)
-    for path in paths:
-        image, frame = split_frame(path)
-        with image.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-        digest.update(b"end of file" + frame.encode())
-    return digest.hexdigest()
-
-
-def versions() -> dict[str, str]:
-    """Versions of this package, of Python and of the libraries its numbers depend on."""
-    names = ("numpy", "scipy", "taichi", "warp-lang", "xarray", "opencv-python-headless", "scikit-learn")
-    found = {"lfpiv": __version__, "python": platform.python_version()}
-    for name in names:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)
-    return found
 
 
 OF_IMAGES = ("structure", "camera_gain", "light_outside")
@@ -162,8 +80,8 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
     frames = list(volumes)
     first = volumes[frames[0]]
     variables: dict[str, tuple[tuple[str, ...], np.ndarray | list[str]]] = {}
-    for axis in _AXES:
-        kept = tuple(name for name in _AXES if name != axis)
+    for axis in AXES:
+        kept = tuple(name for name in AXES if name != axis)
         stack = np.stack([volume.max(axis).transpose(*kept).values for volume in volumes.values()])
         variables[f"projection_{axis}"] = (("frame", *kept), stack.astype(np.float32))
     profiles = np.stack([volume.mean(["y", "x"], dtype=float).values for volume in volumes.values()])
@@ -182,7 +100,7 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
             if name in first.attrs:
                 rows = [np.atleast_1d(np.asarray(volume.attrs[name], float)) for volume in volumes.values()]
                 variables[name] = (("frame", "camera"), np.stack(rows))
-    coordinates |= {axis: (axis, first[axis].values, {"units": "mm"}) for axis in _AXES}
+    coordinates |= {axis: (axis, first[axis].values, {"units": "mm"}) for axis in AXES}
     return xr.Dataset(variables, coordinates)
 
 
@@ -195,7 +113,7 @@ def check_vectors(vectors: xr.Dataset) -> None:
         If a variable, a coordinate, a unit or the attribute ``dt_s`` or ``voxel_mm`` is missing or wrong, or u, v, w do
         not follow from the displacements.
     """
-    for axis in _AXES:
+    for axis in AXES:
         if axis not in vectors.coords or vectors[axis].dims != (axis,):
             raise ValueError(f"vectors: expected the coordinate {axis} in mm, found {list(vectors.coords)}.")
         if (unit := vectors[axis].attrs.get("units")) != "mm":
@@ -203,7 +121,7 @@ def check_vectors(vectors: xr.Dataset) -> None:
     for name, unit in VECTOR_UNITS.items():
         if name not in vectors:
             raise ValueError(f"vectors: expected the variable {name!r}, found {list(vectors.data_vars)}.")
-        if vectors[name].dims[-3:] != _AXES:
+        if vectors[name].dims[-3:] != AXES:
             raise ValueError(f"vectors: expected {name!r} over (z, y, x), found {vectors[name].dims}.")
         if vectors[name].attrs.get("units", "1") != unit:
             raise ValueError(f"vectors: expected {name!r} in {unit}, found {vectors[name].attrs.get('units')}.")
@@ -215,7 +133,7 @@ def check_vectors(vectors: xr.Dataset) -> None:
     if voxel_mm.shape != (3,) or voxel_mm.dtype.kind not in "fiu" or not (voxel_mm > 0).all():
         found = vectors.attrs.get("voxel_mm")
         raise ValueError(f"vectors: expected the attribute voxel_mm, edges (z, y, x) > 0, found {found}.")
-    for name, axis, edge_mm in zip("wvu", _AXES, voxel_mm, strict=True):
+    for name, axis, edge_mm in zip("wvu", AXES, voxel_mm, strict=True):
         displacement = vectors[f"displacement_{axis}"].values
         moved = vectors[name].values / (1e-3 * edge_mm / vectors.attrs["dt_s"])
         wrong = ~np.isclose(moved, displacement, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
@@ -289,7 +207,7 @@ def write_volume(volume: xr.DataArray, path: Path, *, attributes: Mapping[str, A
 def read_volume(path: Path) -> xr.DataArray:
     """Read one volume into memory; raises InputError as `read_vectors` does."""
     dataset = _read(path, None)
-    if "intensity" not in dataset or dataset["intensity"].dims != _AXES:
+    if "intensity" not in dataset or dataset["intensity"].dims != AXES:
         raise InputError(f"{path}: expected a volume 'intensity' over (z, y, x), found {list(dataset.data_vars)}.")
     return dataset["intensity"]
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from lfpiv import files
 from lfpiv.experiment.davis import split_frame
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.results import netcdf
 from lfpiv.version import __version__
 
 
@@ -28,12 +29,12 @@ class Stamp:
     @cached_property
     def hash(self) -> str:
         """Short hash of all parts."""
-        return netcdf.settings_hash(**self.parts)
+        return files.settings_hash(**self.parts)
 
     @property
     def attributes(self) -> dict[str, Any]:
         """What is written into the result."""
-        return {"settings_hash": self.hash, "depends_on": json.dumps(netcdf.plain(self.parts))}
+        return {"settings_hash": self.hash, "depends_on": json.dumps(files.plain(self.parts))}
 
     def changes(self, marks: Mapping[str, Any]) -> list[str]:
         """Names of what changed since a file was made, from its `marks`; empty where the file still fits.
@@ -46,7 +47,7 @@ class Stamp:
             before = dict(json.loads(marks["depends_on"]))
         except (KeyError, ValueError, TypeError):
             return ["settings or images"]
-        now = netcdf.plain(self.parts)
+        now = files.plain(self.parts)
         found = []
         for name in {**before, **now}:
             old, new = before.get(name), now.get(name)
@@ -61,13 +62,13 @@ class Stamp:
 
 
 def marks(path: Path) -> dict[str, Any] | None:
-    """Stamp, figures and findings in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
+    """Stamp, figures and warnings in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
     import h5py
 
     found = {}
     try:
         with h5py.File(path, "r") as file:
-            for name in ("settings_hash", "depends_on", "figures", "findings"):
+            for name in ("settings_hash", "depends_on", "figures", "warnings", "findings"):
                 with contextlib.suppress(KeyError):
                     found[name] = file.attrs[name]
     except OSError:
@@ -87,7 +88,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
             "camera": cameras,
             "board": experiment.board.model_dump(),
             "network": experiment.network.model_dump(),
-            "images": netcdf.content_hash(experiment.calibration_paths()),
+            "images": content_hash(experiment.calibration_paths()),
         }
     )
 
@@ -143,3 +144,15 @@ def _identity(paths: list[Path], start: Path) -> list[list[Any]] | None:
     except OSError:
         return None
     return [[os.path.relpath(path, start), status.st_size, status.st_mtime_ns] for path, status in found]
+
+
+def content_hash(paths: Iterable[Path]) -> str:
+    """Hash of the bytes of several images, in order; a frame of a file that holds several counts, too."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in paths:
+        image, frame = split_frame(path)
+        with image.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+        digest.update(b"end of file" + frame.encode())
+    return digest.hexdigest()

@@ -16,6 +16,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from lfpiv.errors import InputError
+from lfpiv.geometry.grid import AXES
 from lfpiv.results import netcdf
 
 CHUNK_BYTES = 8 << 20
@@ -25,7 +26,6 @@ COMMON = ("dt_s", "voxel_mm", "smart", "correlation", "settings")
 """Attributes that must be equal in all pairs, with all that is stamped on the files but the images of each."""
 
 _NAME = re.compile(r"pair_(\d+)\.nc")
-_AXES = ("z", "y", "x")
 
 
 def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = None) -> xr.Dataset:
@@ -80,16 +80,16 @@ def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = N
     reference = _Signature(paths[0])
     for path in paths[1:]:
         reference.compare(path)
-    shape = tuple(first.sizes[axis] for axis in _AXES)
+    shape = tuple(first.sizes[axis] for axis in AXES)
     variables = {}
     for name in dict.fromkeys([*netcdf.VECTOR_UNITS, *map(str, first.data_vars)]):
-        if first[name].dims != _AXES:
+        if first[name].dims != AXES:
             continue
         stack = _Stack(paths, name, (len(paths), *shape), first[name].dtype)
-        variables[name] = xr.Variable(("pair", *_AXES), indexing.LazilyIndexedArray(stack), first[name].attrs)
+        variables[name] = xr.Variable(("pair", *AXES), indexing.LazilyIndexedArray(stack), first[name].attrs)
     place = {"pair": ("pair", np.array(numbers), {"long_name": "number of the image pair", "units": "1"})}
     kept = {key: first.attrs[key] for key in ("title", "experiment", *COMMON) if key in first.attrs}
-    results = xr.Dataset(variables, {**place, **{axis: first[axis] for axis in _AXES}}, kept)
+    results = xr.Dataset(variables, {**place, **{axis: first[axis] for axis in AXES}}, kept)
     if importlib.util.find_spec("dask") is None:
         return results
     return results.chunk(pair=max(1, CHUNK_BYTES // first["u"].nbytes))
@@ -130,7 +130,7 @@ class _Signature:
             expected, found = self.attributes.get(key, ""), attributes.get(key, "")
             if not np.array_equal(expected, found):
                 raise self._refusal(path, _difference(key, expected, found))
-        for axis in _AXES:
+        for axis in AXES:
             if not np.array_equal(axes[axis], self.axes[axis]):
                 raise self._refusal(path, f"other vector positions along {axis}")
         if names != self.names:
@@ -149,8 +149,8 @@ def _read_signature(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], 
             version = int(np.ravel(file.attrs.get("schema_version", 0))[0])
             attributes = {key: file.attrs[key] for key in COMMON if key in file.attrs}
             stamp = json.loads(file.attrs.get("depends_on", "{}"))
-            axes = {axis: file[axis][...] for axis in _AXES}
-            names = set(file) - {*_AXES, netcdf.RECONSTRUCTION}
+            axes = {axis: file[axis][...] for axis in AXES}
+            names = set(file) - {*AXES, netcdf.RECONSTRUCTION}
     except (OSError, KeyError, ValueError) as error:
         raise InputError(_unreadable(path, error)) from None
     attributes |= {key: json.dumps(value, sort_keys=True) for key, value in stamp.items() if key != "images"}

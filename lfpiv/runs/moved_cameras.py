@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lfpiv import warn
 from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.runs.pair import read_light
-from lfpiv.runs.summary_warnings import named
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, disparities, unlinked
 from lfpiv.selfcalibration.movements import SelfCalibration, explained_mm, fit_movements, self_calibrate
+from lfpiv.warn import Code, Warning, warn
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -90,31 +89,26 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> dic
         disparity = explained_mm(found, movements, experiment.grid) / experiment.grid.voxel_mm
         log.info("cameras show the particles of pair %d within %.2f voxel of each other", pair, disparity)
         if disparity > LARGE_VOXEL:
-            warn.warn(log, "%s", _warning(disparity, experiment, weights.cameras))
+            warn(log, _warning(disparity, experiment, weights.cameras))
         return {"disparity_voxel": round(disparity, 3), "disparity_pair": pair}
     if alone:
         lost = dict.fromkeys(name for some in alone.values() for name in some)
         others = "" if len(lost) == len(weights.cameras) else " and the other cameras"
-        warn.warn(
-            log,
-            "%s",
-            f"{named(list(alone))}: {' and '.join(lost)}{others} show no particles in common within {SEARCH_VOXEL} "
-            "voxels: a camera moved by more, their images are of different instants, or show very few particles.",
-        )
+        figures = {"names": f"{' and '.join(lost)}{others}", "search": SEARCH_VOXEL}
+        warn(log, Warning(code=Code.NOTHING_IN_COMMON, pairs=tuple(alone), figures=figures))
     return {}
 
 
-def _warning(disparity: float, experiment: Experiment, cameras: Mapping[str, CalibratedCamera]) -> str:
+def _warning(disparity: float, experiment: Experiment, cameras: Mapping[str, CalibratedCamera]) -> Warning:
     names = " and ".join(cameras) if len(cameras) == 2 else "the cameras"
     mend = (
         "record the board again"
         if experiment.self_calibration.pairs
         else f"set self_calibration.pairs = {min(5, experiment.pairs)}, or record the board again"
     )
-    return (
-        f"{names} show the same particles {disparity:.1f} voxel ({disparity * experiment.grid.voxel_mm:.3f} mm) apart: "
-        f"a camera moved since the board was recorded; {mend}."
-    )
+    millimetres = disparity * experiment.grid.voxel_mm
+    figures = {"names": names, "voxel": disparity, "mm": millimetres, "advice": mend}
+    return Warning(code=Code.APART, figures=figures)
 
 
 def _darks(experiment: Experiment) -> dict[str, np.ndarray | None]:

@@ -18,13 +18,14 @@ from threadpoolctl import threadpool_limits
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.settings import Correlation
+from lfpiv.files import writing
 from lfpiv.lightfield import image_checks
-from lfpiv.lightfield.image_checks import Finding
 from lfpiv.lightfield.particle_signal import seen_structure
 from lfpiv.results import netcdf, provenance
-from lfpiv.results.folder import RETIRED, Folder, writing
+from lfpiv.results.folder import RETIRED, Folder
 from lfpiv.runs import summary, summary_warnings
 from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.warn import Code, Warning, gather
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -56,8 +57,8 @@ class FrameLight:
     """Noise of that background [counts]."""
     fingerprints: dict[str, bytes]
     """What tells images from copies of each other."""
-    findings: list[Finding]
-    """What is suspicious about them."""
+    warnings: list[Warning]
+    """Doubts about them."""
     seconds: float
     """Time that reading and looking at them took."""
 
@@ -144,17 +145,17 @@ class PairWork:
             for frame, one in zip(frames, read, strict=True)
             for name, mark in one.fingerprints.items()
         )
-        findings = [list(one.findings) for one in read]
+        warnings = [list(one.warnings) for one in read]
         for name in read[0].light:  # what concerns both frames is kept with the first one
-            findings[0] += image_checks.camera_findings(read[0].light[name], read[1].light[name], name)
+            warnings[0] += image_checks.uneven_warnings(read[0].light[name], read[1].light[name], name)
         shown = [self._structure(one.light) for one in read]
-        for frame, found, structure in zip(frames, findings, shown, strict=True):
-            found += image_checks.structure_findings(structure, frame)
-        self._say(pair, [finding for found in findings for finding in found])
+        for frame, found, structure in zip(frames, warnings, shown, strict=True):
+            found += image_checks.signal_warnings(structure, frame)
+        self._log_new(pair, [warning for found in warnings for warning in found])
         volumes = _volumes(self.weights, read, self.experiment, pair, progress)
-        for volume, one, found, structure in zip(volumes, read, findings, shown, strict=True):
+        for volume, one, found, structure in zip(volumes, read, warnings, shown, strict=True):
             volume.attrs |= {"cameras": list(structure), "structure": list(structure.values())}
-            volume.attrs["findings"] = json.dumps(found)
+            volume.attrs["warnings"] = json.dumps([warning.to_json() for warning in found])
             volume.attrs["seconds"] += one.seconds
         return volumes
 
@@ -163,15 +164,15 @@ class PairWork:
         return {name: seen_structure(image, self.weights.cameras[name].decoder) for name, image in light.items()}
 
     @cached_property
-    def said(self) -> set[str]:
-        """Kinds of findings that this process has warned of; the summary names all pairs."""
+    def logged(self) -> set[Code]:
+        """Codes that this process has warned of. The summary names all pairs."""
         return set()
 
-    def _say(self, pair: int, findings: Sequence[Finding]) -> None:
-        new = [finding for finding in findings if finding["what"] not in self.said]
-        for text in summary_warnings.of_images([{"pair": pair, "findings": new}]):
-            log.warning("%s", text)
-        self.said.update(finding["what"] for finding in new)
+    def _log_new(self, pair: int, warnings: Sequence[Warning]) -> None:
+        new = [warning for warning in warnings if warning.code not in self.logged]
+        for warning in gather(new):
+            log.warning("%s", warning.of_pair(pair).sentence)
+        self.logged.update(warning.code for warning in new)
 
     @cached_property
     def darks(self) -> dict[str, np.ndarray | None]:
@@ -187,7 +188,7 @@ class PairWork:
         mark = provenance.of_volumes(self.experiment, self.calibration_hash, pair).attributes
         for number, (volume, frame) in enumerate(zip(volumes, self.experiment.frames, strict=True)):
             path = self.folder.volume(pair, number)
-            own = {key: volume.attrs[key] for key in ("seconds", "findings")}
+            own = {key: volume.attrs[key] for key in ("seconds", "warnings")}
             attributes = {**mark, **own, "pair": pair, "frame": frame}
             with writing(path):
                 netcdf.write_volume(volume, path, attributes=attributes)
@@ -197,7 +198,7 @@ class PairWork:
         """Correlate the volumes of a pair and write its vectors, the figures of the summary with them."""
         experiment, start = self.experiment, time.perf_counter()
         vectors = correlate(*volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
-        vectors = _with_findings(_with_motion(vectors, volumes), volumes)
+        vectors = _with_warnings(_with_motion(vectors, volumes), volumes)
         vectors.attrs["reconstruction_s"] = sum(float(volume.attrs["seconds"]) for volume in volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         condensed = netcdf.build_reconstruction(dict(zip(experiment.frames, volumes, strict=True)))
@@ -226,16 +227,16 @@ def read_light(
 ) -> FrameLight:
     """Read the images of one frame, given the dark image of every camera, and look at each by itself."""
     start = time.perf_counter()
-    light, noise, fingerprints, findings = {}, {}, {}, list[Finding]()
+    light, noise, fingerprints, warnings = {}, {}, {}, list[Warning]()
     for name, camera in cameras.items():
         raw, dark = experiment.particle_image(name, pair, frame), darks[name]
         image = raw if dark is None else raw - dark
         level, noise[name] = camera.decoder.background(image)
         light[name] = image - np.float32(level)
         fingerprints[name] = image_checks.fingerprint(raw)
-        findings += image_checks.frame_findings(raw, light[name], camera.decoder, name, frame)
+        warnings += image_checks.image_warnings(raw, light[name], camera.decoder, name, frame)
     seconds = time.perf_counter() - start
-    return FrameLight(light=light, noise=noise, fingerprints=fingerprints, findings=findings, seconds=seconds)
+    return FrameLight(light=light, noise=noise, fingerprints=fingerprints, warnings=warnings, seconds=seconds)
 
 
 def _volumes(
@@ -280,12 +281,12 @@ def _with_motion(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dat
     return vectors
 
 
-def _with_findings(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dataset:
+def _with_warnings(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dataset:
     """Vectors that know what is suspicious about their images, and count for nothing where those are empty."""
-    findings = [finding for volume in volumes for finding in json.loads(volume.attrs.get("findings", "[]"))]
-    vectors.attrs["findings"] = json.dumps(findings)
+    warnings = [summary_warnings.stored_warnings(volume.attrs) for volume in volumes]
+    vectors.attrs["warnings"] = json.dumps([warning.to_json() for found in warnings for warning in found])
     cameras = volumes[0].attrs.get("cameras", [])
-    if image_checks.unmeasured(findings, len(json.loads(cameras) if isinstance(cameras, str) else cameras)):
+    if image_checks.unmeasured(warnings, len(json.loads(cameras) if isinstance(cameras, str) else cameras)):
         vectors["valid"] = xr.zeros_like(vectors["valid"])  # keeps its attributes
         for name in [name for name in vectors.data_vars if str(name).startswith("uncertainty")]:
             vectors[name] = vectors[name].where(vectors["valid"])

@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv import warn
+from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, check_pairs, read_experiment
-from lfpiv.results import netcdf, provenance
-from lfpiv.results.folder import Folder, make_writable, retire, writing
+from lfpiv.files import writing
+from lfpiv.results import provenance
+from lfpiv.results.folder import Folder, make_writable, retire
 from lfpiv.runs import memory, summary
 from lfpiv.runs.pair import Outcome, PairWork
-from lfpiv.runs.summary_warnings import NAMED, ONE_CAMERA, named
+from lfpiv.warn import NAMED_PAIRS, Code, Warning, collected, name_pairs
 from lfpiv_kernels import runtime
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def open_job(
     made = make_writable(folder.path)
     try:
         with contextlib.ExitStack() as stack:
-            warnings = stack.enter_context(warn.collected())
+            warnings = stack.enter_context(collected())
             if writes_results:
                 stack.enter_context(folder.held())
                 folder.sweep()
@@ -97,7 +98,7 @@ class Job:
         progress: Progress | None,
         device_request: str,
         device: runtime.Device,
-        warnings: list[str],
+        warnings: list[Warning],
         start: float,
     ):
         self.experiment = experiment
@@ -157,7 +158,7 @@ class Job:
             )
         for reason, pairs in changed.items():
             if reason:
-                log.info("%s changed: %s made anew", reason, named(pairs))
+                log.info("%s changed: %s made anew", reason, name_pairs(pairs))
         return todo
 
     def check_images(self, todo: Sequence[int]) -> list[int]:
@@ -178,10 +179,10 @@ class Job:
             for pair, reason in bad.items():
                 self.note(Outcome(pair=pair, reason=reason))
             return []
-        for reason in list(bad.values())[:NAMED]:
+        for reason in list(bad.values())[:NAMED_PAIRS]:
             log.error("%s The other pairs will be done.", reason)
-        if len(bad) > NAMED:
-            log.error("%d pairs have images that cannot be used: %s", len(bad), named(list(bad)))
+        if len(bad) > NAMED_PAIRS:
+            log.error("%d pairs have images that cannot be used: %s", len(bad), name_pairs(list(bad)))
         return list(todo)
 
     def is_finished(self, pair: int) -> bool:
@@ -258,8 +259,7 @@ class Job:
 
     def build_weights(self, calibration: Calibration, todo: Sequence[int]) -> Weights:
         """Build the weights of the grid, for some pairs of which the first tells whether cameras moved."""
-        from lfpiv.calibration.cameras import warn_outside
-        from lfpiv.experiment.nominal_checks import require_seen
+        from lfpiv.calibration.coverage import require_seen, warn_outside
         from lfpiv.runs import moved_cameras
         from lfpiv.weights.operator import build_weights, compare_with_count
 
@@ -267,8 +267,8 @@ class Job:
         require_seen(self.experiment.path, calibration, self.experiment.grid)
         warn_outside(calibration, self.experiment.grid)
         if len(calibration.cameras) == 1:
-            log.warning(ONE_CAMERA)
-        with warn.collected() as warnings:
+            log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
+        with collected() as warnings:
             with self.timed("weights"):
                 weights = build_weights(
                     calibration,
@@ -282,7 +282,12 @@ class Job:
             counted = compare_with_count(weights) if method == "footprint" else {}
             disparity = moved_cameras.check(self.experiment, weights, todo)
         memory_mib = weights.memory_bytes / memory.MIB
-        self.weights_report |= {"method": method, "memory_mib": memory_mib, "warnings": warnings, **disparity}
+        self.weights_report |= {
+            "method": method,
+            "memory_mib": memory_mib,
+            "warnings": [one.to_json() for one in warnings],
+            **disparity,
+        }
         if method == "footprint":
             self.weights_report |= {"form": dict(weights.forms), "cuts": dict(weights.cuts)}
             self.weights_report["profiles_check_l2"] = {
@@ -372,7 +377,7 @@ class Job:
             result["timings_s"]["report"] = self.seconds["report"]
             self._stop_clock(result)
         with writing(self.folder.summary):
-            netcdf.write_json(result, self.folder.summary)
+            files.write_json(result, self.folder.summary)
         return result
 
     def _stop_clock(self, result: dict[str, Any]) -> None:
@@ -392,4 +397,4 @@ def _write_calibration(calibration: Calibration, path: Path, **attributes: Any) 
     with h5py.File(content, "a") as opened:
         opened.attrs.update(attributes)
     with writing(path):
-        netcdf.write_bytes(content.getbuffer(), path)
+        files.write_bytes(content.getbuffer(), path)

@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from lfpiv import files, version
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.results import netcdf
 from lfpiv.runs import summary_warnings
+from lfpiv.warn import Warning
 
 if TYPE_CHECKING:
     from lfpiv.calibration.cameras import CalibratedCamera, Calibration
-    from lfpiv.geometry.optics import Grid
+    from lfpiv.geometry.grid import Grid
     from lfpiv_kernels.runtime import Device
 
 SCHEMA_VERSION = 1
@@ -41,7 +43,7 @@ def build(
     weights: Mapping[str, Any],
     workers: Mapping[str, Any],
     device: Device,
-    warnings: Sequence[str],
+    warnings: Sequence[Warning],
     reused: Sequence[str],
 ) -> dict[str, Any]:
     """Put together the figures of everything a folder holds.
@@ -58,7 +60,7 @@ def build(
     pairs : sequence of dict
         Figures of the finished pairs, from `pair_entry`.
     reconstructed : sequence of dict
-        Number and findings of pairs that have volumes and no vectors yet, from `volumes_entry`.
+        Number and warnings of pairs that have volumes and no vectors yet, from `volumes_entry`.
     failed, failed_earlier : dict
         Pair -> why it has no result: of this invocation, and of earlier ones.
     previous : dict
@@ -69,9 +71,10 @@ def build(
         Processes that worked on pairs: how many, their threads and their peak memory.
     device : Device
         Where the kernels ran.
-    warnings, reused : sequence of str
-        What this invocation warned of by itself, and what was kept from an earlier one. What is doubtful about the
-        results is told from the results, in every invocation.
+    warnings : sequence of Warning
+        Warnings of this invocation. Warnings about results are read from the results, in every invocation.
+    reused : sequence of str
+        What was kept from an earlier invocation.
 
     Returns
     -------
@@ -89,11 +92,12 @@ def build(
     }
     grid = experiment.grid
     weights = dict(weights) or previous.get("weights", {})
-    said = [
-        *summary_warnings.of_rig(calibration, grid),
-        *weights.get("warnings", ()),
-        *summary_warnings.of_images([*pairs, *reconstructed]),
-        *summary_warnings.of_pairs(pairs),
+    found = [
+        *summary_warnings.rig_warnings(calibration, grid),
+        *map(Warning.from_json, weights.get("warnings", ())),
+        *summary_warnings.image_warnings([*pairs, *reconstructed]),
+        *summary_warnings.pair_warnings(pairs),
+        *warnings,
     ]
     return {
         "schema_version": SCHEMA_VERSION,
@@ -107,7 +111,7 @@ def build(
         },
         "device": {"kind": device.kind, "threads": device.threads, "reason": device.reason},
         "workers": dict(workers),
-        "versions": netcdf.versions(),
+        "versions": version.versions(),
         "settings": {
             "smart": experiment.smart.model_dump(),
             "correlation": experiment.correlation.model_dump(),
@@ -126,7 +130,7 @@ def build(
         ),
         "valid_fraction": _mean(pair["valid_fraction"] for pair in pairs),
         "finite_fraction": _mean(pair["finite_fraction"] for pair in pairs),
-        "warnings": list(dict.fromkeys([*said, *warnings])),
+        "warnings": list(dict.fromkeys(warning.sentence for warning in found)),
         "reused": list(reused),
     }
 
@@ -142,7 +146,8 @@ def read(path: Path) -> dict[str, Any]:
 
 def _report(camera: CalibratedCamera, grid: Grid) -> dict[str, Any]:
     """Figures of a camera's calibration, and of the network's part in it over the volume."""
-    return dict(camera.report) | {"network_correction_pitch": network_correction(camera, grid)}
+    texts = [warning.sentence for warning in camera.warnings]
+    return dict(camera.report) | {"warnings": texts, "network_correction_pitch": network_correction(camera, grid)}
 
 
 def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
@@ -166,13 +171,14 @@ def pair_entry(number: int, path: Path, marks: Mapping[str, Any]) -> dict[str, A
     if "figures" in marks:
         figures = json.loads(marks["figures"])
     else:
-        figures = netcdf.plain(pair_figures(netcdf.read_vectors(path), netcdf.read_reconstruction(path)))
+        figures = files.plain(pair_figures(netcdf.read_vectors(path), netcdf.read_reconstruction(path)))
     return {"pair": number, "file": path.name, **figures}
 
 
 def volumes_entry(number: int, marks: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the findings of a pair whose vectors are not there yet, from the marks of its volumes."""
-    return {"pair": number, "findings": [found for mark in marks for found in json.loads(mark.get("findings", "[]"))]}
+    """Return the warnings of a pair whose vectors are not there yet, from the marks of its volumes."""
+    found = [warning.to_json() for mark in marks for warning in summary_warnings.stored_warnings(mark)]
+    return {"pair": number, "warnings": found}
 
 
 def pair_figures(vectors: xr.Dataset, reconstruction: xr.Dataset | None) -> dict[str, Any]:
@@ -185,7 +191,7 @@ def pair_figures(vectors: xr.Dataset, reconstruction: xr.Dataset | None) -> dict
         "finite_fraction": float(finite.mean()),
         "seen_fraction": float(vectors.attrs.get("seen_fraction", 1.0)),
         "verdict": str(vectors.attrs["verdict"]),
-        "findings": json.loads(vectors.attrs.get("findings", "[]")),
+        "warnings": [warning.to_json() for warning in summary_warnings.stored_warnings(vectors.attrs)],
         "reconstruction_s": float(vectors.attrs["reconstruction_s"]),
         "correlation_s": float(vectors.attrs["correlation_s"]),
         "velocity_m_per_s": {name: _spread(vectors[name], valid & finite) for name in ("u", "v", "w")},
@@ -234,4 +240,4 @@ def _mean(values: Iterable[float]) -> float | None:
 
 def _scalars(report: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers and short texts of a camera's report; arrays belong to the calibration file."""
-    return {key: netcdf.plain(value) for key, value in report.items() if not isinstance(value, np.ndarray)}
+    return {key: files.plain(value) for key, value in report.items() if not isinstance(value, np.ndarray)}

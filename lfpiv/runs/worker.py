@@ -21,7 +21,8 @@ from pathlib import Path
 
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.results.folder import Folder, writing
+from lfpiv.files import writing
+from lfpiv.results.folder import Folder
 from lfpiv.runs import memory
 from lfpiv.runs.pair import WRITES, Outcome, PairWork
 from lfpiv.version import __version__

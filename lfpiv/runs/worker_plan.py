@@ -8,11 +8,11 @@ import os
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 
-from lfpiv import warn
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.runs import memory
 from lfpiv.runs.pair import Outcome, PairWork
+from lfpiv.warn import Code, Warning, warn
 from lfpiv_kernels.runtime import Device
 
 log = logging.getLogger(__name__)
@@ -122,15 +122,14 @@ def lowered(planned: Plan, experiment: Experiment, weights: int, device: Device)
     fits = memory.fitting_workers(experiment, weights, planned.workers)
     if fits == planned.workers:
         return planned
-    warn.warn(
-        log,
-        "%d %s instead of %d: beside %.1f GiB of weights each takes %.1f GiB of memory",
-        fits,
-        "worker" if fits == 1 else "workers",
-        planned.workers,
-        weights / memory.GIB,
-        memory.worker_bytes(experiment) / memory.GIB,
-    )
+    figures = {
+        "fits": fits,
+        "noun": "worker" if fits == 1 else "workers",
+        "planned": planned.workers,
+        "weights_gib": weights / memory.GIB,
+        "each_gib": memory.worker_bytes(experiment) / memory.GIB,
+    }
+    warn(log, Warning(code=Code.FEWER_WORKERS, figures=figures))
     return replace(planned, workers=fits, threads=max(device.threads // fits, 1), devices=planned.devices[:fits])
 
 
@@ -138,12 +137,7 @@ def unasked(planned: Plan, device: Device) -> Plan:
     """Several workers that nobody asked for need a package that nobody need have installed; without it, take one."""
     if planned.workers == 1 or importlib.util.find_spec("distributed") is not None:
         return planned
-    warn.warn(
-        log,
-        "one of %d GPUs is used: several processes need the package `distributed`. "
-        "Install it: pip install 'lfpiv[distributed]'",
-        len(set(planned.devices)),
-    )
+    warn(log, Warning(code=Code.ONE_GPU, figures={"gpus": len(set(planned.devices))}))
     return Plan(1, device.threads, (None,), device.kind)
 
 

@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter
 from lfpiv.reconstruction.volume import reconstruct
 
 if TYPE_CHECKING:
-    from lfpiv.geometry.optics import Grid
+    from lfpiv.geometry.grid import Grid
     from lfpiv.weights.operator import Weights
 
 ITERATIONS = 10

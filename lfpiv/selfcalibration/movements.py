@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lfpiv.calibration.camera import Calibration
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, Disparity, disparities, unlinked
 from lfpiv.weights.operator import build_weights
 

@@ -18,9 +18,11 @@ import numpy as np
 import scipy.ndimage
 import xarray as xr
 
+from lfpiv.geometry.grid import AXES
+from lfpiv.geometry.volume import is_finite
 from lfpiv.velocity import validation
 from lfpiv.velocity.predictor import Predictor
-from lfpiv.velocity.volume_pair import is_finite, moves_beyond, prepared, seen, voxel_axes
+from lfpiv.velocity.volume_pair import moves_beyond, prepared, seen, voxel_axes
 from lfpiv_kernels.correlation import correlate as kernel
 from lfpiv_kernels.correlation import deform
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
@@ -38,8 +40,6 @@ FIRST_SEARCH = 0.25
 """Largest displacement of the first pass, as a part of its window, where none is given (the one-quarter rule)."""
 LOWEST_RIVAL = 0.01
 """Coefficient that stands for lower ones in the peak ratio, which is then finite."""
-
-_AXES = ("z", "y", "x")
 
 
 class Verdict(enum.Enum):
@@ -254,9 +254,9 @@ def _dataset(
         deviation[~result.valid] = np.nan
     rival = np.maximum(result.peaks.rival, LOWEST_RIVAL)
     ratio = np.where(result.peaks.correlation > 0, result.peaks.correlation / rival, np.nan)
-    dims = _AXES
+    dims = AXES
     variables: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]] = {}
-    for k, (name, axis) in enumerate(zip("wvu", _AXES, strict=True)):
+    for k, (name, axis) in enumerate(zip("wvu", AXES, strict=True)):
         metres = spacing_mm[k] * 1e-3
         velocity = result.field[..., k] * metres / dt_s
         variables[name] = (dims, velocity, {"units": "m/s", "long_name": f"velocity along {axis}"})
@@ -277,7 +277,7 @@ def _dataset(
     variables["correlation"] = (dims, result.peaks.correlation, coefficient)
     variables["valid"] = (dims, result.valid, {"long_name": "measured and passed validation; false: replaced"})
     places = {}
-    for axis, centres, positions in zip(_AXES, result.centres, axes_mm, strict=True):
+    for axis, centres, positions in zip(AXES, result.centres, axes_mm, strict=True):
         distance = (positions[-1] - positions[0]) / max(len(positions) - 1, 1)
         attributes = {"units": "mm", "long_name": "centre of the window"}
         places[axis] = (axis, positions[0] + distance * centres, attributes)
@@ -321,7 +321,7 @@ def _check_windows(windows: Sequence[Any] | None, shape: tuple[int, int, int]) -
         if len(given) != 3 or not all(is_finite(edge) and int(edge) == edge and edge >= 4 for edge in given):
             raise ValueError(f"windows: expected edges of whole voxels >= 4, one or (z, y, x) per pass, got {window}.")
         edges = _triple(int(edge) for edge in given)
-        too_large = [(axis, edge, n) for axis, edge, n in zip(_AXES, edges, shape, strict=True) if edge > n]
+        too_large = [(axis, edge, n) for axis, edge, n in zip(AXES, edges, shape, strict=True) if edge > n]
         if too_large and np.ndim(window):
             axis, edge, n = too_large[0]
             raise ValueError(

@@ -21,10 +21,11 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import AXES
+
 COMPONENTS = {"u": "x", "v": "y", "w": "z"}
 """Velocity components and the axes they point along."""
 
-_AXES = ("z", "y", "x")
 _PER_MILLIMETRE = 1e3  # a velocity [m/s] over a length [mm], in 1/s
 
 
@@ -214,7 +215,7 @@ def _total(parts: Iterable[xr.DataArray]) -> xr.DataArray:
 
 def _places(vectors: xr.Dataset) -> dict[str, xr.DataArray]:
     """Coordinates of a derived field: those of the vectors, and where all that a difference needs was measured."""
-    kept = {axis: vectors[axis] for axis in _AXES}
+    kept = {axis: vectors[axis] for axis in AXES}
     if "valid" not in vectors:
         return kept
     valid = vectors["valid"].astype(bool)
@@ -222,7 +223,7 @@ def _places(vectors: xr.Dataset) -> dict[str, xr.DataArray]:
         valid,
         xr.zeros_like(valid, float).where(valid),
     )  # NaN spreads exactly as far as the differences reach
-    for axis in _AXES:
+    for axis in AXES:
         measured = measured & gaps.differentiate(axis, edge_order=2).notnull()
     text = "the vector and all its neighbours in the differences were measured"
     return kept | {"valid": measured.assign_attrs(long_name=text)}
@@ -230,7 +231,7 @@ def _places(vectors: xr.Dataset) -> dict[str, xr.DataArray]:
 
 def _field(values: xr.DataArray, places: Mapping[str, xr.DataArray], name: str, units: str, text: str) -> xr.DataArray:
     """Put a derived field into its form: axes last, coordinates, name, unit."""
-    field = values.assign_coords(places).transpose(..., *_AXES).rename(name)
+    field = values.assign_coords(places).transpose(..., *AXES).rename(name)
     field.attrs = {"units": units, "long_name": text}
     return field
 
@@ -238,7 +239,7 @@ def _field(values: xr.DataArray, places: Mapping[str, xr.DataArray], name: str, 
 def _check(vectors: xr.Dataset) -> None:
     """Refuse what is no field of vectors to be differentiated."""
     check_velocity(vectors)
-    for axis in _AXES:
+    for axis in AXES:
         if vectors.sizes[axis] < 3:
             raise ValueError(f"vectors: expected at least 3 along {axis}, found {vectors.sizes[axis]}.")
         steps = np.diff(np.asarray(vectors[axis], float))
@@ -259,13 +260,13 @@ def check_velocity(vectors: xr.Dataset) -> None:
             f"vectors: expected a Dataset as `lfpiv.correlate` returns or `lfpiv.open_results` opens, got "
             f"{type(vectors).__name__}."
         )
-    missing = [name for name in (*COMPONENTS, *_AXES) if name not in vectors.variables]
+    missing = [name for name in (*COMPONENTS, *AXES) if name not in vectors.variables]
     if missing:
         raise ValueError(f"vectors: expected u, v, w over z, y, x, found no {', '.join(missing)}.")
-    for name, unit in {**dict.fromkeys(COMPONENTS, "m/s"), **dict.fromkeys(_AXES, "mm")}.items():
+    for name, unit in {**dict.fromkeys(COMPONENTS, "m/s"), **dict.fromkeys(AXES, "mm")}.items():
         found = vectors[name].attrs.get("units", unit)
         if found != unit:
             raise ValueError(f"vectors: expected {name} in {unit}, found {found!r}. Convert it first.")
     for name in COMPONENTS:
-        if not set(_AXES) <= set(vectors[name].dims):
+        if not set(AXES) <= set(vectors[name].dims):
             raise ValueError(f"vectors: expected {name} over z, y, x, found it over {vectors[name].dims}.")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import AXES
 from lfpiv.velocity.derived import COMPONENTS, check_velocity
 
 STRESSES = ("uu", "vv", "ww", "uv", "uw", "vw")
@@ -231,7 +232,7 @@ def _mean(measured: xr.Dataset) -> xr.Dataset:
 
 def _with_axes(result: xr.Dataset, vectors: xr.Dataset) -> xr.Dataset:
     """Give a result the axes of the vectors with their units; no attributes of theirs."""
-    result = result.assign_coords({axis: vectors[axis] for axis in ("z", "y", "x")})
+    result = result.assign_coords({axis: vectors[axis] for axis in AXES})
     result.attrs = {}
     return result
 

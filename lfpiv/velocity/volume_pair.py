@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import numbers
-from typing import TypeGuard
 
 import numpy as np
 import xarray as xr
 from scipy import fft
 
-VIEWS = "views"
-"""Coordinate of a volume: how many cameras see each voxel. Volumes without it are seen by two or by the only one."""
+from lfpiv.geometry.grid import AXES
+from lfpiv.geometry.volume import VIEWS, is_finite
 
 LARGEST_BLOCK = 128
 """Largest edge of the block in the middle of two volumes that tells how far they moved as a whole [voxel]."""
@@ -21,13 +19,7 @@ CLEAR_SIGMA = 8.0
 """The same over the standard deviation of all lags: of a few million, chance brings one to 5 or 6."""
 
 _BACKGROUND_SAMPLES = 100_000  # voxels whose median is taken for the background
-_AXES = ("z", "y", "x")
 _SPACING_TOLERANCE = 1e-3  # coordinates written as decimal numbers of float32 are that even, relative to the spacing
-
-
-def is_finite(value: object) -> TypeGuard[float]:
-    """Whether a value is a finite real number."""
-    return isinstance(value, numbers.Real) and math.isfinite(value)
 
 
 def prepared(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
@@ -74,9 +66,9 @@ def voxel_axes(
     if voxel_mm is not None:
         raise ValueError("voxel_mm: expected no value with DataArrays, whose coordinates tell it. Leave it out.")
     axes, spacing = [], []
-    for axis in _AXES:
+    for axis in AXES:
         for name, volume in (("volume_a", volume_a), ("volume_b", volume_b)):
-            if volume.dims != _AXES or axis not in volume.coords or volume.sizes[axis] < 2:
+            if volume.dims != AXES or axis not in volume.coords or volume.sizes[axis] < 2:
                 raise ValueError(
                     f"{name}: expected dims (z, y, x) with coordinates [mm] and at least 2 voxels each, got "
                     f"{dict(volume.sizes)} with coordinates {list(volume.coords)}."
@@ -101,7 +93,7 @@ def seen(volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np.ndarra
     if not views:
         return None
     for count in views:
-        if count.dims != _AXES:
+        if count.dims != AXES:
             raise ValueError(f"{VIEWS}: expected a coordinate over (z, y, x), got {count.dims}.")
     both: np.ndarray = np.minimum(views[0].values, views[-1].values) >= 2
     return both

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from lfpiv.errors import InputError
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.lightfield.microimage_layout import microimage_edge
 from lfpiv.weights.ray_fit import fit_rays, grid_models, ray_models
 from lfpiv_kernels import runtime

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lfpiv import warn
 from lfpiv.lightfield.microimage_layout import plain
+from lfpiv.warn import Code, Warning, warn
 from lfpiv.weights.blocks import (
     WHOLE,
     Cuts,
@@ -136,12 +136,7 @@ class CountedVoxels:
         """
         name = self.camera.name
         if not errors:
-            warn.warn(
-                log,
-                "%s: sees none of the voxels drawn at random to check its weights against counted rays: they are "
-                "unchecked. Check the volume's place and size against what the camera sees",
-                name,
-            )
+            warn(log, Warning(code=Code.WEIGHTS_UNCHECKED, subject=name))
         elif np.mean(errors) > AIM_MEAN or max(errors) > AIM_WORST:
             bent, wide = self._bent(), self._wide()
             if form == "profiles" and asked:
@@ -152,13 +147,9 @@ class CountedVoxels:
                 cause = "voxels larger than microlenses; lower volume.voxel_mm"
             else:
                 cause = "not known; neither aberrations nor the voxels' size explain it"
-            warn.warn(
-                log,
-                "%s: weights as %s differ from counted rays by %.1f %% (worst voxel %.1f %%), aimed at are %.0f %% "
-                "(%.1f %%). Cause: %s (rays depart from second order by %.2f, a voxel's edge is %.1f microlens pitch)",
-                *(name, form, 100 * np.mean(errors), 100 * max(errors), 100 * AIM_MEAN, 100 * AIM_WORST),
-                *(cause, bent, wide),
-            )
+            figures = {"form": form, "mean": float(np.mean(errors)), "worst": max(errors), "cause": cause}
+            figures |= {"aim_mean": AIM_MEAN, "aim_worst": AIM_WORST, "bent_pitch": bent, "wide_pitch": wide}
+            warn(log, Warning(code=Code.WEIGHTS_DIFFER, subject=name, figures=figures))
 
     def _bent(self) -> float:
         """Furthest that rays depart from their model, second order in the pupil point [microlens pitch]."""
@@ -290,8 +281,7 @@ def _cut(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np.nd
 def count_blocks(stored: StoredGrid, camera: CalibratedCamera, progress: Progress) -> Blocks:
     """Count the rays of every voxel and pack the counts into blocks."""
     rays, size = plain(camera.optics.sensor_shape), stored.grid.size
-    text = "%s: counting rays for %d voxels; 'footprint' is about a thousand times faster"
-    warn.warn(log, text, camera.name, size)
+    warn(log, Warning(code=Code.COUNT_SLOW, subject=camera.name, figures={"voxels": size}))
     parts = []
     for first in range(0, size, COUNT_CHUNK):
         last = min(first + COUNT_CHUNK, size)

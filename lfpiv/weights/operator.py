@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lfpiv.calibration.coverage import SEEN_SHARE, warn_seen_by_one
 from lfpiv.errors import InputError
-from lfpiv.experiment.nominal_checks import SEEN_SHARE, warn_alone
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.weights.blocks import (
     BLOCK_BYTES,
@@ -186,7 +186,7 @@ class Weights:
             self._camera_sums = np.zeros((len(self.cameras), self.grid.size), np.float32)
             for own, (name, camera) in zip(self._camera_sums, self.cameras.items(), strict=True):
                 self.projector(name).back_project(np.asarray(camera.gain, np.float32).reshape(-1), own)
-            warn_alone(self.views, self.grid, len(self.cameras))
+            warn_seen_by_one(self.views, self.grid, len(self.cameras))
         return self._camera_sums
 
     @property

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lfpiv import files
 from lfpiv.errors import InputError
-from lfpiv.geometry.optics import Grid
-from lfpiv.results import netcdf
-from lfpiv.results.folder import writing
+from lfpiv.files import writing
+from lfpiv.geometry.grid import Grid
 from lfpiv.weights.blocks import StoredGrid
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.projector import Blocks
@@ -86,7 +86,7 @@ def save_weights(weights: Weights, folder: Path) -> str:
             },
         }
         content = digest.hexdigest()
-        netcdf.write_json(header | {"content": content}, folder / _HEADER)
+        files.write_json(header | {"content": content}, folder / _HEADER)
     return content
 
 

@@ -1,135 +1,27 @@
-"""Warp kernels of the window correlation; `correlate` launches them.
+"""Direct correlation of blocks with their surroundings: sums of products at every lag, and sums of blocks over windows.
 
-The lanes of a vector are neighbouring windows. A lattice of windows or blocks is walked by lane: lane
-``ky * pitch + kx`` is the one at row ky and column kx of a layer, rows being followed by spare lanes, so that the lane
-of a neighbour lies at a fixed distance. Volumes are stored split by phase, ``[plane, y % stride, x % stride, lane]``:
-whatever the offset from a window's corner, the voxels at that offset of neighbouring windows are neighbours in memory.
-Arrays of offsets along y and x hold the distance in memory for each offset in voxels.
-
-The inner loops are native: on the CPU in vectors of clang, as wide as the registers; on CUDA a lane is a thread.
+In: both volumes stored by phase (`layout.Phased`). Out: for every layer, lag and lane the sum over the block of
+``a(r) b(r + lag)``. Inner loops are C++: on the CPU a vector holds neighbouring blocks, on CUDA each lane is a thread.
 """
+
+import math
+from dataclasses import dataclass
 
 import warp as wp
 
-from lfpiv_kernels.native import read_native
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation.layout import Lattice, Layers, Phased, make_layers
+from lfpiv_kernels.correlation.memory import Call, launch, new_array
+from lfpiv_kernels.correlation.plan import LANES, Plan
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
-)
-
-LANES = 16
-"""Lanes a CPU task works on; lattices are padded to whole groups of them."""
-MOST_LAGS = 11
-"""Lags along x that are summed in registers at once."""
-
-VECTORS = read_native("blocks_vectors.inc")
-
-_BLOCK = VECTORS + read_native("blocks_block.inc").replace(
-    "CASES",
-    "\n".join(
-        f"                    case {n}: {{ V total[{n}]; sum(total, lag_z, lag_y, lag, row); break; }}"
-        for n in range(3, MOST_LAGS + 1)
-    ),
-).replace("MOST_LAGS", str(MOST_LAGS))
+wp.set_module_options(native.options("blocks.h", contract="fast"))
 
 
-@wp.func_native(_BLOCK)
-def _sum_products(
-    first: wp.array(dtype=float),
-    second: wp.array(dtype=float),
-    first_y: wp.array(dtype=int),
-    first_x: wp.array(dtype=int),
-    second_y: wp.array(dtype=int),
-    second_x: wp.array(dtype=int),
-    first_pitch: int,
-    second_pitch: int,
-    first_plane: int,
-    second_plane: int,
-    block: wp.vec3i,
-    lags: wp.vec3i,
-    lag_begin: int,
-    lag_end: int,
-    lane: int,
-    sum_row: int,
-    sum_pitch: int,
-    slot: int,
-    scratch_pitch: int,
-    scratch_out: wp.array(dtype=float),
-    sum_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
-def _correlate_blocks(
-    # in
-    first: wp.array(dtype=float),  # first volume, split by phase
-    second: wp.array(dtype=float),  # second volume, the same
-    first_y: wp.array(dtype=int),  # offsets along y and x, see the head of this module
-    first_x: wp.array(dtype=int),
-    second_y: wp.array(dtype=int),
-    second_x: wp.array(dtype=int),
-    pitches: wp.vec2i,  # elements per plane of `first` and of `second`
-    stride: int,  # distance of layers of blocks [voxel]
-    block: wp.vec3i,  # edges of a block [voxel]
-    lags: wp.vec3i,  # lags per axis
-    begin_layer: int,
-    ring: int,  # layers that `sum_out` holds: layer i lies at i % ring
-    groups: int,  # groups of lanes
-    group: int,  # lanes of a group: `LANES` on the CPU, 1 on CUDA
-    parts: int,  # parts the lags along z are cut into
-    scratch_pitch: int,  # elements of scratch memory per slot
-    slot: int,
-    begin: int,
-    # out
-    scratch_out: wp.array(dtype=float),
-    sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
-):
-    index = begin + wp.tid()
-    lane = (index % groups) * group
-    part = (index // groups) % parts
-    layer = begin_layer + index // groups // parts
-    plane = layer * stride
-    _sum_products(
-        first,
-        second,
-        first_y,
-        first_x,
-        second_y,
-        second_x,
-        pitches[0],
-        pitches[1],
-        plane,
-        plane,
-        block,
-        lags,
-        part * lags[0] // parts,
-        (part + 1) * lags[0] // parts,
-        lane,
-        (layer % ring) * lags[0] * lags[1] * lags[2],
-        groups * group,
-        slot,
-        scratch_pitch,
-        scratch_out,
-        sum_out,
-    )
-
-
-_SPLIT = read_native("blocks_split.inc")
-
-
-@wp.func_native(_SPLIT)
+@wp.func_native("lfpiv::split_plane(volume.data, shape, lattice, plane, split_out.data);")
 def _split_plane(
     volume: wp.array(dtype=float),
     shape: wp.vec3i,
-    corner: wp.vec3i,
-    stride: wp.vec2i,
-    phases: wp.vec2i,
-    pitch: int,
-    lanes: int,
+    lattice: Lattice,
     plane: int,
     split_out: wp.array(dtype=float),
 ): ...
@@ -140,24 +32,55 @@ def _split(
     # in
     volume: wp.array(dtype=float),  # flat, (z, y, x)
     shape: wp.vec3i,
-    corner: wp.vec3i,  # voxel of plane 0, phase (0, 0), lane 0; what lies outside the volume is 0
-    stride: wp.vec2i,  # distance of the lattice's rows and columns [voxel]
-    phases: wp.vec2i,  # phases stored along y and x
-    pitch: int,  # lanes per row
-    lanes: int,  # lanes stored
+    lattice: Lattice,  # may reach beyond the volume, where values are 0
     begin: int,
     # out
     split_out: wp.array(dtype=float),  # (plane, phase y, phase x, lane)
 ):
-    _split_plane(volume, shape, corner, stride, phases, pitch, lanes, begin + wp.tid(), split_out)
+    _split_plane(volume, shape, lattice, begin + wp.tid(), split_out)
 
 
-_GATHER = VECTORS + read_native("blocks_gather.inc")
+def split_call(volume: wp.array, plan: Plan, lattice: Lattice, split: wp.array) -> Call:
+    """Return the call that stores a volume by phase."""
+    return Call(_split, lattice.planes, [volume, wp.vec3i(*plan.shape), lattice], [split])
 
 
-@wp.func_native(_GATHER)
-def _gather_row(
-    blocks_y: int, blocks_x: int, pitch: int, lanes: int, begin: wp.int64, row_out: wp.array(dtype=float)
+@wp.func_native(
+    "lfpiv::correlate_blocks(first, second, layers, parts, task, scratch_out.data + scratch, sum_out.data);"
+)
+def _correlate_group(
+    first: Phased,
+    second: Phased,
+    layers: Layers,
+    parts: int,
+    task: int,
+    scratch: wp.int64,
+    scratch_out: wp.array(dtype=float),
+    sum_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _correlate_blocks(
+    # in
+    first: Phased,  # blocks of the first volume
+    second: Phased,  # their surroundings in the second volume, from the farthest lag on
+    layers: Layers,
+    parts: int,  # parts of the lags along z, each of which is a task
+    scratch_pitch: int,  # elements of scratch memory per slot
+    slot: int,  # -1 on CUDA, where none is needed
+    begin: int,
+    # out
+    scratch_out: wp.array(dtype=float),
+    sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
+):
+    scratch = wp.int64(wp.max(slot, 0)) * wp.int64(scratch_pitch)
+    _correlate_group(first, second, layers, parts, begin + wp.tid(), scratch, scratch_out, sum_out)
+
+
+@wp.func_native("lfpiv::gather_blocks(layers, blocks_y, blocks_x, pitch, task, sum_out.data);")
+def _gather_lag(
+    layers: Layers, blocks_y: int, blocks_x: int, pitch: int, task: int, sum_out: wp.array(dtype=float)
 ): ...
 
 
@@ -167,14 +90,47 @@ def _gather_blocks(
     blocks_y: int,  # blocks per window along y and x
     blocks_x: int,
     pitch: int,  # lanes per row of blocks
-    lanes: int,  # lanes per lag
-    lags: int,
-    ring: int,  # layers that `sum_out` holds: layer i lies at i % ring
-    begin_layer: int,
+    layers: Layers,
     begin: int,
     # out
-    sum_out: wp.array(dtype=float),  # (layer, lag, lane): of blocks before, of windows' layers of blocks after
+    sum_out: wp.array(dtype=float),  # (layer, lag, lane): before, sums over blocks; after, over a window's y and x
 ):
-    index = begin + wp.tid()
-    row = (begin_layer + index // lags) % ring * lags + index % lags
-    _gather_row(blocks_y, blocks_x, pitch, lanes, wp.int64(row) * wp.int64(lanes), sum_out)
+    _gather_lag(layers, blocks_y, blocks_x, pitch, begin + wp.tid(), sum_out)
+
+
+def is_gathered(plan: Plan) -> bool:
+    """Return whether blocks are added up over each window's y and x once, for all windows that share rows of blocks."""
+    return runtime.device().kind == "cpu" and min(plan.block_count[1:]) > 2
+
+
+def gather(plan: Plan, layers: range, ring: int, sums: wp.array) -> None:
+    """Add up the blocks of some layers over the y and x of each window, in place."""
+    inputs = [*plan.block_count[1:], plan.pitch, make_layers(plan, layers, ring, plan.lanes)]
+    launch(Call(_gather_blocks, len(layers) * math.prod(plan.lags), inputs, [sums]))
+
+
+@dataclass(frozen=True)
+class DirectProducts:
+    """Sums of products of blocks, multiplied voxel by voxel."""
+
+    plan: Plan
+    ring: int
+    """Layers that the sums have memory for."""
+    scratch: wp.array
+    scratch_pitch: int
+
+    @classmethod
+    def prepare(cls, plan: Plan, ring: int) -> "DirectProducts":
+        """Allocate what a group of lanes needs: its blocks and as many planes of the surroundings."""
+        edges = zip(plan.block[1:], plan.lags[1:], strict=True)
+        pitch = LANES * plan.block[0] * (math.prod(plan.block[1:]) + math.prod(b + n - 1 for b, n in edges))
+        on_cpu = runtime.device().kind == "cpu"
+        return cls(plan, ring, new_array(runtime.CHUNKS * pitch if on_cpu else 1), pitch)
+
+    def sum(self, first: Phased, second: Phased, layers: range, sums: wp.array) -> None:
+        """Sum the products of some layers of blocks and their surroundings at every lag."""
+        group, parts = (LANES, 1) if runtime.device().kind == "cpu" else (1, self.plan.lags[0])
+        tasks = make_layers(self.plan, layers, self.ring, group)
+        inputs = [first, second, tasks, parts, self.scratch_pitch]
+        size = len(layers) * tasks.groups * parts
+        launch(Call(_correlate_blocks, size, inputs, [self.scratch, sums], scratch=True))

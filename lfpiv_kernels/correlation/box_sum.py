@@ -5,39 +5,49 @@ import math
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation.memory import Call, launch, to_device
-from lfpiv_kernels.correlation.plan import largest_factor
+from lfpiv_kernels.correlation.plan import Triple, largest_factor, whole_groups
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+wp.set_module_options(native.options("windows.h"))
 
-ROW = 8
-"""Neighbours along x that box sums add at once."""
-Row = wp.types.vector(length=ROW, dtype=float)
+PART = 512
+"""Sums that a CPU task forms; a CUDA thread forms one."""
+
+
+@wp.func_native("""
+    const int64_t begin = (int64_t)task * part;
+    const int count = size - begin < part ? size - begin : part;
+    lfpiv::sum_terms(source.data + begin, distance, terms, count, sum_out.data + begin);
+""")
+def _sum_part(
+    source: wp.array(dtype=float),
+    distance: int,
+    terms: int,
+    size: wp.int64,
+    part: int,
+    task: int,
+    sum_out: wp.array(dtype=float),
+): ...
 
 
 @wp.kernel
 def _box_sum(
     # in
-    source: wp.array(dtype=Row),  # overlapping rows of a flat volume
-    pitch: int,  # distance of the terms [element]
+    source: wp.array(dtype=float),  # flat volume, and padding that the last sums read
+    distance: int,  # of the terms [element]
     terms: int,
-    rows: int,  # rows of `sum_out`
-    batch: int,  # rows per thread
-    first_batch: int,
+    size: wp.int64,  # sums
+    part: int,  # sums per thread
+    begin: int,
     # out
-    sum_out: wp.array(dtype=Row),  # every eighth overlapping row: [i] holds floats 8 i .. 8 i + 7
+    sum_out: wp.array(dtype=float),
 ):
-    begin = (first_batch + wp.tid()) * batch
-    for index in range(begin, wp.min(begin + batch, rows)):
-        total = source[8 * index]
-        for k in range(1, terms):
-            total += source[8 * index + k * pitch]
-        sum_out[index] = total
+    _sum_part(source, distance, terms, size, part, begin + wp.tid(), sum_out)
 
 
-def box_sum(volume: np.ndarray, window: tuple[int, int, int], keep: tuple[slice, ...] | None = None) -> np.ndarray:
-    """Sum over windows: ``out[p]`` adds the window whose first voxel is p; 0 where it would leave the volume.
+def box_sum(volume: np.ndarray, window: Triple, keep: tuple[slice, ...] | None = None) -> np.ndarray:
+    """Sum over windows: ``out[p]`` is the sum over the window whose first voxel is p, 0 if it leaves the volume.
 
     Parameters
     ----------
@@ -50,10 +60,10 @@ def box_sum(volume: np.ndarray, window: tuple[int, int, int], keep: tuple[slice,
     Returns
     -------
     ndarray, float32
-        Of the volume's shape, or what `keep` takes of it.
+        Of the volume's shape, or of `keep`'s.
     """
     keep = keep or (slice(None),) * 3
-    for axis in (2, 1, 0):  # dropping what is not wanted along x first saves most of the work along y and z
+    for axis in (2, 1, 0):  # dropping unwanted sums along x first saves most of the work along y and z
         volume = _sum_along(volume, axis, window[axis])
         volume[(slice(None),) * axis + (slice(volume.shape[axis] - window[axis] + 1, None),)] = 0
         volume = np.ascontiguousarray(volume[(slice(None),) * axis + (keep[axis],)])
@@ -61,23 +71,15 @@ def box_sum(volume: np.ndarray, window: tuple[int, int, int], keep: tuple[slice,
 
 
 def _sum_along(volume: np.ndarray, axis: int, width: int) -> np.ndarray:
-    """Sum `width` neighbours along an axis, starting at each voxel; the last ``width - 1`` sums mean nothing."""
+    """Sum `width` neighbours along an axis from each voxel on; the last ``width - 1`` sums are not valid."""
     pitch = math.prod(volume.shape[axis + 1 :])
-    rows = -(-volume.size // ROW)
-    part = largest_factor(width)  # sums of sums: part + width / part terms
-    taken, written = (np.zeros(rows * ROW + width * pitch + ROW, np.float32) for _ in range(2))
-    taken[: volume.size] = volume.ravel()
-    taken, written = to_device(taken), to_device(written)
-    batch = 1 if runtime.device().kind == "cuda" else 64  # a CPU task costs as much as adding several rows
-    for terms, spacing in ((part, pitch), (width // part, part * pitch)):
+    factor = largest_factor(width)  # sums of sums: factor + width / factor terms
+    source, sums = (np.zeros(whole_groups(volume.size) + width * pitch, np.float32) for _ in range(2))
+    source[: volume.size] = volume.ravel()
+    source, sums = to_device(source), to_device(sums)
+    part = 1 if runtime.device().kind == "cuda" else PART
+    for terms, distance in ((factor, pitch), (width // factor, factor * pitch)):
         if terms > 1:
-            rows_out = wp.array(ptr=written.ptr, dtype=Row, shape=(rows,), device=written.device)
-            launch(Call(_box_sum, -(-rows // batch), [_overlapping(taken), spacing, terms, rows, batch], [rows_out]))
-            taken, written = written, taken
-    return taken.numpy()[: volume.size].reshape(volume.shape)
-
-
-def _overlapping(flat: wp.array) -> wp.array:
-    """View a flat float array as rows of `ROW` that start at every element; the caller keeps it alive."""
-    count = flat.shape[0] - ROW + 1
-    return wp.array(ptr=flat.ptr, dtype=Row, shape=(count,), strides=(4,), device=flat.device)
+            launch(Call(_box_sum, -(-volume.size // part), [source, distance, terms, volume.size, part], [sums]))
+            source, sums = sums, source
+    return source.numpy()[: volume.size].reshape(volume.shape)

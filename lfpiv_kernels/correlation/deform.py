@@ -1,27 +1,22 @@
-"""Symmetric deformation of two volumes by a displacement field: cubic B-spline interpolation in Warp.
+"""Symmetric deformation of two volumes by a displacement field d, by cubic B-spline interpolation.
 
-The first volume is sampled at ``x - d/2``, the second at ``x + d/2``, so that particles displaced by d meet at x.
+The first volume is sampled at ``x - d/2``, the second at ``x + d/2``, so particles displaced by d meet at x. The
+positions x lie a quarter of a voxel beside the voxels, where the interpolation errors of the two volumes cancel.
 
-Interpolation moves a particle a little towards or away from the nearest voxel, by an error E sin(2 pi p) of the
-sampling phase p. With x on the voxels the phases are -d/2 and d/2, the two errors add up to 2 E sin(pi d), and no
-iteration removes that bias (0.017 voxel for cubic splines and particles of 0.7 voxel standard deviation). With x a
-quarter of a voxel beside them the phases are 1/4 -+ d/2, both errors are E cos(pi d), and the bias is gone.
+Notes
+-----
+Interpolation moves a particle towards or away from the nearest voxel by an error E sin(2 pi p) of the sampling phase p.
+With x on the voxels the phases are -d/2 and d/2 and the two errors add up to 2 E sin(pi d), a bias that no iteration
+removes. With x a quarter of a voxel beside them the phases are 1/4 -+ d/2, and both errors are E cos(pi d).
 """
 
 import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.native import read_native
+from lfpiv_kernels import native, runtime
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 4,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
-)
+wp.set_module_options(native.options("deform.h", contract="fast", unroll=4))
 
 OFFSET = 0.25
 """Distance of the sampled positions x from the voxels, along each axis [voxel]."""
@@ -29,18 +24,13 @@ MARGIN = 6
 """Voxels of zeros around a volume before the spline's prefilter: samples fall smoothly to 0 outside the volume."""
 
 
-_SAMPLE = read_native("deform_sample.inc")
-
-
-@wp.func_native(_SAMPLE)
-def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: float, x: float) -> float:
-    """Value of the spline at a position given in coefficients; the nearest edge outside the array."""
-    ...
+@wp.func_native("return lfpiv::sample_spline(coefficients.data, shape, z, y, x);")
+def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: float, x: float) -> float: ...
 
 
 @wp.func
 def _between(field: wp.array3d(dtype=wp.vec3), iz: int, iy: int, ix: int, tz: float, ty: float):
-    """Displacement at a control point along x, interpolated between four along z and y."""
+    """Interpolate the displacement at a control point along x between four along z and y."""
     near = (1.0 - ty) * field[iz, iy, ix] + ty * field[iz, iy + 1, ix]
     far = (1.0 - ty) * field[iz + 1, iy, ix] + ty * field[iz + 1, iy + 1, ix]
     return (1.0 - tz) * near + tz * far
@@ -90,7 +80,7 @@ def _deform_pair(
 
 
 def spline_coefficients(volume: np.ndarray) -> np.ndarray:
-    """Cubic B-spline coefficients of a volume that is 0 outside.
+    """Return the cubic B-spline coefficients of a volume that is 0 outside.
 
     Parameters
     ----------
@@ -106,14 +96,14 @@ def spline_coefficients(volume: np.ndarray) -> np.ndarray:
 def deform_pair(
     first: np.ndarray, second: np.ndarray, field: np.ndarray, spacing: tuple[float, float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the first volume at ``x - d(x)/2`` and the second at ``x + d(x)/2``, x being `OFFSET` beside the voxels.
+    """Sample the first volume at ``x - d(x)/2`` and the second at ``x + d(x)/2``.
 
     Parameters
     ----------
     first, second : ndarray, float32
         `spline_coefficients` of both volumes.
     field : ndarray, shape (n_z, n_y, n_x, 3), float32
-        Displacement d, order (z, y, x) [voxel], on a control grid of at least 2 points per axis; linear between them.
+        Displacement d, order (z, y, x) [voxel], at control points, at least 2 per axis; linear between them.
     spacing : tuple of float
         Distance of the control points, order (z, y, x) [voxel]; the first lies on voxel (0, 0, 0).
 

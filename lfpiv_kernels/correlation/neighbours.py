@@ -1,32 +1,20 @@
-"""What the 26 neighbours of a vector say about it: robust predictions for outlier detection and filling."""
+"""Predictions of vectors from their 26 neighbours, for outlier detection and filling.
+
+In: a vector field and which of its vectors are valid. Out: medians of the neighbours, as they are and moved to the
+middle along the local gradient, and their scatter.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.native import read_native
+from lfpiv_kernels import native, runtime
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+wp.set_module_options(native.options("neighbours.h"))
 
-LANES = 16
-"""Vectors a CPU thread predicts at once; a CUDA thread takes one."""
-
-
-def _sort(size: int) -> str:
-    """Statements that sort `size` values in place: Batcher's odd-even merge network, the same steps for any values."""
-    steps, merged = [], 1
-    while merged < size:
-        distance = merged
-        while distance:
-            for start in range(distance % merged, size - distance, 2 * distance):
-                for low in range(start, min(start + distance, size - distance)):
-                    if low // (2 * merged) == (low + distance) // (2 * merged):
-                        steps.append(f"order(v[{low}], v[{low + distance}]);")
-            distance //= 2
-        merged *= 2
-    return " ".join(steps)
+VECTORS = native.constant("neighbours.h", "VECTORS")
+"""Vectors that a CPU task predicts at once; a CUDA thread predicts one."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +37,18 @@ class Prediction:
     """Number of neighbours, shape (vector,)."""
 
 
-_PREDICT = read_native("neighbours_predict.inc").replace("SORT26", _sort(26)).replace("SORT18", _sort(18))
-
-
-@wp.func_native(_PREDICT)
+@wp.func_native("""
+    const int64_t first = (int64_t)task * group;
+    lfpiv::predict_points(field.data, keep.data, points.data + first, shape, points.shape[0] - first,
+        prediction_out.data + 18 * first, count_out.data + first);
+""")
 def _predict_group(
     field: wp.array(dtype=float),
     keep: wp.array(dtype=int),
     points: wp.array(dtype=int),
     shape: wp.vec3i,
-    first: int,
-    count: int,
+    group: int,
+    task: int,
     prediction_out: wp.array(dtype=float),
     count_out: wp.array(dtype=int),
 ): ...
@@ -72,23 +61,22 @@ def _predict(
     keep: wp.array(dtype=int),  # flat, (z, y, x): 1 where a vector counts as neighbour
     points: wp.array(dtype=int),  # linear index of the vectors wanted
     shape: wp.vec3i,  # of the grid
-    group: int,  # vectors per thread: `LANES` on the CPU, 1 on CUDA
+    group: int,  # vectors per thread: `VECTORS` on the CPU, 1 on CUDA
     first_group: int,
     # out
     prediction_out: wp.array(dtype=float),  # flat, (vector, component, 6): as in `Prediction`
     count_out: wp.array(dtype=int),  # neighbours, (vector,)
 ):
-    first = (first_group + wp.tid()) * group
-    _predict_group(field, keep, points, shape, first, points.shape[0] - first, prediction_out, count_out)
+    _predict_group(field, keep, points, shape, group, first_group + wp.tid(), prediction_out, count_out)
 
 
 def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Prediction:
-    """Predict vectors of a field from their neighbours, the vectors themselves left out.
+    """Predict vectors of a field from their neighbours, without the vectors themselves.
 
     Parameters
     ----------
     field : ndarray, shape (z, y, x, 3)
-        Vectors; those that are not kept may be anything.
+        Vectors; any values where `keep` is false.
     keep : ndarray of bool, shape (z, y, x)
         Vectors that count as neighbours.
     wanted : ndarray of bool, shape (z, y, x)
@@ -116,7 +104,7 @@ def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Predicti
     inputs = [wp.array(np.ascontiguousarray(a, kind).ravel(), dtype=t, device=where.warp) for a, kind, t in arrays]
     prediction = wp.empty((len(points), 3, 6), dtype=float, device=where.warp)
     count = wp.empty(len(points), dtype=int, device=where.warp)
-    group = LANES if where.kind == "cpu" else 1
+    group = VECTORS if where.kind == "cpu" else 1
     layout, outputs = [wp.vec3i(*keep.shape), group], [prediction.flatten(), count]
 
     def part(chunk: int, begin: int, end: int) -> None:

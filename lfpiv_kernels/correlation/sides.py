@@ -1,8 +1,7 @@
-"""One volume of a correlation as the kernels take it: split by phase, with the statistics of its windows."""
+"""The two volumes of a correlation as the kernels read them: stored by phase, with the statistics of their windows."""
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,126 +9,97 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.correlation import blocks as kernels
-from lfpiv_kernels.correlation import windows
-from lfpiv_kernels.correlation.blocks import LANES
+from lfpiv_kernels.correlation.blocks import split_call
+from lfpiv_kernels.correlation.layout import Phased, Statistics, Storage
 from lfpiv_kernels.correlation.memory import Call, launch, new_array, to_device
-from lfpiv_kernels.correlation.plan import Plan, largest_factor, whole_groups
-
-SIGNAL_FLOOR = 1e-4
-"""A window whose variance is below this part of the whole volume's variance holds no signal."""
-
-
-@dataclass(frozen=True)
-class Split:
-    """Values at the lattice of blocks and at every offset from it, (plane, phase y, phase x, lane)."""
-
-    shape: tuple[int, int, int, int]
-    values: wp.array
-    """Flat."""
-    offsets: tuple[wp.array, wp.array]
-    """Distance in memory for every offset in voxels along y and x."""
-
-    @classmethod
-    def empty(cls, plan: Plan, reach: tuple[int, int, int]) -> Split:
-        """Room for the offsets 0 to ``reach - 1``."""
-        phases = tuple(min(s, r) for s, r in zip(plan.stride, reach, strict=True))
-        past = [(r - 1) // s for r, s in zip(reach, plan.stride, strict=True)]
-        lanes = whole_groups(plan.lanes + past[1] * plan.pitch + past[2] + LANES)
-        shape = ((plan.block_grid[0] - 1) * plan.stride[0] + reach[0], phases[1], phases[2], lanes)
-        along_y = _offsets(reach[1], plan.stride[1], phases[2] * lanes, plan.pitch)
-        return cls(shape, new_array(math.prod(shape)), (along_y, _offsets(reach[2], plan.stride[2], lanes, 1)))
-
-    @property
-    def plane(self) -> int:
-        """Elements per plane."""
-        return math.prod(self.shape[1:])
-
-
-@functools.lru_cache
-def _offsets(reach: int, stride: int, phase_pitch: int, lane_pitch: int) -> wp.array:
-    """Distance in memory for the offsets 0 to ``reach - 1`` along one axis; a call needs many, seldom new ones."""
-    offset = np.arange(reach, dtype=np.int32)
-    return to_device(offset % stride * phase_pitch + offset // stride * lane_pitch, int)
+from lfpiv_kernels.correlation.plan import Plan, Triple
+from lfpiv_kernels.correlation.windows import plane_sums_call, plane_sums_shape, signal_floor, statistics_call
 
 
 @dataclass(frozen=True)
 class Side:
-    """One volume as the kernels take it: split by phase, with the statistics of its windows at every lag."""
+    """One volume of a correlation."""
 
-    volume: np.ndarray
-    search: tuple[int, int, int]
-    """Largest lags at which windows are taken; lag 0 alone where they do not move."""
-    voxels: Split
-    mean: Split
-    """Mean of the windows at every lag."""
-    scale: Split
-    """1 / sqrt(sum of squared deviations) of the same, 0 where there is no signal."""
+    blocks: Phased
+    """Voxels of its blocks at lag 0."""
+    surroundings: Phased
+    """Voxels of the same blocks from the farthest lag on."""
+    statistics: Statistics
+    """Mean and scale of its windows at every lag."""
+
+
+@dataclass(frozen=True)
+class _Volume:
+    """One volume, and the memory that its kernels write."""
+
+    values: np.ndarray
+    flat: wp.array
+    search: Triple
+    """Largest lags at which its windows are measured; 0 if only at lag 0."""
+    voxels: Storage
+    statistics: Storage
+    split: wp.array
+    """Voxels stored by phase."""
+    sums: tuple[wp.array, wp.array]
+    """Sums of values and of squares over the windows' y and x."""
+    measured: tuple[wp.array, wp.array]
+    """Mean and scale of the windows, stored by phase."""
 
     @classmethod
-    def empty(cls, plan: Plan, volume: np.ndarray, search: tuple[int, int, int]) -> Side:
-        """Room for one side."""
+    def of(cls, plan: Plan, volume: np.ndarray, search: Triple) -> _Volume:
+        """Allocate memory for a volume whose windows are measured at lags up to `search`."""
+        values = np.ascontiguousarray(volume, np.float32)
         lags = tuple(2 * r + 1 for r in search)
-        reach = tuple(b + n - 1 for b, n in zip(plan.block, lags, strict=True))
-        mean, scale = (Split.empty(plan, lags) for _ in range(2))
-        return cls(np.ascontiguousarray(volume, np.float32), search, Split.empty(plan, reach), mean, scale)
+        voxels = Storage.of(plan, tuple(b + n - 1 for b, n in zip(plan.block, lags, strict=True)))
+        statistics = Storage.of(plan, lags)
+        split, sums = new_array(voxels.size), math.prod(plane_sums_shape(plan, search))
+        first_sums, second_sums = new_array(sums), new_array(sums)
+        mean, scale = new_array(statistics.size), new_array(statistics.size)
+        flat = to_device(values.ravel())
+        return cls(values, flat, search, voxels, statistics, split, (first_sums, second_sums), (mean, scale))
+
+    def calls(self, plan: Plan, square: float) -> tuple[Call, Call, Call]:
+        """Return the calls that store voxels by phase, sum over windows, and then measure the windows."""
+        corner = tuple(o - r for o, r in zip(plan.origin, self.search, strict=True))
+        windows = self.statistics.lattice(plan, plan.origin)
+        return (
+            split_call(self.flat, plan, self.voxels.lattice(plan, corner), self.split),
+            plane_sums_call(self.flat, plan, self.search, windows, self.sums),
+            statistics_call(
+                self.sums, plan, self.search, windows, signal_floor(self.values, square, plan), self.measured
+            ),
+        )
+
+    def side(self) -> Side:
+        """Describe voxels and statistics for the kernels."""
+        storage, (along_z, along_y, along_x) = self.voxels, self.search
+        surroundings, blocks, statistics = Phased(), Phased(), Statistics()
+        surroundings.values, surroundings.plane = self.split, storage.plane
+        surroundings.along_y, surroundings.along_x = storage.along_y, storage.along_x
+        blocks.values, blocks.plane = self.split[along_z * storage.plane :], storage.plane
+        blocks.along_y, blocks.along_x = storage.along_y[along_y:], storage.along_x[along_x:]
+        statistics.mean, statistics.scale = self.measured
+        statistics.along_y, statistics.along_x = self.statistics.along_y, self.statistics.along_x
+        statistics.plane, statistics.centre = self.statistics.plane, wp.vec3i(*self.search)
+        return Side(blocks, surroundings, statistics)
 
 
 def make_sides(
-    plan: Plan,
-    volumes: tuple[np.ndarray, np.ndarray],
-    squares: Sequence[float],
-    searches: tuple[tuple[int, int, int], tuple[int, int, int]],
+    plan: Plan, volumes: Sequence[np.ndarray], squares: Sequence[float], searches: Sequence[Triple]
 ) -> tuple[Side, Side]:
-    """Prepare both volumes, given their sums of squares and the largest lags at which their windows are taken."""
-    first, second = (Side.empty(plan, *pair) for pair in zip(volumes, searches, strict=True))
-    sums = [_plane_sums(plan, side) for side in (first, second)]
-    launch(_split(plan, first), _split(plan, second), *(call for call, _ in sums))
-    of_both = zip((first, second), squares, (room for _, room in sums), strict=True)
-    launch(*(_statistics(plan, *of) for of in of_both))
-    return first, second
+    """Store both volumes by phase and measure the statistics of their windows.
 
-
-def _split(plan: Plan, side: Side) -> Call:
-    """Store the volume split by phase."""
-    voxels = side.voxels
-    corner = tuple(o - r for o, r in zip(plan.origin, side.search, strict=True))
-    phases, lanes = wp.vec2i(*voxels.shape[1:3]), voxels.shape[3]
-    layout = [wp.vec3i(*plan.shape), wp.vec3i(*corner), wp.vec2i(*plan.stride[1:]), phases, plan.pitch, lanes]
-    return Call(kernels._split, voxels.shape[0], [to_device(side.volume.ravel()), *layout], [voxels.values])
-
-
-def _sums_shape(plan: Plan, side: Side) -> tuple[int, int, int]:
-    """Planes of the volume, and the windows that fit along y and x with zeros around it."""
-    depth, *along = plan.shape
-    reach = zip(along, side.search[1:], plan.window[1:], strict=True)
-    return depth, *(n + 2 * r - w + 1 for n, r, w in reach)
-
-
-def _plane_sums(plan: Plan, side: Side) -> tuple[Call, list[wp.array]]:
-    """Sum over the windows' y and x, and where these sums and those of squares go."""
-    sums = [new_array(math.prod(_sums_shape(plan, side))) for _ in range(2)]
-    pitch = whole_groups(plan.shape[2] + 2 * side.search[2] + LANES)
-    scratch_pitch = pitch * (4 + 2 * plan.shape[1] + 2 * (plan.shape[1] + 2 * side.search[1] + 1))
-    on_cpu = runtime.device().kind == "cpu"
-    scratch = new_array((runtime.CHUNKS if on_cpu else plan.shape[0]) * scratch_pitch)
-    factors = wp.vec2i(*map(largest_factor, plan.window[1:]))
-    layout = [wp.vec3i(*plan.shape), wp.vec3i(*side.search), wp.vec3i(*plan.window), factors]
-    rows = [plan.origin[1], plan.stride[1], side.mean.shape[1]]
-    inputs = [to_device(side.volume.ravel()), *layout, *rows]
-    return Call(windows._sum_planes, plan.shape[0], inputs, [scratch, *sums], after_slot=[scratch_pitch]), sums
-
-
-def _statistics(plan: Plan, side: Side, squares: float, sums: list[wp.array]) -> Call:
-    """Statistics of the windows from what `_plane_sums` summed."""
-    variance = squares / side.volume.size - float(side.volume.mean()) ** 2
-    floor = SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
-    phases = [min(s, 2 * r + 1) for s, r in zip(plan.stride, side.search, strict=True)]
-    lattice = [wp.vec3i(*plan.origin), wp.vec3i(*plan.stride), wp.vec3i(*phases)]
-    shape = _sums_shape(plan, side)
-    layout = [wp.vec3i(*shape), side.search[0], wp.vec3i(*plan.window), floor, *lattice]
-    planes, _, _, lanes = side.mean.shape
-    inputs = [*sums, *layout, planes, plan.pitch, lanes]
-    outputs = [side.mean.values, side.scale.values]
-    return Call(windows._window_statistics, shape[1], inputs, outputs)
+    Parameters
+    ----------
+    plan : Plan
+    volumes : two ndarray, shape (z, y, x), float32
+    squares : two float
+        Sum of squares of each volume.
+    searches : two tuple of int
+        Largest lags at which windows of each volume are measured, order (z, y, x) [voxel].
+    """
+    first, second = (_Volume.of(plan, *pair) for pair in zip(volumes, searches, strict=True))
+    splits, sums, statistics = zip(first.calls(plan, squares[0]), second.calls(plan, squares[1]), strict=True)
+    launch(*splits, *sums)
+    launch(*statistics)
+    return first.side(), second.side()

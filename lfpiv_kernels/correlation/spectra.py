@@ -1,69 +1,37 @@
-"""Warp kernels that correlate blocks by transforms along z and y; `correlate` launches them where that is cheaper.
+"""Correlation of blocks with their surroundings by transforms along z and y, where that is cheaper than `blocks`.
 
-Lanes, offsets and volumes split by phase are those of `correlation_kernels`, the transforms those of
-`correlation_transforms.Spectrum`. Transforms along z are made once per plane, those along y once per group of lanes;
-along x products are summed lag by lag, at every pair of frequencies.
-
-CPU only: a GPU has multiplications to spare, and nowhere to keep the spectra of a block.
+Planes are transformed along z once (`planes`), rows along y once per group of lanes. Along x the products are summed
+lag by lag at every pair of frequencies, and transformed back. `transforms` gives folds and waves. CPU only: a GPU has
+enough multipliers, and no memory near them for the spectra of a block.
 """
+
+from dataclasses import dataclass
 
 import warp as wp
 
-from lfpiv_kernels.correlation.blocks import MOST_LAGS, VECTORS
-from lfpiv_kernels.native import read_native
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation.layout import Layers, Phased, make_layers
+from lfpiv_kernels.correlation.memory import Call, launch, new_array
+from lfpiv_kernels.correlation.plan import GROUP, Plan, whole_groups
+from lfpiv_kernels.correlation.planes import PART, transform_call
+from lfpiv_kernels.correlation.transforms import ROWS, Spectrum, Transform
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
-)
-
-ROWS = 3
-"""Frequencies that are computed at once: rows of the matrices are padded to a multiple."""
-SYNTHESISE = read_native("spectra_synthesise.inc")
-
-_SPECTRAL = (
-    "#if !defined(__CUDA_ARCH__)"
-    + VECTORS
-    + SYNTHESISE
-    + read_native("spectra_spectral.inc")
-    .replace(
-        "CASES",
-        "\n".join(
-            f"                    case {n}: {{ V re[{n}]; correlate(re, i, g, real, k, lag); break; }}"
-            for n in range(3, MOST_LAGS + 1)
-        ),
-    )
-    .replace("MOST_LAGS", str(MOST_LAGS))
-    .replace("ROWS", str(ROWS))
-)
+wp.set_module_options(native.options("spectra.h", contract="fast"))
 
 
-@wp.func_native(_SPECTRAL)
-def _sum_spectral(
-    first: wp.array(dtype=float),
-    second: wp.array(dtype=float),
-    first_y: wp.array(dtype=int),
-    first_x: wp.array(dtype=int),
-    second_y: wp.array(dtype=int),
-    second_x: wp.array(dtype=int),
-    first_pitch: int,
-    second_pitch: int,
-    quads: wp.array(dtype=int),
-    folds: wp.vec3i,
-    matrices: wp.array(dtype=float),
-    size: wp.vec2i,
-    stride: int,
-    block: wp.vec3i,
-    lags: wp.vec3i,
-    layer: int,
-    lane: int,
-    lanes: int,
-    wide: int,
-    sum_row: wp.int64,
-    sum_pitch: int,
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const auto scratch = scratch_out.data + (int64_t)slot * scratch_pitch;
+    lfpiv::correlate_spectra(first, second, transform, layers, past, task, scratch, sum_out.data);
+#endif
+""")
+def _correlate_group(
+    first: Phased,
+    second: Phased,
+    transform: Transform,
+    layers: Layers,
+    past: int,
+    task: int,
     slot: int,
     scratch_pitch: wp.int64,
     scratch_out: wp.array(dtype=float),
@@ -74,26 +42,11 @@ def _sum_spectral(
 @wp.kernel
 def _correlate_spectra(
     # in
-    first: wp.array(dtype=float),  # of `_transform_planes`: spectra of layers of blocks, (layer, row, element)
-    second: wp.array(dtype=float),  # the same of their surroundings
-    first_y: wp.array(dtype=int),  # offsets along y and x, see the head of `correlation_kernels`
-    first_x: wp.array(dtype=int),
-    second_y: wp.array(dtype=int),
-    second_x: wp.array(dtype=int),
-    pitches: wp.vec2i,  # elements per plane of `first` and of `second`
-    quads: wp.array(dtype=int),  # rows to fold, of blocks and of their surroundings, `correlation_transforms.fold`
-    folds: wp.vec3i,  # how many of either; whether those of blocks fold about a quarter too
-    matrices: wp.array(dtype=float),  # of `correlation_transforms.Spectrum`
-    size: wp.vec2i,  # transforms' lengths along z and y
-    stride: int,  # distance of blocks along x [voxel]
-    block: wp.vec3i,  # edges of a block [voxel]
-    lags: wp.vec3i,  # lags per axis
-    begin_layer: int,
-    ring: int,  # layers that `sum_out` holds: layer i lies at i % ring
-    groups: int,  # groups of lanes
-    group: int,  # lanes of a group
+    first: Phased,  # spectra of layers of blocks, (layer, row, element), see `planes`
+    second: Phased,  # the same of their surroundings
+    transform: Transform,
+    layers: Layers,
     past: int,  # lanes behind a group's last whose voxels it reaches
-    sum_pitch: int,  # lanes per lag
     scratch_pitch: wp.int64,  # elements of scratch memory per slot
     slot: int,
     begin: int,
@@ -101,35 +54,58 @@ def _correlate_spectra(
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
 ):
-    index = begin + wp.tid()
-    lane = index % groups * group
-    lanes = wp.min(group, sum_pitch - lane)
-    layer = index // groups
-    row = (begin_layer + layer) % ring
-    _sum_spectral(
-        first,
-        second,
-        first_y,
-        first_x,
-        second_y,
-        second_x,
-        pitches[0],
-        pitches[1],
-        quads,
-        folds,
-        matrices,
-        size,
-        stride,
-        block,
-        lags,
-        layer,
-        lane,
-        lanes,
-        (lanes + past + 15) // 16 * 16,
-        wp.int64(row) * wp.int64(lags[0] * lags[1] * lags[2]),
-        sum_pitch,
-        slot,
-        scratch_pitch,
-        scratch_out,
-        sum_out,
-    )
+    task = begin + wp.tid()
+    _correlate_group(first, second, transform, layers, past, task, slot, scratch_pitch, scratch_out, sum_out)
+
+
+@dataclass(frozen=True)
+class SpectralProducts:
+    """Sums of products of blocks, formed from transforms along z and y."""
+
+    plan: Plan
+    ring: int
+    """Layers that the sums have memory for."""
+    spectra: tuple[wp.array, wp.array]
+    """Planes of blocks and of their surroundings, transformed along z."""
+    scratch: wp.array
+    scratch_pitch: int
+
+    @classmethod
+    def prepare(cls, plan: Plan, ring: int, plane: int) -> "SpectralProducts":
+        """Allocate memory for the spectra of planes of at most `plane` elements, and for one group of lanes."""
+        spectrum = Spectrum.of(plan.block, plan.search)
+        folds, folds_around = (len(quads) for quads in spectrum.folds)
+        reach, half = plan.block[2] + plan.lags[2] - 1, spectrum.size[1] // 2 + 1
+        wide = min(plan.stride[2], reach) * whole_groups(GROUP + _lanes_past(plan))
+        pitch = GROUP * plan.block[2] * (8 * folds + 6 * ROWS) + wide * (8 * folds_around + 6 * ROWS)
+        pitch += GROUP * plan.lags[2] * (4 * half + (spectrum.size[0] + 2) * plan.lags[1]) + whole_groups(reach)
+        pitch = max(pitch, *(len(planes.quads) * PART for planes in spectrum.planes))
+        spectra = tuple(new_array(ring * spectrum.size[0] * plane) for _ in range(2))
+        return cls(plan, ring, spectra, new_array(runtime.CHUNKS * pitch), pitch)
+
+    def sum(self, first: Phased, second: Phased, layers: range, sums: wp.array) -> None:
+        """Sum the products of some layers of blocks and their surroundings at every lag."""
+        plan, scratch = self.plan, (self.scratch, self.scratch_pitch)
+        spectrum = Spectrum.of(plan.block, plan.search)
+        transforms = zip((first, second), spectrum.planes, self.spectra, strict=True)
+        calls = [
+            transform_call(of, planes.transform, layers, plan.stride[0], *scratch, to) for of, planes, to in transforms
+        ]
+        launch(*calls)
+        tasks = make_layers(plan, layers, self.ring, GROUP)
+        transformed = [_with_values(*pair) for pair in zip((first, second), self.spectra, strict=True)]
+        inputs = [*transformed, spectrum.transform, tasks, _lanes_past(plan), self.scratch_pitch]
+        size = len(layers) * tasks.groups
+        launch(Call(_correlate_spectra, size, inputs, [self.scratch, sums], scratch=True))
+
+
+def _with_values(volume: Phased, values: wp.array) -> Phased:
+    """Return other values stored like those of a volume."""
+    other = Phased()
+    other.values, other.along_y, other.along_x, other.plane = values, volume.along_y, volume.along_x, volume.plane
+    return other
+
+
+def _lanes_past(plan: Plan) -> int:
+    """Lanes behind a group's last whose voxels it reaches."""
+    return (plan.block[2] + plan.lags[2] - 2) // plan.stride[2]

@@ -1,10 +1,10 @@
-"""Transforms along z and y that correlate blocks with their surroundings, folded about half and a quarter of a length.
+"""Folds and waves of the transforms along z and y by which `spectra` correlates blocks with their surroundings.
 
-A block has offsets 0 to ``edge - 1``, its surroundings ``-search`` to ``edge - 1 + search``; both are counted from the
-block's centre, about which they are symmetric, in whole or in half voxels. A transform as long as the surroundings, one
-more where that is odd, wraps nothing around within the range of lags. Values at plus and minus an offset are first
-added and subtracted, then those with what lies as far from a quarter of the length: even frequencies need the sums, odd
-ones the differences (sines the other way round), and a quarter of the products is left.
+A block has offsets 0 to ``edge - 1``, its surroundings ``-search`` to ``edge - 1 + search``. Both are counted from the
+block's centre, in half voxels if the edge is even, so both are symmetric. The transform is as long as the surroundings,
+rounded up to an even length, so nothing wraps around within the range of lags. It is folded twice: first the values at
+offsets t and -t are added and subtracted, then those at t and size / 2 - t. Even frequencies need the sums, odd ones
+the differences (the reverse for sines), and a quarter of the products is left.
 """
 
 from __future__ import annotations
@@ -16,13 +16,37 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lfpiv_kernels import native
 from lfpiv_kernels.correlation.memory import to_device
-from lfpiv_kernels.correlation.spectra import ROWS
+
+ROWS = native.constant("spectra.h", "ROWS")
+"""Frequencies that are computed at once; rows of the matrices along y are padded to a multiple of it."""
+
+
+@wp.struct
+class PlaneTransform:
+    """Transform of planes along z: the arrays of `Planes` on the device."""
+
+    quads: wp.array(dtype=int)
+    rows: wp.array(dtype=int)
+    matrix: wp.array(dtype=float)
+    folds: int
+    counts: wp.vec4i
+
+
+@wp.struct
+class Transform:
+    """Transforms along y and back: the arrays of `Spectrum` on the device."""
+
+    quads: wp.array(dtype=int)  # folds of a block, then of its surroundings
+    folds: wp.vec3i  # how many of either; 1 if those of a block add a second pair, else 0
+    matrices: wp.array(dtype=float)
+    size: wp.vec2i
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Everything the kernels need to know of the transforms for one shape of blocks and one range of lags."""
+    """Transforms for one shape of blocks and one range of lags."""
 
     size: tuple[int, int]
     """Lengths along z and y."""
@@ -31,24 +55,23 @@ class Spectrum:
     folds: tuple[np.ndarray, np.ndarray]
     """Along y: `fold` of a block and of its surroundings."""
     matrices: np.ndarray
-    """Along y: cosines and sines of a block and of its surroundings, (even or odd frequencies, fold, cosine or sine,
-    frequency, padded to `ROWS`); then back along y and along z, `_back`; all in one."""
+    """Cosines and sines along y of a block and of its surroundings, (even or odd frequencies, fold, cosine or sine,
+    frequency, padded to `ROWS`), then `_back` along y and along z; all in one."""
 
     @functools.cached_property
-    def counts(self) -> tuple[int, int, int]:
-        """Folds along y of a block and of its surroundings; 1 where those of a block add a second pair, else 0."""
+    def transform(self) -> Transform:
+        """Device arrays for the kernel."""
         first, second = self.folds
-        return len(first), len(second), int(first[:, 2:].max() >= 0)
-
-    @functools.cached_property
-    def arrays(self) -> tuple[wp.array, wp.array]:
-        """Folds along y and matrices as the kernels take them."""
-        return to_device(np.concatenate(self.folds).ravel(), int), to_device(self.matrices)
+        transform = Transform()
+        transform.quads = to_device(np.concatenate(self.folds).ravel(), int)
+        transform.folds = wp.vec3i(len(first), len(second), int(first[:, 2:].max() >= 0))
+        transform.matrices, transform.size = to_device(self.matrices), wp.vec2i(*self.size)
+        return transform
 
     @classmethod
     @functools.lru_cache
     def of(cls, block: tuple[int, int, int], search: tuple[int, int, int]) -> Spectrum:
-        """Return the transforms for a block and a search range."""
+        """Return the transforms for a block and a search range, order (z, y, x) [voxel]."""
         size = transform_size(block[0], search[0]), transform_size(block[1], search[1])
         reach = [b + 2 * r for b, r in zip(block, search, strict=True)]
         folds = fold(block[1], size[1]), fold(reach[1], size[1])
@@ -64,10 +87,10 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class Planes:
-    """Transform of real planes: rows are real parts at frequencies 0 to size / 2, then imaginary ones between.
+    """Transform of real planes: rows of real parts at frequencies 0 to size / 2, then imaginary ones between.
 
-    Counted in half voxels, the highest frequency has an imaginary part only, which stands in the place of the real one:
-    in products of two transforms that is the same.
+    Counted in half voxels, the highest frequency has an imaginary part only. It is stored in the place of the real one,
+    which gives the same products of two transforms.
     """
 
     quads: np.ndarray
@@ -80,9 +103,13 @@ class Planes:
     """Waves by class, (fold, row), flat."""
 
     @functools.cached_property
-    def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
-        """Folds, rows and waves as the kernel takes them."""
-        return to_device(self.quads, int), to_device(self.rows, int), to_device(self.matrix)
+    def transform(self) -> PlaneTransform:
+        """Device arrays for the kernel."""
+        transform = PlaneTransform()
+        transform.quads, transform.rows = to_device(self.quads, int), to_device(self.rows, int)
+        transform.matrix = to_device(self.matrix)
+        transform.folds, transform.counts = len(self.quads) // 4, wp.vec4i(*self.counts)
+        return transform
 
     @classmethod
     def of(cls, count: int, size: int) -> Planes:
@@ -104,17 +131,27 @@ class Planes:
 
 
 def transform_size(block: int, search: int) -> int:
-    """Even length of a transform that holds a block and its surroundings."""
+    """Return the even length of a transform that holds a block and its surroundings."""
     return -(-(block + 2 * search) // 2) * 2
 
 
 def fold(count: int, size: int) -> np.ndarray:
-    """Places in a row of `count` values that a transform of length `size` adds or subtracts before it multiplies.
+    """Return the elements of a row that a transform adds and subtracts before it multiplies.
 
-    One row per offset t from the row's centre, 0 <= t <= size / 4: the places of t, -t, size / 2 - t and t - size / 2;
-    -1 where there is none, or where it is the same as one before.
+    Parameters
+    ----------
+    count : int
+        Values in the row.
+    size : int
+        Length of the transform.
+
+    Returns
+    -------
+    ndarray of int32, shape (fold, 4)
+        For each offset t from the row's centre, 0 <= t <= size / 4: the elements at t, -t, size / 2 - t and
+        t - size / 2; -1 where there is none, or where it is the same as an earlier one.
     """
-    farthest, quads = count - 1, []  # twice the offsets are whole
+    farthest, quads = count - 1, []  # offsets are doubled, so that they are whole
     for t in range(farthest % 2, min(size // 2, farthest) + 1, 2):
         pairs = (t, -t if t else None), ((size - t, t - size) if 2 * t != size else (None, None))
         offsets = itertools.chain(*pairs)
@@ -140,15 +177,15 @@ def _analysis(quads: np.ndarray, count: int, size: int) -> np.ndarray:
     return matrix
 
 
-def _back(size: int, search: int, share: float, inner: float) -> np.ndarray:
+def _back(size: int, search: int, scale: float, inner: float) -> np.ndarray:
     """Cosines and sines at even and odd lags for frequencies up to size / 4, (frequency, 4, lag).
 
-    The frequency as far from a quarter of the length is added before or subtracted; `inner` is the weight of those
-    between 0 and size / 2, which may stand for their negatives.
+    The kernel adds or subtracts the terms at frequencies k and size / 2 - k first. `inner` is the weight of frequencies
+    between 0 and size / 2: 2 where they stand for their negatives as well.
     """
     half = size // 2
     frequency, pairs = np.arange(half // 2 + 1), np.arange(search // 2 + 1)
-    weight = np.where(frequency == 0, share, share * inner) * np.where(2 * frequency == half, 0.5, 1.0)
+    weight = np.where(frequency == 0, scale, scale * inner) * np.where(2 * frequency == half, 0.5, 1.0)
     waves = []
     for wave in (np.cos, np.sin):
         for odd in (0, 1):

@@ -1,8 +1,8 @@
 """Standard deviation of measured displacements from the statistics of the correlation, after Wieneke (2015) [1]_.
 
-Of two volumes that are deformed onto each other, the correlation at lags +1 and -1 along an axis would be equal but for
-what does not match: noise, ghosts, lost particles, gradients inside the window. Their difference is a sum over voxels,
-so its variance follows from the scatter of the terms, neighbours included, and the peak fit turns it into voxels.
+For two volumes that are deformed onto each other, the correlation at lags +1 and -1 along an axis differs only by what
+does not match: noise, ghosts, lost particles, gradients inside the window. The difference is a sum over voxels. Its
+variance follows from the scatter of its terms and their neighbours, and the slope of the peak fit turns it into voxels.
 
 References
 ----------
@@ -11,31 +11,34 @@ References
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from lfpiv_kernels.correlation.box_sum import box_sum
+from lfpiv_kernels.correlation.plan import Triple
 
 REACH = 4
-"""Edge of the cubes whose sums of terms are squared: terms closer than this count as correlated [voxel]."""
-_FLATTEST = 1.02  # peak over its neighbours, for windows whose peak is too flat for a fit
+"""Edge of the cubes whose sums of terms are squared [voxel]: nearer terms count as correlated."""
+_FLATTEST = 1.02
+"""Least ratio of the peak to its neighbours; a window with a flatter peak is treated as if it had this one."""
 
 
 def displacement_deviation(
     first: np.ndarray,
     second: np.ndarray,
     *,
-    window: tuple[int, int, int],
-    origin: tuple[int, int, int],
-    step: tuple[int, int, int],
-    count: tuple[int, int, int],
+    window: Triple,
+    origin: Triple,
+    step: Triple,
+    count: Triple,
 ) -> np.ndarray:
     """Estimate the standard deviation of each window's displacement.
 
     Parameters
     ----------
     first, second : ndarray, shape (z, y, x), float32
-        Volumes deformed onto each other: no window has more than a fraction of a voxel of displacement left.
+        Volumes deformed onto each other, so that a fraction of a voxel of displacement remains in each window.
     window, origin, step, count : tuple of int
         Window edges, first voxel of the first window, distance and number of windows, order (z, y, x).
 
@@ -63,7 +66,7 @@ def displacement_deviation(
         difference = plus - minus
         about_zero = _variance_of_sum(difference, window_sum)
         about_mean = about_zero - window_sum(difference) ** 2 * REACH**3 / voxels
-        variance = np.maximum(about_mean, 0.5 * about_zero)  # small windows: the mean takes too much with it
+        variance = np.maximum(about_mean, 0.5 * about_zero)  # a small window's mean holds part of the noise
         with np.errstate(divide="ignore", invalid="ignore"):
             sharpness = np.log(np.maximum(peak / side, _FLATTEST))
             sigma = np.sqrt(variance) / (4 * side * sharpness)
@@ -71,14 +74,14 @@ def displacement_deviation(
     return deviation
 
 
-def _variance_of_sum(terms: np.ndarray, window_sum) -> np.ndarray:
-    """Variance of the sum of correlated terms over windows.
+def _variance_of_sum(terms: np.ndarray, window_sum: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Estimate the variance of the sum of correlated terms over windows.
 
-    The sum over pairs of terms of their product times the overlap of two cubes around them, which is 1 for a term with
-    itself and 0 beyond `REACH`: never negative, unlike a sum of estimated covariances.
+    It is the sum over pairs of terms of their product times the overlap of two cubes around them, which is 1 for a term
+    with itself and 0 beyond `REACH`. Unlike a sum of estimated covariances it is never negative.
     """
     cubes = box_sum(terms, (REACH,) * 3)
-    centred = np.zeros_like(cubes)  # box_sum starts at a voxel; put each cube's sum on its middle
+    centred = np.zeros_like(cubes)  # box_sum starts at a voxel: move each cube's sum to its middle
     shift = REACH // 2
     centred[shift:, shift:, shift:] = cubes[: -shift or None, : -shift or None, : -shift or None]
     return window_sum(centred * centred) / REACH**3

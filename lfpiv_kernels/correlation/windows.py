@@ -1,37 +1,43 @@
-"""Warp kernels for the statistics of windows at every lag; `correlation_sides` launches them.
+"""Statistics of a volume's windows at every lag: mean and scale ``1 / sqrt(sum of squared deviations)``.
 
-Lanes, offsets and volumes split by phase are those of `correlation_kernels`.
+Two steps: sums over the windows' y and x in each plane, then sums of planes along z. Inner loops are C++.
 """
 
+import math
+
+import numpy as np
 import warp as wp
 
-from lfpiv_kernels.correlation.blocks import VECTORS
-from lfpiv_kernels.native import read_native
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation.layout import Lattice
+from lfpiv_kernels.correlation.memory import Call, new_array
+from lfpiv_kernels.correlation.plan import LANES, Plan, Triple, largest_factor, whole_groups
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
+wp.set_module_options(native.options("windows.h", contract="fast"))
+
+SIGNAL_FLOOR = 1e-4
+"""Lowest variance of a window that holds signal, as a share of the whole volume's variance."""
+
+
+@wp.struct
+class Extent:
+    """A volume with zeros around it, and the windows that fit; triples in the order (z, y, x)."""
+
+    shape: wp.vec3i  # of the volume
+    margin: wp.vec3i  # zeros on either side
+    window: wp.vec3i
+    factors: wp.vec2i  # of the window's edges along y and x
+
+
+@wp.func_native(
+    "lfpiv::sum_plane(volume.data, extent, lattice, z, scratch_out.data + scratch, sum_out.data, square_out.data);"
 )
-
-_PLANE = VECTORS + read_native("windows_plane.inc")
-
-
-@wp.func_native(_PLANE)
 def _sum_plane(
     volume: wp.array(dtype=float),
-    shape: wp.vec3i,
-    margin: wp.vec3i,
-    window: wp.vec3i,
-    part: wp.vec2i,
-    corner: int,
-    stride: int,
-    phases: int,
+    extent: Extent,
+    lattice: Lattice,
     z: int,
-    slot: int,
-    scratch_pitch: wp.int64,
+    scratch: wp.int64,
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),
     square_out: wp.array(dtype=float),
@@ -42,15 +48,10 @@ def _sum_plane(
 def _sum_planes(
     # in
     volume: wp.array(dtype=float),  # flat, (z, y, x)
-    shape: wp.vec3i,
-    margin: wp.vec3i,  # zeros around the volume along y and x that windows may cover
-    window: wp.vec3i,
-    part: wp.vec2i,  # factors of the window's edges along y and x
-    corner: int,  # rows that windows start from: this one, each `stride` behind it, and as many after each as `phases`
-    stride: int,
-    phases: int,
-    slot: int,  # scratch memory to use; -1: that of the plane
+    extent: Extent,
+    lattice: Lattice,  # windows wanted, counted from the first that fits
     scratch_pitch: wp.int64,
+    slot: int,  # scratch memory to use; -1: that of the plane
     begin: int,
     # out
     scratch_out: wp.array(dtype=float),
@@ -61,47 +62,17 @@ def _sum_planes(
     memory = slot
     if slot < 0:
         memory = z
-    _sum_plane(
-        volume,
-        shape,
-        margin,
-        window,
-        part,
-        corner,
-        stride,
-        phases,
-        z,
-        memory,
-        scratch_pitch,
-        scratch_out,
-        sum_out,
-        square_out,
-    )
+    _sum_plane(volume, extent, lattice, z, wp.int64(memory) * scratch_pitch, scratch_out, sum_out, square_out)
 
 
-_STATISTICS = read_native("windows_statistics.inc")
-
-
-@wp.func_native(_STATISTICS)
-def _row_statistics(
+@wp.func_native("lfpiv::measure_row(sum.data, square.data, extent, floor, lattice, y, mean_out.data, scale_out.data);")
+def _measure_row(
     sum: wp.array(dtype=float),
-    squares: wp.array(dtype=float),
-    shape: wp.vec3i,
-    depth: int,
-    count: int,
+    square: wp.array(dtype=float),
+    extent: Extent,
     floor: float,
-    z: int,
-    planes: int,
-    stride_z: int,
-    phases_z: int,
+    lattice: Lattice,
     y: int,
-    corner: int,
-    stride: int,
-    phases: int,
-    pitch: int,
-    out: wp.int64,
-    out_pitch: int,
-    plane_pitch: wp.int64,
     mean_out: wp.array(dtype=float),
     scale_out: wp.array(dtype=float),
 ): ...
@@ -111,44 +82,62 @@ def _row_statistics(
 def _window_statistics(
     # in
     sum: wp.array(dtype=float),  # of `_sum_planes`
-    squares: wp.array(dtype=float),
-    shape: wp.vec3i,  # of `sum`
-    margin: int,  # zeros before and behind the volume along z that windows may cover
-    window: wp.vec3i,
-    floor: float,  # window sum of squared deviations that is no signal
-    corner: wp.vec3i,  # the lattice: window of plane 0, phase (0, 0), lane 0, counted from the first one that fits
-    stride: wp.vec3i,
-    phases: wp.vec3i,
-    planes: int,
-    pitch: int,
-    lanes: int,
+    square: wp.array(dtype=float),
+    extent: Extent,
+    floor: float,  # sum of squared deviations up to which a window holds no signal
+    lattice: Lattice,  # windows wanted, counted from the first that fits
     begin: int,
     # out
-    mean_out: wp.array(dtype=float),  # window means, split by phase
-    scale_out: wp.array(dtype=float),  # 1 / sqrt(window sum of squared deviations), 0 where there is no signal
+    mean_out: wp.array(dtype=float),  # stored by phase
+    scale_out: wp.array(dtype=float),  # the same
 ):
-    y = begin + wp.tid()
-    row = y - corner[1]
-    if row >= 0 and row % stride[1] < phases[1] and (row // stride[1] + 1) * pitch <= lanes:
-        _row_statistics(
-            sum,
-            squares,
-            shape,
-            window[0],
-            window[0] * window[1] * window[2],
-            floor,
-            corner[0] - margin,
-            planes,
-            stride[0],
-            phases[0],
-            y,
-            corner[2],
-            stride[2],
-            phases[2],
-            pitch,
-            wp.int64(row % stride[1] * phases[2]) * wp.int64(lanes) + wp.int64(row // stride[1] * pitch),
-            lanes,
-            wp.int64(phases[1] * phases[2]) * wp.int64(lanes),
-            mean_out,
-            scale_out,
-        )
+    _measure_row(sum, square, extent, floor, lattice, begin + wp.tid(), mean_out, scale_out)
+
+
+def _extent(plan: Plan, search: Triple) -> Extent:
+    """Describe a plan's volume for windows that move by up to `search`."""
+    extent = Extent()
+    extent.shape, extent.margin, extent.window = (wp.vec3i(*of) for of in (plan.shape, search, plan.window))
+    extent.factors = wp.vec2i(*map(largest_factor, plan.window[1:]))
+    return extent
+
+
+def plane_sums_shape(plan: Plan, search: Triple) -> Triple:
+    """Return the planes of the volume, and the windows that fit along y and x with zeros around it."""
+    depth, *along = plan.shape
+    reach = zip(along, search[1:], plan.window[1:], strict=True)
+    return depth, *(n + 2 * r - w + 1 for n, r, w in reach)
+
+
+def plane_sums_call(
+    volume: wp.array, plan: Plan, search: Triple, lattice: Lattice, sums: tuple[wp.array, wp.array]
+) -> Call:
+    """Return the call that sums values and squares of each plane over the windows' y and x."""
+    pitch = whole_groups(plan.shape[2] + 2 * search[2] + LANES)
+    scratch_pitch = pitch * (4 + 2 * plan.shape[1] + 2 * (plan.shape[1] + 2 * search[1] + 1))
+    on_cpu = runtime.device().kind == "cpu"
+    scratch = new_array((runtime.CHUNKS if on_cpu else plan.shape[0]) * scratch_pitch)
+    inputs = [volume, _extent(plan, search), lattice, scratch_pitch]
+    return Call(_sum_planes, plan.shape[0], inputs, [scratch, *sums], scratch=True)
+
+
+def signal_floor(volume: np.ndarray, square: float, plan: Plan) -> float:
+    """Return the sum of squared deviations up to which a window holds no signal.
+
+    `square` is the sum of the volume's squares.
+    """
+    variance = square / volume.size - float(volume.mean()) ** 2
+    return SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
+
+
+def statistics_call(
+    sums: tuple[wp.array, wp.array],
+    plan: Plan,
+    search: Triple,
+    lattice: Lattice,
+    floor: float,
+    statistics: tuple[wp.array, wp.array],
+) -> Call:
+    """Return the call that finds mean and scale of windows from the sums of their planes."""
+    inputs = [*sums, _extent(plan, search), floor, lattice]
+    return Call(_window_statistics, plane_sums_shape(plan, search)[1], inputs, statistics)

@@ -14,11 +14,11 @@ from scipy import ndimage
 from support.ideal_rig import rotation
 
 import lfpiv
-from lfpiv.calibration import checks
+from lfpiv import warn
+from lfpiv.calibration import checks, coverage
 from lfpiv.calibration.board.board import HELD_BYTES, Planes, agreeing_dots
-from lfpiv.calibration.cameras import warn_outside
+from lfpiv.calibration.coverage import warn_outside
 from lfpiv.calibration.thin_lens_model import thin_lens_model
-from lfpiv.experiment import nominal_checks
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.image_checks import APERTURE, microimage_px, stated_px
@@ -26,6 +26,7 @@ from lfpiv.runs import summary
 from lfpiv.simulation.flows import KINDS, window_mean
 from lfpiv.simulation.scene import true_mapping
 from lfpiv.simulation.simulator import simulate
+from lfpiv.warn import Code
 
 MAPPING_PITCH = 0.015  # the project's limit for the mean error over the board's volume
 MAPPING_AIM_PITCH = 0.006  # its aim, reached on clean images
@@ -229,7 +230,7 @@ def test_saturated_dots_are_left_out_with_a_dark_image_too(rig, tmp_path):
     setup = dataclasses.replace(experiment.cameras[0], dark_path=dark)
     camera = lfpiv.calibrate(dataclasses.replace(experiment, cameras=(setup,))).cameras["only"]
     assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0]) <= MAPPING_AIM_PITCH
-    assert any("saturated and left out" in text for text in camera.report["warnings"])
+    assert any(warning.code is Code.BOARD_SATURATED for warning in camera.warnings)
 
 
 def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(rig, tmp_path):
@@ -238,7 +239,7 @@ def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(r
     with pytest.raises(lfpiv.InputError, match=r"plane_03\.tif.*found the same image as .*plane_02\.tif"):
         lfpiv.calibrate(spoiled(experiment, tmp_path / "data", {3: copy}))
     camera = lfpiv.calibrate(some_planes(experiment, -0.8, -0.4, 0.1, 0.4, 0.8)).cameras["only"]
-    (text,) = (text for text in camera.report["warnings"] if "do not fit the others" in text)
+    (text,) = (warning.sentence for warning in camera.warnings if warning.code is Code.PLANE_LEFT_OUT)
     assert "25 of 25 dots of plane 2" in text and "z = 0.1 mm" in text and "plane_02.tif" in text
     assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8]) <= MAPPING_AIM_PITCH  # it goes without them
 
@@ -247,12 +248,12 @@ def test_few_dots_and_a_poor_mapping_are_warned_of(rig):
     """Eight dots have six to train with; their labels are many, but tell no more than the dots' ray models."""
     _, _, calibration = rig
     camera = calibration.cameras["only"]
-    assert camera.report["warnings"] == []
+    assert camera.warnings == ()
     for training_dots, sigma, expected in ((88, 0.004, []), (6, 0.09, ["72 values for its 162", "0.090 pitch off"])):
-        report = camera.report | {"sigma_nor_test": sigma, "warnings": []}
-        checks.warn(dataclasses.replace(camera, report=report), "lens_integral", training_dots)
-        assert len(report["warnings"]) == len(expected)
-        assert all(part in text for part, text in zip(expected, report["warnings"], strict=True))
+        report = camera.report | {"sigma_nor_test": sigma}
+        with warn.collected() as found:
+            checks.check_mapping(dataclasses.replace(camera, report=report), "lens_integral", training_dots)
+        assert all(part in warning.sentence for part, warning in zip(expected, found, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -298,11 +299,11 @@ def test_a_wrong_f_number_is_refused_or_warned_of(rig):
         setup = experiment.cameras[0]
         optics = dataclasses.replace(setup.optics, f_number=number)
         wrong = dataclasses.replace(experiment, cameras=(dataclasses.replace(setup, optics=optics),))
-        return lfpiv.thin_lens(wrong).cameras["only"].report["warnings"]
+        return lfpiv.thin_lens(wrong).cameras["only"].warnings
 
-    assert with_f_number(4.0) == []
-    (text,) = with_f_number(3.6)
-    assert re.search(r"not 13\.9 px as f_number = 3\.6 .*; f_number = (3\.9\d|4|4\.0\d) would fit", text)
+    assert with_f_number(4.0) == ()
+    (warning,) = with_f_number(3.6)
+    assert re.search(r"not 13\.9 px as f_number = 3\.6 .*; f_number = (3\.9\d|4|4\.0\d) would fit", warning.sentence)
     for number in (0.4, 2.8, 5.6):
         with pytest.raises(lfpiv.InputError, match="white"):
             with_f_number(number)
@@ -348,13 +349,13 @@ def test_particle_images_in_place_of_boards_are_refused(rig, tmp_path):
 def test_a_volume_that_the_calibrated_camera_does_not_see_is_refused(rig, caplog):
     experiment, _, calibration = rig
     sees = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
-    assert nominal_checks.seen_share(calibration.cameras["only"], sees) == 1
+    assert coverage.seen_share(calibration.cameras["only"], sees) == 1
     beside = lfpiv.Grid.from_extent(centre_mm=(0, 4.0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
     with pytest.raises(lfpiv.InputError, match=r"around \(0, 4, 0\) mm of which camera 'only' sees nothing"):
-        nominal_checks.require_seen(experiment.path, calibration, beside)
+        coverage.require_seen(experiment.path, calibration, beside)
     half = lfpiv.Grid.from_extent(centre_mm=(0, 2.2, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
     with caplog.at_level(logging.WARNING):
-        nominal_checks.require_seen(experiment.path, calibration, half)
+        coverage.require_seen(experiment.path, calibration, half)
     assert "% of the volume" in caplog.text
 
 

@@ -8,6 +8,7 @@ import tifffile
 import xarray as xr
 
 import lfpiv
+from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment import images
 from lfpiv.experiment.experiment import ExperimentTable, open_experiment
@@ -383,10 +384,10 @@ def test_a_vector_file_of_another_form_is_refused(tmp_path):
 
 def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
     path = tmp_path / "summary.json"
-    netcdf.write_json({"value": float("nan"), "array": np.arange(2), "path": (1, 2)}, path)
+    files.write_json({"value": float("nan"), "array": np.arange(2), "path": (1, 2)}, path)
     old = path.read_text()
     assert json.loads(old) == {"value": None, "array": [0, 1], "path": [1, 2]}
-    with pytest.raises(RuntimeError), netcdf.replacing(path) as scratch:
+    with pytest.raises(RuntimeError), files.replacing(path) as scratch:
         scratch.write_text("half")
         raise RuntimeError
     assert path.read_text() == old and list(tmp_path.iterdir()) == [path]
@@ -394,10 +395,10 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
 
 def test_settings_hash_sees_every_value_and_no_order():
     settings = Smart().model_dump()
-    hashes = {netcdf.settings_hash(smart=settings), netcdf.settings_hash(smart=dict(reversed(settings.items())))}
+    hashes = {files.settings_hash(smart=settings), files.settings_hash(smart=dict(reversed(settings.items())))}
     assert len(hashes) == 1
     for key, value in settings.items():
-        hashes.add(netcdf.settings_hash(smart=settings | {key: f"{value}, but another"}))
+        hashes.add(files.settings_hash(smart=settings | {key: f"{value}, but another"}))
     assert len(hashes) == 1 + len(settings)
 
 

@@ -11,12 +11,13 @@ import tifffile
 from support import scenes
 
 import lfpiv
-from lfpiv import statistics, warn
+from lfpiv import statistics
 from lfpiv.lightfield import image_checks
 from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, SATURATED, dark_blocks, gap_light, saturated_share
 from lfpiv.results import netcdf
-from lfpiv.runs import pair, pipeline, summary_warnings
+from lfpiv.runs import pair, pipeline
 from lfpiv.simulation.simulator import simulate
+from lfpiv.warn import Code, Warning
 
 CLEAR = GAP_LIGHT / 5  # what belongs together keeps clear of the limit; real images gave 0.013, rendered ones 0.001
 GOOD = 0.02  # pitch; nobody would look twice
@@ -91,12 +92,12 @@ def test_what_is_suspicious_about_images_is_found(pair_of_cameras):
     first, second = (experiment.particle_image("left", 0, frame) for frame in "ab")
 
     def found(image):
-        return [item["what"] for item in image_checks.frame_findings(image, image - 40, decoder, "left", "a")]
+        return [item.code for item in image_checks.image_warnings(image, image - 40, decoder, "left", "a")]
 
-    assert found(first) == found(second) == image_checks.camera_findings(first, second, "left") == []
-    assert found(np.roll(first, QUARTER_PITCH_PX, axis=1)) == ["misplaced"]
-    assert found(np.minimum(first * 40, 4095)) == ["saturated"]
-    assert [item["what"] for item in image_checks.camera_findings(first, second * 0.05, "left")] == ["uneven"]
+    assert found(first) == found(second) == image_checks.uneven_warnings(first, second, "left") == []
+    assert found(np.roll(first, QUARTER_PITCH_PX, axis=1)) == [Code.MISPLACED]
+    assert found(np.minimum(first * 40, 4095)) == [Code.SATURATED]
+    assert [item.code for item in image_checks.uneven_warnings(first, second * 0.05, "left")] == [Code.UNEVEN]
     images = [(name, image_checks.fingerprint(image)) for name, image in (("one", first), ("other", second))]
     image_checks.require_different(images)
     with pytest.raises(lfpiv.InputError, match=r"a copy: .* found the same image as one\. Check particles\.images"):
@@ -114,9 +115,12 @@ def test_what_is_suspicious_about_images_is_found(pair_of_cameras):
     ],
 )
 def test_vectors_count_where_two_cameras_saw_particles(cameras, empty, unmeasured):
-    findings = [{"what": "empty", "camera": name[2:], "frame": name[0], "value": 0.0} for name in empty]
-    findings.append({"what": "dim", "camera": "left", "frame": "a", "value": 0.04})
-    assert image_checks.unmeasured(findings, cameras) == unmeasured
+    frames = [
+        [Warning(code=Code.EMPTY, subject=name) for name in empty if name.startswith(frame)]
+        + [Warning(code=Code.DIM, subject="left")]
+        for frame in "ab"
+    ]
+    assert image_checks.unmeasured(frames, cameras) == unmeasured
 
 
 @pytest.fixture(scope="module")
@@ -189,29 +193,6 @@ def test_warnings_outlive_the_invocation(spoilt, tmp_path, monkeypatch):
     assert [text for text in pipeline.report(file, alone)["warnings"] if "saturated" in text or "of 9" in text]
 
 
-def test_warnings_are_kept_whatever_the_log_shows():
-    log = logging.getLogger("lfpiv.silent")
-    log.setLevel(logging.CRITICAL)
-    warn.warn(log, "nobody collects")
-    with warn.collected() as outer:
-        warn.warn(log, "%d %s", 2, "lenses")
-        with warn.collected() as inner:
-            warn.warn(log, "100 % dark")
-            warn.warn(log, "100 % dark")
-        warn.warn(log, "the end")
-    assert outer == ["2 lenses", "the end"] and inner == ["100 % dark"]
-
-
-def test_many_pairs_with_the_same_trouble_are_one_line():
-    trouble = [
-        {"what": "saturated", "camera": "left", "frame": "a", "value": 0.1 + number / 1e4} for number in range(1000)
-    ]
-    (text,) = summary_warnings.of_images({"pair": number, "findings": [found]} for number, found in enumerate(trouble))
-    assert text.startswith("left, frame a, pairs 0, 1, 2, 3, 4 and 995 more: 10 to 20 % of the bright pixels")
-    poor = [{"pair": number, "verdict": "look", "valid_fraction": 0.01 * number} for number in (3, 5)]
-    assert summary_warnings.of_pairs(poor) == ["pairs 3, 5: 3 to 5 % of the vectors are valid; look"]
-
-
 def spoil(experiment, pattern, change):
     for path in experiment.parent.glob(pattern):
         changed = np.ascontiguousarray(change(tifffile.imread(path)))
@@ -234,9 +215,9 @@ def test_a_saturated_white_image_and_pictures_on_their_side_are_named(small_run,
     file = small_run.images(tmp_path / "data")
     spoil(file, "white/*.tif", lambda image: np.minimum(image * 4.0, 4095))
     spoil(file, "**/*.tif", np.rot90)
-    report = calibrate_first(file).report
-    assert report["sigma_nor_test"] < GOOD
-    saturated, turned = report["warnings"]
+    camera = calibrate_first(file)
+    assert camera.report["sigma_nor_test"] < GOOD
+    saturated, turned = (warning.sentence for warning in camera.warnings)
     assert "white image's bright pixels are saturated" in saturated and "turned by 90 degrees" in turned
 
 
@@ -247,9 +228,9 @@ def test_wrong_spacing_and_size_of_the_dots_show(small_run, tmp_path, caplog):
     assert "dot_diameter_mm = 0.1\n" in text
     file.write_text(text.replace("dot_diameter_mm = 0.1\n", "dot_diameter_mm = 0.15\n"), "utf-8")
     with caplog.at_level(logging.CRITICAL, "lfpiv"):
-        report = calibrate_first(file).report
-    assert report["sigma_nor_test"] < GOOD
-    magnified, wide = report["warnings"]
+        camera = calibrate_first(file)
+    assert camera.report["sigma_nor_test"] < GOOD
+    wide, magnified = (warning.sentence for warning in camera.warnings)
     assert re.search(r"magnified 1\.(09\d|1\d\d) times, not 1", magnified)
     assert wide.startswith("left: the board's dots look 0.") and wide.endswith("mm wide, not 0.15 mm")
     right = small_run.summary["calibration"]["left"]

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from support.ideal_rig import IdealCamera, IdealRig, optics, two_cameras
 
 import lfpiv
-from lfpiv.experiment import nominal_checks
+from lfpiv.calibration import coverage
 from lfpiv.lightfield.microimage_layout import plain
 from lfpiv.reconstruction import particle_size, smart
 from lfpiv.results import netcdf
@@ -673,11 +673,9 @@ def test_a_volume_tells_what_fewer_than_two_cameras_see(tmp_path, caplog):
     np.testing.assert_array_equal(weights.column_sum, weights.T(ones))
     alone = round(100 * (views < 2).mean())
     assert 30 < alone < 70 and f"{alone} % of the volume is seen by fewer than two cameras" in caplog.text
-    (said,) = nominal_checks.sight_warnings(
-        half_seen_rig(), grid
-    )  # of a sample of eight planes each way, before any weights
+    (said,) = coverage.sight_warnings(half_seen_rig(), grid)  # of a sample of eight planes each way, before any weights
     assert re.match(r"about \d\d % of the volume is seen by fewer than two cameras; vectors there are not valid", said)
-    assert abs(int(said.split()[1]) - alone) <= 2 * 100 / nominal_checks.SAMPLES  # a plane at either end
+    assert abs(int(said.split()[1]) - alone) <= 2 * 100 / coverage.SAMPLES  # a plane at either end
 
     positions = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)) * (0.8, 1.8, 0.8)
     images = weights(lfpiv.metrics.truth_volume(positions, None, grid, 0.07))

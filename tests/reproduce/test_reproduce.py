@@ -1,5 +1,6 @@
 """`lfpiv reproduce`: the contract of its results and page, resuming, and three of its cases at tiny sizes."""
 
+import dataclasses
 import json
 import re
 import sys
@@ -50,7 +51,8 @@ def cases(monkeypatch):
 
     for key, run in (("good", good), ("broken", broken)):
         monkeypatch.setitem(sys.modules, f"lfpiv.reproduce.{key}", types.SimpleNamespace(TITLE=f"{key} & co", run=run))
-    monkeypatch.setattr(reproduce, "CASES", ("good", "broken"))
+    modules = {key: f"lfpiv.reproduce.{key}" for key in ("good", "broken")}
+    monkeypatch.setattr(reproduce, "PAPER", dataclasses.replace(reproduce.PAPER, modules=modules))
     return calls
 
 

@@ -18,7 +18,7 @@ from lfpiv import derived
 from lfpiv.cli import commands
 from lfpiv.errors import StorageError
 from lfpiv.experiment import davis, images
-from lfpiv.results import export, netcdf
+from lfpiv.results import export, netcdf, provenance
 
 NUMBERS = (0, 2, 3)
 SINGLE = 1e-6  # relative rounding of single precision, in which images are stored
@@ -369,7 +369,7 @@ def test_an_experiment_of_buffers_opens(lvpyio, recorded):
     np.testing.assert_array_equal(
         experiment.particle_image("1", last, "0"), lvpyio[f"B{last:05d}"][2].components["PIXEL"].planes[0]
     )
-    hashes = {netcdf.content_hash([path]) for pair in range(2) for path in experiment.pair_paths(pair)}
+    hashes = {provenance.content_hash([path]) for pair in range(2) for path in experiment.pair_paths(pair)}
     assert len(hashes) == 8
 
 

@@ -17,7 +17,7 @@ import lfpiv
 from lfpiv.cli import commands
 from lfpiv.errors import ClusterError, InputError, StorageError
 from lfpiv.experiment.experiment import read_experiment
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import cluster_workers, dispatch, memory, pipeline, worker_plan
 from lfpiv.runs.pair import Outcome

@@ -10,7 +10,7 @@ from support.small_run import small_scene
 
 import lfpiv
 from lfpiv.calibration.camera import Calibration
-from lfpiv.geometry.optics import Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.runs import pipeline
 from lfpiv.selfcalibration import disparity, movements
 from lfpiv.selfcalibration.disparity import Disparity

@@ -1,96 +1,20 @@
-"""Correlation: kernels against slow twins, known displacements, symmetries, validation, honest uncertainty."""
+"""Correlation: known displacements, symmetries, validation, honest uncertainty."""
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import scipy.ndimage
-import warp as wp
 import xarray as xr
+from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, shear, uniform
 
 import lfpiv
 from lfpiv.velocity import cross_correlation as vectors
 from lfpiv.velocity import validation
-from lfpiv_kernels import runtime
-from lfpiv_kernels.correlation import blocks as correlation_kernels
-from lfpiv_kernels.correlation import box_sum as boxsum
 from lfpiv_kernels.correlation import correlate as kernel
-from lfpiv_kernels.correlation import deform, neighbours
-from lfpiv_kernels.correlation import peaks as peak_kernels
-from lfpiv_kernels.correlation import plan as correlation_plan
-from lfpiv_kernels.correlation import planes as plane_kernels
-from lfpiv_kernels.correlation import spectra as spectral_kernels
-from lfpiv_kernels.correlation import transforms as correlation_transforms
-from lfpiv_kernels.correlation import windows as window_kernels
+from lfpiv_kernels.correlation import deform
 
 pytestmark = pytest.mark.usefixtures("device")
-
-TOLERANCE_SUM = 2e-5  # float32 sums of up to 4096 products and their square root: 4096 ** 0.5 * 1.2e-7, rounded up
-TOLERANCE_PEAK = (
-    2e-3  # the fit divides differences of logarithms: it magnifies TOLERANCE_SUM up to a hundredfold [voxel]
-)
-TOLERANCE_SPLINE = 1e-5  # 64 float32 products, coefficients up to 2.5 times the values
-TOLERANCE_MEDIAN = 1e-6  # order statistics of float32 values near 1
-
-
-# --- synthetic volumes -------------------------------------------------------------------------------------------
-
-
-def blobs(position, intensity, shape, sigma=0.7):
-    """Sum of Gaussian blobs on a voxel grid; positions (n, 3) in voxels, order (z, y, x)."""
-    volume = np.zeros(shape)
-    reach = np.arange(-4, 5)
-    middle = np.rint(position).astype(int)
-    index = middle[:, :, None] + reach  # (n, 3, 9)
-    profile = np.exp(-((index - position[:, :, None]) ** 2) / (2 * sigma**2))
-    profile *= (index >= 0) & (index < np.array(shape)[:, None])
-    index = np.clip(index, 0, np.array(shape)[:, None] - 1)
-    value = np.einsum("n,nz,ny,nx->nzyx", intensity, profile[:, 0], profile[:, 1], profile[:, 2])
-    where = np.broadcast_arrays(index[:, 0, :, None, None], index[:, 1, None, :, None], index[:, 2, None, None, :])
-    np.add.at(volume, tuple(where), value)
-    return volume.astype(np.float32)
-
-
-def particle_pair(shape, flow, *, seed, density=0.017, ghosts=0.0, noise=0.0, lost=0.0):
-    """Two volumes of the same particles, moved by -+ flow / 2, with what spoils them: ghosts, noise, lost particles."""
-    rng = np.random.default_rng(seed)
-    margin = 8
-    room = np.array(shape) + 2 * margin
-    count = rng.poisson(density * room.prod())
-    position = rng.random((count, 3)) * room - margin
-    displacement = flow(position)
-    intensity = rng.lognormal(0, 0.3, count)
-    pair = []
-    for sign in (-0.5, 0.5):
-        kept = rng.random(count) >= lost
-        volume = blobs((position + sign * displacement)[kept], intensity[kept], shape)
-        number = rng.poisson(ghosts * count)
-        volume += blobs(rng.random((number, 3)) * room - margin, 0.7 * rng.lognormal(0, 0.5, number), shape)
-        pair.append(volume + noise * rng.standard_normal(shape).astype(np.float32))
-    return pair
-
-
-def uniform(*displacement):
-    return lambda position: np.broadcast_to(np.array(displacement, float), position.shape)
-
-
-def shear(shape, rate=0.06):
-    middle = (np.array(shape) - 1) / 2
-    return lambda position: rate * (position - middle)[..., [2, 0, 1]] * (0.3, 1, 1)
-
-
-def ring(shape, peak=2.0, core=10.0):
-    """Vortex ring about z: magnitude peak (r/core) exp(1 - r/core) around its core line."""
-    middle, radius = (np.array(shape) - 1) / 2, min(shape[1:]) / 4
-
-    def flow(position):
-        z, y, x = np.moveaxis(position - middle, -1, 0)
-        rho = np.hypot(y, x) + 1e-9
-        speed = peak / core * np.exp(1 - np.hypot(rho - radius, z) / core)
-        return np.stack([speed * (rho - radius), -speed * z * y / rho, -speed * z * x / rho], -1)
-
-    return flow
 
 
 def measured(result):
@@ -108,225 +32,6 @@ def error_of(result, flow, window):
 
 def correlate(pair, **options):
     return lfpiv.correlate(*pair, dt_s=1e-3, voxel_mm=1.0, **options)
-
-
-# --- kernels against twins ---------------------------------------------------------------------------------------
-
-
-def coefficients_twin(first, second, window, step, search):
-    """Correlation coefficient of every window at every lag, from the definition, in float64."""
-    origin, count = kernel.window_grid(first.shape, window, step)
-    padded = np.pad(second.astype(float), [(r, r) for r in search])
-    result = np.zeros((*count, *(2 * r + 1 for r in search)))
-    for cell in np.ndindex(*count):
-        corner = [o + k * s for o, k, s in zip(origin, cell, step, strict=True)]
-        a = first[tuple(slice(c, c + w) for c, w in zip(corner, window, strict=True))].astype(float)
-        a = a - a.mean()
-        for lag in np.ndindex(*result.shape[3:]):
-            begin = np.add(corner, lag)
-            b = padded[tuple(slice(c, c + w) for c, w in zip(begin, window, strict=True))]
-            b = b - b.mean()
-            result[cell + lag] = (a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())
-    return result
-
-
-def peaks_twin(score, search):
-    """Displacement of the two highest peaks of one window, NaN where there is none; highest value and its rival."""
-
-    def refine(lag):
-        place = []
-        for axis in range(3):
-            values = [score[tuple(np.add(lag, k * np.eye(3, dtype=int)[axis]))] for k in (-1, 0, 1)]
-            if min(values) > 0:
-                values = np.log(values)
-            place.append(lag[axis] - search[axis] + 0.5 * (values[0] - values[2]) / np.dot(values, (1, -2, 1)))
-        return place
-
-    top = np.array(score.shape) - 1
-    first = np.unravel_index(score.argmax(), score.shape)
-    second, best, rival = None, 0.0, 0.0
-    for lag in np.ndindex(*score.shape):
-        if np.abs(np.subtract(lag, first)).max() > 2:
-            rival = max(rival, score[lag])
-        if (np.array(lag) == 0).any() or (lag == top).any() or np.abs(np.subtract(lag, first)).max() <= 1:
-            continue
-        around = [score[tuple(np.add(lag, sign * unit))] for unit in np.eye(3, dtype=int) for sign in (-1, 1)]
-        if score[lag] > best and score[lag] >= max(around):
-            second, best = lag, score[lag]
-    inside = not ((np.array(first) == 0).any() or (first == top).any())
-    nothing = [np.nan] * 3
-    return (refine(first) if inside else nothing), (refine(second) if second else nothing), score[first], rival
-
-
-@pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
-@pytest.mark.parametrize("method", ["direct", "spectral", "fft"])
-@pytest.mark.parametrize(
-    ("window", "step", "search"),
-    [
-        ((8, 8, 8), (4, 4, 4), (3, 3, 3)),
-        ((7, 9, 10), (7, 3, 5), (2, 5, 3)),
-        ((16, 16, 16), (16, 8, 8), (4, 4, 4)),
-        ((8, 8, 8), (12, 4, 4), (3, 3, 3)),  # layers of blocks that no window needs, between those of two slabs
-        ((12, 12, 8), (6, 4, 2), (3, 2, 6)),  # several blocks along y and x, two parts of the lags along x
-        (
-            (9, 10, 5),
-            (3, 5, 7),
-            (2, 4, 3),
-        ),  # odd blocks, whose transforms are longer than needed; windows that leave gaps
-        ((12, 12, 8), (12, 12, 8), (11, 2, 3)),  # lags along z in two parts; blocks longer than half a transform
-    ],
-)
-def test_peaks_equal_the_definition(monkeypatch, window, step, search, method, symmetric):
-    monkeypatch.setattr(kernel, "_SLAB_BYTES", 1)  # every layer of windows on its own
-    if method != "fft":
-        monkeypatch.setattr(correlation_plan, "_SPECTRAL_SECONDS", 1e9 if method == "direct" else 0.0)
-        method = "direct"
-    first, second = particle_pair((21, 26, 28), uniform(0.4, -1.2, 0.8), seed=1, ghosts=0.5, noise=0.05)
-    score = coefficients_twin(first, second, window, step, search)
-    if symmetric:
-        score = 0.5 * (score + coefficients_twin(second, first, window, step, search)[..., ::-1, ::-1, ::-1])
-    peaks = kernel.correlate_windows(
-        first, second, window=window, step=step, search=search, method=method, symmetric=symmetric
-    )
-    assert peaks.correlation.shape == score.shape[:3]
-    for cell in np.ndindex(*score.shape[:3]):
-        displacement, second_displacement, highest, rival = peaks_twin(score[cell], search)
-        np.testing.assert_allclose(peaks.correlation[cell], highest, atol=TOLERANCE_SUM)
-        np.testing.assert_allclose(peaks.rival[cell], rival, atol=TOLERANCE_SUM)
-        np.testing.assert_allclose(peaks.displacement[cell], displacement, atol=TOLERANCE_PEAK)
-        np.testing.assert_allclose(peaks.second_displacement[cell], second_displacement, atol=TOLERANCE_PEAK)
-        assert peaks.measured[cell] == np.isfinite(displacement).all()
-
-
-def planes_twin(planes, values):
-    """Rows that `_transform_planes` makes of one column of planes."""
-    folds = planes.quads.reshape(-1, 4)
-    up, down, far_up, far_down = np.append(values, 0)[folds].T  # the place -1 holds nothing
-    classes = [up + down + far_up + far_down, up - down - far_up + far_down]
-    classes += [up + down - far_up - far_down, up - down + far_up - far_down]
-    parts = np.split(planes.matrix, len(folds) * np.cumsum(planes.counts)[:-1])
-    rows = np.empty(len(planes.rows))
-    rows[planes.rows] = np.concatenate([c @ m.reshape(len(folds), -1) for c, m in zip(classes, parts, strict=True)])
-    return rows
-
-
-@pytest.mark.parametrize(("edge", "search"), [(1, 2), (4, 4), (8, 8), (7, 3), (12, 2), (9, 2)])
-def test_spectra_of_blocks_and_surroundings_give_their_correlation(edge, search):
-    rng = np.random.default_rng(7)
-    block, around = rng.normal(size=edge), rng.normal(size=edge + 2 * search)
-    spectrum = correlation_transforms.Spectrum.of((edge,) * 3, (search,) * 3)
-    rows = [planes_twin(planes, values) for planes, values in zip(spectrum.planes, (block, around), strict=True)]
-    half = spectrum.size[0] // 2
-    taps, near = (row[: half + 1] + 1j * np.pad(row[half + 1 :], 1) for row in rows)
-    found = np.fft.irfft(taps.conj() * near, spectrum.size[0])[np.arange(-search, search + 1)]
-    np.testing.assert_allclose(found, np.correlate(around, block, "valid"), atol=TOLERANCE_SUM)
-
-
-@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
-@pytest.mark.parametrize(
-    "module",
-    [boxsum, correlation_kernels, peak_kernels, plane_kernels, spectral_kernels, window_kernels],
-    ids=lambda module: module.__name__.rpartition(".")[2],
-)
-def test_correlation_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):
-    (compiled,) = wp.compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
-    entries = compiled.read_text().count(".visible .entry")
-    assert entries == len(wp.get_module(module.__name__).kernels)
-
-
-@pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
-def test_peaks_do_not_depend_on_how_they_are_computed(monkeypatch, device, symmetric):
-    pair = particle_pair((30, 34, 38), uniform(0.4, -1.2, 0.8), seed=8, ghosts=0.5, noise=0.05)
-    arguments = {"window": (12, 12, 12), "step": (6, 6, 6), "search": (4, 4, 4), "symmetric": symmetric}
-
-    def peaks():
-        found = kernel.correlate_windows(*pair, method="direct", **arguments)
-        return {name: getattr(found, name) for name in ("displacement", "second_displacement", "correlation", "rival")}
-
-    ways = []
-    for cost in (0.0, 1e9):  # of transforms that replace products
-        monkeypatch.setattr(correlation_plan, "_SPECTRAL_SECONDS", cost)
-        ways.append(peaks())
-        plan = correlation_plan.make_plan(pair[0].shape, pair[1].shape, (12,) * 3, (6,) * 3, (4,) * 3, "direct")[0]
-        assert device.kind == "cuda" or plan.spectral == (cost == 0)
-    for name, values in ways[0].items():
-        np.testing.assert_allclose(values, ways[1][name], atol=TOLERANCE_PEAK, err_msg=name)
-    with ThreadPoolExecutor(1) as pool:
-        monkeypatch.setattr(runtime, "_pool", pool)
-        for name, values in peaks().items():
-            np.testing.assert_array_equal(values, ways[1][name], err_msg=f"{name} depends on the number of threads")
-
-
-def test_windows_without_signal_are_not_measured():
-    first, second = particle_pair((16, 24, 40), uniform(0, 0, 0), seed=2)
-    first[:, :, :20], second[:, :, :20] = 0, 0
-    peaks = kernel.correlate_windows(first, second, window=(8, 8, 8), step=(8, 8, 8), search=(3, 3, 3))
-    assert not peaks.measured[:, :, :2].any() and peaks.measured[:, :, 3:].all()
-
-
-@pytest.mark.parametrize("window", [(1, 5, 16), (7, 12, 9)])
-def test_box_sums(window):
-    volume = np.random.default_rng(3).random((19, 21, 23), dtype=np.float32)
-    expected = np.lib.stride_tricks.sliding_window_view(volume.astype(float), window).sum((-1, -2, -3))
-    result = boxsum.box_sum(volume, window)
-    inside = tuple(slice(n) for n in expected.shape)
-    np.testing.assert_allclose(result[inside], expected, rtol=TOLERANCE_SUM)
-    assert result.sum(dtype=float) == pytest.approx(result[inside].sum(dtype=float))
-    keep = (slice(0, 12, 3), slice(2, 9, 2), slice(0, 6, 5))
-    np.testing.assert_array_equal(boxsum.box_sum(volume, window, keep), result[keep])
-
-
-def test_deformation_samples_the_spline():
-    rng = np.random.default_rng(4)
-    volumes = rng.random((2, 14, 17, 19), dtype=np.float32)
-    field = rng.normal(0, 2, (3, 4, 5, 3)).astype(np.float32)
-    spacing = (13 / 2, 16 / 3, 18 / 4)
-    deformed = deform.deform_pair(*map(deform.spline_coefficients, volumes), field, spacing)
-    place = np.stack(np.meshgrid(*(np.arange(n) + deform.OFFSET for n in volumes.shape[1:]), indexing="ij"))
-    cell = place / np.reshape(spacing, (3, 1, 1, 1))
-    inside = (cell <= np.reshape(field.shape[:3], (3, 1, 1, 1)) - 1.0).all(0)  # beyond it the field is continued
-    shift = np.stack([scipy.ndimage.map_coordinates(field[..., k], cell, order=1) for k in range(3)])
-    for volume, result, sign in zip(volumes, deformed, (-0.5, 0.5), strict=True):
-        wide = np.pad(volume.astype(float), 20)  # zero outside
-        expected = scipy.ndimage.map_coordinates(wide, place + sign * shift + 20, order=3)
-        np.testing.assert_allclose(result[inside], expected[inside], atol=TOLERANCE_SPLINE)
-
-
-def predictions_twin(field, keep):
-    """Median and scatter of the neighbours, as they are and with their gradient removed, for every vector."""
-    padded = np.pad(np.where(keep[..., None], field, np.nan), [(1, 1)] * 3 + [(0, 0)], constant_values=np.nan)
-    result = np.full((4, *field.shape), np.nan)
-    offset = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"))
-    for point in np.ndindex(*keep.shape):
-        for component in range(3):
-            cube = padded[tuple(slice(p, p + 3) for p in point) + (component,)].copy()
-            cube[1, 1, 1] = np.nan
-            if np.isnan(cube).all():
-                continue
-            differences = [np.diff(cube, axis=axis) for axis in range(3)]
-            slope = [0 if np.isnan(d).all() else np.nanmedian(d) for d in differences]
-            moved = cube - np.tensordot(slope, offset, 1)
-            for k, values in ((0, cube), (2, moved)):
-                median = np.nanmedian(values)
-                result[(k, *point, component)] = median
-                result[(k + 1, *point, component)] = np.nanmedian(np.abs(values - median))
-    return result
-
-
-def test_predictions_from_neighbours():
-    rng = np.random.default_rng(5)
-    field = rng.normal(size=(4, 5, 6, 3))
-    keep = rng.random(field.shape[:3]) < 0.6
-    keep[:, :, 4:] = False  # vectors without any neighbour
-    keep[0, 0, 0] = True
-    field[~keep] = np.nan
-    expected = predictions_twin(field, keep)
-    result = neighbours.predict(field, keep, np.ones_like(keep))
-    for k, name in enumerate(("median", "scatter", "level", "level_scatter")):
-        values = getattr(result, name).reshape(field.shape)
-        np.testing.assert_allclose(values, expected[k], atol=TOLERANCE_MEDIAN * 10, err_msg=name)
-    some = rng.random(keep.shape) < 0.3
-    np.testing.assert_array_equal(neighbours.predict(field, keep, some).level, result.level[some.ravel()])
 
 
 # --- validation --------------------------------------------------------------------------------------------------
@@ -456,16 +161,11 @@ def test_large_displacements_need_only_the_quarter_rule():
     assert np.abs(error_of(result, far, 16)[1:-1, 1:-1, 1:-1]).mean() < 0.02
 
 
-def test_swapping_the_volumes_negates_and_moving_both_moves_the_field():
+def test_swapping_the_volumes_negates_the_field():
     pair = particle_pair((36, 48, 48), ring((36, 48, 48)), seed=33)
     options = {"windows": (16, 12, 12), "max_displacement_voxel": 3}
     forward, backward = measured(correlate(pair, **options)), measured(correlate(pair[::-1], **options))
     np.testing.assert_allclose(forward, -backward, atol=TOLERANCE_PEAK)
-    options = {"window": (12, 12, 12), "step": (6, 6, 6), "search": (3, 3, 3), "symmetric": True}
-    still = kernel.correlate_windows(*pair, **options).displacement
-    moved = kernel.correlate_windows(*(np.roll(v, (6, -6, 6), (0, 1, 2)) for v in pair), **options).displacement
-    # by one step of the grid; windows at the edge see what was rolled in
-    np.testing.assert_allclose(moved[2:-1, 1:-2, 2:-1], still[1:-2, 2:-1, 1:-2], atol=TOLERANCE_PEAK)
 
 
 @pytest.mark.parametrize("windows", [(32, 16, 16), (32, 16, 8)], ids=["16", "8"])
@@ -634,13 +334,6 @@ def test_bad_input_is_refused(change, message):
     good = {"volume_a": np.zeros((20, 24, 28)), "volume_b": np.zeros((20, 24, 28)), "dt_s": 1e-3, "voxel_mm": 0.1}
     with pytest.raises(ValueError, match=message):
         lfpiv.correlate(**{**good, **change})
-
-
-def test_the_kernel_refuses_what_is_not_finite():
-    pair = particle_pair((16, 16, 16), uniform(0, 0, 0), seed=42)
-    pair[1][3, 4, 5] = np.nan
-    with pytest.raises(ValueError, match="second: expected finite values"):
-        kernel.correlate_windows(*pair, window=(8, 8, 8), step=(4, 4, 4), search=(3, 3, 3))
 
 
 def test_coordinates_must_agree():

@@ -8,9 +8,9 @@ import pytest
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
-from lfpiv import warn as notices
 from lfpiv.lightfield.decoder import disc_fraction
 from lfpiv.lightfield.microimage_layout import lay_out, microimage_centres
+from lfpiv.warn import collected
 from lfpiv.weights import blocks as weightblocks
 from lfpiv.weights import choice as weightcheck
 from lfpiv.weights.blocks import StoredGrid, blocks_of, count_voxels, pack_camera
@@ -442,17 +442,17 @@ def test_a_voxel_is_cut_only_along_edges_that_matter():
 def test_profiles_stay_where_pixels_are_hardly_nearer_and_a_warning_says_why():
     grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
     rig = IdealRig({"spherical": Spherical("spherical", rotation(45)), "rolled": RIGS["rolled 40"]})
-    with notices.collected() as texts:
+    with collected() as texts:
         weights = lfpiv.build_weights(rig, grid)
     assert weights.forms == {"spherical": "profiles", "rolled": "pixels"}
     errors = weights.profile_errors["spherical"]
     assert np.mean(errors) > FOOTPRINT_MEAN
-    (text,) = texts
+    (text,) = (warning.sentence for warning in texts)
     assert text.startswith(f"spherical: weights as profiles differ from counted rays by {100 * np.mean(errors):.1f} %")
     assert "aberrations beyond the second order" in text
-    with notices.collected() as texts:
+    with collected() as texts:
         compare_with_count(lfpiv.build_weights(IdealRig({"rolled": RIGS["rolled 40"]}), grid, form="profiles"))
-    assert len(texts) == 1 and "set compute.weights_form to 'auto'" in texts[0]
+    assert len(texts) == 1 and "set compute.weights_form to 'auto'" in texts[0].sentence
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -470,9 +470,9 @@ def test_only_voxels_that_are_seen_judge(seed):
 
 def test_weights_that_nothing_judges_say_so():
     grid = lfpiv.Grid(shape=(1, 1, 2), voxel_mm=VOXEL_MM, first_centre_mm=(0.0, 9.0, 0.0))
-    with notices.collected() as texts:
+    with collected() as texts:
         weights = lfpiv.build_weights(two_cameras(), grid)
-    assert len(texts) == 2 and all("unchecked" in text for text in texts)
+    assert len(texts) == 2 and all("unchecked" in warning.sentence for warning in texts)
     assert compare_with_count(weights) == {"cam1": [], "cam2": []}
 
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv import warn
 from lfpiv.calibration.board.dot_model import spread_over_pupil
 from lfpiv.calibration.board.edges import MARGIN, Extent, numbered, outline, require_stated
 from lfpiv.calibration.board.pose import (
@@ -28,6 +27,7 @@ from lfpiv.calibration.board.pose import (
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
 from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
@@ -151,7 +151,7 @@ def find_dots(
         chiefs.append(rays[named])
     dot, chief = np.concatenate(dots), np.concatenate(chiefs)
     if any(shift):
-        warn.warn(log, "the board's dots were renamed by %d columns and %d rows to match its outline", *shift)
+        warn(log, Warning(code=Code.BOARD_RENAMED, figures={"columns": int(shift[0]), "rows": int(shift[1])}))
         pose = plan.fitted(board.of_dots_mm(dot), chief, optics)
     in_field = np.stack([_in_field(pose, board.points_mm(p), optics) for p in range(len(signals))])
     return Detection(pose, sign, dot, chief, in_field)
@@ -241,15 +241,8 @@ def _shift_to_edges(
 
 
 def _warn_of_open(extent: Extent, axis: str, board: DotBoard) -> None:
-    warn.warn(
-        log,
-        "no edge of the board is in view along %s (%d dots, %d stated): they are named right only where the "
-        "camera's axis meets the board within half a spacing (%g mm) of its middle",
-        axis,
-        extent.count,
-        extent.stated,
-        board.spacing_mm / 2,
-    )
+    figures = {"axis": axis, "count": extent.count, "stated": extent.stated, "half_spacing_mm": board.spacing_mm / 2}
+    warn(log, Warning(code=Code.BOARD_EDGE_UNSEEN, figures=figures))
 
 
 def _lit_share(pose: CameraPose, points: np.ndarray, decoder: LightFieldDecoder) -> np.ndarray:

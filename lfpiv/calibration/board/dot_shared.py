@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from lfpiv import warn
 from lfpiv.calibration.board.dot_model import BENDS, TERMS, DotFit, LensIntegral, ray_terms
 from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +96,8 @@ def settle(
             break
     if abs(at[0]) > _NOTABLE:
         seen = nominal_diameter_mm * np.exp(at[0])
-        warn.warn(log, "the board's dots look %.3g mm wide, not %.3g mm", seen, nominal_diameter_mm)
+        figures = {"seen_mm": float(seen), "stated_mm": nominal_diameter_mm}
+        warn(log, Warning(code=Code.DOT_WIDTH, figures=figures))
     return _shared(at, nominal_diameter_mm, pitch)
 
 

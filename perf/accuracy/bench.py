@@ -19,7 +19,9 @@ from lfpiv import metrics
 from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration
 from lfpiv.experiment.settings import Correlation, Smart
-from lfpiv.reproduce import Progress, rigs, store
+from lfpiv.geometry.grid import AXES
+from lfpiv.reproduce import rigs, store
+from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import FULL_SCALE, render_camera
 from lfpiv.velocity.cross_correlation import correlate
@@ -213,26 +215,26 @@ class Bench:
 
         def compute() -> dict[str, ArrayLike]:
             weights = self.weights(calibration or self.rig.calibration, cameras)
-            found, told = [], []
+            found, signals = [], []
             for images in self.images(pair, cameras):
                 first = self._flat(weights, images) if flat_guess else None
                 found.append(rigs.reconstruct_images(weights, images, smart, floor=floor, first=first))
-                told += [self._signal(weights, name, images[name], pair) for name in cameras]
-            means = {key: np.mean([one[key] for one in told]) for key in told[0]}
+                signals += [self._signal(weights, name, images[name], pair) for name in cameras]
+            means = {key: np.mean([one[key] for one in signals]) for key in signals[0]}
             for key in ("iterations", "sieve_voxel"):
                 means[key] = np.mean([volume.attrs[key] for volume in found])
             return {"volumes": np.stack([volume.values for volume in found]), **means}
 
         kept = store.kept_arrays(self.folder / f"{name}.npz", settings, compute)
         coords = {axis: (axis, self.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
-        pair_values, told = kept.pop("volumes"), {key: float(value) for key, value in kept.items()}
-        attributes = {"sieve_voxel": told["sieve_voxel"]}  # the correlation smooths what is not smooth already
-        return [xr.DataArray(values, coords, ("z", "y", "x"), attrs=attributes) for values in pair_values], told
+        pair_values, signal = kept.pop("volumes"), {key: float(value) for key, value in kept.items()}
+        attributes = {"sieve_voxel": signal["sieve_voxel"]}  # the correlation smooths what is not smooth already
+        return [xr.DataArray(values, coords, AXES, attrs=attributes) for values in pair_values], signal
 
     def judge(
         self,
         volumes: list[xr.DataArray],
-        told: Mapping[str, float],
+        signal: Mapping[str, float],
         *,
         pair: Pair,
         correlation: Correlation | None = None,
@@ -260,7 +262,7 @@ class Bench:
             ghost_ratio=ghost_ratio,
             ghosts=ghosts,
             elongation=elongation,
-            iterations=told.get("iterations", float("nan")),
+            iterations=signal.get("iterations", float("nan")),
         )
 
     def true_volumes(self, pair: Pair) -> list[xr.DataArray]:

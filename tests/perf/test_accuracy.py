@@ -1,12 +1,17 @@
-"""Cases of `lfpiv reproduce` beyond the paper, at tiny sizes; and what the injector's averages are made of."""
+"""Cases of `perf/accuracy`, at tiny sizes."""
 
 import json
 
+import bench
+import cameras
+import choices
 import numpy as np
+import optics
 import pytest
+import run
+import sweeps
 
-from lfpiv import reproduce
-from lfpiv.reproduce import bench, cameras, choices, lsi, lsi_twin, optics, sweeps
+from lfpiv.reproduce.study import compute
 from lfpiv.weights import choice as weightcheck
 
 SEED = 3
@@ -51,7 +56,7 @@ def tiny(tmp_path_factory):
         patch.setattr(module, name, value)
     out = tmp_path_factory.mktemp("beyond")
     try:
-        reproduce.reproduce(reproduce.BEYOND, out, seed=SEED)
+        compute(run.ACCURACY, "all", out, "small", seed=SEED)
         yield out
     finally:
         patch.undo()
@@ -106,9 +111,9 @@ def test_choices_are_held_against_the_defaults(figures):
 
 def test_only_what_changes_the_volumes_is_reconstructed():
     every = choices.OPEN | choices.OWN
-    kept = {key for key, choice in every.items() if not weightcheck.reconstructs}
+    kept = {key for key, choice in every.items() if not choice.reconstructs}
     assert kept == {"power_1", "windows_8", "windows_16"}
-    assert all(weightcheck.like is None or weightcheck.like in every for choice in every.values())
+    assert all(choice.like is None or choice.like in every for choice in every.values())
 
 
 def test_cases_share_their_runs_and_the_page_tells_them_apart(tiny, figures):
@@ -117,12 +122,10 @@ def test_cases_share_their_runs_and_the_page_tells_them_apart(tiny, figures):
     assert len([name for name in runs if name.startswith("two_")]) == 2  # of the sweep's two exposures
     assert not list((tiny / "work").rglob(".*")), "scratch files left behind"
     text = (tiny / "index.html").read_text()
-    assert text.index("Beyond the paper</h1>") < text.index(f"<h2 id='{reproduce.BEYOND[0]}'>")
     assert text.count("Beyond the paper</h1>") == 1
-    for key in reproduce.BEYOND:
+    for key in run.ACCURACY.modules:
         for figure in figures[key]["figures"]:
             assert (tiny / figure["file"]).stat().st_size > 10_000, figure
-    assert reproduce.CASES == (*reproduce.PAPER, *reproduce.BEYOND)
 
 
 def test_standard_errors_are_those_of_independent_vectors():
@@ -132,35 +135,11 @@ def test_standard_errors_are_those_of_independent_vectors():
     assert told == pytest.approx(np.std([values.mean() for values in means]), rel=SAMPLED)  # eight times the same
 
 
-# -- the injector's averages -------------------------------------------------------------------------------------------
-
-
-def test_profiles_between_layers_are_not_smoothed():
-    twin = lsi_twin.Twin(lsi.SIZES["small"], seed=1)
-    axes = [np.linspace(-6, 6, 9), np.linspace(-3, 3, 5), np.array([-1.0, 0.0, 1.0])]
-    z, y, x = np.meshgrid(*axes, indexing="ij")
-    field = np.stack([z**3 - z + y, 2 - z**2 + x], axis=-1)
-    found = lsi._along(twin, axes, field)
-    depth, y = np.meshgrid(twin.depths_mm, axes[1], indexing="ij")
-    expected = np.stack([depth**3 - depth + y, 2 - depth**2 + twin.profile_x_mm], axis=-1)
-    np.testing.assert_allclose(found, expected, atol=1e-9)  # a cubic, at depths between the layers
-    field[4, 2] = np.nan  # a window that no pair measured, in the layer at z = 0
-    found = lsi._along(twin, axes, field)
-    lost = np.isnan(found).any(-1)
-    assert lost[1, 2] and lost.sum() == 1
-
-
-def test_error_by_pairs_tells_chance_from_bias():
-    twin = lsi_twin.Twin(lsi.SIZES["small"], seed=1)
-    axes = [np.linspace(-6, 6, 60), np.linspace(-3, 3, 40), np.array([-1.0, 0.0, 1.0])]
-    rng, pairs, bias, spread = np.random.default_rng(2), 40, 0.2, 0.1
-    each = rng.standard_normal((pairs, 1, 40, 1, 3)) * spread * np.ones((1, 60, 1, 3, 1))
-    each[..., 1] += bias
-    reference = np.ones((3, 40, 2)) / 1000 / twin.dt_s  # as large as a displacement of 1 mm
-    told = lsi.error_by_pairs(twin, {"axes_mm": axes, "departures_mm": each}, reference)
-    assert told["pairs"] == [1, 2, 5, 10, 20, 40]
-    for count, error, chance in zip(told["pairs"], told["error"], told["chance"], strict=True):
-        expected = spread * np.sqrt(2 / np.pi / count)
-        assert chance == pytest.approx([expected] * 2, rel=0.1)  # forty pairs at forty heights
-        assert error[0] == pytest.approx(expected, rel=0.5)  # forty heights of one average
-    assert told["error"][-1][1] == pytest.approx(bias, rel=0.05)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["fig10"], "cases: expected some of optics, cameras"), (["--seed", "-1"], "seed: expected")],
+)
+def test_wrong_arguments_are_refused_in_one_line(tmp_path, capsys, arguments, message):
+    assert run.main([*arguments, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(message) and error.count("\n") == 1

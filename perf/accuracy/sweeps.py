@@ -7,8 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lfpiv.reproduce import Progress, bench, page, plots
-from lfpiv.reproduce.bench import DEFAULT, Bench, Judged, Pair
+import bench
+from bench import DEFAULT, Bench, Judged, Pair
+
+from lfpiv.reproduce import page, plots
+from lfpiv.reproduce.study import Progress
 
 TITLE = "Noise and seeding"
 
@@ -16,7 +19,7 @@ PPM = {"small": (0.05, 0.2, 0.5, 1.0, 2.0), "paper": (0.02, 0.05, 0.1, 0.2, 0.5,
 """Seeding, at the bench's exposure."""
 COUNTS = {"small": (300.0, 30.0, 8.0, 2.5), "paper": (300.0, 100.0, 30.0, 15.0, 8.0, 4.0, 2.5)}
 """Level of a pixel lit by one particle [count], at the bench's seeding; the noise stays as it is."""
-Told = dict[str, float]
+Signal = dict[str, float]
 """What the images of a run were like; see `Bench.volumes`."""
 AXES = {"x": "#2f81d6", "y": "#2ca36b", "z": "#e0762a"}
 
@@ -32,14 +35,14 @@ def compute(
 ) -> dict[str, Any]:
     """Measure on a calibrated bench with two cameras."""
     pairs = [replace(DEFAULT, ppm=ppm) for ppm in ppms] + [replace(DEFAULT, counts=level) for level in counts]
-    judged: dict[Pair, tuple[Judged, Told]] = {}
+    judged: dict[Pair, tuple[Judged, Signal]] = {}
     truth: dict[Pair, Judged] = {}
     for done, pair in enumerate(pairs):
         progress(f"{pair.ppm:g} ppm, {pair.counts:g} counts", done / len(pairs))
         if pair in judged:
             continue
-        volumes, told = own.volumes(bench.run_name(pair, "two"), pair=pair)
-        judged[pair] = own.judge(volumes, told, pair=pair), told
+        volumes, signal = own.volumes(bench.run_name(pair, "two"), pair=pair)
+        judged[pair] = own.judge(volumes, signal, pair=pair), signal
         if pair.counts == DEFAULT.counts:
             truth[pair] = own.judge(own.true_volumes(pair), {}, pair=pair)
     progress("sweeps", 1.0)
@@ -49,8 +52,8 @@ def compute(
     best, worst = min(seeding, key=lambda row: row[1].error.mean), max(seeding, key=lambda row: row[1].error.mean)
     return page.result(
         {
-            "seeding": [{"ppm": ppm, **told, **one.row()} for ppm, one, told, _ in seeding],
-            "noise": [{"ppm": DEFAULT.ppm, **told, **one.row()} for _, one, told in noise],
+            "seeding": [{"ppm": ppm, **signal, **one.row()} for ppm, one, signal, _ in seeding],
+            "noise": [{"ppm": DEFAULT.ppm, **signal, **one.row()} for _, one, signal in noise],
             "size_mm": own.size_mm,
         },
         comparison=[
@@ -60,11 +63,11 @@ def compute(
             ),
             *(
                 page.compare(
-                    f"mean error at {_electrons(told)} electrons per particle and camera",
+                    f"mean error at {_electrons(signal)} electrons per particle and camera",
                     one.error.mean,
                     unit="voxel",
                 )
-                for _, one, told in (noise[0], noise[-1])
+                for _, one, signal in (noise[0], noise[-1])
             ),
         ],
         figures=[
@@ -80,12 +83,12 @@ def compute(
                 "caption": f"Seeding, at {_electrons(seeding[0][2])} electrons per particle and camera. Errors "
                 "in voxels, against the flow's mean over each window; true: of the true particles' correlation.",
                 "columns": ["ppm", *bench.COLUMNS, "true", "SNR"],
-                "rows": [[ppm, *one.cells(), exact.error.mean, told["snr"]] for ppm, one, told, exact in seeding],
+                "rows": [[ppm, *one.cells(), exact.error.mean, signal["snr"]] for ppm, one, signal, exact in seeding],
             },
             {
                 "caption": f"Noise, at {DEFAULT.ppm:g} ppm. Electrons: what one camera receives of one particle.",
                 "columns": ["electrons", "SNR", *bench.COLUMNS],
-                "rows": [[_electrons(told), told["snr"], *one.cells()] for _, one, told in noise],
+                "rows": [[_electrons(signal), signal["snr"], *one.cells()] for _, one, signal in noise],
             },
         ],
         notes=[
@@ -104,13 +107,13 @@ def compute(
     )
 
 
-def _electrons(told: Told) -> int:
+def _electrons(signal: Signal) -> int:
     """Electrons of a particle, to what is worth reading."""
-    return int(float(f"{told['electrons']:.2g}"))
+    return int(float(f"{signal['electrons']:.2g}"))
 
 
-def _about_saturation(seeding: Sequence[tuple[float, Judged, Told, Judged]]) -> list[str]:
-    clipped = [(ppm, told["saturated"]) for ppm, _, told, _ in seeding if told["saturated"] > 1e-4]
+def _about_saturation(seeding: Sequence[tuple[float, Judged, Signal, Judged]]) -> list[str]:
+    clipped = [(ppm, signal["saturated"]) for ppm, _, signal, _ in seeding if signal["saturated"] > 1e-4]
     if not clipped:
         return []
     text = ", ".join(f"{100 * share:.2g} % at {ppm:g} ppm" for ppm, share in clipped)
@@ -118,7 +121,7 @@ def _about_saturation(seeding: Sequence[tuple[float, Judged, Told, Judged]]) -> 
 
 
 def _draw(
-    seeding: Sequence[tuple[float, Judged, Told, Judged]], noise: Sequence[tuple[float, Judged, Told]], path: Path
+    seeding: Sequence[tuple[float, Judged, Signal, Judged]], noise: Sequence[tuple[float, Judged, Signal]], path: Path
 ) -> None:
     drawn = plots.figure(8.5, 5.2)
     (error_by_ppm, error_by_snr), (q_by_ppm, q_by_snr) = drawn.subplots(2, 2, sharex="col", sharey="row")

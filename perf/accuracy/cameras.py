@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import bench
 import numpy as np
 import xarray as xr
+from bench import Bench, Judged, Pair
 
-from lfpiv.reproduce import Progress, bench, page, plots, rigs
-from lfpiv.reproduce.bench import Bench, Judged, Pair
+from lfpiv.reproduce import page, plots, rigs
+from lfpiv.reproduce.study import Progress
 
 TITLE = "One, two and three cameras"
 
@@ -35,12 +37,12 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
     for done, (ppm, name) in enumerate(todo):
         progress(f"{NAMES[name]}, {ppm:g} ppm", done / len(todo))
         pair = Pair(ppm=ppm)
-        told: dict[str, float] = {}
+        signal: dict[str, float] = {}
         if name == "truth":
             volumes = own.true_volumes(pair)
         else:
-            volumes, told = own.volumes(bench.run_name(pair, name), pair=pair, cameras=SETS[name])
-        judged[name, ppm] = own.judge(volumes, told, pair=pair)
+            volumes, signal = own.volumes(bench.run_name(pair, name), pair=pair, cameras=SETS[name])
+        judged[name, ppm] = own.judge(volumes, signal, pair=pair)
         if ppm == ppms[0]:
             shown[name] = volumes[0]
     progress("cameras", 1.0)

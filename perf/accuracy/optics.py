@@ -7,12 +7,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import bench
 import numpy as np
 import xarray as xr
+from bench import DEFAULT, Bench, Judged
 
 from lfpiv.calibration.cameras import Calibration, thin_lens
-from lfpiv.reproduce import Progress, bench, page, plots, rigs
-from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
+from lfpiv.reproduce import page, plots, rigs
+from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.scene import Scene, true_mapping
 
 TITLE = "Real optics: where ray tracing fails and the network does not"
@@ -82,7 +84,7 @@ RayErrors = dict[str, dict[str, float]]
 SMALLEST_PITCH = 2e-4
 """Lowest ray error shown [pitch]: DRT's through ideal optics is none."""
 FURTHER = 1.5
-"""A fitted lens this many times further off than the nominal one is told of."""
+"""A fitted lens this many times further off than the nominal one is described."""
 SLICE_VOXEL = 2
 """Thickness of the slices that are shown [voxel]."""
 
@@ -110,8 +112,8 @@ def compute(scale: str, work: Path, optics: Mapping[str, Optics], *, seed: int, 
             continue
         for number, name in enumerate(CORRELATED):
             step(f"pair by {NAMES[name]}", (1 + number) / (1 + len(CORRELATED)))
-            volumes, told = own.volumes(name, pair=DEFAULT, calibration=mappings[name])
-            judged[key, name] = own.judge(volumes, told, pair=DEFAULT)
+            volumes, signal = own.volumes(name, pair=DEFAULT, calibration=mappings[name])
+            judged[key, name] = own.judge(volumes, signal, pair=DEFAULT)
             shown[key, name] = volumes[0]
         volumes = own.true_volumes(DEFAULT)
         judged[key, "truth"], shown[key, "truth"] = own.judge(volumes, {}, pair=DEFAULT), volumes[0]

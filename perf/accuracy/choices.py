@@ -7,16 +7,19 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import bench
 import numpy as np
 import xarray as xr
+from bench import DEFAULT, Bench, Judged
 from numpy.typing import ArrayLike
 
 from lfpiv.calibration.cameras import Calibration, thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.motion import reconstruct_pair
-from lfpiv.reproduce import Progress, bench, page, plots, rigs, store
-from lfpiv.reproduce.bench import DEFAULT, Bench, Judged
+from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.reproduce.study import Progress
 
 TITLE = "What each choice is worth"
 
@@ -223,7 +226,7 @@ def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray
     kept = store.kept_arrays(own.folder / f"{name}.npz", settings, compute)
     coords = {axis: (axis, own.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
     smooth = {"sieve_voxel": float(kept["sieve_voxel"])}
-    volumes = [xr.DataArray(values, coords, ("z", "y", "x"), attrs=smooth) for values in kept["volumes"]]
+    volumes = [xr.DataArray(values, coords, AXES, attrs=smooth) for values in kept["volumes"]]
     return volumes, {"iterations": float(kept["iterations"])}
 
 
@@ -271,15 +274,17 @@ def _table(
 
 def _verdict(choices: Mapping[str, Choice], gaps: Mapping[str, tuple[float, float]], default: Judged) -> str:
     """Say which choices differ from the defaults by more than chance."""
-    told = {key: gap for key, (gap, error) in gaps.items() if abs(gap) > max(SURE * error, WORTH * default.error.mean)}
-    better = [choices[key].label for key, gap in told.items() if gap < 0]
+    notable = {
+        key: gap for key, (gap, error) in gaps.items() if abs(gap) > max(SURE * error, WORTH * default.error.mean)
+    }
+    better = [choices[key].label for key, gap in notable.items() if gap < 0]
     share = ", ".join(
         f"{choices[key].label} ({100 * gaps[key][0] / default.error.mean:+.0f} %)"
         for key in sorted(gaps, key=lambda key: -gaps[key][0])[:3]
     )
     text = (
-        f"Beyond {SURE:g} standard errors and {100 * WORTH:g} % of the error, {len(told) - len(better)} of {len(gaps)} "
-        f"choices are worse than the defaults; better: {'; '.join(better) or 'none'}."
+        f"Beyond {SURE:g} standard errors and {100 * WORTH:g} % of the error, {len(notable) - len(better)} of "
+        f"{len(gaps)} choices are worse than the defaults; better: {'; '.join(better) or 'none'}."
     )
     return f"{text} Those that cost most: {share}."
 

@@ -1,0 +1,147 @@
+"""Tell how much of a volume the calibrated cameras see. Refuse a volume that a camera does not see."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lfpiv.calibration.camera import CalibratedCamera, Calibration
+from lfpiv.errors import InputError
+from lfpiv.geometry.grid import Grid
+from lfpiv.warn import Code, Warning
+
+log = logging.getLogger(__name__)
+
+
+SAMPLES = 8
+"""Voxels along each axis that tell how much of a volume a camera sees."""
+
+
+FEW = 0.5
+"""Part of the volume below which a camera sees so little of it that a warning is due."""
+
+
+SEEN_SHARE = 0.1
+"""Least sum of a voxel's weights in a camera that sees it, as a share of the largest one in the volume: a tenth of the
+pupil."""
+
+
+LEAST_ALONE = 0.01
+"""Part of the volume, seen by fewer than two cameras, above which a warning is due."""
+
+
+def require_seen(path: Path, calibration: Calibration, grid: Grid) -> None:
+    """Refuse a volume of which a calibrated camera sees nothing; warn where it sees less than half.
+
+    Raises
+    ------
+    InputError
+        Names the camera.
+    """
+    for camera in calibration.cameras.values():
+        share = seen_share(camera, grid)
+        if share == 0:
+            raise InputError(
+                f"{path}: volume: expected a volume in the view of every camera, found one around "
+                f"{grid.centre_text()} of which camera {camera.name!r} sees nothing by its calibration. Check "
+                "volume.centre_mm and size_mm against the board's extent."
+            )
+    for warning in sight_warnings(calibration, grid):
+        log.warning("%s", warning.sentence)
+
+
+def sight_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
+    """Say of every calibrated camera that sees less than half of a volume how much it sees, and what two do not see."""
+    sampled = {camera.name: _sees(camera, grid) for camera in calibration.cameras.values()}
+    warnings = [
+        Warning(code=Code.OUTSIDE_SIGHT, subject=name, figures={"share": float(seen.mean())})
+        for name, seen in sampled.items()
+        if seen.mean() < FEW
+    ]
+    if len(sampled) > 1:
+        warnings += _seen_by_one(np.sum(list(sampled.values()), 0), _sampled_axes(grid))
+    return warnings
+
+
+def seen_share(camera: CalibratedCamera, grid: Grid) -> float:
+    """Part of a volume's voxels of which some ray through the pupil meets a camera's sensor, by a sample of them."""
+    return float(_sees(camera, grid).mean())
+
+
+def _sampled_axes(grid: Grid) -> list[np.ndarray]:
+    """Places of some planes of voxels along z, y, x [mm], the outer ones among them."""
+    return [
+        grid.axis_mm(axis)[np.unique(np.linspace(0, n - 1, SAMPLES).round().astype(int))]
+        for axis, n in enumerate(grid.shape)
+    ]
+
+
+def _sees(camera: CalibratedCamera, grid: Grid) -> np.ndarray:
+    """Whether some ray from a voxel through the pupil meets the sensor, for voxels on all of the sampled planes."""
+    z, y, x = np.meshgrid(*_sampled_axes(grid), indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    half = np.array(camera.optics.sensor_shape[::-1]) * camera.optics.pixel_mm / 2
+    seen = np.zeros(len(points), bool)
+    for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+        pupil = np.tile(0.9 * camera.optics.pupil_radius_mm * np.array([u, v], float), (len(points), 1))
+        seen |= (np.abs(camera.map(points, pupil)) <= half).all(1)
+    return seen.reshape(x.shape)
+
+
+def warn_seen_by_one(views: np.ndarray, grid: Grid, cameras: int) -> None:
+    """Log a warning where voxels of a grid are seen by but one of several cameras; `views` counts them, (z, y, x)."""
+    if cameras > 1:
+        for warning in _seen_by_one(views, [grid.axis_mm(axis) for axis in range(3)]):
+            log.warning("%s", warning.sentence)
+
+
+def _seen_by_one(views: np.ndarray, axes_mm: Sequence[np.ndarray]) -> list[Warning]:
+    """Say how much of a volume fewer than two cameras see, and where; `views` counts them at places along z, y, x."""
+    seen = views >= 2
+    if 1 - seen.mean() < LEAST_ALONE:
+        return []
+    where = "none of it is seen by two"
+    if seen.any():
+        reach = []
+        for axis, name in ((2, "x"), (1, "y"), (0, "z")):
+            inside = axes_mm[axis][seen.any(tuple({0, 1, 2} - {axis}))]
+            reach.append(f"{name} {inside[0]:.3g} to {inside[-1]:.3g}")
+        where = f"two see no more than {', '.join(reach)} mm"
+    return [Warning(code=Code.SEEN_BY_ONE, figures={"share": float(1 - seen.mean()), "where": where})]
+
+
+def warn_outside(calibration: Calibration, grid: Grid) -> None:
+    """Log a warning for every camera whose calibrated region does not hold all voxels of a grid."""
+    for warning in outside_warnings(calibration, grid):
+        log.warning("%s", warning.sentence)
+
+
+def outside_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
+    """Say of every camera whose calibrated region does not hold all voxels of a grid how much lies outside.
+
+    The region is the box that the board's dots spanned, widened by half a voxel.
+    """
+    warnings = []
+    for camera in calibration.cameras.values():
+        if camera.region_mm is None:
+            continue
+        inside, distance = 1.0, 0.0
+        for axis in range(3):
+            centres = grid.axis_mm(2 - axis)
+            low, high = camera.region_mm[:, axis]
+            over = np.maximum(np.maximum(low - centres, centres - high) - grid.voxel_mm / 2, 0.0)
+            inside *= float((over <= 1e-9).mean())
+            distance = float(np.hypot(distance, over.max()))
+        if inside == 1:
+            continue
+        low, high = camera.region_mm
+        box = ", ".join(f"{name} {a:g} to {b:g}" for name, a, b in zip("xyz", low, high, strict=True))
+        advice = "shrink the volume or use a larger board or more planes"
+        if camera.baseline is None:
+            advice += ', or set network.baseline = "thin_lens": a network alone extrapolates badly'
+        figures = {"share": 1 - inside, "region": box, "distance_mm": distance, "advice": advice}
+        warnings.append(Warning(code=Code.OUTSIDE_CALIBRATION, subject=camera.name, figures=figures))
+    return warnings

@@ -1,0 +1,92 @@
+"""Write files whole or not at all: each is written under a temporary name and renamed. Turn values into JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv.errors import StorageError
+
+MIB = 1 << 20
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a scratch path in the folder of `path`; renamed to `path` at the end, removed on any failure.
+
+    The path is new each time, so that two processes may write one file; what a killed one leaves ends in ``.tmp``.
+    """
+    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield scratch
+        with scratch.open("rb") as file:
+            os.fsync(file.fileno())  # the name must not outlive a power failure without its bytes
+        os.replace(scratch, path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def write_bytes(content: bytes | memoryview, path: Path) -> None:
+    """Write a file, whole or not at all; HDF5 files too: HDF5's own writing crashes the process on a full disk."""
+    with replacing(path) as scratch:
+        scratch.write_bytes(content)
+
+
+def write_text(text: str, path: Path) -> None:
+    """Write a text file, whole or not at all."""
+    with replacing(path) as scratch:
+        scratch.write_text(text, "utf-8")
+
+
+def write_json(value: Any, path: Path) -> None:
+    """Write a JSON file, whole or not at all; NaN and infinity become null."""
+    write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n", path)
+
+
+def plain(value: Any) -> Any:
+    """Turn arrays, NumPy numbers, tuples, paths and non-finite numbers into what JSON knows."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def settings_hash(**parts: Any) -> str:
+    """Short hash of everything a result depends on; the order of keys does not matter."""
+    text = json.dumps(plain(parts), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what goes wrong while a result is written into a StorageError that says how to go on."""
+    try:
+        yield
+    except StorageError:
+        raise
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        free = ""
+        with contextlib.suppress(OSError):
+            free = f", {shutil.disk_usage(path.parent).free / MIB:,.0f} MiB free there"
+        raise StorageError(
+            f"{path}: cannot be written: {reason}{free}. What is finished is kept and whole; mend that, and the same "
+            "command goes on from there."
+        ) from error

@@ -1,0 +1,80 @@
+"""The voxel grid of a volume: a frozen value in millimetres, axes ordered (z, y, x)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+AXES = ("z", "y", "x")
+"""Names of a volume's axes, in order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Regular grid of cubic voxels."""
+
+    shape: tuple[int, int, int]
+    """Voxel counts, order (z, y, x)."""
+    voxel_mm: float
+    """Voxel edge [mm]."""
+    first_centre_mm: tuple[float, float, float]
+    """Centre of voxel (0, 0, 0) [mm], order (z, y, x)."""
+
+    def __post_init__(self) -> None:
+        """Check the values: raises ValueError."""
+        whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 1 for n in self.shape)
+        if not (len(self.shape) == 3 and whole):
+            raise ValueError(f"shape: expected three whole numbers of voxels >= 1 (z, y, x), got {self.shape}.")
+        if not (math.isfinite(self.voxel_mm) and self.voxel_mm > 0):
+            raise ValueError(f"voxel_mm: expected a length > 0 mm, got {self.voxel_mm!r}.")
+        if not (len(self.first_centre_mm) == 3 and all(map(math.isfinite, self.first_centre_mm))):
+            raise ValueError(f"first_centre_mm: expected three finite lengths (z, y, x), got {self.first_centre_mm}.")
+
+    @classmethod
+    def from_extent(
+        cls, *, centre_mm: tuple[float, float, float], size_mm: tuple[float, float, float], voxel_mm: float
+    ) -> Grid:
+        """Grid of n = round(size / voxel) voxels per axis around a centre; both in the order (x, y, z).
+
+        Raises
+        ------
+        ValueError
+            If a value is not finite, `voxel_mm` is not above 0, or `size_mm` is less than a voxel.
+
+        Examples
+        --------
+        >>> from lfpiv import Grid
+        >>> grid = Grid.from_extent(centre_mm=(0, 0, 1), size_mm=(0.6, 0.4, 0.2), voxel_mm=0.1)
+        >>> grid.shape
+        (2, 4, 6)
+        >>> grid.axis_mm(0).round(3).tolist()  # z
+        [0.95, 1.05]
+        """
+        if not (math.isfinite(voxel_mm) and voxel_mm > 0):
+            raise ValueError(f"voxel_mm: expected a length > 0 mm, got {voxel_mm!r}.")
+        if not all(math.isfinite(size) and round(size / voxel_mm) >= 1 for size in size_mm):
+            raise ValueError(f"size_mm: expected (x, y, z) of at least a voxel of {voxel_mm:g} mm each, got {size_mm}.")
+        nx, ny, nz = (round(size / voxel_mm) for size in size_mm)
+        x, y, z = (centre - (n - 1) / 2 * voxel_mm for centre, n in zip(centre_mm, (nx, ny, nz), strict=True))
+        return cls(shape=(nz, ny, nx), voxel_mm=voxel_mm, first_centre_mm=(z, y, x))
+
+    @property
+    def size(self) -> int:
+        """Number of voxels."""
+        return math.prod(self.shape)
+
+    def axis_mm(self, axis: int) -> np.ndarray:
+        """Voxel centres along one axis (0: z, 1: y, 2: x) [mm]."""
+        return self.first_centre_mm[axis] + self.voxel_mm * np.arange(self.shape[axis])
+
+    def centres_mm(self) -> np.ndarray:
+        """All voxel centres in C order of (z, y, x), as (x, y, z) points [mm], shape (voxel, 3)."""
+        z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in range(3)), indexing="ij")
+        return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+
+    def centre_text(self) -> str:
+        """Return the centre (x, y, z) in words, for messages."""
+        centre = (round(float(self.axis_mm(axis).mean()), 6) + 0.0 for axis in (2, 1, 0))
+        return f"({', '.join(f'{value:g}' for value in centre)}) mm"

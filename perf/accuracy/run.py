@@ -1,0 +1,47 @@
+"""Measure what this software's choices are worth: cases beside the paper's, on one page as `lfpiv reproduce` makes it.
+
+    python perf/accuracy/run.py [CASE ...] --out DIR [--scale small|paper] [--seed N]
+
+Cases: real optics, one to three cameras, seeding and noise, choices of method. All are computed where none is named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from lfpiv.errors import InputError
+from lfpiv.reproduce.study import SCALES, Study, compute
+
+ACCURACY = Study(
+    title="Beyond the paper",
+    about="What the paper did not show, on rigs of the same main and microlenses with smaller volumes and noisy images",
+    modules={key: key for key in ("optics", "cameras", "sweeps", "choices")},
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the cases; return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", default=["all"], metavar="CASE", help=", ".join(ACCURACY.modules))
+    parser.add_argument("--out", default="accuracy", help="folder for the results")
+    parser.add_argument("--scale", choices=SCALES, default="small")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    try:
+        compute(
+            ACCURACY,
+            options.cases,
+            options.out,
+            options.scale,
+            seed=options.seed,
+            progress=lambda step, fraction: print(f"{100 * fraction:3.0f} % {step}", file=sys.stderr),
+        )
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
