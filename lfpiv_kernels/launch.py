@@ -22,6 +22,8 @@ class Call:
     inputs: Sequence[object]
     outputs: Sequence[object]
     scratch: bool = False
+    inner: tuple[int, ...] = ()
+    """Further axes of the threads. Only the first axis, `size`, is cut into parts."""
 
 
 def launch(*calls: Call, parts: int | None = None, device: str | None = None) -> None:
@@ -57,7 +59,8 @@ def launch(*calls: Call, parts: int | None = None, device: str | None = None) ->
             if call.scratch:
                 slot = free.pop()
                 inputs = [*call.inputs, slot, first]
-            wp.launch(call.kernel, dim=last - first, inputs=inputs, outputs=call.outputs, device=device)
+            dim = (last - first, *call.inner)
+            wp.launch(call.kernel, dim=dim, inputs=inputs, outputs=call.outputs, device=device)
             if call.scratch:
                 free.append(slot)
 

@@ -72,8 +72,3 @@ def _included(header: str) -> list[Path]:
             if FOLDER / name not in paths:
                 paths.append(FOLDER / name)
     return paths
-
-
-def read_native(name: str) -> str:
-    """Return the text of a source file of this folder, after an empty line."""
-    return "\n" + (FOLDER / name).read_text(encoding="utf-8")
