@@ -181,11 +181,11 @@ class RayMap:
 
     def spread(self, image: wp.array, rays_out: wp.array) -> None:
         """Write each pixel's light, times their shares, on its rays: the adjoint of `collect`."""
-        launch(Call(_spread, self.rays.runs, [self.rays, image], [rays_out]))
+        launch(Call(_spread, self.rays.runs, [self.rays, image], [rays_out]), parts=runtime.CHUNKS)
 
     def collect(self, rays: wp.array, image_out: wp.array) -> None:
         """Sum the rays of every pixel, each times its share. Pixels without rays do not change."""
-        launch(Call(_collect, self.rays.runs, [self.rays, rays], [image_out]))
+        launch(Call(_collect, self.rays.runs, [self.rays, rays], [image_out]), parts=runtime.CHUNKS)
 
 
 def _on_cpu(array: np.ndarray) -> wp.array:
