@@ -16,7 +16,7 @@ from lfpiv_kernels.weights.microimages import Microimages
 
 wp.set_module_options(native.options("pixel_rays.h"))
 
-RUN = native.constant("pixel_rays.h", "RUN")
+RUN: int = native.constant("pixel_rays.h", "RUN")
 """Pixels that a thread goes through."""
 
 

@@ -34,9 +34,9 @@ from lfpiv_kernels.weights.ray_model import GEOMETRY_SIZE
 
 wp.set_module_options(native.options("footprint.h", contract="fast"))
 
-TALLEST = native.constant("footprint.h", "TALLEST")
+TALLEST: int = native.constant("footprint.h", "TALLEST")
 """Rows of a block at most."""
-MOST_PARTS = native.constant("footprint.h", "MOST_PARTS")
+MOST_PARTS: int = native.constant("footprint.h", "MOST_PARTS")
 """Parts of a voxel at most."""
 FORMS = ("profiles", "pixels")
 """Rank-1 blocks, or one value per ray."""

@@ -15,7 +15,7 @@ from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 wp.set_module_options(native.options("microimages.h", contract="off"))  # rounds as NumPy does
 
-LAYERS = native.constant("microimages.h", "LAYERS")
+LAYERS: int = native.constant("microimages.h", "LAYERS")
 """Versions of each microimage."""
 
 

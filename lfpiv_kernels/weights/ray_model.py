@@ -4,18 +4,18 @@ import taichi as ti
 
 from lfpiv_kernels import native
 
-BLOCK_WIDTH = native.constant("projector.h", "BLOCK_WIDTH")
+BLOCK_WIDTH: int = native.constant("projector.h", "BLOCK_WIDTH")
 """Largest width of a block of weights [pixel]: one vector load."""
-MODEL_SIZE = native.constant("ray_model.h", "MODEL_SIZE")
+MODEL_SIZE: int = native.constant("ray_model.h", "MODEL_SIZE")
 """Floats of a voxel's ray model: 6 polynomial coefficients (1, u, v, uu, uv, vv) of s, 6 of t [mm], the projected
 voxel edges along x, y, z as (s, t) [mm], and their change with the pupil point, (s_u, s_v, t_u, t_v) along x, y, z."""
-LEVELS = native.constant("ray_model.h", "LEVELS")
+LEVELS: float = native.constant("ray_model.h", "LEVELS")
 """Largest 8-bit value."""
 
 Camera = ti.types.vector(8, ti.f32)
 """r = f_m/s_i, pixel [mm], columns / 2, rows / 2, pupil radius [mm], columns, rows, edge of a microimage [pixel]."""
 
-GEOMETRY_SIZE = native.constant("ray_model.h", "GEOMETRY_SIZE")
+GEOMETRY_SIZE: int = native.constant("ray_model.h", "GEOMETRY_SIZE")
 """Floats of a camera's geometry: `Camera`, ``lattice.Lattice``, half extent of a lens's cell along s and t [mm], and
 the matrix ``lattice.cell_frame``, row by row."""
 
