@@ -12,9 +12,9 @@ from scipy import ndimage, optimize
 from threadpoolctl import threadpool_limits
 
 import lfpiv
-from lfpiv.calibration.network import train
+from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.geometry.grid import Grid
-from lfpiv.weights.blocks import COUNT_POINTS
+from lfpiv.weights.counting import COUNT_POINTS
 from lfpiv.weights.operator import COUNT_SAMPLES_ONE, compare_with_count
 from lfpiv_kernels import runtime
 from lfpiv_kernels.correlation import correlate, deform
@@ -305,7 +305,7 @@ def _train(scale, epochs) -> Work:
     outputs = camera.map(inputs[:, :3], inputs[:, 3:]) + rng.normal(0, 0.1 * LABEL_NOISE, (count, 2))
 
     def run(epochs=epochs):
-        return train(inputs, outputs, epochs=epochs, patience=epochs, unit=camera.lattice.pitch_mm)
+        return train(inputs, outputs, TrainingSettings(epochs=epochs, patience=epochs), unit=camera.lattice.pitch_mm)
 
     def check(training):
         require(training.epochs == epochs, f"stopped after {training.epochs} epochs")

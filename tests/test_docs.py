@@ -186,7 +186,7 @@ def quoted():
 def test_the_tutorial_quotes_the_demonstration(quoted):
     """The run itself is compared when the pages are built; here the scene is, and that no figure escapes."""
     text = quoted.TUTORIAL.read_text("utf-8")
-    with importlib.resources.as_file(importlib.resources.files("lfpiv") / "demo_scene.toml") as path:
+    with importlib.resources.as_file(importlib.resources.files("lfpiv.cli") / "demo_scene.toml") as path:
         scene = open_scene(path)
     said = quoted.quotes(text)
     assert quoted.of_scene(scene).items() <= said.items()

@@ -13,7 +13,7 @@ import warp as wp
 from support.ideal_rig import two_cameras
 
 import lfpiv
-from lfpiv.calibration.network import train
+from lfpiv.calibration.training import train
 from lfpiv_kernels import runtime
 from lfpiv_kernels.correlation import correlate, deform
 from lfpiv_kernels.weights import footprint, ray_model
@@ -150,6 +150,6 @@ def test_training_needs_few_epochs():
     inputs = rng.uniform(-1, 1, (3000, 5))
     truth = np.stack([inputs[:, 0] + 0.3 * inputs[:, 1] * inputs[:, 3], inputs[:, 1] - 0.2 * inputs[:, 4] ** 2], 1)
     noise = 0.01
-    result = train(inputs, truth + rng.normal(0, noise, truth.shape), epochs=200)
+    result = train(inputs, truth + rng.normal(0, noise, truth.shape))
     best = int(np.argmax(result.validation_rms < 1.1 * noise))
     assert 0 < best <= EPOCHS

@@ -38,7 +38,7 @@ def _compare_with_the_tutorial():
     from lfpiv.cli import demo
     from lfpiv.simulation.scene import open_scene
 
-    with importlib.resources.as_file(importlib.resources.files("lfpiv") / "demo_scene.toml") as path:
+    with importlib.resources.as_file(importlib.resources.files("lfpiv.cli") / "demo_scene.toml") as path:
         scene = open_scene(path)
     summary = json.loads((DEMO / "summary.json").read_text("utf-8")) | {"demo": demo.compare_with_truth(scene, DEMO)}
     for text in quoted.differences(quoted.TUTORIAL.read_text("utf-8"), scene, summary):
@@ -52,7 +52,7 @@ def setup(app):
     logging.getLogger("lfpiv").setLevel(logging.ERROR)  # the scripts make bad figures on purpose
     logging.getLogger("lfpiv_kernels").setLevel(logging.ERROR)
     EXTRA.mkdir(parents=True, exist_ok=True)
-    scene = importlib.resources.files("lfpiv") / "demo_scene.toml"
+    scene = importlib.resources.files("lfpiv.cli") / "demo_scene.toml"
     (DOCS / "generated" / "demo_scene.toml").write_text(scene.read_text("utf-8"), "utf-8")
     app.connect("builder-inited", prepare, priority=100)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

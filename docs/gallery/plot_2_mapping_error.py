@@ -25,7 +25,7 @@ experiment = lfpiv.open_experiment(folder / "experiment" / "experiment.toml")
 calibration = lfpiv.load_calibration(folder / "calibration.h5")  # or lfpiv.calibrate(experiment): half a minute
 ray_tracing = lfpiv.thin_lens(experiment, angle_error_deg=1.0)
 for name, camera in calibration.cameras.items():
-    print(f"{name}: {camera.report['dots_found']} dots, sigma_nor {camera.report['sigma_nor_test']:.4f} pitch")
+    print(f"{name}: {camera.report.dots_found} dots, sigma_nor {camera.report.sigma_nor_test:.4f} pitch")
 
 # %%
 # The error is the distance, on the array, between the mapped and the true ray, mean over the pupil, in microlens

@@ -1,10 +1,13 @@
-"""A calibrated camera, the calibration of a rig, and their file."""
+"""A calibrated camera, the calibration of a rig, and their HDF5 file.
+
+The mapping of a camera is (x, y, z, u, v) -> (s, t) [mm] (Eqs. 6-7): a network, a thin lens, or the sum of both.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,39 +17,41 @@ import numpy as np
 
 from lfpiv.calibration.board.board import BoardDots
 from lfpiv.calibration.network import Network
+from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import InputError
-from lfpiv.geometry.optics import LensLattice, Optics, pair
+from lfpiv.geometry.optics import LensLattice, Optics, float_pair
 from lfpiv.lightfield.decoder import LightFieldDecoder
-from lfpiv.lightfield.microimage_layout import lay_out
+from lfpiv.lightfield.microimage_layout import microimages_of
 from lfpiv.warn import Warning
 from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.weights.microimages import Microimages
 
 SCHEMA_VERSION = 1
+"""Version of the calibration file."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CalibratedCamera:
-    """One camera: its microlens array, its light-field decoder, and the mapping of its rays."""
+    """One camera: its microlens array, its light-field decoder and its ray mapping."""
 
     name: str
     optics: Optics
     lattice: LensLattice
     decoder: LightFieldDecoder
-    """Pupil points, coverage, gain and background of the sensor's pixels."""
+    """Pupil point, coverage, gain and background of each pixel."""
     network: Network | None = None
-    """BP-NN of Eqs. 6-7, (x, y, z, u, v) -> (s, t) [mm], or its correction to `baseline`; None for DRT."""
+    """Network of Eqs. 6-7, (x, y, z, u, v) -> (s, t) [mm], or its correction to `baseline`. None for DRT."""
     baseline: ThinLensModel | None = None
-    """Thin lens under the network, or None."""
+    """Thin lens that the network corrects, or None."""
     region_mm: np.ndarray | None = None
-    """Corners (x, y, z) of the box that the board's dots spanned [mm], shape (2, 3); None for DRT."""
-    report: dict[str, Any] = field(default_factory=dict)
-    """Figures of quality, JSON-able: sigma_nor_test, dots_found, dots_expected, lens_array_rms_px, ..."""
+    """Lower and upper corner (x, y, z) of the box around the board's dots [mm], shape (2, 3). None for DRT."""
+    report: LensArrayQuality | None = None
+    """Figures of quality. A `CalibrationQuality` for a camera calibrated with a board."""
     warnings: tuple[Warning, ...] = ()
     """Doubts about the calibration."""
     dots: BoardDots | None = None
-    """The labels the network was trained on."""
+    """Measured dots and the labels that the mapping was fitted to."""
     test_errors: np.ndarray | None = None
     """Error of each held-out label [microlens pitch], shape (n,)."""
 
@@ -54,16 +59,16 @@ class CalibratedCamera:
     def gain(self) -> np.ndarray:
         """White-image gain of every pixel, shape (rows, columns), float32.
 
-        The board's dots tell how much of the white image's scatter from pixel to pixel is response and how much is
-        noise; without them, or where the estimator of the dots does not measure it, it is taken as noise.
+        The board's dots show which part of the white image's variance from pixel to pixel is pixel response. All of it
+        counts as noise without a board, and with the Gaussian estimator, which does not measure that part.
         """
         share = 0.0 if self.dots is None else self.dots.response_share
         return self.decoder.shrunk_gain(0.0 if math.isnan(share) else share)
 
     @cached_property
     def microimages(self) -> Microimages:
-        """How the rays of the microlenses lie in memory; it is the same for every grid."""
-        return lay_out(self.optics, self.lattice)
+        """Layout of the sensor's pixels by microimage, as the projector reads them."""
+        return microimages_of(self.optics, self.lattice)
 
     def map(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
         """Trace rays to the microlens array (Eqs. 6-7).
@@ -73,12 +78,12 @@ class CalibratedCamera:
         points_mm : array_like, shape (n, 3)
             Object points (x, y, z) [mm].
         pupil_mm : array_like, shape (n, 2)
-            Where the rays cross the main lens pupil, (u, v) [mm].
+            Points where the rays cross the pupil of the main lens, (u, v) [mm].
 
         Returns
         -------
         ndarray, shape (n, 2), float64
-            Where they meet the microlens array, (s, t) [mm].
+            Positions where they meet the microlens array, (s, t) [mm].
 
         Raises
         ------
@@ -94,7 +99,7 @@ class CalibratedCamera:
         return rays if self.network is None else rays + self.network(np.hstack([points, pupil]))
 
     def map_fan(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
-        """Trace a fan of rays from every point, in single precision on the running device.
+        """Trace a fan of rays from every point, in single precision on the device in use.
 
         Parameters
         ----------
@@ -106,26 +111,27 @@ class CalibratedCamera:
         Returns
         -------
         ndarray, shape (n, k, 2), float32
-            Where the rays meet the microlens array, (s, t) [mm].
+            Positions where the rays meet the microlens array, (s, t) [mm].
         """
         if self.network is None:
-            every = np.repeat(points_mm, len(pupil_mm), axis=0), np.tile(pupil_mm, (len(points_mm), 1))
-            return self.map(*every).astype(np.float32).reshape(len(points_mm), len(pupil_mm), 2)
+            rays = np.repeat(points_mm, len(pupil_mm), axis=0), np.tile(pupil_mm, (len(points_mm), 1))
+            return self.map(*rays).astype(np.float32).reshape(len(points_mm), len(pupil_mm), 2)
         arrays = self.network.to_arrays() | ({} if self.baseline is None else self.baseline.to_arrays())
         points, pupil = (np.ascontiguousarray(array, np.float32) for array in (points_mm, pupil_mm))
         return mapping.evaluate(arrays, points, pupil)
 
     def moved(self, rotation: np.ndarray, shift_mm: np.ndarray) -> CalibratedCamera:
-        """Return the camera after a rigid movement: its rays of x are this one's of ``rotation x + shift``.
+        """Return the camera after a rigid movement.
 
-        Exact: the movement becomes part of the network's first layer and of the thin lens's pose.
+        The new camera maps a point x as this camera maps ``rotation x + shift``. The result is exact: the first layer
+        of the network and the pose of the thin lens take up the movement.
 
         Parameters
         ----------
         rotation : ndarray, shape (3, 3)
-            Orthonormal.
+            Rotation matrix.
         shift_mm : ndarray, shape (3,)
-            Along x, y, z [mm].
+            Shift along x, y, z [mm].
         """
         network, baseline = self.network, self.baseline
         if network is not None:
@@ -144,10 +150,10 @@ class Calibration:
     """The calibrated cameras of a rig. Made by `calibrate`, `load_calibration` or `thin_lens`."""
 
     cameras: dict[str, CalibratedCamera]
-    """Camera name -> camera."""
+    """Cameras by name."""
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration to an HDF5 file, overwriting it."""
+        """Write the calibration to an HDF5 file. Overwrite an older file."""
         with h5py.File(path, "w") as file:
             file.attrs["schema_version"] = SCHEMA_VERSION
             file.attrs["cameras"] = list(self.cameras)
@@ -157,6 +163,15 @@ class Calibration:
 
 def load_calibration(path: str | Path) -> Calibration:
     """Read a calibration that `Calibration.save` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        The HDF5 file.
+
+    Returns
+    -------
+    Calibration
 
     Raises
     ------
@@ -183,7 +198,7 @@ def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:
         group.attrs[f"optics.{name}"] = value
     for name, value in vars(camera.lattice).items():
         group.attrs[f"lattice.{name}"] = value
-    group.attrs["report"] = json.dumps(camera.report)
+    group.attrs["report"] = json.dumps({} if camera.report is None else camera.report.to_json())
     group.attrs["warnings"] = json.dumps([warning.to_json() for warning in camera.warnings])
     if camera.region_mm is not None:
         group["region_mm"] = camera.region_mm
@@ -216,7 +231,8 @@ def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
     nominal = values("optics.")
     nominal["sensor_shape"] = tuple(int(n) for n in nominal["sensor_shape"])
     cell = values("lattice.")
-    cell["origin_mm"], cell["basis_mm"] = pair(cell["origin_mm"]), tuple(pair(row) for row in cell["basis_mm"])
+    cell["origin_mm"] = float_pair(cell["origin_mm"])
+    cell["basis_mm"] = tuple(float_pair(row) for row in cell["basis_mm"])
     optics, lattice = Optics(**nominal), LensLattice(**cell)
 
     def arrays(label: str) -> dict[str, Any]:
@@ -235,7 +251,7 @@ def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
         network=Network.from_arrays(arrays("network")) if "network" in group else None,
         baseline=ThinLensModel.from_arrays(arrays("baseline")) if "baseline" in group else None,
         region_mm=group["region_mm"][()] if "region_mm" in group else None,
-        report=report,
+        report=LensArrayQuality.from_json(report) if report else None,
         warnings=tuple(Warning.from_json(stored) for stored in warnings),
         dots=BoardDots(**arrays("dots")) if "dots" in group else None,
         test_errors=group["test_errors"][()] if "test_errors" in group else None,

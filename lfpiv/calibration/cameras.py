@@ -1,21 +1,28 @@
-"""`calibrate`: white images and board images -> the mapping of every camera, with what is known of its quality."""
+"""Calibrate the cameras of an experiment: from white and board images to the ray mapping of each camera.
+
+Section 3.1 of the paper: the white image gives the microlens array, the board images give labelled rays of dots, and a
+thin lens plus a network is fitted to the labels (Eqs. 6-7). The mean error on held-out dots is sigma_nor (Eq. 8).
+`thin_lens` gives the mapping by direct ray tracing (DRT) instead, from the stated optics and angles only (Eqs. 1-3).
+"""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lfpiv.calibration import checks
-from lfpiv.calibration.board.board import DotBoard, Planes, agreeing_dots, measure_board
+from lfpiv.calibration.board.board import BoardDots, DotBoard, Planes, agreeing_dots, measure_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration, load_calibration
-from lfpiv.calibration.network import train
-from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
-from lfpiv.calibration.virtual_samples import guide_between
+from lfpiv.calibration.checks import NominalDifference
+from lfpiv.calibration.quality import CalibrationQuality, LensArrayQuality
+from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens, thin_lens_model
+from lfpiv.calibration.training import Training, TrainingSettings, train
+from lfpiv.calibration.virtual_samples import sampler_between_dots
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.geometry.optics import LensLattice
@@ -27,20 +34,17 @@ __all__ = ["CalibratedCamera", "Calibration", "calibrate", "load_calibration", "
 
 log = logging.getLogger(__name__)
 
-PUPIL_SCALE, PUPIL_SCALE_INCOMPLETE = 0.3, 0.1
-"""Largest departure of the fitted pupil from the stated one, and the same where over a tenth of the dots are missing.
-Good boards fit within 0.01 and are complete; planes in the wrong order, a wrong angle's sign, an unnoticed mirror gave
-0.17 to 1.2 and lost a quarter of the dots or more, because depth and defocus then disagree."""
 MODEL_ERROR_PITCH = 0.002
-"""Error of a dot's labels that they share and their standard errors do not hold [microlens pitch]."""
+"""Error that all labels of a dot share, beside their standard errors [microlens pitch]."""
 
 Progress = Callable[[float], None]
+"""Called with the finished fraction."""
 
 
 def calibrate(experiment: Experiment, progress: Progress | None = None) -> Calibration:
     """Calibrate every camera of an experiment from its white and board images (section 3.1 of the paper).
 
-    No camera angle enters the mapping; the nominal one only names the board's dots.
+    The mapping does not depend on the nominal camera angles. They only help to number the board's dots.
 
     Parameters
     ----------
@@ -56,7 +60,7 @@ def calibrate(experiment: Experiment, progress: Progress | None = None) -> Calib
     Raises
     ------
     InputError
-        If a white image shows no microlens array or the board's dots cannot be found; names camera and file.
+        If a white image shows no microlens array or the board's dots cannot be found. Names camera and file.
     """
     cameras = {}
     for number, setup in enumerate(experiment.cameras):
@@ -73,14 +77,18 @@ def calibrate(experiment: Experiment, progress: Progress | None = None) -> Calib
 
 
 def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibration:
-    """Calibration by direct ray tracing (DRT): the ideal thin lens of section 2.1 at the nominal camera angles.
+    """Calibrate by direct ray tracing (DRT): the ideal thin lens of section 2.1 at the nominal camera angles.
 
     Parameters
     ----------
     experiment : Experiment
-        From `open_experiment`; its white images give the microlens arrays.
+        From `open_experiment`. Its white images give the microlens arrays.
     angle_error_deg : float
         Error added to the magnitude of every camera's angle [degree], Eqs. 11-12.
+
+    Returns
+    -------
+    Calibration
 
     Raises
     ------
@@ -94,144 +102,189 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
     cameras = {}
     for setup in experiment.cameras:
         with collected() as warnings:
-            lattice, decoder, report = _decode(experiment, setup)
-        angle = setup.nominal_angle_deg
+            sensor = _decode(experiment, setup)
+        nominal = setup.nominal_angle_deg
         cameras[setup.name] = CalibratedCamera(
             name=setup.name,
             optics=setup.optics,
-            lattice=lattice,
-            decoder=decoder,
+            lattice=sensor.lattice,
+            decoder=sensor.decoder,
             baseline=thin_lens_model(
-                setup.optics, angle + np.copysign(angle_error_deg, angle) if angle else angle_error_deg
+                setup.optics, nominal + np.copysign(angle_error_deg, nominal) if nominal else angle_error_deg
             ),
-            report=report,
+            report=sensor.quality,
             warnings=tuple(replace(warning, subject=setup.name) for warning in warnings),
         )
     return Calibration(cameras)
 
 
-def _decode(experiment: Experiment, setup: CameraSetup) -> tuple[LensLattice, LightFieldDecoder, dict[str, Any]]:
-    white, dark = experiment.white(setup.name), experiment.dark(setup.name)
-    optics = setup.optics
-    try:
-        array = find_lens_array(white, dark, nominal_pitch_px=optics.microimage_pitch_px, layout=optics.layout)
-        lattice = array.lattice(optics)
-        decoder = LightFieldDecoder.from_white(optics, lattice, white, dark)
-    except ValueError as error:
-        raise InputError(f"{setup.white_path}: white_image of camera {setup.name!r}: {error}") from None
-    report: dict[str, Any] = {
-        "lens_array_rms_px": float(array.rms_px),
-        "lens_array_pitch_px": float(array.pitch_px),
-        "lens_array_rotation_deg": float(array.rotation_deg),
-        "lenses": len(array.centres_px),
-    }
-    checks.check_white(setup, white, dark, decoder)
-    return lattice, decoder, report
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sensor:
+    """Microlens array and decoder of one camera, from its white image."""
+
+    lattice: LensLattice
+    decoder: LightFieldDecoder
+    quality: LensArrayQuality
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Mapping:
+    """Ray mapping of one camera, fitted to the labels of its dots."""
+
+    baseline: ThinLensModel | None
+    """Thin lens that the network corrects, or None."""
+    training: Training
+    """The network and its errors."""
+    agreeing: np.ndarray
+    """Labels used, shape (n,), bool."""
+    nominal: NominalDifference
+    """Difference from the stated pose and magnification."""
 
 
 def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress) -> CalibratedCamera:
-    lattice, decoder, report = _decode(experiment, setup)
+    sensor = _decode(experiment, setup)
     step(0.15)
-    board, settings, dark = experiment.board, experiment.network, experiment.dark(setup.name)
+    dots = _measure_dots(experiment, setup, sensor.decoder, step)
+    step(0.75)
+    mapping = _fit_mapping(experiment, setup, dots, sensor.lattice.pitch_mm)
+    step(0.95)
+    rejected = dots.rejected + _disagreeing_per_plane(dots, mapping.agreeing, math.prod(experiment.board.dots))
+    checks.check_rejected(experiment, setup, dots, rejected)
+    quality = _quality(sensor, dots, mapping, int(rejected.sum()))
+    training_dots = len(np.unique(dots.dot[mapping.agreeing][mapping.training.split.training]))
+    checks.check_mapping(setup, quality, mapping.training.network, experiment.network.estimator, training_dots)
+    log.info(
+        "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots",
+        setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test,
+    )  # fmt: skip
+    step(1.0)
+    used = dots.points_mm[mapping.agreeing]
+    return CalibratedCamera(
+        name=setup.name,
+        optics=setup.optics,
+        lattice=sensor.lattice,
+        decoder=sensor.decoder,
+        network=mapping.training.network,
+        baseline=mapping.baseline,
+        region_mm=np.stack([used.min(0), used.max(0)]),
+        report=quality,
+        dots=dots,
+        test_errors=mapping.training.test_errors,
+    )
+
+
+def _decode(experiment: Experiment, setup: CameraSetup) -> _Sensor:
+    """Find the microlens array in the white image and make the decoder."""
+    white, dark, optics = experiment.white(setup.name), experiment.dark(setup.name), setup.optics
+    with _input_errors(f"{setup.white_path}: white_image of camera {setup.name!r}"):
+        array = find_lens_array(white, dark, nominal_pitch_px=optics.microimage_pitch_px, layout=optics.layout)
+        lattice = array.lattice(optics)
+        decoder = LightFieldDecoder.from_white(optics, lattice, white, dark)
+    checks.check_white(setup, white, dark, decoder)
+    quality = LensArrayQuality(
+        lens_array_rms_px=float(array.rms_px),
+        lens_array_pitch_px=float(array.pitch_px),
+        lens_array_rotation_deg=float(array.rotation_deg),
+        lenses=len(array.centres_px),
+    )
+    return _Sensor(lattice=lattice, decoder=decoder, quality=quality)
+
+
+def _measure_dots(experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, step: Progress) -> BoardDots:
+    """Check the board images and measure the dots in them."""
+    board, dark = experiment.board, experiment.dark(setup.name)
     images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
     checks.check_light(experiment, setup, decoder, images, dark)
     step(0.2)
-    try:
-        dots = measure_board(
-            images,
-            decoder,
-            DotBoard(
-                dots=board.dots,
-                spacing_mm=board.spacing_mm,
-                diameter_mm=board.dot_diameter_mm,
-                planes_mm=tuple(board.planes_mm),
-            ),
-            nominal_angle_deg=setup.nominal_angle_deg,
-            estimator=settings.estimator,
-            dark=dark,
-        )
-    except np.linalg.LinAlgError:  # a ValueError too, whose text says nothing
-        raise InputError(
-            f"{experiment.path}: board.images of camera {setup.name!r}: expected images of the board's dots, found "
-            "blobs that no camera sees as a board. Check that these are board images and what [board] says."
-        ) from None
-    except ValueError as error:
-        raise InputError(f"{experiment.path}: board.images of camera {setup.name!r}: {error}") from None
-    checks.check_planes(experiment, setup, dots)
-    step(0.75)
-
-    points, pupil, array = dots.points_mm, dots.pupil_mm, dots.array_mm
-    pitch = lattice.pitch_mm
-    std = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch)
-    try:
-        fitted = fit_thin_lens(points, pupil, array, setup.optics, std=std)
-        complete = dots.found.sum() >= 0.9 * dots.expected.sum()
-        if not abs(fitted.pupil_scale - 1) <= (PUPIL_SCALE if complete else PUPIL_SCALE_INCOMPLETE):
-            raise InputError(
-                f"{experiment.path}: camera {setup.name!r}: expected dots that a camera of the stated optics can see, "
-                f"found {dots.found.sum()} of {dots.expected.sum()} dots that would need its pupil scaled by "
-                f"{fitted.pupil_scale:.2f}. Check the sign of nominal_angle_deg, image_flip, and the order and sign of "
-                "board.planes_mm."
+    place = f"{experiment.path}: board.images of camera {setup.name!r}"
+    with _input_errors(place):
+        try:
+            dots = measure_board(
+                images,
+                decoder,
+                DotBoard(
+                    dots=board.dots,
+                    spacing_mm=board.spacing_mm,
+                    diameter_mm=board.dot_diameter_mm,
+                    planes_mm=tuple(board.planes_mm),
+                ),
+                nominal_angle_deg=setup.nominal_angle_deg,
+                estimator=experiment.network.estimator,
+                dark=dark,
             )
-        missed = float(np.median(np.linalg.norm(array - fitted(points, pupil), axis=1))) / pitch
-        nominal = checks.compare_with_nominal(setup, fitted, missed)
-        keep = agreeing_dots(dots, array - fitted(points, pupil), pitch)
-        baseline = fitted if settings.baseline == "thin_lens" else None
-        target = array if baseline is None else array - baseline(points, pupil)
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "expected images of the board's dots, found blobs that no camera sees as a board. Check that these are "
+                "board images and what [board] says."
+            ) from None
+    checks.check_planes(experiment, setup, dots)
+    return dots
+
+
+def _fit_mapping(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> _Mapping:
+    """Fit a thin lens to the labels, leave out dots that disagree with their neighbours, and train the network."""
+    settings, place = experiment.network, f"{experiment.path}: labels of camera {setup.name!r}"
+    std = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch_mm)
+    with _input_errors(place):
+        lens = fit_thin_lens(dots.points_mm, dots.pupil_mm, dots.array_mm, setup.optics, std=std)
+    checks.check_pupil(experiment, setup, dots, lens)
+    residual = dots.array_mm - lens(dots.points_mm, dots.pupil_mm)
+    typical_residual = float(np.median(np.linalg.norm(residual, axis=1))) / pitch_mm
+    nominal = checks.compare_with_nominal(setup, lens, typical_residual)
+    agreeing = agreeing_dots(dots, residual, pitch_mm)
+    baseline = lens if settings.baseline == "thin_lens" else None
+    points, pupil, std = dots.points_mm[agreeing], dots.pupil_mm[agreeing], std[agreeing]
+    target = (dots.array_mm if baseline is None else residual)[agreeing]
+    with _input_errors(place):
         training = train(
-            np.hstack([points, pupil])[keep],
-            target[keep],
-            hidden=settings.hidden,
-            epochs=settings.epochs,
-            groups=dots.dot[keep],
-            std=std[keep],
-            guide=guide_between(points[keep], pupil[keep], target[keep], std[keep], pitch_mm=pitch, seed=settings.seed),
-            shrink=baseline is not None,
-            seed=settings.seed,
-            unit=pitch,
+            np.hstack([points, pupil]),
+            target,
+            TrainingSettings(
+                hidden=tuple(settings.hidden),
+                epochs=settings.epochs,
+                shrink=baseline is not None,
+                seed=settings.seed,
+            ),
+            groups=dots.dot[agreeing],
+            std=std,
+            virtual_samples=sampler_between_dots(points, pupil, target, std, pitch_mm=pitch_mm, seed=settings.seed),
+            unit=pitch_mm,
         )
-    except InputError:
-        raise
+    return _Mapping(baseline=baseline, training=training, agreeing=agreeing, nominal=nominal)
+
+
+def _disagreeing_per_plane(dots: BoardDots, agreeing: np.ndarray, dots_per_plane: int) -> np.ndarray:
+    """Count the dots of each plane that disagree with their neighbours."""
+    return np.bincount(np.unique(dots.dot[~agreeing]) // dots_per_plane, minlength=len(dots.found))
+
+
+def _quality(sensor: _Sensor, dots: BoardDots, mapping: _Mapping, rejected: int) -> CalibrationQuality:
+    training = mapping.training
+    return CalibrationQuality(
+        **vars(sensor.quality),
+        turn_from_nominal_deg=mapping.nominal.turn_deg,
+        magnification=mapping.nominal.magnification,
+        sigma_nor_test=training.sigma_nor,
+        dots_found=int(dots.found.sum()),
+        dots_expected=int(dots.expected.sum()),
+        dots_found_per_plane=dots.found.tolist(),
+        dots_expected_per_plane=dots.expected.tolist(),
+        dots_rejected=rejected,
+        labels=int(mapping.agreeing.sum()),
+        epochs=training.epochs,
+        stop=training.stop.value,
+        training_s=training.seconds,
+        network_shrinkage=training.shrinkage,
+        dot_diameter_mm=dots.diameter_mm,
+        blur_px=dots.blur_px,
+        response_share=dots.response_share,
+    )
+
+
+@contextlib.contextmanager
+def _input_errors(place: str) -> Iterator[None]:
+    """Raise every ValueError as an InputError that names the file and the camera."""
+    try:
+        yield
     except ValueError as error:
-        raise InputError(f"{experiment.path}: labels of camera {setup.name!r}: {error}") from None
-    step(0.95)
-    found, expected = int(dots.found.sum()), int(dots.expected.sum())
-    left_out = np.bincount(np.unique(dots.dot[~keep]) // math.prod(board.dots), minlength=len(images)) + dots.rejected
-    checks.check_left_out(experiment, setup, dots, left_out)
-    report |= {
-        "turn_from_nominal_deg": nominal.turn_deg,
-        "magnification": nominal.magnification,
-        "sigma_nor_test": training.sigma_nor,
-        "dots_found": found,
-        "dots_expected": expected,
-        "dots_found_per_plane": dots.found.tolist(),
-        "dots_expected_per_plane": dots.expected.tolist(),
-        "dots_rejected": int(left_out.sum()),
-        "labels": int(keep.sum()),
-        "epochs": training.epochs,
-        "stop": training.stop.value,
-        "training_s": training.seconds,
-        "network_shrinkage": training.shrinkage,
-        "dot_diameter_mm": dots.diameter_mm,
-        "blur_px": dots.blur_px,
-        "response_share": dots.response_share,
-    }
-    camera = CalibratedCamera(
-        name=setup.name,
-        optics=setup.optics,
-        lattice=lattice,
-        decoder=decoder,
-        network=training.network,
-        baseline=baseline,
-        region_mm=np.stack([points[keep].min(0), points[keep].max(0)]),
-        report=report,
-        dots=dots,
-        test_errors=training.test_errors,
-    )
-    training_dots = len(np.unique(dots.dot[keep][training.training_index]))
-    checks.check_mapping(camera, settings.estimator, training_dots)
-    log.info(
-        "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots", setup.name, found, expected, training.sigma_nor
-    )
-    step(1.0)
-    return camera
+        raise InputError(f"{place}: {error}") from None

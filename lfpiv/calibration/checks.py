@@ -1,6 +1,6 @@
-"""Whether a camera's white and board images, and what is stated of them, can be right; what a user must know if not.
+"""Check the white and board images of a camera and the fitted mapping against the stated optics, pose and board.
 
-What is certainly wrong is refused by an `InputError`; what is suspicious becomes one of the report's warnings.
+What is impossible is refused by an `InputError`. What is doubtful becomes a warning.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lfpiv.calibration.board.board import BoardDots, few_pixels
-from lfpiv.calibration.camera import CalibratedCamera
+from lfpiv.calibration.network import Network
+from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel, thin_lens_model
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment
@@ -36,35 +37,40 @@ from lfpiv.warn import SENTENCES, Code, Warning, warn
 log = logging.getLogger(__name__)
 
 TURN_DEG = 20.0
-"""Turn of a camera from its nominal pose that is no misalignment: ten degrees are allowed, and windows bend rays."""
+"""Rotation from the nominal pose above which a warning is due [degree]."""
 MAGNIFICATION = 0.04
-"""Relative difference from the stated magnification that is worth a look; a wrong dot spacing gives half its own."""
-EXPLAINED = 0.2
-"""Median distance of the dots' rays from the thin lens's that it can be held to [microlens pitch]."""
-SIGMA_NOR = {"lens_integral": 0.03, "gaussian": 0.1}
-"""Mean error on held-out dots worth a warning, by the dots' estimator [microlens pitch]: good boards leave 0.002 to
-0.01, and Gaussian fits, whose own error is 0.04 to 0.07, some 0.05."""
+"""Relative difference from the stated magnification above which a warning is due."""
+EXPLAINED_PITCH = 0.2
+"""Median residual of the thin lens below which its magnification is compared [microlens pitch]."""
+PUPIL_SCALE, PUPIL_SCALE_INCOMPLETE = 0.3, 0.1
+"""Largest difference of the fitted pupil scale from 1, and the same where over a tenth of the dots are missing."""
+COMPLETE = 0.9
+"""Part of the expected dots that a complete board shows."""
+SIGMA_NOR_PITCH = {"lens_integral": 0.03, "gaussian": 0.1}
+"""Error on held-out dots above which a warning is due, by estimator [microlens pitch]."""
+LENS_ARRAY_RMS_PX = 0.25
+"""Distance of the microimages from a lattice above which a warning is due [pixel]."""
 VALUES_PER_DOT = 12
-"""Numbers that a dot tells: its ray model, quadratic in the pupil point, for s and t. Its 37 labels are no more."""
+"""Values that one dot contributes: a ray model for s and t, quadratic in the pupil point."""
 REJECTED = 0.5
-"""Part of a plane's dots that is left out, from which on something is wrong with the plane."""
+"""Part of a plane's dots that is rejected above which a warning is due."""
 FEWEST_PLANES = 2
-"""Planes of the board a calibration needs: one alone does not tell the camera's depth."""
+"""Least number of planes. One plane does not determine the camera's depth."""
 
 
 def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, decoder: LightFieldDecoder) -> None:
-    """Compare the microimages of the white image with the stated aperture, and warn of saturation.
+    """Compare the diameter of the microimages with the stated aperture, and warn of saturation.
 
-    With a stated aperture larger than the true one all light falls where some is expected; no other check finds that.
+    No other check finds a stated aperture that is larger than the true one.
 
     Raises
     ------
     InputError
-        If the microimages cannot be those of the stated optics.
+        If the diameter differs by more than `OTHER_APERTURE`.
     """
     seen, stated = microimage_px(white, dark, decoder), stated_px(setup.optics)
-    off = 0.0 if seen is None else max(seen / stated, stated / seen) - 1
-    if seen is not None and off > APERTURE:
+    difference = 0.0 if seen is None else max(seen / stated, stated / seen) - 1
+    if seen is not None and difference > APERTURE:
         optics = setup.optics
         figures = {
             "seen_px": seen,
@@ -74,7 +80,7 @@ def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, 
             "fitting": optics.f_number * stated / seen,
         }
         warning = Warning(code=Code.APERTURE, figures=figures)
-        if off > OTHER_APERTURE:
+        if difference > OTHER_APERTURE:
             raise InputError(f"{setup.white_path}: white_image of camera {setup.name!r}: {warning.sentence}")
         warn(log, replace(warning, subject=setup.name))
     share = saturated_share(white)
@@ -84,30 +90,42 @@ def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, 
 
 @dataclass(frozen=True, kw_only=True)
 class NominalDifference:
-    """Pose and magnification of a camera, as the board's dots show them, against the stated ones."""
+    """Pose and magnification of a camera, fitted to the dots, against the stated ones."""
 
     turn_deg: float
     """Rotation from the stated pose [degree]."""
     magnification: float
-    """Magnification of the board's middle."""
+    """Magnification at the middle of the board."""
 
 
-def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, missed: float) -> NominalDifference:
-    """Warn of a camera that the dots see in another pose, or magnifying otherwise, than the experiment file states.
+def check_pupil(experiment: Experiment, setup: CameraSetup, dots: BoardDots, fitted: ThinLensModel) -> None:
+    """Refuse labels that fit only a camera with another pupil: depth and defocus of the dots contradict each other."""
+    found, expected = dots.found.sum(), dots.expected.sum()
+    limit = PUPIL_SCALE if found >= COMPLETE * expected else PUPIL_SCALE_INCOMPLETE
+    if not abs(fitted.pupil_scale - 1) <= limit:
+        raise InputError(
+            f"{experiment.path}: camera {setup.name!r}: expected dots that a camera of the stated optics can see, "
+            f"found {found} of {expected} dots that would need its pupil scaled by {fitted.pupil_scale:.2f}. Check the "
+            "sign of nominal_angle_deg, image_flip, and the order and sign of board.planes_mm."
+        )
 
-    No result depends on the stated values. But a difference shows images turned on their side, or a wrong spacing of the
-    dots or planes, which no other check finds. Where the thin lens misses the dots' rays by more than `EXPLAINED`, as
-    behind a tilted window, its magnification is not compared.
+
+def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, residual_pitch: float) -> NominalDifference:
+    """Warn where the fitted pose or magnification differs from the stated one.
+
+    No result depends on the stated values. A difference shows rotated images or a wrong spacing of dots or planes, and
+    no other check finds them. The magnification is compared only where the thin lens fits the labels, so not behind a
+    tilted window. `residual_pitch` is the labels' median distance from the fitted thin lens [microlens pitch].
     """
     nominal = thin_lens_model(setup.optics, setup.nominal_angle_deg)
     turn = Rotation.from_matrix(fitted.rotation @ nominal.rotation.T).magnitude() * 180 / math.pi
-    depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the board's middle
+    depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the middle of the board
     magnification = fitted.image_distance_mm / (fitted.object_distance_mm - depth)
     ratio = magnification * nominal.object_distance_mm / nominal.image_distance_mm
     if turn > TURN_DEG:
         figures = {"turn_deg": float(turn), "nominal_deg": setup.nominal_angle_deg}
         warn(log, Warning(code=Code.TURNED, subject=setup.name, figures=figures))
-    if missed < EXPLAINED and not 1 / (1 + MAGNIFICATION) < ratio < 1 + MAGNIFICATION:
+    if residual_pitch < EXPLAINED_PITCH and not 1 / (1 + MAGNIFICATION) < ratio < 1 + MAGNIFICATION:
         figures = {"magnification": float(magnification), "stated": abs(setup.optics.magnification)}
         warn(log, Warning(code=Code.MAGNIFIED, subject=setup.name, figures=figures))
     return NominalDifference(turn_deg=float(turn), magnification=float(magnification))
@@ -120,7 +138,7 @@ def check_light(
     images: Sequence[np.ndarray],
     dark: np.ndarray | None,
 ) -> None:
-    """Refuse board images that are copies or belong to another white image; warn of saturated and doubtful ones."""
+    """Refuse board images that are copies or that belong to another white image. Warn of saturated images."""
     paths = [experiment.board_path(setup.name, plane) for plane in range(len(images))]
     first: dict[bytes, int] = {}
     saturated = np.zeros(len(images))
@@ -140,14 +158,15 @@ def check_light(
     light = gap_light(images[plane] if dark is None else images[plane] - dark, decoder)
     if light > NO_PLACE:
         raise InputError(
-            f"{paths[plane]}: board.images of camera {setup.name!r}: {SENTENCES[Code.MISPLACED]} Are these board images?"
+            f"{paths[plane]}: board.images of camera {setup.name!r}: {SENTENCES[Code.MISPLACED]} "
+            "Are these board images?"
         )
     if light > GAP_LIGHT:
         warn(log, Warning(code=Code.BOARD_MISPLACED, subject=setup.name, figures={"path": str(paths[plane])}))
 
 
 def check_planes(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> None:
-    """Refuse a board seen in fewer than two planes; warn of each plane in which no dot was found, by file."""
+    """Refuse a board with dots in fewer than two planes. Warn of each plane without dots."""
     planes = experiment.board.planes_mm
     empty = [plane for plane in range(len(planes)) if dots.found[plane] == 0]
     shown = len(planes) - len(empty)
@@ -162,15 +181,18 @@ def check_planes(experiment: Experiment, setup: CameraSetup, dots: BoardDots) ->
         warn(log, Warning(code=Code.PLANE_EMPTY, subject=setup.name, figures=figures))
 
 
-def check_left_out(experiment: Experiment, setup: CameraSetup, dots: BoardDots, left_out: np.ndarray) -> None:
-    """Warn of each plane of which most dots do not fit the others: wrongly placed, or another plane's image."""
+def check_rejected(experiment: Experiment, setup: CameraSetup, dots: BoardDots, rejected: np.ndarray) -> None:
+    """Warn of each plane with most dots rejected: its depth is wrong, or its image belongs to another plane.
+
+    `rejected` counts the rejected dots of each plane, with those that disagree with their neighbours.
+    """
     seen = dots.found + dots.rejected
-    bad = np.flatnonzero((seen > 0) & (left_out >= REJECTED * seen))
-    if len(bad) > len(seen) / 2:  # most planes: the cause is not a plane, see `check_mapping`
+    bad = np.flatnonzero((seen > 0) & (rejected >= REJECTED * seen))
+    if len(bad) > len(seen) / 2:  # the cause is not a single plane; see `check_mapping`
         return
     for plane in map(int, bad):
         figures = {
-            "left_out": int(left_out[plane]),
+            "left_out": int(rejected[plane]),
             "seen": int(seen[plane]),
             "plane": plane,
             "z_mm": experiment.board.planes_mm[plane],
@@ -179,21 +201,21 @@ def check_left_out(experiment: Experiment, setup: CameraSetup, dots: BoardDots, 
         warn(log, Warning(code=Code.PLANE_LEFT_OUT, subject=setup.name, figures=figures))
 
 
-def check_mapping(camera: CalibratedCamera, estimator: str, training_dots: int) -> None:
-    """Warn of few dots, an irregular lens array, and a mapping that misses the held-out dots."""
-    report, sigma_nor = camera.report, SIGMA_NOR[estimator]
+def check_mapping(
+    setup: CameraSetup, quality: CalibrationQuality, network: Network, estimator: str, training_dots: int
+) -> None:
+    """Warn of missing dots, an irregular lens array, too few dots for the network, and a large test error."""
 
     def doubt(code: Code, **figures: float | str) -> None:
-        warn(log, Warning(code=code, subject=camera.name, figures=figures))
+        warn(log, Warning(code=code, subject=setup.name, figures=figures))
 
-    if report["dots_found"] < 0.9 * report["dots_expected"]:
-        hint = few_pixels(camera.optics) if estimator == "lens_integral" else ""
-        doubt(Code.DOTS_MISSING, found=report["dots_found"], expected=report["dots_expected"], hint=hint)
-    if report["lens_array_rms_px"] > 0.25:
-        doubt(Code.LENSES_IRREGULAR, rms_px=report["lens_array_rms_px"])
-    if camera.network is not None:
-        values, parameters = VALUES_PER_DOT * training_dots, sum(layer.size for layer in camera.network.layers())
-        if values < parameters:
-            doubt(Code.FEW_LABELS, dots=training_dots, values=values, parameters=parameters)
-    if not report["sigma_nor_test"] <= sigma_nor:
-        doubt(Code.MAPPING_ERROR, sigma_nor=report["sigma_nor_test"], usual=sigma_nor)
+    if quality.dots_found < COMPLETE * quality.dots_expected:
+        hint = few_pixels(setup.optics) if estimator == "lens_integral" else ""
+        doubt(Code.DOTS_MISSING, found=quality.dots_found, expected=quality.dots_expected, hint=hint)
+    if quality.lens_array_rms_px > LENS_ARRAY_RMS_PX:
+        doubt(Code.LENSES_IRREGULAR, rms_px=quality.lens_array_rms_px)
+    values, parameters = VALUES_PER_DOT * training_dots, sum(layer.size for layer in network.layers())
+    if values < parameters:
+        doubt(Code.FEW_LABELS, dots=training_dots, values=values, parameters=parameters)
+    if not quality.sigma_nor_test <= SIGMA_NOR_PITCH[estimator]:
+        doubt(Code.MAPPING_ERROR, sigma_nor=quality.sigma_nor_test, usual=SIGMA_NOR_PITCH[estimator])

@@ -1,4 +1,8 @@
-"""Tell how much of a volume the calibrated cameras see. Refuse a volume that a camera does not see."""
+"""Compare a volume with what the calibrated cameras see, and with the region in which they are calibrated.
+
+A volume that one camera does not see at all is refused. Parts that too few cameras see, or that lie outside the
+calibrated region, become warnings.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +19,25 @@ from lfpiv.warn import Code, Warning
 
 log = logging.getLogger(__name__)
 
-
 SAMPLES = 8
-"""Voxels along each axis that tell how much of a volume a camera sees."""
-
-
-FEW = 0.5
-"""Part of the volume below which a camera sees so little of it that a warning is due."""
-
-
+"""Voxels sampled along each axis of a volume."""
+PUPIL_PART = 0.9
+"""Distance of the sampled rays from the pupil's centre [pupil radius]."""
+LEAST_SEEN = 0.5
+"""Part of the volume seen by a camera below which a warning is due."""
 SEEN_SHARE = 0.1
-"""Least sum of a voxel's weights in a camera that sees it, as a share of the largest one in the volume: a tenth of the
-pupil."""
-
-
-LEAST_ALONE = 0.01
-"""Part of the volume, seen by fewer than two cameras, above which a warning is due."""
+"""Least sum of a voxel's weights in a camera that sees it, relative to the largest sum in the volume."""
+LEAST_UNPAIRED = 0.01
+"""Part of the volume seen by fewer than two cameras above which a warning is due."""
 
 
 def require_seen(path: Path, calibration: Calibration, grid: Grid) -> None:
-    """Refuse a volume of which a calibrated camera sees nothing; warn where it sees less than half.
+    """Refuse a volume that a calibrated camera does not see. Warn where a camera sees less than half of it.
 
     Raises
     ------
     InputError
-        Names the camera.
+        Names `path`, the experiment file, and the camera.
     """
     for camera in calibration.cameras.values():
         share = seen_share(camera, grid)
@@ -54,12 +52,12 @@ def require_seen(path: Path, calibration: Calibration, grid: Grid) -> None:
 
 
 def sight_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
-    """Say of every calibrated camera that sees less than half of a volume how much it sees, and what two do not see."""
+    """Warn of each camera that sees less than half of a volume, and of parts that fewer than two cameras see."""
     sampled = {camera.name: _sees(camera, grid) for camera in calibration.cameras.values()}
     warnings = [
         Warning(code=Code.OUTSIDE_SIGHT, subject=name, figures={"share": float(seen.mean())})
         for name, seen in sampled.items()
-        if seen.mean() < FEW
+        if seen.mean() < LEAST_SEEN
     ]
     if len(sampled) > 1:
         warnings += _seen_by_one(np.sum(list(sampled.values()), 0), _sampled_axes(grid))
@@ -67,12 +65,15 @@ def sight_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
 
 
 def seen_share(camera: CalibratedCamera, grid: Grid) -> float:
-    """Part of a volume's voxels of which some ray through the pupil meets a camera's sensor, by a sample of them."""
+    """Return the part of a volume's voxels that a camera sees, from a sample of the voxels.
+
+    A camera sees a voxel if some ray from it through the pupil meets the sensor.
+    """
     return float(_sees(camera, grid).mean())
 
 
 def _sampled_axes(grid: Grid) -> list[np.ndarray]:
-    """Places of some planes of voxels along z, y, x [mm], the outer ones among them."""
+    """Return positions of some voxels along z, y, x [mm], the outermost voxels included."""
     return [
         grid.axis_mm(axis)[np.unique(np.linspace(0, n - 1, SAMPLES).round().astype(int))]
         for axis, n in enumerate(grid.shape)
@@ -80,28 +81,28 @@ def _sampled_axes(grid: Grid) -> list[np.ndarray]:
 
 
 def _sees(camera: CalibratedCamera, grid: Grid) -> np.ndarray:
-    """Whether some ray from a voxel through the pupil meets the sensor, for voxels on all of the sampled planes."""
+    """Return whether a camera sees each of the sampled voxels, shape (z, y, x)."""
     z, y, x = np.meshgrid(*_sampled_axes(grid), indexing="ij")
     points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
     half = np.array(camera.optics.sensor_shape[::-1]) * camera.optics.pixel_mm / 2
     seen = np.zeros(len(points), bool)
     for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
-        pupil = np.tile(0.9 * camera.optics.pupil_radius_mm * np.array([u, v], float), (len(points), 1))
+        pupil = np.tile(PUPIL_PART * camera.optics.pupil_radius_mm * np.array([u, v], float), (len(points), 1))
         seen |= (np.abs(camera.map(points, pupil)) <= half).all(1)
     return seen.reshape(x.shape)
 
 
-def warn_seen_by_one(views: np.ndarray, grid: Grid, cameras: int) -> None:
-    """Log a warning where voxels of a grid are seen by but one of several cameras; `views` counts them, (z, y, x)."""
+def warn_seen_by_one(camera_counts: np.ndarray, grid: Grid, cameras: int) -> None:
+    """Log a warning where only one of several cameras sees voxels. `camera_counts` has the shape (z, y, x)."""
     if cameras > 1:
-        for warning in _seen_by_one(views, [grid.axis_mm(axis) for axis in range(3)]):
+        for warning in _seen_by_one(camera_counts, [grid.axis_mm(axis) for axis in range(3)]):
             log.warning("%s", warning.sentence)
 
 
-def _seen_by_one(views: np.ndarray, axes_mm: Sequence[np.ndarray]) -> list[Warning]:
-    """Say how much of a volume fewer than two cameras see, and where; `views` counts them at places along z, y, x."""
-    seen = views >= 2
-    if 1 - seen.mean() < LEAST_ALONE:
+def _seen_by_one(camera_counts: np.ndarray, axes_mm: Sequence[np.ndarray]) -> list[Warning]:
+    """Warn of the part of a volume that fewer than two cameras see. `axes_mm` are the positions along z, y, x."""
+    seen = camera_counts >= 2
+    if 1 - seen.mean() < LEAST_UNPAIRED:
         return []
     where = "none of it is seen by two"
     if seen.any():
@@ -120,9 +121,9 @@ def warn_outside(calibration: Calibration, grid: Grid) -> None:
 
 
 def outside_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
-    """Say of every camera whose calibrated region does not hold all voxels of a grid how much lies outside.
+    """Warn of every camera whose calibrated region does not hold all voxels of a grid.
 
-    The region is the box that the board's dots spanned, widened by half a voxel.
+    The region is the box around the board's dots, half a voxel wider on each side.
     """
     warnings = []
     for camera in calibration.cameras.values():

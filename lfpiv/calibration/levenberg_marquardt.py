@@ -1,6 +1,9 @@
-"""Trainers of feedforward networks; a trainer is one function ``(layers, training, validation, **settings) -> Fit``.
+"""Levenberg-Marquardt training of feedforward networks with tanh hidden layers and a linear output layer.
 
-Layers are matrices (inputs + 1, nodes) whose last row is the bias; hidden layers are tanh, the last one is linear.
+A trainer takes first layers and scaled samples and returns a `Fit`. A layer is a matrix (inputs + 1, nodes) with the
+biases in the last row. With the weighted residuals e and their negative Jacobian J, a step solves
+(J^T J + damping D) step = J^T e ([1]_). The gain ratio sets the damping ([2]_), and geodesic acceleration adds a
+second-order correction ([3]_).
 
 References
 ----------
@@ -15,7 +18,6 @@ from __future__ import annotations
 
 import enum
 import math
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,25 +26,27 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-BLOCK_BYTES = 1 << 20
-"""Memory of one block of Jacobian rows: large enough for BLAS, small enough to stay in the cache."""
-LEAST_ROWS = 512
-"""Samples in a block at least, so that adding products up costs little beside making them."""
-RANGES = 8
-"""Ranges of samples that are summed separately. Fixed, so that results do not depend on the number of threads."""
-LEAST_DAMPING, FIRST_DAMPING, LAST_DAMPING = 1e-15, 1e-3, 1e12
-"""Damping below which it has no effect, of the first step, and where a step is too short to matter; relative to the
-diagonal of J^T J."""
-LONGEST_CORRECTION = 0.375
-"""Second-order correction above which a step is not trusted, as a share of the step ([3]_: 2 |a| / |v| <= 0.75)."""
+from lfpiv_kernels.runtime import cores
 
+BLOCK_BYTES = 1 << 20
+"""Memory of one block of Jacobian rows [byte]."""
+LEAST_ROWS = 512
+"""Least number of samples in a block."""
+RANGES = 8
+"""Ranges of samples that are summed in parallel. Fixed, so that results do not depend on the number of threads."""
+LEAST_DAMPING, FIRST_DAMPING, LAST_DAMPING = 1e-15, 1e-3, 1e12
+"""Least damping, damping of the first step, and damping that ends the search for a step, relative to D."""
+LONGEST_CORRECTION = 0.375
+"""Largest second-order correction of an accepted step, relative to the step. [3]_ demands 2 |a| / |v| <= 0.75."""
+LEAST_SCALE = 1e-12
+"""Lower limit of D's diagonal, relative to its largest element. Parameters of dead nodes have no derivative."""
 
 Terms = tuple[np.ndarray, ...]
 """Arrays to be summed over the samples."""
 
 
-class Stop(enum.Enum):
-    """Why training ended; the text is the advice."""
+class TrainingStop(enum.Enum):
+    """Reason why training ended. The text is the advice."""
 
     VALIDATION = "the validation error no longer falls; the best epoch was kept"
     MINIMUM = "no step lowers the training error any more; this is a minimum of the training error"
@@ -51,24 +55,128 @@ class Stop(enum.Enum):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Samples:
-    """Scaled samples as a trainer sees them."""
+    """Scaled samples of a trainer."""
 
     inputs: np.ndarray
     """Shape (n, d), within [-1, 1]."""
     outputs: np.ndarray
     """Shape (n, m)."""
     weights: np.ndarray
-    """Factor of each sample's residual, shape (n, 1); mean square 1."""
+    """Factor on the residual of each sample, shape (n, 1)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fit:
-    """What a trainer returns: layers and rms errors in scaled units."""
+    """Result of a trainer. Errors are in scaled units."""
 
     layers: list[np.ndarray]
+    """Trained layers."""
     training_rms: list[float]
+    """Error of the training part before the first and after each epoch."""
     validation_rms: list[float]
-    stop: Stop
+    """Error of the validation part."""
+    stop: TrainingStop
+    """Reason why training ended."""
+
+
+def levenberg_marquardt(
+    layers: list[np.ndarray],
+    training: Samples,
+    validation: Samples,
+    *,
+    epochs: int,
+    patience: int,
+    tolerance: float,
+) -> Fit:
+    """Train by Levenberg-Marquardt with geodesic acceleration and early stopping.
+
+    D is the largest diagonal of J^T J so far (Marquardt's scaling).
+
+    Parameters
+    ----------
+    layers : list of ndarray
+        First layers.
+    training, validation : Samples
+        Scaled samples. The validation part decides when to stop and which epoch is returned.
+    epochs : int
+        Largest number of accepted steps.
+    patience : int
+        Epochs without a fall of the validation error by `tolerance` after which training stops.
+    tolerance : float
+        Relative fall of the validation error that counts.
+
+    Returns
+    -------
+    Fit
+        Holds the layers of the epoch with the lowest validation error.
+    """
+    unpack = _unpacker(layers)
+    theta = np.concatenate([layer.ravel() for layer in layers])
+    gram, gradient, squares = normal_equations(layers, training)
+    training_rms, validation_rms = [math.sqrt(squares / training.outputs.size)], [_rms_error(layers, validation)]
+    best, best_theta, mark, mark_epoch = validation_rms[0], theta, validation_rms[0], 0
+    damping, growth, scale = FIRST_DAMPING, 2.0, np.zeros(theta.size)
+    stop = TrainingStop.EPOCH_LIMIT
+    while len(training_rms) <= epochs:
+        scale = np.maximum(scale, gram.diagonal())
+        scale = np.maximum(scale, LEAST_SCALE * scale.max())
+        while damping < LAST_DAMPING:
+            trial = np.inf
+            if (steps := _steps(unpack, theta, training, gram + np.diag(damping * scale), gradient)) is not None:
+                step, correction = steps
+                if correction @ (scale * correction) <= LONGEST_CORRECTION**2 * (step @ (scale * step)):
+                    trial = _sum_of_squares(unpack(theta + step + correction), training)
+            if trial < squares:
+                gain = (squares - trial) / (step @ (damping * scale * step + gradient))
+                damping, growth = max(damping * max(0.1, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING), 2.0
+                break
+            damping, growth = damping * growth, growth * 2
+        else:
+            stop = TrainingStop.MINIMUM
+            break
+        theta = theta + step + correction
+        gram, gradient, squares = normal_equations(unpack(theta), training)
+        training_rms.append(math.sqrt(squares / training.outputs.size))
+        validation_rms.append(_rms_error(unpack(theta), validation))
+        if validation_rms[-1] < best:
+            best, best_theta = validation_rms[-1], theta
+        if best < mark * (1 - tolerance):
+            mark, mark_epoch = best, len(training_rms) - 1
+        elif len(training_rms) - 1 - mark_epoch >= patience:
+            stop = TrainingStop.VALIDATION
+            break
+    return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
+
+
+def _unpacker(layers: Sequence[np.ndarray]) -> Callable[[np.ndarray], list[np.ndarray]]:
+    """Return the function that cuts one vector of parameters into layers of these shapes."""
+    shapes, edges = [layer.shape for layer in layers], np.cumsum([layer.size for layer in layers])[:-1]
+
+    def unpack(vector: np.ndarray) -> list[np.ndarray]:
+        return [part.reshape(shape) for part, shape in zip(np.split(vector, edges), shapes, strict=True)]
+
+    return unpack
+
+
+def _steps(
+    unpack: Callable[[np.ndarray], list[np.ndarray]],
+    theta: np.ndarray,
+    training: Samples,
+    damped: np.ndarray,
+    gradient: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the first-order step and its second-order correction, or None where `damped` is not positive definite."""
+    try:
+        factor = cho_factor(damped, overwrite_a=True, check_finite=False)
+    except LinAlgError:
+        return None
+    step = cho_solve(factor, gradient, check_finite=False)
+    bend = second_order_gradient(unpack(theta), unpack(step), training)
+    return step, -0.5 * cho_solve(factor, bend, check_finite=False)
+
+
+def _rms_error(layers: Sequence[np.ndarray], samples: Samples) -> float:
+    return math.sqrt(_sum_of_squares(layers, samples) / samples.outputs.size)
 
 
 def forward(layers: Sequence[np.ndarray], inputs: np.ndarray) -> list[np.ndarray]:
@@ -82,28 +190,28 @@ def forward(layers: Sequence[np.ndarray], inputs: np.ndarray) -> list[np.ndarray
     return outputs
 
 
-def _add_up(job: Callable[[int, int], Terms], size: int, rows: int) -> Terms:
-    """Sum of ``job(first, last)``, a tuple of arrays, over blocks of `rows` samples, on the cores of this process.
+def _sum_over_blocks(terms_of: Callable[[int, int], Terms], count: int, rows: int) -> Terms:
+    """Return the sum of ``terms_of(first, last)`` over blocks of `rows` samples, computed by several threads.
 
-    The samples are cut into a fixed number of ranges, each summed by one thread, and the ranges are added in order: the
-    result does not depend on the number of threads. BLAS should run on one thread meanwhile (`train` sees to that).
+    Each of a fixed number of ranges is summed by one thread, and the ranges are added in order. So the result does not
+    depend on the number of threads. The caller limits BLAS to one thread.
     """
 
     def add_range(edge: tuple[int, int]) -> Terms:
-        total = job(edge[0], min(edge[0] + rows, edge[1]))
+        total = terms_of(edge[0], min(edge[0] + rows, edge[1]))
         for first in range(edge[0] + rows, edge[1], rows):
-            for a, b in zip(total, job(first, min(first + rows, edge[1])), strict=True):
+            for a, b in zip(total, terms_of(first, min(first + rows, edge[1])), strict=True):
                 a += b
         return total
 
-    edges = [size * part // RANGES for part in range(RANGES + 1)]
-    with ThreadPoolExecutor(_cores()) as pool:
+    edges = [count * part // RANGES for part in range(RANGES + 1)]
+    with ThreadPoolExecutor(cores()) as pool:
         totals = list(pool.map(add_range, [edge for edge in pairwise(edges) if edge[0] < edge[1]]))
     return tuple(sum(terms[1:], terms[0]) for terms in zip(*totals, strict=True))
 
 
 def _sum_of_squares(layers: Sequence[np.ndarray], samples: Samples) -> float:
-    """Weighted sum of squared residuals."""
+    """Return the weighted sum of squared residuals."""
 
     def squares(first: int, last: int) -> Terms:
         part = slice(first, last)
@@ -111,22 +219,25 @@ def _sum_of_squares(layers: Sequence[np.ndarray], samples: Samples) -> float:
         return (np.vdot(residual, residual).reshape(1),)
 
     widest = max(layer.shape[1] for layer in layers)
-    return float(_add_up(squares, len(samples.inputs), max(LEAST_ROWS, BLOCK_BYTES // (8 * 2 * widest)))[0][0])
+    return float(_sum_over_blocks(squares, len(samples.inputs), max(LEAST_ROWS, BLOCK_BYTES // (8 * 2 * widest)))[0][0])
 
 
 def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.ndarray, np.ndarray, float]:
-    """J^T J, J^T e and e^T e of the residuals e = weight (outputs - network) by backpropagation ([1]_).
+    """Return J^T J, J^T e and e^T e of the residuals e = weight (outputs - network) by backpropagation ([1]_).
 
-    J is the derivative of the network's weighted outputs by the parameters: all layers of `layers`, each flattened in
-    C order, one after the other. The rows of J that belong to one sample share most of their factors: the last hidden
-    layer's columns are, for output o, ``W[j, o]`` times columns ``(1 - h_j^2) a_i`` that do not depend on o, and the
-    output layer's columns are the hidden outputs themselves. So these two layers enter the products once per sample,
-    not once per output, and J is never stored: blocks of samples are summed up.
+    J is the derivative of the network's weighted outputs by the parameters: all layers, each flattened in C order, one
+    after the other. J is never stored. The last hidden layer's columns of J are, for output o, ``W[j, o]`` times
+    columns ``(1 - h_j^2) a_i`` that do not depend on o, and the output layer's columns are the hidden outputs. So these
+    two layers enter the products once per sample instead of once per output.
 
     Returns
     -------
-    tuple
-        ``(gram (p, p), gradient (p,), sum of squares)`` for p parameters.
+    gram : ndarray, shape (p, p)
+        J^T J of p parameters.
+    gradient : ndarray, shape (p,)
+        J^T e.
+    squares : float
+        e^T e.
     """
     output_layer = layers[-1][:-1]
     nodes, outputs = output_layer.shape
@@ -164,9 +275,9 @@ def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.nda
         return tuple(sums)
 
     rows = max(LEAST_ROWS, BLOCK_BYTES // (8 * (shared_size + outputs * deep_size)))
-    squares, shared, shared_gradient, *rest = _add_up(products, len(samples.inputs), rows)
+    squares, shared, shared_gradient, *rest = _sum_over_blocks(products, len(samples.inputs), rows)
 
-    # Unfold the shared products: parameter (i, j) of the last hidden layer, parameter (k, o) of the output layer.
+    # Expand the shared products to parameters (i, j) of the last hidden layer and (k, o) of the output layer.
     fan_in = layers[-2].shape[0]
     size = deep_size + hidden_size + layers[-1].size
     gram, gradient = np.empty((size, size)), np.empty(size)
@@ -189,8 +300,8 @@ def normal_equations(layers: list[np.ndarray], samples: Samples) -> tuple[np.nda
     return gram, gradient, float(squares[0])
 
 
-def _bending(layers: Sequence[np.ndarray], steps: Sequence[np.ndarray], samples: Samples) -> np.ndarray:
-    """J^T f'' for the second derivative f'' of the weighted outputs along a step of the layers, exactly."""
+def second_order_gradient(layers: Sequence[np.ndarray], steps: Sequence[np.ndarray], samples: Samples) -> np.ndarray:
+    """Return J^T f'' for the second derivative f'' of the weighted outputs along a step of the layers, shape (p,)."""
 
     def products(first: int, last: int) -> Terms:
         weight = samples.weights[first:last]
@@ -219,90 +330,4 @@ def _bending(layers: Sequence[np.ndarray], steps: Sequence[np.ndarray], samples:
         return (np.concatenate(gradient),)
 
     widest = max(layer.shape[1] for layer in layers)
-    return _add_up(products, len(samples.inputs), max(LEAST_ROWS, BLOCK_BYTES // (8 * 4 * widest)))[0]
-
-
-def levenberg_marquardt(
-    layers: list[np.ndarray],
-    training: Samples,
-    validation: Samples,
-    *,
-    epochs: int,
-    patience: int,
-    tolerance: float,
-) -> Fit:
-    """Train by Levenberg-Marquardt with geodesic acceleration and early stopping.
-
-    The step solves (J^T J + damping D) step = J^T e ([1]_) with Marquardt's scaling, D the largest diagonal of J^T J
-    so far; the second-order correction along it ([3]_) follows the narrow curved valleys of a network's error and
-    takes about a fifth of the epochs of plain Levenberg-Marquardt. Damping follows the gain ratio ([2]_).
-
-    Parameters
-    ----------
-    layers : list of ndarray
-        First weights, each (inputs + 1, nodes) with the bias in the last row.
-    training, validation : Samples
-        Scaled samples; the second part only decides when to stop and which epoch is kept.
-    epochs : int
-        Accepted steps at most.
-    patience : int
-        Training stops when the lowest validation error has fallen by less than `tolerance` in so many epochs.
-    tolerance : float
-        Relative fall of the validation error that counts.
-    """
-    shapes = [layer.shape for layer in layers]
-    edges = np.cumsum([layer.size for layer in layers])[:-1]
-    theta = np.concatenate([layer.ravel() for layer in layers])
-
-    def unpack(vector: np.ndarray) -> list[np.ndarray]:
-        return [part.reshape(shape) for part, shape in zip(np.split(vector, edges), shapes, strict=True)]
-
-    def validation_error(vector: np.ndarray) -> float:
-        return math.sqrt(_sum_of_squares(unpack(vector), validation) / validation.outputs.size)
-
-    gram, gradient, squares = normal_equations(layers, training)
-    training_rms, validation_rms = [np.sqrt(squares / training.outputs.size)], [validation_error(theta)]
-    best, best_theta, mark, mark_epoch = validation_rms[0], theta, validation_rms[0], 0
-    damping, growth, scale = FIRST_DAMPING, 2.0, np.zeros(theta.size)
-    stop = Stop.EPOCH_LIMIT
-    while len(training_rms) <= epochs:
-        scale = np.maximum(scale, gram.diagonal())
-        scale = np.maximum(scale, 1e-12 * scale.max())  # dead nodes have no derivative
-        while damping < LAST_DAMPING:  # until a step lowers the error
-            trial = np.inf
-            try:
-                factor = cho_factor(gram + np.diag(damping * scale), overwrite_a=True, check_finite=False)
-            except LinAlgError:
-                factor = None
-            if factor is not None:
-                step = cho_solve(factor, gradient, check_finite=False)
-                correction = -0.5 * cho_solve(
-                    factor, _bending(unpack(theta), unpack(step), training), check_finite=False
-                )
-                if correction @ (scale * correction) <= LONGEST_CORRECTION**2 * (step @ (scale * step)):
-                    trial = _sum_of_squares(unpack(theta + step + correction), training)
-            if trial < squares:
-                gain = (squares - trial) / (step @ (damping * scale * step + gradient))
-                damping, growth = max(damping * max(0.1, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING), 2.0
-                break
-            damping, growth = damping * growth, growth * 2
-        else:
-            stop = Stop.MINIMUM
-            break
-        theta = theta + step + correction
-        gram, gradient, squares = normal_equations(unpack(theta), training)
-        training_rms.append(np.sqrt(squares / training.outputs.size))
-        validation_rms.append(validation_error(theta))
-        if validation_rms[-1] < best:
-            best, best_theta = validation_rms[-1], theta
-        if best < mark * (1 - tolerance):
-            mark, mark_epoch = best, len(training_rms) - 1
-        elif len(training_rms) - 1 - mark_epoch >= patience:
-            stop = Stop.VALIDATION
-            break
-    return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return _sum_over_blocks(products, len(samples.inputs), max(LEAST_ROWS, BLOCK_BYTES // (8 * 4 * widest)))[0]

@@ -1,11 +1,20 @@
-"""The thin-lens mapping of a plenoptic camera in free pose: the DRT mapping, and a baseline fitted to dot labels.
+"""The thin-lens camera in any pose (Eqs. 1-3): the DRT mapping, and the baseline that the network corrects.
 
-A network knows nothing outside the dots it was trained on; the closed form extrapolates. A network trained on the
-residual of the fitted closed form keeps both: aberrations where there are dots, sane rays where there are none.
+A network extrapolates badly beyond the dots. A thin lens extrapolates well, but has no aberrations. So the default
+mapping is a thin lens fitted to the labels plus a network trained on the residual.
+
+The fit minimises the robust cost sum of r^2 / (1 + (r / c)^2) with c = `OUTLIER` standard deviations, plus a prior, by
+Levenberg-Marquardt steps ([1]_).
+
+References
+----------
+.. [1] S. Geman and D. E. McClure, "Statistical methods for tomographic image reconstruction", Bull. ISI 52, 5-21
+       (1987).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,44 +23,50 @@ import numpy as np
 from lfpiv.geometry.optics import Optics
 
 FIT_SAMPLES = 20_000
-"""Labels used by a fit at most, evenly spread: eleven numbers need no more."""
+"""Largest number of labels in a fit, evenly drawn from all labels."""
 PRIOR = np.repeat([1e3, 0.05], [6, 5])
-"""Deviation of each fitted number from its start that costs as much as one label off by its standard deviation: none
-to speak of for the pose, 5 % of the data sheet (0.5 mm for the axis) for the optics. Dots in a thin volume hardly tell
-some of them apart; where they do, thousands of labels outweigh it."""
+"""Prior standard deviation of each parameter: free for the pose, 5 % for the optics, 0.5 mm for the optical axis."""
 ITERATIONS, STEP, CONVERGED = 50, 1e-6, 1e-9
-"""Steps at most, the difference step, and the step that ends the fit (numbers of order 0.01)."""
+"""Largest number of steps, step of the finite differences, and length of the last step."""
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-12
-"""Damping of the first step, and the least, relative to the diagonal of the normal equations (Levenberg, Marquardt)."""
+"""Damping of the first step, and the least damping, relative to the diagonal of the normal equations."""
 OUTLIER = 4.0
-"""Residual, in robust standard deviations, at which a label counts a quarter."""
+"""Residual that has a quarter of the full weight [robust standard deviations]."""
 SMALLEST_STD_MM = 1e-7
-"""Residual taken for an exact fit [mm]."""
+"""Lower limit of the residual's robust standard deviation [mm]."""
+LEAST_LABELS = 20
+"""Least number of labels of a fit."""
+LEAST_DEPTH = 1e-4
+"""Smallest extent of the dots relative to their largest extent."""
+TRIMMING = 4.0
+"""Residual above which the linear start leaves out a label [median residuals]."""
+MAD_TO_STD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ThinLensModel:
-    """Thin-lens camera in closed form, Eqs. 1-3 with the imaging equations of a thin lens and a free pose.
+    """Thin-lens camera in closed form: Eqs. 1-3 with the imaging equations of a thin lens and a free pose.
 
-    With (xc, yc, zc) = rotation (point - offset) and d = object_distance - zc, a ray through the pupil at (u, v) meets
-    the array at s = array_offset_s + k u - m xc, t = array_offset_t + k v - m yc, where m = image_distance / d
-    and k = pupil_scale (1 - image_distance / focal_length + m).
+    With (xc, yc, zc) = rotation (point - offset) and d = object_distance - zc, the magnification is
+    m = image_distance / d. A ray through the pupil point (u, v) meets the array at s = array_offset_s + k u - m xc,
+    t = array_offset_t + k v - m yc, where k = pupil_scale (1 - image_distance / focal_length + m).
     """
 
     rotation: np.ndarray
-    """World to camera, shape (3, 3), orthonormal with determinant 1."""
+    """Rotation from world to camera axes, shape (3, 3)."""
     offset_mm: np.ndarray
-    """World point (x, y, z) that lies on the optical axis at the object distance, shape (3,) [mm]."""
+    """World point (x, y, z) on the optical axis at the object distance, shape (3,) [mm]."""
     object_distance_mm: float
-    """Main lens to `offset_mm` [mm]."""
+    """Distance from the main lens to `offset_mm` [mm]."""
     image_distance_mm: float
-    """Main lens to the microlens array [mm]."""
+    """Distance from the main lens to the microlens array [mm]."""
     focal_length_mm: float
     """Focal length of the main lens [mm]."""
     pupil_scale: float = 1.0
-    """True over nominal pupil coordinate; differs from 1 where f_m / s_i of the data sheet is off."""
+    """True over nominal pupil coordinate. Differs from 1 where f_m / s_i of the data sheet is wrong."""
     array_offset_mm: np.ndarray = field(default_factory=lambda: np.zeros(2))
-    """Where the optical axis meets the array (s, t), shape (2,) [mm]."""
+    """Point (s, t) where the optical axis meets the array, shape (2,) [mm]."""
 
     def __post_init__(self) -> None:
         for name, shape in (("rotation", (3, 3)), ("offset_mm", (3,)), ("array_offset_mm", (2,))):
@@ -68,12 +83,12 @@ class ThinLensModel:
         points : array_like, shape (n, 3)
             Object points (x, y, z) in world axes [mm].
         pupil : array_like, shape (n, 2)
-            Where each ray crosses the pupil (u, v) [mm].
+            Points (u, v) where the rays cross the pupil [mm].
 
         Returns
         -------
         ndarray, shape (n, 2)
-            Where each ray meets the array (s, t) [mm].
+            Positions (s, t) where the rays meet the array [mm].
         """
         camera = (np.asarray(points, float) - self.offset_mm) @ self.rotation.T
         magnification = self.image_distance_mm / (self.object_distance_mm - camera[:, 2:])
@@ -82,12 +97,12 @@ class ThinLensModel:
         return array
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return the model as named arrays, for files and kernels; `from_arrays` is the inverse."""
+        """Return the model as named arrays for files and kernels. `from_arrays` is the inverse."""
         return {f"thin_lens_{name}": np.asarray(getattr(self, name), float) for name in self.__dataclass_fields__}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> ThinLensModel:
-        """Build a model from the arrays of `to_arrays`; other keys are ignored.
+        """Build a model from the arrays of `to_arrays`. Ignore other keys.
 
         Raises
         ------
@@ -103,14 +118,14 @@ class ThinLensModel:
 
 
 def thin_lens_model(optics: Optics, angle_deg: float) -> ThinLensModel:
-    """Return the DRT mapping: an ideal camera turned about y by its angle, Eqs. 1-3.
+    """Return the DRT mapping: an ideal camera rotated about y by its angle, Eqs. 1-3.
 
     Parameters
     ----------
     optics : Optics
         Nominal optics.
     angle_deg : float
-        Angle of the camera to the z axis [degree]; add an angle error to it for the paper's DRT contrast (Eqs. 11-12).
+        Angle of the camera to the z axis [degree]. It includes the angle error of Eqs. 11-12.
 
     Raises
     ------
@@ -131,33 +146,52 @@ def thin_lens_model(optics: Optics, angle_deg: float) -> ThinLensModel:
 def fit_thin_lens(
     points: np.ndarray, pupil: np.ndarray, array: np.ndarray, optics: Optics, *, std: np.ndarray | None = None
 ) -> ThinLensModel:
-    """Fit the thin-lens camera to labels of rays; needs no angle, any pose is found.
+    """Fit the thin-lens camera to labelled rays. Any pose is found; no nominal angle is needed.
 
-    A fit of s, t = a + A (x, y, z) + (k + b (x, y, z)) (u, v) by linear least squares starts it: A's rows are the
-    camera's axes times the magnification, b its optical axis times s_i / s_o^2. A robust Levenberg-Marquardt fit of
-    pose, image distance, focal length, pupil scale and axis follows, held near the data sheet only where the labels
-    leave it open; mislabelled dots drop out of it.
+    Linear least squares of s, t = a + A (x, y, z) + (k + b (x, y, z)) (u, v) start the fit: the rows of A are the
+    camera's axes times the magnification, and b is its optical axis times s_i / s_o^2. A robust fit of pose, image
+    distance, focal length, pupil scale and optical axis follows. Mislabelled dots have next to no weight in it, and the
+    data sheet decides only what the labels leave open.
 
     Parameters
     ----------
     points : array_like, shape (n, 3)
         Object points (x, y, z) [mm].
     pupil : array_like, shape (n, 2)
-        Where the rays cross the pupil (u, v) [mm].
+        Points (u, v) where the rays cross the pupil [mm].
     array : array_like, shape (n, 2)
-        Where the rays meet the microlens array (s, t) [mm].
+        Positions (s, t) where the rays meet the microlens array [mm].
     optics : Optics
         Nominal optics.
     std : array_like, shape (n,), optional
-        Standard deviation of each label [mm]; default: equal, estimated from the residual.
+        Standard deviation of each label [mm]. Default: equal, estimated from the residual.
+
+    Returns
+    -------
+    ThinLensModel
 
     Raises
     ------
     ValueError
-        If shapes do not fit, values are not finite, there are fewer than 20 labels, the points do not span the two
-        lateral directions, or the labels are mirrored.
+        If shapes do not fit, values are not finite, there are fewer than 20 labels, the points lie in one plane or
+        line, or the labels are mirrored.
     """
     points, pupil, array = (np.asarray(value, float) for value in (points, pupil, array))
+    std = np.ones(len(points)) if std is None else np.asarray(std, float)
+    _check_labels(points, pupil, array, std)
+    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), FIT_SAMPLES)).astype(int))
+    points, pupil, array, std = points[chosen], pupil[chosen], array[chosen], std[chosen] / np.median(std)
+    start = _linear_start(points, pupil, array, optics)
+
+    def residual_of(parameters: np.ndarray) -> np.ndarray:
+        deviation = _moved(start, optics, parameters)(points, pupil) - array
+        residual: np.ndarray = (deviation / std[:, None]).ravel()
+        return residual
+
+    return _moved(start, optics, _robust_minimum(residual_of))
+
+
+def _check_labels(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, std: np.ndarray) -> None:
     count = len(points)
     if points.shape != (count, 3) or pupil.shape != (count, 2) or array.shape != (count, 2):
         raise ValueError(
@@ -167,50 +201,49 @@ def fit_thin_lens(
     for name, value in (("points", points), ("pupil", pupil), ("array", array)):
         if not np.isfinite(value).all():
             raise ValueError(f"{name}: expected finite values [mm], got NaN or infinity; leave those labels out.")
-    if count < 20:
-        raise ValueError(f"points: a thin-lens fit needs at least 20 labels, got {count}; find more dots.")
-    if std is not None:
-        std = np.asarray(std, float)
-        if std.shape != (count,) or not (np.isfinite(std) & (std > 0)).all():
-            raise ValueError(f"std: expected {count} positive finite values, one per label, got shape {std.shape}.")
-    chosen = np.unique(np.linspace(0, count - 1, min(count, FIT_SAMPLES)).astype(int))
-    points, pupil, array = points[chosen], pupil[chosen], array[chosen]
-    std = np.ones(len(chosen)) if std is None else std[chosen] / np.median(std)
-    start = _linear_start(points, pupil, array, optics)
+    if count < LEAST_LABELS:
+        raise ValueError(f"points: a thin-lens fit needs at least {LEAST_LABELS} labels, got {count}; find more dots.")
+    if std.shape != (count,) or not (np.isfinite(std) & (std > 0)).all():
+        raise ValueError(f"std: expected {count} positive finite values, one per label, got shape {std.shape}.")
 
-    def misfit(parameters: np.ndarray) -> np.ndarray:
-        deviation: np.ndarray = _moved(start, optics, parameters)(points, pupil) - array
-        return (deviation / std[:, None]).ravel()
+
+def _robust_minimum(residual_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return the eleven parameters of `_moved` with the least robust cost, by damped Gauss-Newton steps."""
 
     def cost(residual: np.ndarray, parameters: np.ndarray, sigma: float) -> float:
-        robust = residual**2 / (1 + (residual / (OUTLIER * sigma)) ** 2)  # Geman and McClure: mislabelled dots drop out
+        robust = residual**2 / (1 + (residual / (OUTLIER * sigma)) ** 2)
         return float(robust.sum() + ((sigma / PRIOR * parameters) ** 2).sum())
 
-    parameters, damping = np.zeros(11), FIRST_DAMPING
-    residual = misfit(parameters)
+    parameters, damping = np.zeros(PRIOR.size), FIRST_DAMPING
+    residual = residual_of(parameters)
     for _ in range(ITERATIONS):
-        sigma = max(1.4826 * float(np.median(np.abs(residual))), SMALLEST_STD_MM)
+        sigma = max(MAD_TO_STD * float(np.median(np.abs(residual))), SMALLEST_STD_MM)
         weight = 1 / (1 + (residual / (OUTLIER * sigma)) ** 2) ** 2
-        columns = np.stack([(misfit(parameters + nudge) - residual) / STEP for nudge in STEP * np.eye(11)], axis=1)
-        weighted = columns * weight[:, None]
-        gram = weighted.T @ columns + np.diag((sigma / PRIOR) ** 2)
+        steps = STEP * np.eye(PRIOR.size)
+        jacobian = np.stack([(residual_of(parameters + step) - residual) / STEP for step in steps], axis=1)
+        weighted = jacobian * weight[:, None]
+        gram = weighted.T @ jacobian + np.diag((sigma / PRIOR) ** 2)
         gradient = weighted.T @ residual + (sigma / PRIOR) ** 2 * parameters
         present = cost(residual, parameters, sigma)
-        while True:  # numbers the labels hardly tell apart invite steps far beyond where the fit is linear
+        while True:  # a step along badly determined parameters can leave the range where the model is linear
             step = np.linalg.solve(gram + damping * np.diag(gram.diagonal()), -gradient)
-            trial = misfit(parameters + step)
-            small = bool(np.abs(step).max() < CONVERGED)
-            if small or cost(trial, parameters + step, sigma) <= present:
+            trial = residual_of(parameters + step)
+            converged = bool(np.abs(step).max() < CONVERGED)
+            if converged or cost(trial, parameters + step, sigma) <= present:
                 break
             damping *= 10
         parameters, residual, damping = parameters + step, trial, max(damping / 10, LEAST_DAMPING)
-        if small:
+        if converged:
             break
-    return _moved(start, optics, parameters)
+    return parameters
 
 
 def _moved(start: ThinLensModel, optics: Optics, p: np.ndarray) -> ThinLensModel:
-    """`start` moved by eleven numbers of order 0.01: turn (3), shift (3), and optics relative to the data sheet (5)."""
+    """Return `start` changed by eleven parameters of order 0.01.
+
+    They are a rotation (3), a shift (3), image distance, focal length and pupil scale relative to the data sheet (3),
+    and the optical axis on the array (2).
+    """
     focus = optics.image_distance_mm
     return ThinLensModel(
         rotation=_rotation(p[:3]) @ start.rotation,
@@ -224,11 +257,11 @@ def _moved(start: ThinLensModel, optics: Optics, p: np.ndarray) -> ThinLensModel
 
 
 def _linear_start(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, optics: Optics) -> ThinLensModel:
-    """Pose from the bilinear fit, optics from the data sheet."""
+    """Return the pose of a bilinear fit with the optics of the data sheet."""
     count, middle = len(points), points.mean(axis=0)
     centred = points - middle
     strength = np.linalg.svd(centred, compute_uv=False)
-    if strength[2] < 1e-4 * strength[0]:
+    if strength[2] < LEAST_DEPTH * strength[0]:
         raise ValueError(
             "points: a thin-lens fit needs dots that span a volume, these lie in one plane or line; "
             "give board images at two or more depths."
@@ -240,11 +273,11 @@ def _linear_start(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, opti
         columns[axis, :, 8] = pupil[:, axis]
         columns[axis, :, 9:12] = pupil[:, axis : axis + 1] * centred
     matrix, right = columns.reshape(2 * count, 12), array.T.ravel()
-    keep = np.ones(2 * count, bool)
+    used = np.ones(2 * count, bool)
     for _ in range(4):
-        solution = np.linalg.lstsq(matrix[keep], right[keep], rcond=None)[0]
+        solution = np.linalg.lstsq(matrix[used], right[used], rcond=None)[0]
         deviation = np.abs(right - matrix @ solution)
-        keep = deviation <= 4 * np.median(deviation) + 1e-12  # without mislabelled dots
+        used = deviation <= TRIMMING * np.median(deviation) + 1e-12  # without mislabelled dots
     first, second, gain_slope = -solution[1:4], -solution[5:8], solution[9:12]
     axes = [first / np.linalg.norm(first), second / np.linalg.norm(second)]
     axes.append(np.cross(*axes))
@@ -258,9 +291,7 @@ def _linear_start(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, opti
     magnification = np.sqrt(np.linalg.norm(first) * np.linalg.norm(second))
     depth = optics.object_distance_mm - optics.image_distance_mm / magnification
     camera_middle = np.array([-solution[0] / magnification, -solution[4] / magnification, depth])
-    start = thin_lens_model(optics, 0.0)
-    start = replace(start, rotation=rotation, offset_mm=middle - rotation.T @ camera_middle)
-    return start
+    return replace(thin_lens_model(optics, 0.0), rotation=rotation, offset_mm=middle - rotation.T @ camera_middle)
 
 
 def _rotation_y(angle: float) -> np.ndarray:
@@ -270,7 +301,7 @@ def _rotation_y(angle: float) -> np.ndarray:
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rotation about `vector` by its length, Rodrigues."""
+    """Return the rotation about `vector` by its length, after Rodrigues."""
     x, y, z = vector
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.linalg.norm(vector)

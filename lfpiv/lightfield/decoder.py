@@ -1,14 +1,13 @@
-"""Decode raw plenoptic images: the microlens, the pupil point and the light of every pixel; sub-aperture views.
+"""Decode raw plenoptic images: find the microlens, the pupil point and the light of every pixel.
 
-With the plane of the microlens array at distance s_i behind the main lens and the sensor f_m behind the array, Eq. 9
-sends a ray (u, v) -> (s, t) that lands on the microlens centred at s_l to the sensor point
-``X = s_l + (f_m / s_i) (s - u)``. Seen through the centre of its microlens (s = s_l) a pixel at X therefore belongs to
-the pupil point
+The microlens array lies at the distance s_i behind the main lens, and the sensor f_m behind the array. Eq. 9 maps a ray
+(u, v) -> (s, t) that meets the microlens centred at s_l to the sensor point ``X = s_l + (f_m / s_i) (s - u)``. So a
+pixel at X sees, through the centre of its microlens (s = s_l), the pupil point
 
     u = s_l - (X - s_l) s_i / f_m = -(X - X_c) s_i / f_m,     X_c = s_l (1 + f_m / s_i),
 
-where X_c is the centre of the microimage. The pupil is read relative to each microimage's own centre: its pitch on the
-sensor exceeds the pitch of the lenses by f_m / s_i and is not a whole number of pixels.
+where X_c is the centre of the microimage. The microimages' pitch on the sensor exceeds the pitch of the lenses by
+f_m / s_i and is not a whole number of pixels, so each microimage has its own centre.
 """
 
 from __future__ import annotations
@@ -22,20 +21,30 @@ from scipy import ndimage
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LensLattice, Optics
 
-_JUDGED_COVERAGE = 0.5  # pixels less than half inside a microimage are too dim to tell their response
-_CORE_COVERAGE = 0.99  # pixels wholly inside a microimage
-_GAP_MARGIN_PX = 1.0  # pixels this far outside every microimage see no light
-_GAP_PIXELS = 500  # fewer pixels in the gaps than this are no sample of the background
-_FALLBACK_PERCENTILE = 1.0
-_PATTERN_BIN_PX = 0.5  # resolution of the mean pattern of a microimage
-_DEAD_LENS = 0.2  # a lens darker than this fraction of its neighbours is dead
+CORE_COVERAGE = 0.99
+"""Least coverage of a pixel that lies inside a microimage."""
+NORMAL_MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+_JUDGED_COVERAGE = 0.5  # least coverage of a pixel whose own response is measured
+_GAP_MARGIN_PX = 1.0  # least distance of a gap pixel from every microimage
+_GAP_PIXELS = 500  # least number of gap pixels that give the background
+_FALLBACK_PERCENTILE = 1.0  # percentile of the image that gives the background without gaps
+_LEAST_SIGNAL = 3.0  # least white signal [standard deviations of the background]
+_PATTERN_BIN_PX = 0.5  # bin of the mean pattern of a microimage
+_DEAD_LENS = 0.2  # light of a dead lens, relative to its neighbours, or less
+_TYPICAL_LENSES = 5  # side of the square of lenses that gives the typical light
 _GAIN_RANGE = (0.0, 2.0)
-_NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+_BLOCK_ROWS = 256  # rows of pixels assigned to lenses at once
+_EDGE_REACH_PX = 0.75  # distance from the disc's edge within which a pixel is partly covered
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LightFieldDecoder:
-    """What every pixel of one plenoptic camera sees. Made by `from_white`; all arrays have the sensor's shape."""
+    """Microlens, pupil point and response of every pixel of one plenoptic camera. Made by `from_white`.
+
+    All arrays have the sensor's shape.
+    """
 
     optics: Optics
     """Nominal optics."""
@@ -44,19 +53,19 @@ class LightFieldDecoder:
     lens_index: np.ndarray
     """Lattice index (i, j) of the microlens in front of each pixel, shape (rows, columns, 2), int16."""
     pupil_mm: np.ndarray
-    """Pupil point (u, v) seen by each pixel through the centre of its lens [mm], shape (rows, columns, 2), float32."""
+    """Pupil point (u, v) that each pixel sees through its lens's centre [mm], shape (rows, columns, 2), float32."""
     coverage: np.ndarray
-    """Fraction of each pixel inside the nominal image of the pupil, summed over the lenses that touch it, float32."""
+    """Fraction of each pixel inside the nominal images of the pupil, summed over the lenses, float32."""
     gain: np.ndarray
-    """White image over coverage, 1 at a typical pixel: vignetting and pixel response; 0 under dead lenses, float32."""
+    """White image over coverage, float32: vignetting and pixel response. 1 at a typical pixel, 0 under dead lenses."""
     smooth_gain: np.ndarray
-    """The part of `gain` that is no noise: light of each lens times the mean pattern of a microimage, float32."""
+    """Smooth part of `gain`: light of each lens times the mean pattern of a microimage, float32."""
     gaps: np.ndarray
     """Pixels between the microimages that see no light, bool."""
     white_counts: float
-    """White-image signal of a typical pixel [counts]."""
+    """Signal of a typical pixel in the white image [counts]."""
     counts_per_photon: float
-    """Shot noise: variance over mean of the white image from pixel to pixel [counts]; holds the pixel response too."""
+    """Variance over mean of the white image from pixel to pixel [counts]: shot noise and pixel response."""
 
     @classmethod
     def from_white(
@@ -73,7 +82,11 @@ class LightFieldDecoder:
         white : ndarray, shape (rows, columns)
             Image of an evenly lit scene [counts].
         dark : ndarray, shape (rows, columns), optional
-            Image with the lens capped [counts]. Without it the gaps between the microimages give the dark level.
+            Image with the lens capped [counts]. Default: the gaps between the microimages give the dark level.
+
+        Returns
+        -------
+        LightFieldDecoder
 
         Raises
         ------
@@ -88,10 +101,10 @@ class LightFieldDecoder:
             signal = white - np.float32(level)
         else:
             dark = _checked("dark", dark, optics)
-            signal, sigma = white - dark, _NORMAL_MAD * float(np.median(np.abs(dark - np.median(dark))))
-        core = coverage > _CORE_COVERAGE
+            signal, sigma = white - dark, NORMAL_MAD * float(np.median(np.abs(dark - np.median(dark))))
+        core = coverage > CORE_COVERAGE
         plateau = float(np.median(signal[core])) if core.any() else 0.0
-        if not plateau > 3 * sigma or plateau <= 0:
+        if not plateau > _LEAST_SIGNAL * sigma or plateau <= 0:
             raise InputError(
                 f"white: expected microimages brighter than the gaps between them, found {plateau:.3g} counts above a "
                 f"background with noise {sigma:.3g}. Check that the image was lit and belongs to this camera."
@@ -111,18 +124,25 @@ class LightFieldDecoder:
         )
 
     def background(self, image: np.ndarray) -> tuple[float, float]:
-        """Level and noise of pixels that see no light [counts], so that raw images need no dark frame.
+        """Return level and noise of the pixels that see no light [counts]. Images without a dark frame need them.
 
-        They are the median and the scaled median absolute deviation of the gaps between the microimages; where the
-        microimages leave no gaps, a low percentile and the spread below it.
+        They are the median and the scaled median absolute deviation of the gaps between the microimages. Without gaps
+        they are a low percentile of the image and the spread below it.
         """
         return _background(_checked("image", image, self.optics), self.gaps)
 
     def shrunk_gain(self, response_share: float) -> np.ndarray:
-        """Gain in which only a part of the white image's scatter from pixel to pixel counts as pixel response.
+        """Return the gain with a part of the white image's deviation from its smooth part.
 
-        The rest is noise of the white image. 1 gives `gain`, 0 gives `smooth_gain`; a measured board tells the best
-        share (`lfpiv.calibration.board.board.BoardDots.response_share`).
+        Parameters
+        ----------
+        response_share : float
+            Part of that deviation that is pixel response, the rest being noise. 1 gives `gain`, 0 gives `smooth_gain`.
+            The calibration board gives the best value.
+
+        Returns
+        -------
+        ndarray, shape (rows, columns), float32
         """
         gain: np.ndarray = self.smooth_gain + np.float32(response_share) * (self.gain - self.smooth_gain)
         return gain
@@ -130,10 +150,10 @@ class LightFieldDecoder:
     def sub_aperture(
         self, image: np.ndarray, pupil_mm: tuple[float, float], *, level: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """View through one pupil point: a white-normalised value per microlens (section 3.1 (2), Fig. 5 of the paper).
+        """Return the sub-aperture image of one pupil point: one white-normalised value per microlens.
 
-        The image and the white response are read at X = s_l (1 + f_m/s_i) - u f_m/s_i under every lens, each at its own
-        sub-pixel phase, and divided.
+        See section 3.1 (2) and Fig. 5 of the paper. Image and white response are interpolated at
+        X = s_l (1 + f_m/s_i) - u f_m/s_i under every lens, and divided.
 
         Parameters
         ----------
@@ -142,14 +162,14 @@ class LightFieldDecoder:
         pupil_mm : (float, float)
             Pupil point (u, v) [mm].
         level : float, optional
-            Dark level of the image [counts]; default: `background`.
+            Dark level of the image [counts]. Default: `background`.
 
         Returns
         -------
         values : ndarray, shape (I, J), float32
-            Light per lens, 1 where it is as bright as the white scene; nan where the pupil point is not seen.
+            Light per lens, 1 where it is as bright as the white scene, nan where the pupil point is not seen.
         centres_mm : ndarray, shape (I, J, 2)
-            Lens centres (s, t) [mm]; axis 0 runs along the lattice's first basis vector.
+            Lens centres (s, t) [mm]. Axis 0 runs along the lattice's first basis vector.
         """
         image = _checked("image", image, self.optics)
         level = self.background(image)[0] if level is None else level
@@ -157,7 +177,7 @@ class LightFieldDecoder:
         return self.sample(image - np.float32(level), index, pupil_mm), self.lattice.centres_mm(index)
 
     def sample(self, signal: np.ndarray, lens_index: np.ndarray, pupil_mm: ArrayLike) -> np.ndarray:
-        """White-normalised light of chosen lenses at chosen pupil points; nan where they are not seen.
+        """Return the white-normalised light of lenses at pupil points.
 
         Parameters
         ----------
@@ -167,6 +187,11 @@ class LightFieldDecoder:
             Lattice indices (i, j).
         pupil_mm : array_like, shape (..., 2)
             Pupil points (u, v) [mm], broadcast against `lens_index`.
+
+        Returns
+        -------
+        ndarray, float32
+            nan where a pupil point is not seen.
         """
         scale, pupil_mm = self.optics.sensor_per_pupil, np.asarray(pupil_mm, float)
         at = self.lattice.centres_mm(lens_index) * (1 + scale) - pupil_mm * scale
@@ -182,7 +207,7 @@ class LightFieldDecoder:
         return values
 
     def lens_grid(self) -> np.ndarray:
-        """Lattice indices (i, j) of a rectangle of lenses that covers the sensor, shape (I, J, 2)."""
+        """Return the lattice indices (i, j) of a rectangle of lenses that covers the sensor, shape (I, J, 2)."""
         low = self.lens_index.min((0, 1)).astype(int)
         high = self.lens_index.max((0, 1)).astype(int)
         along = [np.arange(first, last + 1) for first, last in zip(low, high, strict=True)]
@@ -200,7 +225,7 @@ def _checked(name: str, image: np.ndarray, optics: Optics) -> np.ndarray:
 
 
 def _assign_lenses(optics: Optics, lattice: LensLattice) -> tuple[np.ndarray, np.ndarray]:
-    """Lens of each pixel (int16) and the pixel's offset from the centre of that lens's microimage [mm] (float32)."""
+    """Return the lens of each pixel (int16) and the pixel's offset from its microimage's centre [mm] (float32)."""
     rows, columns = optics.sensor_shape
     widening = 1 + optics.sensor_per_pupil
     inverse = np.linalg.inv(np.asarray(lattice.basis_mm))
@@ -208,23 +233,23 @@ def _assign_lenses(optics: Optics, lattice: LensLattice) -> tuple[np.ndarray, np
     lens_index = np.empty((rows, columns, 2), np.int16)
     offset = np.empty((rows, columns, 2), np.float32)
     column = np.arange(columns)
-    for first in range(0, rows, 256):  # bounds the memory of the float64 positions
-        row, col = np.meshgrid(np.arange(first, min(first + 256, rows)), column, indexing="ij")
+    for first in range(0, rows, _BLOCK_ROWS):
+        row, col = np.meshgrid(np.arange(first, min(first + _BLOCK_ROWS, rows)), column, indexing="ij")
         position = optics.sensor_mm(np.stack([col, row], axis=-1)) / widening
         index = np.rint((position - np.asarray(lattice.origin_mm)) @ inverse).astype(int)
         miss = position - lattice.centres_mm(index)
-        doubtful = (miss**2).sum(-1) > inscribed**2  # inside the inscribed circle of a cell the lens is certain
+        doubtful = (miss**2).sum(-1) > inscribed**2  # inside a cell's inscribed circle the lens is certain
         index[doubtful] = lattice.nearest(position[doubtful])
-        lens_index[first : first + 256] = index
-        offset[first : first + 256] = (position - lattice.centres_mm(index)) * widening
+        lens_index[first : first + _BLOCK_ROWS] = index
+        offset[first : first + _BLOCK_ROWS] = (position - lattice.centres_mm(index)) * widening
     return lens_index, offset
 
 
 def _neighbours(lattice: LensLattice) -> np.ndarray:
-    """Vectors to the lenses around a lens [mm], shape (n, 2)."""
+    """Return the vectors from a lens to its neighbours [mm], shape (n, 2)."""
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     vectors: np.ndarray = np.asarray(steps, float) @ np.asarray(lattice.basis_mm)
-    near: np.ndarray = vectors[np.hypot(*vectors.T) < 1.6 * lattice.pitch_mm]  # not a hexagon's far corners
+    near: np.ndarray = vectors[np.hypot(*vectors.T) < 1.6 * lattice.pitch_mm]  # no far corners
     return near
 
 
@@ -234,13 +259,13 @@ def _neighbour_distances(lattice: LensLattice) -> np.ndarray:
 
 
 def _cover(optics: Optics, lattice: LensLattice, offset_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fraction of each pixel inside the pupil images around it, and which pixels lie clear of all of them."""
+    """Return the fraction of each pixel inside the pupil images around it, and the pixels in the gaps."""
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
     offset = offset_mm / np.float32(optics.pixel_mm)
     coverage, distance = disc_fraction(offset, radius)
     widening = (1 + optics.sensor_per_pupil) / optics.pixel_mm
     for vector in _neighbours(lattice) * widening:
-        if np.hypot(*vector) / 2 < radius + 1:  # this neighbour's microimage can reach into pixels of a lens
+        if np.hypot(*vector) / 2 < radius + 1:  # the neighbour's microimage reaches pixels of this lens
             near = offset @ vector.astype(np.float32) > np.float32(vector @ vector / 2 - np.hypot(*vector) * 2)
             more, far = disc_fraction(offset[near] - vector.astype(np.float32), radius)
             coverage[near] += more
@@ -249,14 +274,26 @@ def _cover(optics: Optics, lattice: LensLattice, offset_mm: np.ndarray) -> tuple
 
 
 def disc_fraction(offset: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Fraction of unit pixels centred at `offset` inside a disc around 0, and their distance to its edge [pixel].
+    """Return the fraction of pixels inside a disc around 0, and their distance to its edge.
 
-    The edge is taken as straight within a pixel, moved by its mean curvature; exact to (1/radius)^2 / 50.
+    The edge is taken as straight within a pixel and shifted by its mean curvature. The error is (1/radius)^2 / 50.
+
+    Parameters
+    ----------
+    offset : ndarray, shape (..., 2), float32
+        Centres of the pixels [pixel].
+    radius : float
+        Radius of the disc [pixel].
+
+    Returns
+    -------
+    fraction, distance : ndarray, shape (...), float32
+        The distance is negative inside the disc [pixel].
     """
     distance = np.hypot(offset[..., 0], offset[..., 1])
     outside = distance - np.float32(radius)
     fraction = (outside < 0).astype(np.float32)
-    edge = np.abs(outside) < 0.75
+    edge = np.abs(outside) < _EDGE_REACH_PX
     normal = np.maximum(np.abs(offset[edge]) / np.maximum(distance[edge], 1e-6)[:, None], 1e-3)
     reach = -(outside[edge] + 1 / (24 * max(radius, 1.0)))  # the pixel's centre inside the edge
     half_sum, half_gap = (normal[:, 0] + normal[:, 1]) / 2, (normal[:, 0] - normal[:, 1]) / 2
@@ -278,16 +315,16 @@ def _background(image: np.ndarray, gaps: np.ndarray) -> tuple[float, float]:
     else:
         level = float(np.percentile(image, _FALLBACK_PERCENTILE))
         spread = level - float(np.percentile(image, _FALLBACK_PERCENTILE / 4))
-    return level, max(_NORMAL_MAD * spread, 1 / np.sqrt(12))  # no camera is quieter than its quantisation
+    return level, max(NORMAL_MAD * spread, 1 / np.sqrt(12))  # least: the noise of quantisation
 
 
 def _gains(
     light: np.ndarray, coverage: np.ndarray, lens_index: np.ndarray, offset_mm: np.ndarray, optics: Optics
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Response of each pixel relative to a typical one, and its smooth part; both end at dead lenses.
+    """Return the response of each pixel relative to a typical one, and its smooth part. Both are 0 at dead lenses.
 
-    The smooth part is the mean response of the pixel's lens times the pattern common to all microimages. It stands in
-    for the response where the pixel's own light is too little to judge.
+    The smooth part is the mean response of the pixel's lens times the mean pattern of a microimage. It replaces the
+    response of pixels with little coverage.
     """
     judged = coverage > _JUDGED_COVERAGE
     gain = np.divide(light, coverage, out=np.zeros_like(light), where=judged)
@@ -298,7 +335,7 @@ def _gains(
     size = int(lenses.prod())
     mean = _group_ratio(lens, size, gain, np.ones_like(gain), judged)
     seen = np.where(np.bincount(lens[judged], minlength=size) > 0, mean, np.nan).reshape(lenses)
-    typical = ndimage.generic_filter(seen, _nanmedian, size=5, mode="nearest").ravel()
+    typical = ndimage.generic_filter(seen, _nanmedian, size=_TYPICAL_LENSES, mode="nearest").ravel()
     mean[mean < _DEAD_LENS * typical] = 0
     lens_mean = mean[lens]
     alive = judged & (lens_mean > 0)
@@ -316,7 +353,7 @@ def _gains(
 
 
 def _group_ratio(group: np.ndarray, size: int, above: np.ndarray, below: np.ndarray, use: np.ndarray) -> np.ndarray:
-    """Sum of one array over the sum of another within each group of used pixels; 0 for empty groups, float32."""
+    """Return the ratio of two arrays' sums over each group of used pixels, 0 for empty groups, float32."""
     chosen = group[use]
     numerator, denominator = (np.bincount(chosen, values[use], size) for values in (above, below))
     return np.divide(numerator, denominator, out=np.zeros(size), where=denominator > 0).astype(np.float32)
@@ -328,8 +365,8 @@ def _nanmedian(values: np.ndarray) -> float:
 
 
 def _counts_per_photon(signal: np.ndarray, core: np.ndarray) -> float:
-    """Variance over mean of the white image, from differences between neighbouring pixels of one microimage."""
-    pairs = core[:, 1:] & core[:, :-1]
-    step = (signal[:, 1:] - signal[:, :-1])[pairs]
-    variance = (_NORMAL_MAD * np.median(np.abs(step))) ** 2 / 2
+    """Return variance over mean of the white image, from differences of neighbouring pixels of one microimage."""
+    both = core[:, 1:] & core[:, :-1]
+    step = (signal[:, 1:] - signal[:, :-1])[both]
+    variance = (NORMAL_MAD * np.median(np.abs(step))) ** 2 / 2
     return float(variance / np.median(signal[core]))

@@ -1,8 +1,8 @@
-"""Microlens array from a white image: sub-pixel lattice of the microimages' centres.
+"""Find the microlens array in a white image: the lattice of the microimages' centres, to a fraction of a pixel.
 
-The white image's autocorrelation gives the lattice's vectors, the symmetry of its mean cell the phase. Each microimage
-is then fitted with the mean microimage, moved, scaled and tilted in brightness; the result is an affine lattice through
-the fitted centres, robust against dead lenses and dust.
+The autocorrelation of the image gives the lattice vectors, and the symmetry of its mean cell gives the phase
+(`lfpiv.lightfield.lens_basis`). Then the centre of each microimage is measured (`lfpiv.lightfield.microimage_fit`), and
+a robust fit of centre = origin + i basis[0] + j basis[1] leaves out dead lenses and dust.
 """
 
 from __future__ import annotations
@@ -14,64 +14,76 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.geometry.optics import LAYOUTS, LensLattice, Optics, pair
+from lfpiv.geometry.optics import LAYOUTS, LensLattice, Optics, float_pair
 from lfpiv.lightfield.lens_basis import cell_angle_deg, find_basis, find_phase, indices_inside, lattice_pitch
-from lfpiv.lightfield.microimage_fit import BLUR_REACH_PX, cut_patches, measure, robust_fit
+from lfpiv.lightfield.microimage_fit import (
+    cut_patches,
+    measure_microimages,
+    patch_half_px,
+    robust_fit,
+    whole_microimages,
+)
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
 SAMPLE_LENSES = 1500
-"""Microimages that fix the lattice before all are measured."""
+"""Number of microimages in the first passes."""
 MIN_LENSES = 12
-"""Fewest measured microimages: four values per unknown of the lattice."""
+"""Least number of measured microimages: four values for each unknown of the lattice."""
 MAX_PASSES = 20
-"""Most passes of an iteration that usually ends after three to five."""
+"""Largest number of first passes."""
 PASS_TOLERANCE_PX = 0.01
-"""Change of the lattice that ends the first passes [pixel]; the final ones start within it."""
+"""Change of the lattice that ends the first passes [pixel]."""
+LEAST_LIT = 0.5
+"""Part of the microimages that is lit below which a warning is due."""
+LEAST_AGREEING, LARGEST_RMS_PITCH = 0.5, 0.1
+"""Least part of the lit microimages on the lattice, and their largest distance from it [pitch, rms]."""
 DISTORTION_PX = 0.05
-"""Smooth distortion worth a warning [pixel, rms]: what would move a pupil coordinate by a twentieth of a pixel."""
+"""Smooth distortion above which a warning is due [pixel, rms]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensArray:
     """Microimage centres of one camera as a lattice on the sensor: centre = origin + i basis[0] + j basis[1].
 
-    Positions are (column, row) in pixels, integer at a pixel's centre. Microimage (0, 0) is the one nearest the
-    sensor's centre.
+    Positions are (column, row) in pixels, integer at a pixel's centre. Microimage (0, 0) is nearest to the sensor's
+    centre.
     """
 
     centres_px: np.ndarray
-    """Centres of all microimages whose centre lies on the sensor, cut ones included [pixel], shape (lens, 2)."""
+    """Centres of all microimages whose centre lies on the sensor [pixel], shape (lens, 2)."""
     index: np.ndarray
-    """Their lattice indices (i, j), shape (lens, 2), integer; i runs fastest."""
+    """Their lattice indices (i, j), shape (lens, 2). i runs fastest."""
     origin_px: tuple[float, float]
     """Centre of microimage (0, 0) [pixel]."""
     basis_px: tuple[tuple[float, float], tuple[float, float]]
-    """Vectors to the microimages (1, 0) and (0, 1) [pixel], the first -45 to 45 (hexagonal: -15 to 45) degrees from
-    +column, the second 90 (60) degrees further towards +row."""
+    """Vectors to the microimages (1, 0) and (0, 1) [pixel]. The first lies at -45 to 45 (hexagonal: -15 to 45) degrees
+    from +column, the second 90 (60) degrees further towards +row."""
     layout: str
     """"square" or "hexagonal"."""
     rms_px: float
-    """Root mean square distance between measured centres and lattice, outliers left out [pixel]."""
+    """Root mean square distance between measured centres and lattice, without outliers [pixel]."""
     measured: int
-    """Number of microimages that the lattice rests on."""
+    """Number of microimages that the lattice was fitted to."""
     sensor_shape: tuple[int, int]
     """Shape of the white image [pixel], order (rows, columns)."""
 
     @property
     def pitch_px(self) -> float:
-        """Distance between neighbouring centres, from the area of the lattice's cell [pixel]."""
+        """Distance of neighbouring centres [pixel], from the area of the lattice's cell."""
         return lattice_pitch(np.asarray(self.basis_px), self.layout)
 
     @property
     def rotation_deg(self) -> float:
-        """Angle from +column towards +row of basis[0], mean over both lattice vectors [degree]."""
+        """Rotation of the lattice from +column towards +row [degree], mean over both lattice vectors."""
         first, second = (math.degrees(math.atan2(row, column)) for column, row in self.basis_px)
         return (first + second - cell_angle_deg(self.layout)) / 2
 
     def lattice(self, optics: Optics) -> LensLattice:
-        """Lens centres in the microlens plane, s_l = X_c / (1 + f_m/s_i), the optical axis at the sensor's centre.
+        """Return the lens centres in the plane of the microlenses, s_l = X_c / (1 + f_m/s_i).
+
+        The optical axis is taken to meet the sensor at its centre.
 
         Raises
         ------
@@ -87,7 +99,9 @@ class LensArray:
         scale = 1 + optics.sensor_per_pupil
         origin = optics.sensor_mm(np.asarray(self.origin_px)) / scale
         basis = np.asarray(self.basis_px) * optics.pixel_mm / scale
-        return LensLattice(origin_mm=pair(origin), basis_mm=(pair(basis[0]), pair(basis[1])), layout=self.layout)
+        return LensLattice(
+            origin_mm=float_pair(origin), basis_mm=(float_pair(basis[0]), float_pair(basis[1])), layout=self.layout
+        )
 
 
 def find_lens_array(
@@ -105,9 +119,13 @@ def find_lens_array(
     dark : ndarray, shape (rows, columns), optional
         Dark frame [counts], subtracted from `white`.
     nominal_pitch_px : float, optional
-        Expected distance of neighbouring microimages [pixel], good to 10 %; found from the image where missing.
+        Expected distance of neighbouring microimages [pixel], correct to 10 %. Default: found from the image.
     layout : {"square", "hexagonal"}
-        Arrangement of the lenses; a hexagonal array may lie in any orientation.
+        Arrangement of the lenses. A hexagonal array may have any orientation.
+
+    Returns
+    -------
+    LensArray
 
     Raises
     ------
@@ -116,7 +134,7 @@ def find_lens_array(
 
     Examples
     --------
-    A made-up white image: round microimages every 12.3 pixels, one of them centred at column 100, row 80:
+    A synthetic white image: round microimages every 12.3 pixels, one of them centred at column 100, row 80:
 
     >>> import numpy as np, lfpiv
     >>> row, column = np.mgrid[:160, :200]
@@ -132,19 +150,17 @@ def find_lens_array(
     nominal = _checked_pitch(nominal_pitch_px, image.shape)
 
     basis = find_basis(image, nominal, layout)
-    origin = find_phase(image, basis, layout)
-    origin, basis, rms, measured = _fit_lattice(image, origin, basis, layout)
-
+    lattice, rms, measured = _fit_lattice(image, _Lattice(find_phase(image, basis, layout), basis), layout)
     rows, columns = image.shape
-    index = indices_inside(origin, basis, (-0.5, -0.5), (columns - 0.5, rows - 0.5))
-    centres = origin + index @ basis
+    index = indices_inside(lattice.origin, lattice.basis, (-0.5, -0.5), (columns - 0.5, rows - 0.5))
+    centres = lattice.nodes(index)
     middle = np.argmin(((centres - ((columns - 1) / 2, (rows - 1) / 2)) ** 2).sum(1))
     origin, index = centres[middle], index - index[middle]
     array = LensArray(
         centres_px=centres,
         index=index,
-        origin_px=pair(origin),
-        basis_px=(pair(basis[0]), pair(basis[1])),
+        origin_px=float_pair(origin),
+        basis_px=(float_pair(lattice.basis[0]), float_pair(lattice.basis[1])),
         layout=layout,
         rms_px=rms,
         measured=measured,
@@ -161,7 +177,7 @@ def find_lens_array(
 
 
 def _checked_image(white: np.ndarray, dark: np.ndarray | None) -> np.ndarray:
-    """White image less the dark frame as float32, after all checks."""
+    """Check white and dark image, and return their difference as float32."""
     white = _checked_frame("white", white)
     image = white.astype(np.float32)
     if dark is not None:
@@ -214,48 +230,58 @@ def _checked_pitch(nominal_pitch_px: float | None, shape: tuple[int, int]) -> fl
 # Centres and lattice -------------------------------------------------------------------------------------------------
 
 
-def _fit_lattice(
-    image: np.ndarray, origin: np.ndarray, basis: np.ndarray, layout: str
-) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """Measure the microimages and put a lattice through their centres: origin, basis, rms [pixel], number measured."""
-    pitch = lattice_pitch(basis, layout)
-    half = math.ceil(pitch * min(0.5 * np.abs(basis).sum(0).max() / pitch, 0.71))  # of a square that holds a cell
-    for _ in range(MAX_PASSES):
-        index = _whole_microimages(image.shape, origin, basis, half)
-        index = index[:: math.ceil(len(index) / SAMPLE_LENSES)]
-        nodes = origin + index @ basis
-        shift, lit, microimage = measure(cut_patches(image, nodes, half), nodes, basis)
-        origin, basis, _ = _robust_lattice(index[lit], (nodes + shift)[lit], origin, basis)
-        if np.abs(origin + index @ basis - nodes).max() < PASS_TOLERANCE_PX:
-            break
+@dataclass(frozen=True, eq=False)
+class _Lattice:
+    origin: np.ndarray
+    """Centre of the microimage (0, 0), (column, row) [pixel]."""
+    basis: np.ndarray
+    """Lattice vectors, rows (column, row) [pixel]."""
 
-    index = _whole_microimages(image.shape, origin, basis, half)
-    centres = origin + index @ basis
-    for _ in range(2):  # the second time from its own centre, where the linear fit is exact
-        shift, lit, _ = measure(cut_patches(image, centres, half), centres, basis, microimage)
-        centres = centres + shift
-    if lit.mean() < 0.5:
-        warn(log, Warning(code=Code.LENSES_UNLIT, figures={"lit": int(lit.sum()), "count": len(lit)}))
-    index, centres = index[lit], centres[lit]
-    origin, basis, kept = _robust_lattice(index, centres, origin, basis)
-    residual = centres - origin - index @ basis
-    rms = math.sqrt((residual[kept] ** 2).sum(1).mean())
-    if kept.mean() < 0.5 or rms > 0.1 * pitch:
+    def nodes(self, index: np.ndarray) -> np.ndarray:
+        centres: np.ndarray = self.origin + index @ self.basis
+        return centres
+
+
+def _fit_lattice(image: np.ndarray, start: _Lattice, layout: str) -> tuple[_Lattice, float, int]:
+    """Measure the microimages and fit a lattice. Return it, its rms residual [pixel] and the number of centres."""
+    pitch = lattice_pitch(start.basis, layout)
+    half = patch_half_px(start.basis, pitch)
+    lattice, mean_microimage = _fit_sample(image, start, half)
+
+    index = whole_microimages(image.shape, lattice.origin, lattice.basis, half)
+    _check_count(index, lattice.basis)
+    centres = lattice.nodes(index)
+    for _ in range(2):  # the second pass starts from the measured centre, where the linear fit is exact
+        fit = measure_microimages(cut_patches(image, centres, half), centres, lattice.basis, mean_microimage)
+        centres = centres + fit.shift_px
+    if fit.lit.mean() < LEAST_LIT:
+        warn(log, Warning(code=Code.LENSES_UNLIT, figures={"lit": int(fit.lit.sum()), "count": len(fit.lit)}))
+    index, centres = index[fit.lit], centres[fit.lit]
+    lattice, inliers = _robust_lattice(index, centres, lattice)
+    residual = centres - lattice.origin - index @ lattice.basis
+    rms = math.sqrt((residual[inliers] ** 2).sum(1).mean())
+    if inliers.mean() < LEAST_AGREEING or rms > LARGEST_RMS_PITCH * pitch:
         raise InputError(
-            f"white: no regular array of microimages found: {kept.sum()} of {len(kept)} lit places on a {layout} "
+            f"white: no regular array of microimages found: {inliers.sum()} of {len(inliers)} lit places on a {layout} "
             f"lattice of pitch {pitch:.2f} px agree with it, to {rms:.2f} px. Expected most of them, to a tenth of the "
             "pitch. Check the file, the layout and the exposure."
         )
-    _warn_of_distortion(index[kept] @ basis, residual[kept])
-    return origin, basis, rms, int(kept.sum())
+    _warn_of_distortion(index[inliers] @ lattice.basis, residual[inliers])
+    return lattice, rms, int(inliers.sum())
 
 
-def _whole_microimages(shape: tuple[int, int], origin: np.ndarray, basis: np.ndarray, half: int) -> np.ndarray:
-    """List the indices (i, j) of the microimages whose patch lies in the image, the blur's reach included."""
-    margin = half + BLUR_REACH_PX + 1
-    index = indices_inside(origin, basis, (margin, margin), (shape[1] - 1 - margin, shape[0] - 1 - margin))
-    _check_count(index, basis)
-    return index
+def _fit_sample(image: np.ndarray, lattice: _Lattice, half: int) -> tuple[_Lattice, np.ndarray]:
+    """Improve a lattice by a sample of the microimages. Return it and the mean microimage."""
+    for _ in range(MAX_PASSES):
+        index = whole_microimages(image.shape, lattice.origin, lattice.basis, half)
+        _check_count(index, lattice.basis)
+        index = index[:: math.ceil(len(index) / SAMPLE_LENSES)]
+        nodes = lattice.nodes(index)
+        fit = measure_microimages(cut_patches(image, nodes, half), nodes, lattice.basis)
+        lattice, _ = _robust_lattice(index[fit.lit], (nodes + fit.shift_px)[fit.lit], lattice)
+        if np.abs(lattice.nodes(index) - nodes).max() < PASS_TOLERANCE_PX:
+            break
+    return lattice, fit.mean_microimage
 
 
 def _check_count(index: np.ndarray, basis: np.ndarray) -> None:
@@ -266,18 +292,16 @@ def _check_count(index: np.ndarray, basis: np.ndarray) -> None:
         )
 
 
-def _robust_lattice(
-    index: np.ndarray, centres: np.ndarray, origin: np.ndarray, basis: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lattice through centres: origin, basis and which centres counted."""
-    _check_count(index, basis)
+def _robust_lattice(index: np.ndarray, centres: np.ndarray, near: _Lattice) -> tuple[_Lattice, np.ndarray]:
+    """Fit a lattice to centres, starting from one near them. Return it and the inliers, bool."""
+    _check_count(index, near.basis)
     design = np.column_stack([np.ones(len(index)), index])
-    change, kept = robust_fit(design, centres - origin - index @ basis)
-    return origin + change[0], basis + change[1:], kept
+    change, inliers = robust_fit(design, centres - near.origin - index @ near.basis)
+    return _Lattice(near.origin + change[0], near.basis + change[1:]), inliers
 
 
 def _warn_of_distortion(places: np.ndarray, residual: np.ndarray) -> None:
-    """Log a warning where a cubic field through the residuals is both certain and large."""
+    """Warn where a cubic field through the residuals is both significant and larger than `DISTORTION_PX`."""
     x, y = (places / np.abs(places).max()).T
     terms = np.stack([x**a * y**b for a in range(4) for b in range(4 - a)], axis=1)
     smooth = terms @ np.linalg.lstsq(terms, residual, rcond=None)[0]

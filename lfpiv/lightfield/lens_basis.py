@@ -1,4 +1,8 @@
-"""Lattice vectors and phase of a microlens array, found in its white image without knowing anything of it."""
+"""Find the lattice vectors and the phase of a microlens array in its white image, without a first guess.
+
+`find_basis` takes the lattice vectors from the peaks of the autocorrelation. `find_phase` folds the image into one
+lattice cell and takes the lens centre from the cell's symmetry.
+"""
 
 from __future__ import annotations
 
@@ -12,30 +16,40 @@ from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LAYOUTS
 
 TILE_PX = 1024
-"""Side of the part of the image that the autocorrelation sees [pixel]; lags reach half of it."""
+"""Side of the image's middle part that is evaluated [pixel]. Lags of the autocorrelation reach half of it."""
 PEAK_FRACTION = 0.7
-"""A lag is a lattice vector if its correlation is above this part of the best; between lattice vectors it is lower."""
+"""Least correlation at a lattice vector, relative to the highest one."""
 SIGNIFICANCE = 8
-"""Correlation that is no chance [standard deviations of that of unrelated pixels, one in the root of their number]."""
+"""Least correlation of an array [standard deviations of the correlation of as many unrelated pixels]."""
 NOMINAL_TOLERANCE = 0.2
-"""Largest relative error of a nominal pitch: twice what a data sheet may be off."""
+"""Largest relative error of a nominal pitch."""
 CELL_TOLERANCE = 0.03
-"""Largest misfit of a neighbour to the layout [pitch]; real arrays stay within 1 %."""
+"""Largest distance of a neighbour from the layout [pitch]."""
 CANDIDATES = 200
-"""Shortest lags tried as lattice vector."""
+"""Number of shortest lags tried as lattice vector."""
+NARROWEST_MEAN_PX = 3
+"""Least width of the local mean [pixel]."""
+PEAK_REACH = 0.9
+"""Longest lag of a peak, relative to the longest lag."""
 DISC_RADII = np.arange(0.2, 0.81, 0.02)
-"""Radii of microimages tried [pitch]; of the largest, four overlap in the middle between their lenses."""
+"""Radii of microimages tried [pitch]. Four of the largest overlap in the middle between their lenses."""
 
 
 # Lattice vectors from the autocorrelation ----------------------------------------------------------------------------
 
 
 def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndarray:
-    """Lattice vectors, rows (column, row) [pixel], in the standard order of `LensArray.basis_px`."""
+    """Return the lattice vectors, rows (column, row) [pixel], in the order of `LensArray.basis_px`.
+
+    Raises
+    ------
+    InputError
+        If the image shows no array, or one of another layout or nominal pitch [pixel].
+    """
     tile = _middle(image)
     width, best = nominal or min(tile.shape) / 4, -1.0
-    while width >= 3:  # a narrow mean hides unequal lenses, a wide one keeps more signal: the lattice itself decides
-        correlation = _autocorrelation(_evened(tile, width))
+    while width >= NARROWEST_MEAN_PX:  # a narrow mean removes unequal lenses, a wide one leaves more signal
+        correlation = _autocorrelation(_flattened(tile, width))
         peaks = _correlation_peaks(correlation)
         trial = {name: _best_lag(correlation, *peaks, name) for name in LAYOUTS}
         score = max(score for score, _ in trial.values())
@@ -64,25 +78,26 @@ def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndar
 
 
 def _middle(image: np.ndarray) -> np.ndarray:
+    """Return the middle part of an image."""
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape]
     return image[start[0] : start[0] + TILE_PX, start[1] : start[1] + TILE_PX]
 
 
-def _evened(tile: np.ndarray, width: float) -> np.ndarray:
-    """Tile less its local mean in units of its local contrast: unequal and dead lenses must not outweigh the gaps."""
+def _flattened(tile: np.ndarray, width: float) -> np.ndarray:
+    """Subtract the local mean and divide by the local contrast, so that unequal and dead lenses do not dominate."""
     size = 2 * round(width / 2) + 1
     mean = ndimage.uniform_filter(tile, size)
-    even: np.ndarray = tile / np.maximum(mean, 0.1 * max(mean.max(), 1e-30)) - 1
-    contrast = np.sqrt(np.maximum(ndimage.uniform_filter(even**2, 2 * size + 1), 0))
-    even /= np.maximum(contrast, max(np.median(contrast), 1e-30))
-    even -= even.mean()
-    return even
+    flat: np.ndarray = tile / np.maximum(mean, 0.1 * max(mean.max(), 1e-30)) - 1
+    contrast = np.sqrt(np.maximum(ndimage.uniform_filter(flat**2, 2 * size + 1), 0))
+    flat /= np.maximum(contrast, max(np.median(contrast), 1e-30))
+    flat -= flat.mean()
+    return flat
 
 
 def _autocorrelation(tile: np.ndarray) -> np.ndarray:
-    """Correlation coefficient of the tile with itself over the overlap at each lag up to half of it.
+    """Return the correlation coefficient of the tile with itself over the overlap, for lags up to half the tile.
 
-    Lag zero lies in the middle and holds the mean of its neighbours, so pixel noise leaves no spike.
+    Lag zero lies in the middle. It holds the mean of its neighbours, because pixel noise raises it.
     """
     rows, columns = tile.shape
     reach = rows // 2, columns // 2
@@ -100,13 +115,13 @@ def _autocorrelation(tile: np.ndarray) -> np.ndarray:
 
 
 def _overlap_sums(tile: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Sum over the tile's part that meets itself at each lag (row >= 0): of the one copy and of the other."""
+    """Return the sums of both copies of the tile over their overlap, for each lag with row >= 0."""
     total = np.zeros(np.add(tile.shape, 1))
     total[1:, 1:] = tile.cumsum(0, dtype=float).cumsum(1)
     r = np.arange(reach[0] + 1)[:, None]
     c = np.arange(-reach[1], reach[1] + 1)[None]
     rows, columns = tile.shape
-    left, right = np.maximum(-c, 0), columns - np.maximum(c, 0)  # columns that have a partner at column + c
+    left, right = np.maximum(-c, 0), columns - np.maximum(c, 0)  # columns with a partner at column + c
 
     def box(top: np.ndarray, bottom: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
         inside: np.ndarray = total[bottom, last] - total[top, last] - total[bottom, first] + total[top, first]
@@ -116,7 +131,7 @@ def _overlap_sums(tile: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray,
 
 
 def _correlation_peaks(correlation: np.ndarray) -> tuple[np.ndarray, float]:
-    """Local maxima of a half plane, lags (n, 2) as (column, row), and the radius of the lobe about lag zero [pixel]."""
+    """Return the local maxima of a half plane as lags (column, row), and the radius of the lobe at lag zero [pixel]."""
     middle = np.array(correlation.shape) // 2
     row, column = np.ogrid[-middle[0] : middle[0] + 1, -middle[1] : middle[1] + 1]
     radius = np.hypot(row, column)
@@ -125,15 +140,15 @@ def _correlation_peaks(correlation: np.ndarray) -> tuple[np.ndarray, float]:
     rises = np.flatnonzero(np.diff(profile[1:]) > 0)
     lobe = 1 + int(rises[0]) if len(rises) else len(profile)
     top = ndimage.maximum_filter(correlation, 2 * math.ceil(0.4 * lobe) + 1) == correlation
-    top &= ((row > 0) | ((row == 0) & (column > 0))) & (radius > lobe) & (radius < 0.9 * middle.min())
+    top &= ((row > 0) | ((row == 0) & (column > 0))) & (radius > lobe) & (radius < PEAK_REACH * middle.min())
     return (np.argwhere(top) - middle)[:, ::-1], lobe
 
 
 def _best_lag(correlation: np.ndarray, lags: np.ndarray, lobe: float, layout: str) -> tuple[float, np.ndarray]:
-    """Shortest lag (column, row) that spans a lattice of high correlation, with the lattice's score.
+    """Return the score of the best lattice and its shortest lag (column, row).
 
-    The score is the lowest correlation at the neighbours of lag zero. Multiples of the lattice score as high as the
-    true one, so the shortest of the best is taken.
+    The score is the lowest correlation at the neighbours of lag zero. Multiples of the true lattice have the same
+    score, so the shortest of the best lags counts.
     """
     middle = np.array(correlation.shape) // 2
     height = correlation[tuple((lags[:, ::-1] + middle).T)]
@@ -153,17 +168,17 @@ def _best_lag(correlation: np.ndarray, lags: np.ndarray, lobe: float, layout: st
 
 
 def cell_angle_deg(layout: str) -> float:
-    """Angle between the two lattice vectors [degree]."""
+    """Return the angle between the two lattice vectors [degree]."""
     return 60.0 if layout == "hexagonal" else 90.0
 
 
 def lattice_pitch(basis: np.ndarray, layout: str) -> float:
-    """Distance of neighbouring lenses [pixel], from the area of the lattice's cell."""
+    """Return the distance of neighbouring lenses [pixel], from the area of the lattice's cell."""
     return math.sqrt(abs(np.linalg.det(basis)) / math.sin(math.radians(cell_angle_deg(layout))))
 
 
 def _standard_basis(lag: np.ndarray, layout: str) -> np.ndarray:
-    """Lattice vectors, ordered and signed as `LensArray.basis_px` says, of the lattice that one of them spans."""
+    """Return the lattice vectors in the order of `LensArray.basis_px`, from one lattice vector."""
     turn, lowest = (60.0, -15.0) if layout == "hexagonal" else (90.0, -45.0)
     angle = math.degrees(math.atan2(lag[1], lag[0]))
     angles = np.radians(lowest + (angle - lowest) % turn + np.array([0, turn]))
@@ -172,7 +187,7 @@ def _standard_basis(lag: np.ndarray, layout: str) -> np.ndarray:
 
 
 def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np.ndarray:
-    """Lattice vectors through the correlation's peaks at lags of doubling length, each predicted by the last fit."""
+    """Fit the lattice vectors to the correlation's peaks within a radius that doubles from fit to fit."""
     middle = np.array(correlation.shape)[::-1] // 2
     half = max(1, int(lobe / 4))
     offset = np.arange(-half, half + 1)
@@ -190,16 +205,16 @@ def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np
         hessian = 4 * xx * yy - xy**2
         peak = (xx < 0) & (hessian > 0)
         shift = np.stack([xy * dy - 2 * yy * dx, xy * dx - 2 * xx * dy], 1)[peak] / hessian[peak, None]
-        kept = (np.abs(shift) <= half + 1).all(1)
-        if np.linalg.matrix_rank(index[peak][kept]) == 2:
-            basis = np.linalg.lstsq(index[peak][kept], lag[peak][kept] + shift[kept], rcond=None)[0]
+        close = (np.abs(shift) <= half + 1).all(1)
+        if np.linalg.matrix_rank(index[peak][close]) == 2:
+            basis = np.linalg.lstsq(index[peak][close], lag[peak][close] + shift[close], rcond=None)[0]
         if reach > np.hypot(*limit):
             return basis
         reach *= 2
 
 
 def indices_inside(origin: np.ndarray, basis: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
-    """List the indices (i, j) of all lattice nodes with low <= node < high, row after row, shape (node, 2)."""
+    """Return the indices (i, j) of all lattice nodes with low <= node < high, shape (node, 2). i runs fastest."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
     reach = (corners - origin) @ np.linalg.inv(basis)
@@ -215,32 +230,32 @@ def indices_inside(origin: np.ndarray, basis: np.ndarray, low: ArrayLike, high: 
 
 
 def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
-    """Place of a lens centre (column, row) [pixel] near the image's middle, good to about a pixel.
+    """Return a lens centre (column, row) near the image's middle, correct to about a pixel [pixel].
 
-    The mean cell looks the same after a quarter (sixth) turn about a lens centre. In a square array also about the
-    gaps between four lenses. Discs of some size about the lens centres explain it better than discs about the gaps,
-    even where microimages overlap so far that a gap, between four bright overlaps, is brighter than a centre.
+    The mean cell is symmetric under a quarter turn (hexagonal: a sixth) about a lens centre. A square cell has the same
+    symmetry about the gap between four lenses. The cell correlates better with discs about the lens centres than with
+    discs about the gaps, even where overlaps make the gap brighter than the centre.
     """
     pitch = lattice_pitch(basis, layout)
-    crop = _evened(_middle(image), pitch)
+    crop = _flattened(_middle(image), pitch)
     bins = 2 * int(np.clip(pitch / 2, 3, 16))
     cell = _mean_cell(crop, basis, bins)
 
     turn = np.array([[0, -1], [1, 1]]) if layout == "hexagonal" else np.array([[0, -1], [1, 0]])
     place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 2)
-    offset = place[:, None] - place[None]  # (point, centre, 2): lattice coordinates about every possible centre
+    offset = place[:, None] - place[None]  # (point, centre, 2), for every bin as centre
     turned = (place[None] + offset @ turn.T) % bins
     symmetry = (cell.reshape(-1, 1) * cell[turned[..., 0], turned[..., 1]]).sum(0)
     centre = place[np.argmax(symmetry)]
     if layout == "square":
-        centre = max(centre, (centre + bins // 2) % bins, key=lambda middle: _disc_likeness(cell, basis, middle))
+        centre = max(centre, (centre + bins // 2) % bins, key=lambda middle: _disc_correlation(cell, basis, middle))
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape[::-1]]
     phase: np.ndarray = centre / bins @ basis + start
     return phase
 
 
-def _disc_likeness(cell: np.ndarray, basis: np.ndarray, centre: np.ndarray) -> float:
-    """Correlation of a cell with equal discs about the lattice nodes that `centre` belongs to, of the best radius."""
+def _disc_correlation(cell: np.ndarray, basis: np.ndarray, centre: np.ndarray) -> float:
+    """Return the correlation of a cell with equal discs about the lattice nodes at `centre`, for the best radius."""
     bins = len(cell)
     place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 1, 2) - centre
     around = bins * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1), indexing="ij"), -1).reshape(1, -1, 2)
@@ -248,12 +263,12 @@ def _disc_likeness(cell: np.ndarray, basis: np.ndarray, centre: np.ndarray) -> f
     pitch = np.hypot(*basis[0])
     away = np.linalg.norm((inner - around) @ basis / bins, axis=-1)
     found = [np.clip((radius * pitch - away) * bins / pitch + 0.5, 0, 1).sum(1) for radius in DISC_RADII]
-    even = cell.ravel() - cell.mean()
-    return max(float(even @ (disc - disc.mean())) / max(float(disc.std()), 1e-9) for disc in found)
+    flat = cell.ravel() - cell.mean()
+    return max(float(flat @ (disc - disc.mean())) / max(float(disc.std()), 1e-9) for disc in found)
 
 
 def _mean_cell(crop: np.ndarray, basis: np.ndarray, bins: int) -> np.ndarray:
-    """Crop folded into one lattice cell of bins x bins (i, j), each pixel shared by the four nearest bins."""
+    """Fold the crop into one lattice cell of bins x bins (i, j). The four nearest bins share each pixel."""
     inverse = np.linalg.inv(basis) * bins
     row, column = np.ogrid[: crop.shape[0], : crop.shape[1]]
     i, j = (column * inverse[0, k] + row * inverse[1, k] for k in (0, 1))

@@ -1,36 +1,92 @@
-"""Each microimage of a white image measured: its centre from a fit with the mean microimage, moved and tilted."""
+"""Measure the centre of each microimage of a white image by a fit of the mean microimage.
+
+The model of one microimage is brightness * T(x - shift) * (1 + slope . x) + background, where T is the mean microimage,
+symmetric about its middle. Linear least squares give the shift, which is the centre, and the slope. Vignetting acts on
+pixels or on whole lenses. It tilts a microimage, or makes overlapping neighbours differ. A slope that varies smoothly
+over the sensor describes both, so that neither moves the centres.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
+from lfpiv.lightfield.lens_basis import indices_inside
+
 BLUR_PX = 0.9
-"""Gaussian blur of the microimages before the fit [pixel]: removes what the pixels alias, so no locking to pixels."""
+"""Standard deviation of the Gaussian blur of the microimages before the fit [pixel]. It prevents pixel locking."""
 BLUR_REACH_PX = 3
-"""Reach of the blur [pixel], over three standard deviations."""
+"""Half width of the blur [pixel]."""
 SHIFT_DIFFERENCE = np.array([1, -8, 0, 8, -1]) / 12
-"""What a shift adds, per pixel: the negative first derivative to fourth order, as convolution weights."""
+"""Negative first derivative to fourth order, as convolution weights: the change of T per pixel of shift."""
 PATCH_BLOCK = 512
-"""Microimages cut out at a time, so that they stay in the processor's cache."""
+"""Microimages cut out at a time. They fit the processor's cache."""
+LONGEST_HALF_CELL = 0.71
+"""Upper limit of a patch's half width [pitch], half the diagonal of a square cell."""
 TEMPLATE_LENSES = 500
-"""Microimages whose median is the mean microimage."""
+"""Number of microimages whose median is T."""
+TEMPLATE_BRIGHTNESS = 0.5
+"""Least brightness of these microimages, relative to the brightest decile."""
+LEAST_BRIGHTNESS = 0.1
+"""Lower limit of a microimage's brightness, relative to the brightest decile."""
 LIT_FRACTION = 0.1
-"""A microimage with less than this part of the brightest decile's contrast is dead or dark."""
+"""Contrast of a lit microimage, relative to the brightest decile. Others are dead or dark."""
+CORE_PITCHES = 0.3
+"""Radius around its centre in which a microimage does not overlap others [pitch]."""
+LARGEST_SHIFT = 0.25
+"""Upper limit of the measured shift [root of the cell's area]."""
 OUTLIER_SCALES = 4.685
-"""Tukey's biweight constant [standard deviations]: 95 % efficiency on normal errors."""
+"""Tukey's biweight constant [standard deviations], 95 % efficient for normal errors."""
 MEDIAN_DISTANCE = {1: 0.6745, 2: math.sqrt(2 * math.log(2))}
 """Median distance of normal errors from their mean in one and two dimensions [standard deviations]."""
 FIT_PASSES = 20
-"""Most passes of a robust fit that usually ends after three to five."""
+"""Largest number of passes of a robust fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class MicroimageFit:
+    """Result of `measure_microimages`."""
+
+    shift_px: np.ndarray
+    """Shift of each microimage from the middle of its patch, (column, row) [pixel], shape (lens, 2)."""
+    lit: np.ndarray
+    """Whether each microimage is lit, shape (lens,), bool."""
+    mean_microimage: np.ndarray
+    """T, shape (patch, patch)."""
+
+
+def patch_half_px(basis: np.ndarray, pitch: float) -> int:
+    """Return the half width of the square patch around one lattice cell [pixel]."""
+    half_cell = 0.5 * float(np.abs(basis).sum(0).max())
+    return math.ceil(pitch * min(half_cell / pitch, LONGEST_HALF_CELL))
+
+
+def whole_microimages(shape: tuple[int, ...], origin: np.ndarray, basis: np.ndarray, half: int) -> np.ndarray:
+    """Return the indices (i, j) of the microimages whose patch and its blur lie inside the image, shape (lens, 2)."""
+    margin = half + BLUR_REACH_PX + 1
+    return indices_inside(origin, basis, (margin, margin), (shape[1] - 1 - margin, shape[0] - 1 - margin))
 
 
 def cut_patches(image: np.ndarray, centres: np.ndarray, half: int) -> np.ndarray:
-    """Blurred image at whole pixels from each centre, shape (lens, 2 half + 1, 2 half + 1).
+    """Sample the blurred image at whole pixels from each centre.
 
-    The blur is sampled about the sub-pixel centre, so it interpolates as well; every microimage is seen alike.
+    The blur is centred on the sub-pixel centre, so that it interpolates, too.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        White image [counts].
+    centres : ndarray, shape (lens, 2)
+        Expected centres (column, row) [pixel].
+    half : int
+        Half width of a patch [pixel].
+
+    Returns
+    -------
+    ndarray, shape (lens, 2 half + 1, 2 half + 1), float32
     """
     tap = np.arange(-BLUR_REACH_PX, BLUR_REACH_PX + 1)
     nearest = np.rint(centres).astype(int)
@@ -49,85 +105,62 @@ def cut_patches(image: np.ndarray, centres: np.ndarray, half: int) -> np.ndarray
     return patches
 
 
-def measure(
-    patches: np.ndarray, places: np.ndarray, basis: np.ndarray, microimage: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shift of each microimage from its patch's middle [pixel], shape (lens, 2), which are lit, the mean microimage T.
+def measure_microimages(
+    patches: np.ndarray, centres: np.ndarray, basis: np.ndarray, mean_microimage: np.ndarray | None = None
+) -> MicroimageFit:
+    """Measure the shift of each microimage from the middle of its patch.
 
-    Least squares of brightness * T(x - shift) * (1 + slope . x) + background, linear in shift and slope. T is made
-    symmetric about its middle: that defines the centre. Vignetting may act on pixels, so that brightness slopes within
-    a microimage, or on whole lenses, so that neighbours that overlap it differ; the slope, a smooth field over the
-    sensor, is their share, and keeps either from moving the centres.
+    Parameters
+    ----------
+    patches : ndarray, shape (lens, patch, patch), float32
+        From `cut_patches`.
+    centres : ndarray, shape (lens, 2)
+        Centres of the patches (column, row) [pixel].
+    basis : ndarray, shape (2, 2)
+        Lattice vectors (column, row) [pixel].
+    mean_microimage : ndarray, shape (patch, patch), optional
+        T. Default: the symmetric median of the bright patches.
     """
     half = patches.shape[1] // 2
     row, column = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
     window = _cell_window(column, row, basis)
-    brightness = np.tensordot(patches, window.astype(np.float32), 2) / window.sum()
-    usual = max(np.percentile(brightness, 90), 1e-30)  # a part of the sensor may be dark
-    brightness = np.maximum(brightness / usual, 0.1)
-    patches = patches / (usual * brightness)[:, None, None].astype(np.float32)
-    if microimage is None:
-        bright = np.flatnonzero(brightness >= 0.5)
-        microimage = np.median(patches[bright[:: math.ceil(len(bright) / TEMPLATE_LENSES)]], axis=0)
-        microimage = (microimage + microimage[::-1, ::-1]) / 2
+    patches, brightness = _normalised(patches, window)
+    if mean_microimage is None:
+        mean_microimage = _symmetric_median(patches, brightness)
 
-    moved = [ndimage.convolve1d(microimage, SHIFT_DIFFERENCE, axis=axis, mode="nearest") for axis in (1, 0)]
-    overlap = _neighbours_light(microimage, column, row, basis)
-    terms = [microimage, np.ones_like(row), *moved, column * microimage - overlap[0], row * microimage - overlap[1]]
-    design = np.stack([term.ravel() for term in terms], axis=1)
-    weighted = design * window.reshape(-1, 1)
-    normal, moments = weighted.T @ design, patches.reshape(len(patches), -1) @ weighted.astype(np.float32)
+    overlap = _neighbours_light(mean_microimage, column, row, basis)
+    derivatives = [ndimage.convolve1d(mean_microimage, SHIFT_DIFFERENCE, axis=axis, mode="nearest") for axis in (1, 0)]
+    slopes = [column * mean_microimage - overlap[0], row * mean_microimage - overlap[1]]
+    terms = np.stack([t.ravel() for t in (mean_microimage, np.ones_like(row), *derivatives, *slopes)], axis=1)
+    weighted = terms * window.reshape(-1, 1)
+    normal, moments = weighted.T @ terms, patches.reshape(len(patches), -1) @ weighted.astype(np.float32)
 
-    size = np.ptp(places, axis=0).max()
-    x, y = ((places - places.mean(0)) / size).T
-    field = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    c = robust_fit(field, np.log(brightness)[:, None])[0][:, 0]
-    gradient = np.stack([c[1] + 2 * c[3] * x + c[4] * y, c[2] + c[4] * x + 2 * c[5] * y], axis=1) / size
+    field, gradient = _brightness_gradient(centres, brightness)
     moments = moments - gradient @ (overlap.reshape(2, -1) @ weighted)
-
-    free = moments @ np.linalg.pinv(normal)
-    slopes = free[:, 4:] / np.maximum(free[:, :1], 0.1)
-    coefficients, kept = robust_fit(field, slopes)
-    smooth = field @ coefficients
-    noise = ((slopes - smooth)[kept] ** 2).mean() * field.shape[1] / len(field)
-    signal = (gradient**2).mean()  # bounds the slope where blurred microimages hardly tell it from a shift
-    moments = moments - smooth * (signal / max(signal + noise, 1e-30)) @ normal[4:]
+    moments = moments - _smooth_slopes(moments, normal, field, gradient) @ normal[4:]
     solution = moments[:, :4] @ np.linalg.pinv(normal[:4, :4])
-    limit = 0.25 * math.sqrt(abs(np.linalg.det(basis)))
-    shift = np.clip(solution[:, 2:] / np.maximum(solution[:, :1], 0.1), -limit, limit)
+    limit = LARGEST_SHIFT * math.sqrt(abs(np.linalg.det(basis)))
+    shift = np.clip(solution[:, 2:] / np.maximum(solution[:, :1], LEAST_BRIGHTNESS), -limit, limit)
     contrast = brightness * solution[:, 0]
-    lit = contrast > LIT_FRACTION * np.percentile(contrast, 90)
-    return shift, lit, microimage
-
-
-def _neighbours_light(microimage: np.ndarray, column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Light of the nearest neighbour where microimages overlap, times the neighbour's offset [pixel], shape (2, ...).
-
-    One microimage alone is nowhere brighter than at its heart; what is brighter overlaps.
-    """
-    heart = np.hypot(column, row) < 0.3 * np.hypot(*basis[0])
-    light = np.where(heart, 0, np.maximum(microimage - microimage[heart].max(), 0))
-    offsets = np.array([i * basis[0] + j * basis[1] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
-    distance = (column - offsets[:, 0, None, None]) ** 2 + (row - offsets[:, 1, None, None]) ** 2
-    weighted: np.ndarray = light * offsets[distance.argmin(0)].transpose(2, 0, 1)
-    return weighted
-
-
-def _cell_window(column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Part of each pixel that is nearest to the middle's lattice node."""
-    inside = np.full(column.shape, np.inf)
-    for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)):
-        neighbour = i * basis[0] + j * basis[1]
-        distance = np.hypot(*neighbour)
-        inside = np.minimum(inside, distance / 2 - np.abs(column * neighbour[0] + row * neighbour[1]) / distance)
-    return np.clip(inside + 0.5, 0, 1)
+    return MicroimageFit(shift, contrast > LIT_FRACTION * np.percentile(contrast, 90), mean_microimage)
 
 
 def robust_fit(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit values (row, axis) by iterated least squares with Tukey's weights: solution and which rows counted."""
+    """Fit values by iterated least squares with Tukey's biweight.
+
+    Parameters
+    ----------
+    design : ndarray, shape (row, term)
+    values : ndarray, shape (row, axis)
+
+    Returns
+    -------
+    solution : ndarray, shape (term, axis)
+    inliers : ndarray, shape (row,), bool
+        Rows with a positive weight.
+    """
     solution = np.zeros((design.shape[1], values.shape[1]))
-    offset = np.median(values, axis=0)
-    residual = values - offset
+    residual = values - np.median(values, axis=0)
     median = MEDIAN_DISTANCE[values.shape[1]]
     for _ in range(FIT_PASSES):
         distance = np.sqrt((residual**2).sum(1))
@@ -139,3 +172,69 @@ def robust_fit(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.n
         if np.abs(design @ (solution - last)).max() <= 1e-3 * scale:
             break
     return solution, reduced < 1
+
+
+def _normalised(patches: np.ndarray, window: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Divide the patches by their brightness. Return them and their brightness relative to the brightest decile."""
+    brightness = np.tensordot(patches, window.astype(np.float32), 2) / window.sum()
+    usual = max(np.percentile(brightness, 90), 1e-30)  # a part of the sensor may be dark
+    brightness = np.maximum(brightness / usual, LEAST_BRIGHTNESS)
+    return patches / (usual * brightness)[:, None, None].astype(np.float32), brightness
+
+
+def _symmetric_median(patches: np.ndarray, brightness: np.ndarray) -> np.ndarray:
+    bright = np.flatnonzero(brightness >= TEMPLATE_BRIGHTNESS)
+    median = np.median(patches[bright[:: math.ceil(len(bright) / TEMPLATE_LENSES)]], axis=0)
+    symmetric: np.ndarray = (median + median[::-1, ::-1]) / 2
+    return symmetric
+
+
+def _brightness_gradient(centres: np.ndarray, brightness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit the logarithm of the brightness by a quadratic field over the sensor.
+
+    Return the field's terms, shape (lens, 6), and its gradient at each lens [1/pixel], shape (lens, 2).
+    """
+    size = np.ptp(centres, axis=0).max()
+    x, y = ((centres - centres.mean(0)) / size).T
+    field = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    c = robust_fit(field, np.log(brightness)[:, None])[0][:, 0]
+    return field, np.stack([c[1] + 2 * c[3] * x + c[4] * y, c[2] + c[4] * x + 2 * c[5] * y], axis=1) / size
+
+
+def _smooth_slopes(moments: np.ndarray, normal: np.ndarray, field: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Fit the slopes of all microimages by a quadratic field, shrunk by the ratio of signal to noise, shape (lens, 2).
+
+    The signal is the gradient of the brightness. The shrinkage bounds the slope where a blurred microimage hardly
+    distinguishes it from a shift.
+    """
+    free = moments @ np.linalg.pinv(normal)
+    slopes = free[:, 4:] / np.maximum(free[:, :1], LEAST_BRIGHTNESS)
+    coefficients, inliers = robust_fit(field, slopes)
+    smooth = field @ coefficients
+    noise = ((slopes - smooth)[inliers] ** 2).mean() * field.shape[1] / len(field)
+    signal = (gradient**2).mean()
+    shrunk: np.ndarray = smooth * (signal / max(signal + noise, 1e-30))
+    return shrunk
+
+
+def _neighbours_light(microimage: np.ndarray, column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return the light of the nearest neighbour where microimages overlap, times its offset [pixel], shape (2, ...).
+
+    A single microimage is brightest in its core. Light above that level comes from a neighbour.
+    """
+    core = np.hypot(column, row) < CORE_PITCHES * np.hypot(*basis[0])
+    light = np.where(core, 0, np.maximum(microimage - microimage[core].max(), 0))
+    offsets = np.array([i * basis[0] + j * basis[1] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
+    distance = (column - offsets[:, 0, None, None]) ** 2 + (row - offsets[:, 1, None, None]) ** 2
+    weighted: np.ndarray = light * offsets[distance.argmin(0)].transpose(2, 0, 1)
+    return weighted
+
+
+def _cell_window(column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return the part of each pixel that is nearer to the middle than to any other lattice node."""
+    inside = np.full(column.shape, np.inf)
+    for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        neighbour = i * basis[0] + j * basis[1]
+        distance = np.hypot(*neighbour)
+        inside = np.minimum(inside, distance / 2 - np.abs(column * neighbour[0] + row * neighbour[1]) / distance)
+    return np.clip(inside + 0.5, 0, 1)

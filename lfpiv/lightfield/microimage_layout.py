@@ -1,4 +1,7 @@
-"""Where a camera's microimages lie on its sensor, as the projector takes them."""
+"""Lay out the pixels of a sensor by microimage, as the projector reads them.
+
+The microimage of the lens at s_l is centred at X_c = s_l (1 + f_m/s_i) on the sensor (Eq. 9).
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,12 @@ from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 
 def microimage_edge(optics: Optics) -> int:
-    """Pixels along each side of the square around a microimage, wherever its centre lies in a pixel."""
+    """Return the side of the square that holds a microimage at any sub-pixel position [pixel]."""
     return math.floor(2 * optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm) + 2
 
 
 def microimage_centres(optics: Optics, lattice: LensLattice, margin_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of the microimages on the sensor (Eq. 9), of all lenses whose nodes may lie on it.
+    """Return the centres of the microimages on the sensor (Eq. 9).
 
     Parameters
     ----------
@@ -27,14 +30,14 @@ def microimage_centres(optics: Optics, lattice: LensLattice, margin_px: float) -
     lattice : LensLattice
         Its microlenses.
     margin_px : float
-        How far beyond the sensor's edges centres are wanted, too [pixel].
+        Margin around the sensor in which centres are returned as well [pixel].
 
     Returns
     -------
     first : ndarray, shape (2,), int
         Lattice indices (i, j) of the first lens.
     centre : ndarray, shape (lenses along j, lenses along i, 2)
-        (column, row) [pixel]; pixel n spans n to n + 1.
+        (column, row) [pixel]. Pixel n spans n to n + 1.
     """
     widening = (1 + optics.sensor_per_pupil) / optics.pixel_mm
     rows, columns = optics.sensor_shape
@@ -50,13 +53,12 @@ def microimage_centres(optics: Optics, lattice: LensLattice, margin_px: float) -
     return first, lattice.centres_mm(index) * widening + half
 
 
-def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
-    """Lay a sensor's pixels out as the rays of its lenses.
+def microimages_of(optics: Optics, lattice: LensLattice) -> Microimages:
+    """Return the blocks of pixels behind the lenses, one block for every lens whose microimage meets the sensor.
 
-    The microimage of the lens at s_l is centred at s_l (1 + f_m/s_i) on the sensor (Eq. 9) and as wide as the pupil's
-    image; every lens whose microimage meets the sensor has a block. A pixel at the edge shows the part of its cell
-    inside the pupil, whose middle lies inwards of its own: so a lens has more versions of its block, with shares for
-    weights that fall or rise outwards.
+    A microimage is as wide as the image of the pupil (Eq. 9). A pixel at its edge sees only the part of its cell inside
+    the pupil, and the middle of that part lies nearer to the centre than the pixel's own. Versions of each block hold
+    the shares of such pixels for weights that fall or rise outwards.
     """
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
     first, centre = microimage_centres(optics, lattice, radius + 1)
@@ -67,7 +69,7 @@ def lay_out(optics: Optics, lattice: LensLattice) -> Microimages:
 
 
 def plain(sensor_shape: tuple[int, int]) -> Microimages:
-    """Every pixel as one ray, in rows padded by BLOCK_WIDTH: for weights that were counted pixel by pixel."""
+    """Return every pixel as one ray, in rows padded by BLOCK_WIDTH, for weights that were counted per pixel."""
     rows, columns = sensor_shape
     pixel = np.full((rows, columns + BLOCK_WIDTH), -1, np.int32)
     pixel[:, :columns] = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)

@@ -8,7 +8,7 @@ from matplotlib.colors import Normalize
 from matplotlib.patches import PathPatch, Polygon, Rectangle
 
 from lfpiv.geometry.grid import Grid
-from lfpiv.geometry.optics import LensLattice, Optics, pair
+from lfpiv.geometry.optics import LensLattice, Optics, float_pair
 from lfpiv.report.dot_map import DotMap, rms_by
 from lfpiv.report.lens_map import LensMap, lattice_px
 from lfpiv.report.svg import INK, SERIES, arrows, colour_bar, new_panel, spread_ticks, style, to_svg
@@ -114,7 +114,7 @@ def mapping_field(dots: DotMap, board_dots: tuple[int, int], grid: Grid, *, dept
     )
     low, high = ([grid.axis_mm(axis)[end] for axis in (2, 2 - up)] for end in (0, -1))
     corner, size = np.array(low) - grid.voxel_mm / 2, np.array(high) - np.array(low) + grid.voxel_mm
-    axes.add_patch(Rectangle(pair(corner), *size, fill=False, edgecolor=INK, linestyle="--", linewidth=1))
+    axes.add_patch(Rectangle(float_pair(corner), *size, fill=False, edgecolor=INK, linestyle="--", linewidth=1))
     axes.margins(0.08)
     axes.autoscale_view()
     name = "yz"[depth]

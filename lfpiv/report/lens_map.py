@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from lfpiv.geometry.optics import LensLattice, Optics
-from lfpiv.lightfield.lens_basis import indices_inside
-from lfpiv.lightfield.microimage_fit import BLUR_REACH_PX, cut_patches, measure, robust_fit
+from lfpiv.lightfield.microimage_fit import (
+    cut_patches,
+    measure_microimages,
+    patch_half_px,
+    robust_fit,
+    whole_microimages,
+)
 
 MOST_LENSES = 6000
 """Microimages measured, drawn evenly by chance: 60 and more in each cell of the map."""
@@ -57,19 +61,17 @@ def lens_map(white: np.ndarray, dark: np.ndarray | None, optics: Optics, lattice
     """
     image = np.asarray(white, np.float32) - (0 if dark is None else np.asarray(dark, np.float32))
     origin, basis = lattice_px(optics, lattice)
-    pitch = lattice.pitch_mm * (1 + optics.sensor_per_pupil) / optics.pixel_mm
-    half = math.ceil(pitch * min(0.5 * np.abs(basis).sum(0).max() / pitch, 0.71))  # of a square that holds a cell
-    margin = half + BLUR_REACH_PX + 1
-    rows, columns = image.shape
-    index = indices_inside(origin, basis, (margin, margin), (columns - 1 - margin, rows - 1 - margin))
+    half = patch_half_px(basis, lattice.pitch_mm * (1 + optics.sensor_per_pupil) / optics.pixel_mm)
+    index = whole_microimages(image.shape, origin, basis, half)
     if len(index) > MOST_LENSES:
         index = index[np.sort(np.random.default_rng(0).choice(len(index), MOST_LENSES, replace=False))]
     nodes = origin + index @ basis
-    shift, lit, microimage = measure(cut_patches(image, nodes, half), nodes, basis)
-    more, lit, _ = measure(cut_patches(image, nodes + shift, half), nodes + shift, basis, microimage)
-    shift = shift + more  # the second time from its own centre, where the linear fit is exact
-    nodes, shift = nodes[lit], shift[lit]
-    kept = robust_fit(np.column_stack([np.ones(len(nodes)), nodes / max(rows, columns)]), shift)[1]
+    fit = measure_microimages(cut_patches(image, nodes, half), nodes, basis)
+    centres = nodes + fit.shift_px  # the second pass starts from the measured centre, where the linear fit is exact
+    fit = measure_microimages(cut_patches(image, centres, half), centres, basis, fit.mean_microimage)
+    lit, shift = fit.lit, (centres + fit.shift_px - nodes)[fit.lit]
+    nodes = nodes[lit]
+    kept = robust_fit(np.column_stack([np.ones(len(nodes)), nodes / max(image.shape)]), shift)[1]
     return _in_cells(nodes[kept], shift[kept], image.shape, int(len(lit) - kept.sum()))
 
 

@@ -14,9 +14,10 @@ import numpy as np
 from lfpiv.calibration.board.board import BoardDots, DotBoard, measure_board
 from lfpiv.calibration.cameras import MODEL_ERROR_PITCH
 from lfpiv.calibration.levenberg_marquardt import levenberg_marquardt
-from lfpiv.calibration.network import sigma_nor, train
+from lfpiv.calibration.network import sigma_nor
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
-from lfpiv.calibration.virtual_samples import guide_between
+from lfpiv.calibration.training import TrainingSettings, train
+from lfpiv.calibration.virtual_samples import sampler_between_dots
 from lfpiv.reproduce import page, plots, store
 from lfpiv.reproduce.rigs import Rig, numerical_rig
 from lfpiv.reproduce.study import Progress
@@ -160,22 +161,18 @@ def fit(
     if samples is not None and samples < len(chosen):
         chosen = np.sort(np.random.default_rng([seed, 13]).permutation(chosen)[:samples])
     points, pupil, array = dots.points_mm[chosen], dots.pupil_mm[chosen], dots.array_mm[chosen]
-    lens, target, std, guide = None, array, None, None
+    lens, target, std, sampler = None, array, None, None
     if baseline == "thin_lens":
         lens = fit_thin_lens(points, pupil, array, camera.optics)
         target, std = array - lens(points, pupil), np.hypot(dots.std_mm[chosen], MODEL_ERROR_PITCH * pitch)
-        guide = guide_between(points, pupil, target, std, pitch_mm=pitch, seed=seed)
+        sampler = sampler_between_dots(points, pupil, target, std, pitch_mm=pitch, seed=seed)
     training = train(
         np.hstack([points, pupil]),
         target,
-        hidden=hidden,
-        trainer=TRAINERS[trainer],
-        epochs=epochs,
+        TrainingSettings(hidden=hidden, trainer=TRAINERS[trainer], epochs=epochs, shrink=lens is not None, seed=seed),
         groups=dots.dot[chosen],
         std=std,
-        guide=guide,
-        shrink=lens is not None,
-        seed=seed,
+        virtual_samples=sampler,
         unit=pitch,
     )
     low, high = dots.points_mm.min(0), dots.points_mm.max(0)

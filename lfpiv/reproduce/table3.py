@@ -11,7 +11,7 @@ import numpy as np
 
 from lfpiv.calibration.board.board import BoardDots
 from lfpiv.calibration.camera import Calibration
-from lfpiv.calibration.network import train
+from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.geometry.grid import Grid
 from lfpiv.reproduce import page
 from lfpiv.reproduce.rigs import Rig, numerical_rig, volume_grid
@@ -66,10 +66,8 @@ def _time_training(rig: Rig, name: str, scale: str, seed: int) -> dict[str, Any]
     training = train(
         np.hstack([points, pupil]),
         array,
-        epochs=EPOCHS[scale],
-        split=PARTS,
+        TrainingSettings(epochs=EPOCHS[scale], split=PARTS, seed=seed),
         groups=dot,
-        seed=seed,
         unit=camera.lattice.pitch_mm,
     )
     return {

@@ -1,6 +1,6 @@
 """Train networks by the other trainers of Table 1: Bayesian regularisation, and gradient descent with momentum.
 
-Both have the signature of `levenberg_marquardt`, so that `lfpiv.calibration.network.train` takes them as its `trainer`.
+Both have the signature of `levenberg_marquardt` and go into `lfpiv.calibration.training.TrainingSettings.trainer`.
 
 References
 ----------
@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
 
-from lfpiv.calibration.levenberg_marquardt import Fit, Samples, Stop, forward, normal_equations
+from lfpiv.calibration.levenberg_marquardt import Fit, Samples, TrainingStop, forward, normal_equations
 
 FIRST_DAMPING, LEAST_DAMPING, LAST_DAMPING = 5e-3, 1e-20, 1e10
 """Damping of the first step, smallest damping, and damping at which training stops: the customary values for [1]_."""
@@ -65,7 +65,7 @@ def bayesian_regularisation(
     values = training.outputs.size
     gram, gradient, squares = normal_equations(layers, training)
     training_rms, validation_rms = [np.sqrt(squares / values)], [_rms(layers, validation)]
-    gamma, damping, stop = float(theta.size), FIRST_DAMPING, Stop.EPOCH_LIMIT
+    gamma, damping, stop = float(theta.size), FIRST_DAMPING, TrainingStop.EPOCH_LIMIT
     alpha, beta = _hyperparameters(min(gamma, 0.9 * values), values, squares, theta)
     while len(training_rms) <= epochs:
         objective = beta * squares + alpha * (theta @ theta)
@@ -79,7 +79,7 @@ def bayesian_regularisation(
                     break
             damping *= 10
         else:
-            stop = Stop.MINIMUM
+            stop = TrainingStop.MINIMUM
             break
         theta = trial
         gram, gradient, squares = normal_equations(unpack(theta), training)
@@ -92,7 +92,7 @@ def bayesian_regularisation(
         training_rms.append(np.sqrt(squares / values))
         validation_rms.append(_rms(unpack(theta), validation))
         if len(training_rms) > patience and training_rms[-1] > (1 - tolerance) * training_rms[-1 - patience]:
-            stop = Stop.MINIMUM
+            stop = TrainingStop.MINIMUM
             break
     return Fit(layers=unpack(theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 
@@ -124,7 +124,7 @@ def gradient_descent(
     theta = best_theta = pack(layers)
     step, rate, stalled = np.zeros_like(theta), FIRST_RATE, 0
     training_rms, validation_rms = [_rms(layers, training)], [_rms(layers, validation)]
-    best, stop = validation_rms[0], Stop.EPOCH_LIMIT
+    best, stop = validation_rms[0], TrainingStop.EPOCH_LIMIT
     rng = np.random.default_rng(len(training.inputs))
     for _ in range(epochs):
         order = rng.permutation(len(training.inputs))
@@ -145,7 +145,7 @@ def gradient_descent(
         if stalled == STALLED:
             rate, stalled = rate * SLOWER, 0
             if rate < LAST_RATE:
-                stop = Stop.VALIDATION
+                stop = TrainingStop.VALIDATION
                 break
     return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 

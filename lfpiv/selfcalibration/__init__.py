@@ -1,1 +1,1 @@
-"""Self-calibration: how far apart cameras show the same particles, and the cameras' movements that explain it."""
+"""Self-calibration: disparities between cameras, measured with particles, and the camera movements that explain them."""

@@ -201,13 +201,13 @@ class Projector:
     light lies in both parts and is added up.
 
     `project` and `back_project` may be called from several threads, which take turns. A caller of `scatter` and
-    `gather` that needs the light on the rays in between calls them inside `kept`.
+    `gather` that needs the light on the rays in between calls them inside `reserved`.
 
     Arrays in and out are float32, C-contiguous and flat. On the CPU they are used in place.
     """
 
     def __init__(self, blocks: Blocks):
-        self._turn, self._kept = threading.RLock(), False
+        self._turn, self._reserved = threading.RLock(), False
         self.blocks = blocks
         self._on_cpu = runtime.device().kind == "cpu"
         self._matrix = Matrix()
@@ -248,7 +248,7 @@ class Projector:
         return RayMap(self.blocks.microimages, self.rays.numpy(), self._places, [start for start, _ in self._spans])
 
     @contextlib.contextmanager
-    def kept(self) -> Iterator[None]:
+    def reserved(self) -> Iterator[None]:
         """Reserve the rays for this thread. Other threads wait.
 
         Raises
@@ -257,16 +257,16 @@ class Projector:
             If this thread has reserved them already: it would overwrite the light on them.
         """
         with self._turn:
-            if self._kept:
+            if self._reserved:
                 raise RuntimeError(
                     "weights: these are in use by a reconstruction of the same thread, whose `progress` cannot project "
                     "with them. Do so before or after it, or build weights of its own."
                 )
-            self._kept = True
+            self._reserved = True
             try:
                 yield
             finally:
-                self._kept = False
+                self._reserved = False
 
     def scatter(self, volume: np.ndarray) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays."""
@@ -303,7 +303,7 @@ class Projector:
 
     def project(self, volume: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Write the image of `volume`, shape (voxel,), into `out`, shape (pixel,), and return it."""
-        with self.kept():
+        with self.reserved():
             self.scatter(volume)
             out.fill(0.0)  # pixels that no voxel lights
             image = to_device(out, float)
@@ -317,7 +317,7 @@ class Projector:
 
         Return `out`.
         """
-        with self.kept():
+        with self.reserved():
             self.map.spread(to_device(image, float), self.rays)
             return self.gather(out)
 

@@ -1,4 +1,4 @@
-"""Decoding against rays traced one by one and scenes whose light is known."""
+"""Decoder against single traced rays and scenes of known light."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ DARK_LEVEL = 40.0  # counts
 READ_NOISE = 2.0  # counts
 
 HALF_PIXEL = 0.5 + 1e-3  # a ray lands within half a pixel of its pixel's centre, plus float32 rounding
-SAMPLED_AREA = 0.012  # areas by 20 x 20 points per pixel: one row of points, 1/20, over a quarter of edge pixels
-VIEW_ERROR = 0.02  # four pixels of noise 0.2 % in image and white, light read whole pixels from the lens's own phase
+SAMPLED_AREA = 0.012  # error of areas by 20 x 20 points per pixel: a quarter of one row of points
+VIEW_ERROR = 0.02  # noise of 0.2 % in four pixels of image and white, and their interpolation
 
 
 def make_optics(layout="square", f_number=4.0):
@@ -36,7 +36,7 @@ def make_lattice(layout="square", roll_deg=1.3):
 
 
 def sampled_coverage(optics, lattice, points=20):
-    """Part of each pixel inside the discs of all lenses, by points; microimage by microimage."""
+    """Return the part of each pixel inside the discs of all lenses, by counting points."""
     rows, columns = optics.sensor_shape
     steps = (np.arange(points) + 0.5) / points - 0.5
     row = (np.arange(rows)[:, None] + steps).ravel()
@@ -66,13 +66,13 @@ def camera(request):
 
 
 def test_pixels_see_the_pupil_points_their_rays_come_from(camera):
-    """Rays through lens centres, traced forwards through the microlens, land in pixels that decode to their origin."""
+    """Rays traced through lens centres meet pixels that decode to the rays' pupil points."""
     optics, random = camera.optics, np.random.default_rng(1)
     index = random.integers(-5, 6, size=(3000, 2))
     angle, radius = 2 * np.pi * random.random(3000), 0.9 * optics.pupil_radius_mm * np.sqrt(random.random(3000))
     pupil = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     lens = camera.lattice.centres_mm(index)
-    slope = (lens - pupil) / optics.image_distance_mm  # a ray through a lens's centre keeps its slope
+    slope = (lens - pupil) / optics.image_distance_mm  # a lens does not bend a ray through its centre
     position = optics.sensor_px(lens + optics.microlens_focal_length_mm * slope)
     col, row = np.rint(position).astype(int).T
     inside = (row >= 0) & (row < optics.sensor_shape[0]) & (col >= 0) & (col < optics.sensor_shape[1])
@@ -85,7 +85,7 @@ def test_pixels_see_the_pupil_points_their_rays_come_from(camera):
 
 @pytest.mark.parametrize("f_number", [4.0, 3.4])
 def test_coverage_is_the_area_inside_the_microimages(f_number):
-    """Touching and overlapping microimages."""
+    """The microimages touch at f/4 and overlap at f/3.4."""
     optics, lattice = make_optics(f_number=f_number), make_lattice()
     decoder = LightFieldDecoder.from_white(optics, lattice, white_image(optics, lattice))
     reference = sampled_coverage(optics, lattice)
@@ -109,24 +109,24 @@ def test_gain_recovers_vignetting_pixel_response_and_dead_lenses():
     assert (decoder.gain[dead] == 0).all() and (decoder.smooth_gain[dead] == 0).all()
     core = (decoder.coverage > 0.99) & ~dead
     scale = np.median((vignetting * pixels)[core])
-    noise = 4 * READ_NOISE / WHITE_COUNTS + 0.01  # four standard deviations, and what the blurred coverage differs
+    noise = 4 * READ_NOISE / WHITE_COUNTS + 0.01  # four standard deviations, and the error of the coverage
     assert np.percentile(np.abs(decoder.gain * scale - vignetting * pixels)[core], 99) < noise
     smooth_error = (decoder.smooth_gain * scale / vignetting - 1)[core]
-    assert smooth_error.std() < 0.05 / 3  # some 30 pixels per element of the common pattern on so small a sensor
+    assert smooth_error.std() < 0.05 / 3  # about 30 pixels per bin of the mean pattern
     assert np.allclose(decoder.shrunk_gain(1.0), decoder.gain, atol=1e-6)
     assert decoder.gain.min() >= 0 and decoder.gain.max() <= 2
 
 
 def test_background_is_read_between_the_microimages(camera):
-    """Even in an image full of light, and without a dark frame."""
+    """It needs neither a dark image nor a dark frame."""
     level, sigma = camera.background(white_image(camera.optics, camera.lattice, seed=9))
     count = camera.gaps.sum()
-    assert abs(level - DARK_LEVEL) < 5 * 1.2533 * READ_NOISE / np.sqrt(count) + 0.05  # error of a median, and rounding
+    assert abs(level - DARK_LEVEL) < 5 * 1.2533 * READ_NOISE / np.sqrt(count) + 0.05  # errors of median and rounding
     assert abs(sigma / READ_NOISE - 1) < 0.15
 
 
-def test_views_are_the_scene_at_the_lens_centres(camera):
-    """A scene that changes over the array and over the pupil, divided by an uneven white image."""
+def test_sub_aperture_images_are_the_scene_at_the_lens_centres(camera):
+    """The scene varies over array and pupil, and the white image is uneven."""
     optics, lattice = camera.optics, camera.lattice
     columns = np.arange(optics.sensor_shape[1])
     uneven = np.broadcast_to(1 - 0.2 * (columns / 260) ** 2, optics.sensor_shape)
@@ -146,7 +146,7 @@ def test_views_are_the_scene_at_the_lens_centres(camera):
         assert np.abs(ratio - 1).max() < VIEW_ERROR
 
 
-def test_views_keep_to_the_pupil(camera):
+def test_sub_aperture_images_end_at_the_pupil(camera):
     values, _ = camera.sub_aperture(np.full(camera.optics.sensor_shape, 99.0), (1.3 * camera.optics.pupil_radius_mm, 0))
     assert np.isnan(values).mean() > 0.95
 

@@ -1,4 +1,4 @@
-"""Images that are right in form and wrong otherwise: of another camera, misplaced, saturated, half exposed, copied."""
+"""Checks of images that are correct in form and still wrong: misplaced, saturated, half exposed or copied."""
 
 import dataclasses
 import logging
@@ -19,19 +19,19 @@ from lfpiv.runs import pair, pipeline
 from lfpiv.simulation.simulator import simulate
 from lfpiv.warn import Code, Warning
 
-CLEAR = GAP_LIGHT / 5  # what belongs together keeps clear of the limit; real images gave 0.013, rendered ones 0.001
-GOOD = 0.02  # pitch; nobody would look twice
+CLEAR = GAP_LIGHT / 5  # gap light of a camera's own images; real images gave 0.013, rendered ones 0.001
+GOOD = 0.02  # [pitch] below every limit that warns
 MAGNIFICATION = 0.002  # ten times the spread over rigs and seeds
 QUARTER_PITCH_PX = 3  # of 12.5
 OFFSETS_MM = ((0.0, 0.0), (0.05, 0.03))
-"""Of the arrays on their sensors: half a pitch and a third of one apart, as likely as any."""
+"""Offsets of the arrays on their sensors: half a pitch and a third of a pitch apart."""
 
 
 @pytest.fixture(scope="module", params=[("square", 4.0), ("hexagonal", 5.5)], ids=lambda rig: rig[0])
 def pair_of_cameras(request, tmp_path_factory, device):
-    """Experiment and calibration of two cameras whose arrays lie differently on their sensors.
+    """Experiment and calibration of two cameras whose arrays have different offsets.
 
-    At f/4 the microimages of a hexagonal array touch all around and leave no gaps to look at.
+    The hexagonal array has f/5.5, because its microimages leave no gaps at f/4.
     """
     layout, f_number = request.param
     optics = {"microlens_layout": layout, "f_number": f_number}
@@ -50,7 +50,7 @@ def pair_of_cameras(request, tmp_path_factory, device):
     return experiment, lfpiv.thin_lens(experiment)
 
 
-def test_light_between_the_microimages_tells_another_cameras_image(pair_of_cameras):
+def test_light_between_the_microimages_shows_another_cameras_image(pair_of_cameras):
     experiment, calibration = pair_of_cameras
     left, right = (calibration.cameras[name].decoder for name in ("left", "right"))
     for image in (experiment.particle_image("left", 0, "a"), experiment.board_image("left", 0)):
@@ -67,14 +67,14 @@ def test_light_between_the_microimages_tells_another_cameras_image(pair_of_camer
 
 @pytest.mark.parametrize("bits", [8, 12, 16])
 @pytest.mark.parametrize("justified", ["right", "left"])
-def test_saturation_is_told_at_the_end_of_a_range(bits, justified):
+def test_saturation_is_found_at_the_end_of_a_range(bits, justified):
     rng = np.random.default_rng(bits)
     top = 2**bits - 1
     step = 2 ** (16 - bits) if justified == "left" else 1
     light = rng.exponential(0.2 * top, (300, 300))
     assert saturated_share(np.minimum(light * 4, top).round() * step) > SATURATED
     assert saturated_share((light * 0.9 * top / light.max()).round() * step) == 0
-    assert saturated_share(np.minimum(light, 0.7 * top)) == 0  # flat, but not at the end
+    assert saturated_share(np.minimum(light, 0.7 * top)) == 0  # clipped, but not at the end of the range
 
 
 def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
@@ -86,7 +86,7 @@ def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
     assert dark_blocks(first, half) >= 2 and dark_blocks(half, first) == dark_blocks(first, half)
 
 
-def test_what_is_suspicious_about_images_is_found(pair_of_cameras):
+def test_suspicious_images_are_found(pair_of_cameras):
     experiment, calibration = pair_of_cameras
     decoder = calibration.cameras["left"].decoder
     first, second = (experiment.particle_image("left", 0, frame) for frame in "ab")
@@ -110,11 +110,11 @@ def test_what_is_suspicious_about_images_is_found(pair_of_cameras):
         (1, ["a only"], True),
         (2, [], False),
         (2, ["b left"], True),
-        (3, ["a left", "b right"], False),  # two cameras saw each frame
+        (3, ["a left", "b right"], False),  # two cameras show each frame
         (3, ["b left", "b right"], True),
     ],
 )
-def test_vectors_count_where_two_cameras_saw_particles(cameras, empty, unmeasured):
+def test_vectors_count_where_two_cameras_show_particles(cameras, empty, unmeasured):
     frames = [
         [Warning(code=Code.EMPTY, subject=name) for name in empty if name.startswith(frame)]
         + [Warning(code=Code.DIM, subject="left")]
@@ -125,7 +125,7 @@ def test_vectors_count_where_two_cameras_saw_particles(cameras, empty, unmeasure
 
 @pytest.fixture(scope="module")
 def spoilt(small_run, tmp_path_factory):
-    """A run of which every pair has other bad images; the user has silenced the log. File, folder, exit status."""
+    """Run an experiment with different bad images in each pair and a silent log. Return file, folder and summary."""
     folder = tmp_path_factory.mktemp("spoilt")
     file, out = small_run.images(folder / "data"), small_run.calibrated(folder / "out")
     rng = np.random.default_rng(0)
@@ -146,8 +146,8 @@ def spoilt(small_run, tmp_path_factory):
     return file, out, summary
 
 
-def test_the_images_of_every_pair_are_looked_at(spoilt):
-    """What cannot be is no result, what is doubtful is said once with its pairs, whatever the log shows."""
+def test_the_images_of_every_pair_are_checked(spoilt):
+    """A copied image fails its pair; each doubt appears once with its pairs, independent of the log level."""
     _, out, summary = spoilt
     ((failed),) = summary["failed"]
     assert failed["pair"] == 1 and "frame b: expected an image of its own, found the same image as" in failed["reason"]
@@ -165,7 +165,7 @@ def test_the_images_of_every_pair_are_looked_at(spoilt):
 
 
 def test_a_pair_of_noise_enters_no_mean(spoilt):
-    """Correlation calls its vectors valid; the images say that there is nothing to measure."""
+    """The correlation marks its vectors as valid, but the images show no particles."""
     file, out, summary = spoilt
     vectors = netcdf.read_vectors(out / "vectors" / "pair_0000.nc")
     assert not vectors["valid"].any() and np.isnan(vectors["uncertainty"]).all()
@@ -175,13 +175,13 @@ def test_a_pair_of_noise_enters_no_mean(spoilt):
     mean, good = statistics.mean(results), statistics.mean(results.sel(pair=[2, 3]))
     assert int(mean["pairs_counted"].max()) == 2
     np.testing.assert_array_equal(mean["u"], good["u"])
-    (out / "vectors" / "pair_0000.nc").unlink()  # and of volumes in files, the same
+    (out / "vectors" / "pair_0000.nc").unlink()  # the same from stored volumes
     pipeline.correlate(file, out, pairs=(0, 1))
     assert netcdf.read_vectors(out / "vectors" / "pair_0000.nc").equals(vectors)
 
 
 def test_warnings_outlive_the_invocation(spoilt, tmp_path, monkeypatch):
-    """The same command again, and a report made anew, say what the first run said."""
+    """A second run and a new report give the warnings of the first run."""
     file, out, first = spoilt
     pages = []
     monkeypatch.setattr("lfpiv.report.write_report", lambda *arguments: pages.append(arguments[2]["warnings"]))
@@ -189,7 +189,7 @@ def test_warnings_outlive_the_invocation(spoilt, tmp_path, monkeypatch):
         assert again["warnings"] == first["warnings"] and len(first["warnings"]) > len(first["pairs"])
     assert pages == [first["warnings"]] * 2
     alone = shutil.copytree(out, tmp_path / "out")
-    shutil.rmtree(alone / "vectors")  # volumes know it, too
+    shutil.rmtree(alone / "vectors")  # the volumes hold the warnings, too
     assert [text for text in pipeline.report(file, alone)["warnings"] if "saturated" in text or "of 9" in text]
 
 
@@ -216,20 +216,20 @@ def test_a_saturated_white_image_and_pictures_on_their_side_are_named(small_run,
     spoil(file, "white/*.tif", lambda image: np.minimum(image * 4.0, 4095))
     spoil(file, "**/*.tif", np.rot90)
     camera = calibrate_first(file)
-    assert camera.report["sigma_nor_test"] < GOOD
+    assert camera.report.sigma_nor_test < GOOD
     saturated, turned = (warning.sentence for warning in camera.warnings)
     assert "white image's bright pixels are saturated" in saturated and "turned by 90 degrees" in turned
 
 
 def test_wrong_spacing_and_size_of_the_dots_show(small_run, tmp_path, caplog):
-    """In the magnification, and in what the dots look like; kept with the calibration, whatever the log shows."""
+    """The magnification and the apparent diameter show them; the calibration holds both warnings at any log level."""
     file = small_run.images(tmp_path / "data")
     text = file.read_text("utf-8").replace("spacing_mm = 0.5", "spacing_mm = 0.45")
     assert "dot_diameter_mm = 0.1\n" in text
     file.write_text(text.replace("dot_diameter_mm = 0.1\n", "dot_diameter_mm = 0.15\n"), "utf-8")
     with caplog.at_level(logging.CRITICAL, "lfpiv"):
         camera = calibrate_first(file)
-    assert camera.report["sigma_nor_test"] < GOOD
+    assert camera.report.sigma_nor_test < GOOD
     wide, magnified = (warning.sentence for warning in camera.warnings)
     assert re.search(r"magnified 1\.(09\d|1\d\d) times, not 1", magnified)
     assert wide.startswith("left: the board's dots look 0.") and wide.endswith("mm wide, not 0.15 mm")

@@ -1,4 +1,4 @@
-"""Lens array from the white image, against rendered arrays whose true lattice is known."""
+"""Lens array found in white images, against the true lattice of rendered arrays."""
 
 import logging
 
@@ -9,9 +9,9 @@ from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
 from lfpiv.lightfield.lens_array import find_lens_array
 
-TOLERANCE_CLEAN = 0.015  # [px] without noise, at the worst corner; 6 x 6 samples a pixel alone place a disc to 0.005 px
-TOLERANCE_INTEGER = 0.02  # [px] the same, but every microimage has the same phase, so that nothing averages out
-TOLERANCE_VIGNETTED = 0.02  # [px] brightness falls to a third within twelve lenses: six times what a camera shows
+TOLERANCE_CLEAN = 0.015  # [px] without noise, at the worst corner; 6 x 6 samples a pixel render a disc to 0.005 px
+TOLERANCE_INTEGER = 0.02  # [px] the same where all microimages have one phase, so that errors do not average out
+TOLERANCE_VIGNETTED = 0.02  # [px] brightness falls to a third within twelve lenses, six times a camera's vignetting
 TOLERANCE_NOISY = 0.06  # [px] corner of a lattice through >= 90 centres of 0.15 px each: 0.15 / sqrt(90) * 3.5
 TOLERANCE_SAME = 0.01  # [px] two views of the same noise: only interpolation and the lenses at the border differ
 TOLERANCE_PITCH = 4e-3  # relative, of the real arrays' published pitch
@@ -23,7 +23,7 @@ def basis_of(pitch, rotation_deg, layout):
 
 
 def nodes_near(shape, origin, basis, margin):
-    """True centres within `margin` pixels of the sensor; obvious and slow."""
+    """Return the true centres within `margin` pixels of the sensor."""
     reach = int(2 * max(shape) / np.hypot(*basis[0])) + 2
     j, i = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     centres = np.asarray(origin) + np.stack([i.ravel(), j.ravel()], 1) @ basis
@@ -32,7 +32,7 @@ def nodes_near(shape, origin, basis, margin):
 
 
 def render(shape, origin, basis, diameter, *, soft=0.0, square=False, brightness=None, bend=None):
-    """Sum of microimages, each integrated over the pixels with 6 x 6 samples; 1 in the middle of an average one."""
+    """Render microimages, integrated over the pixels by 6 x 6 samples. The middle of an average one is 1."""
     half = int(np.ceil(diameter / 2 * (1.5 if square else 1) + 4 * soft)) + 1
     centres = nodes_near(shape, origin, basis, half)
     centres = centres if bend is None else centres + bend(centres)
@@ -55,13 +55,13 @@ def render(shape, origin, basis, diameter, *, soft=0.0, square=False, brightness
 
 
 def expose(image, rng, *, peak=3000, offset=100, bits=12):
-    """Counts of a camera: shot noise, read noise of two counts, offset, full scale."""
+    """Return the counts of a camera with shot noise, read noise of two counts, offset and full scale."""
     counts = rng.poisson(np.maximum(image, 0) * peak) + rng.normal(offset, 2, image.shape)
     return np.clip(np.rint(counts), 0, 2**bits - 1).astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def worst_error(array, origin, basis):
-    """Largest distance of a found centre from the true lattice [px]; checks that none is missing or invented."""
+    """Return the largest distance of a found centre from the true lattice [px]. No centre is missing or surplus."""
     rows, columns = array.sensor_shape
     index = (array.centres_px - origin) @ np.linalg.inv(basis)
     assert len(np.unique(np.rint(index), axis=0)) == len(index)
@@ -79,7 +79,7 @@ def worst_error(array, origin, basis):
         (7.3, 0.4, "square", 0.9),
         (31.7, 9.5, "square", 1.0),
         (14.6, 1.3, "square", 1.3),  # gaps between four lenses are brighter than lenses
-        (16.9, -3.0, "square", 1.55),  # and there are none
+        (16.9, -3.0, "square", 1.55),  # and the microimages leave no gaps
         (18.25, 0.05, "hexagonal", 1.0),
         (12.6, 30.2, "hexagonal", 0.8),
         (20.4, 17.0, "hexagonal", 1.06),
@@ -122,7 +122,7 @@ def test_vignetting_moves_no_centre(layout, whole_lenses, fill):
 
 
 @pytest.mark.parametrize("seed", range(14))
-def test_random_array_with_all_that_goes_wrong(seed):
+def test_random_array_with_dead_lenses_dust_vignetting_and_noise(seed):
     rng = np.random.default_rng(seed)
     layout = ("square", "hexagonal")[seed % 2]
     pitch = float(np.exp(rng.uniform(np.log(9), np.log(30))))

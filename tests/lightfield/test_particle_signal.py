@@ -1,4 +1,4 @@
-"""Images of particles told from images of noise: rendered seedings here, the ways in which a camera is noisy there."""
+"""Separation of particle images from noise: rendered seedings against several kinds of camera noise."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from lfpiv.runs import summary_warnings
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import simulate
 
-PARTICLES = 4 * NOISE  # real images keep clear of the limit: 0.27 and more were seen at a signal of ten times the noise
+PARTICLES = 4 * NOISE  # least structure of particles; 0.27 and more at ten times the noise
 
 BACKGROUND, READ_NOISE = 40.0, 3.0  # counts, as simulated
 
@@ -56,7 +56,7 @@ def light_and_decoder(scene, folder):
     return experiment, decoder
 
 
-def judged(image, decoder):
+def structure_of(image, decoder):
     image = np.asarray(image, np.float32)
     return seen_structure(image - np.float32(decoder.background(image)[0]), decoder)
 
@@ -67,21 +67,21 @@ def judged(image, decoder):
         ("square", 20, None, 30.0),  # 0.05 particles per microlens, ten times the read noise
         ("square", 20, 0.05, 600.0),
         ("hexagonal", 40, None, 600.0),
-        ("square", 400, 0.07, 30.0),  # 1 per microlens, as blobs: the smoothest images there are
+        ("square", 400, 0.07, 30.0),  # 1 per microlens, as blobs: the smoothest images
         ("hexagonal", 400, None, 600.0),
     ],
 )
 def test_particles_at_any_seeding_are_no_noise(tmp_path, device, layout, count, sigma_mm, brightness):
     experiment, decoder = light_and_decoder(scene(layout, count, sigma_mm, brightness), tmp_path / "data")
     image = experiment.particle_image("only", 0, "a")
-    assert judged(image, decoder) > PARTICLES
+    assert structure_of(image, decoder) > PARTICLES
     hot = image.copy()
     hot.ravel()[np.random.default_rng(0).integers(0, hot.size, hot.size // 500)] = 4095
-    assert judged(hot, decoder) > PARTICLES
+    assert structure_of(hot, decoder) > PARTICLES
 
 
 def test_one_bright_particle_on_a_large_sensor_is_no_noise(tmp_path, device):
-    """Clipping, which holds hot pixels down, holds it down too."""
+    """Clipping removes a single particle as it removes hot pixels."""
     experiment, decoder = light_and_decoder(scene("square", 1, None, 600.0), tmp_path / "data")
     image = experiment.particle_image("only", 0, "a") - np.float32(BACKGROUND)
     row, column = np.unravel_index(gaussian_filter(image, 5).argmax(), image.shape)
@@ -109,14 +109,13 @@ def test_noise_of_every_kind_is_noise(tmp_path, device):
         "stripes both ways": read + 5 * rng.standard_normal((shape[0], 1)) + 5 * rng.standard_normal(shape[1]),
         "smoothed by the camera": gaussian_filter(100 * rng.standard_normal(shape), 0.7),
     }
-    found = {name: judged(image, decoder) for name, image in noises.items()}
+    found = {name: structure_of(image, decoder) for name, image in noises.items()}
     assert max(found.values()) < EMPTY, found
 
 
 def test_images_without_particles_and_dim_ones_are_named():
     found = signal_warnings({"left": 0.6, "right": 0.001}, "b") + signal_warnings({"left": 0.03}, "a")
-    stored = [warning.to_json() for warning in found]
-    gathered = summary_warnings.image_warnings([{"pair": 3, "warnings": stored}, {"pair": 4}])
+    gathered = summary_warnings.image_warnings({3: found, 4: []})
     dim, empty = (warning.sentence for warning in gathered)
     assert empty.startswith("right, frame b, pair 3: no particles, only noise") and "0.001" in empty
     assert dim.startswith("left, frame a, pair 3: particles hardly rise above the noise") and "0.03" in dim

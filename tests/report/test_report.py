@@ -225,7 +225,7 @@ def test_a_lattice_in_the_wrong_place_shows_in_every_cell(reported):
     camera, experiment = reported.calibration.cameras["left"], reported.experiment
     white, optics = experiment.white("left"), experiment.camera("left").optics
     right = lens_map(white, None, optics, camera.lattice)
-    assert right.total_rms_px == pytest.approx(camera.report["lens_array_rms_px"], rel=RMS_AGREEMENT)
+    assert right.total_rms_px == pytest.approx(camera.report.lens_array_rms_px, rel=RMS_AGREEMENT)
     move = SHIFT_PX * optics.pixel_mm / (1 + optics.sensor_per_pupil)
     origin = camera.lattice.origin_mm[0] + move, camera.lattice.origin_mm[1]
     wrong = lens_map(white, None, optics, dataclasses.replace(camera.lattice, origin_mm=origin))
@@ -330,7 +330,7 @@ def test_a_report_before_any_pair_is_finished(reported, tmp_path, monkeypatch):
 
 def test_ray_tracing_at_nominal_angles_is_reported_without_dots(reported):
     traced = lfpiv.thin_lens(reported.experiment)
-    summary = {"calibration": {name: dict(camera.report) for name, camera in traced.cameras.items()}}
+    summary = {"calibration": {name: camera.report.to_json() for name, camera in traced.cameras.items()}}
     page = Page(calibration.section(reported.experiment, traced, summary))
     assert "Microlens array of left" in page.text["figcaption"] and "eld-out" not in page.text["figcaption"]
 

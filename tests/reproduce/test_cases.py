@@ -11,7 +11,7 @@ from support import scenes
 
 import lfpiv
 from lfpiv.calibration.levenberg_marquardt import Samples, forward, levenberg_marquardt
-from lfpiv.calibration.network import train
+from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.errors import InputError
 from lfpiv.reproduce import fig19, lsi, lsi_twin, planar_piv, table1, table3, trainers
 from lfpiv.reproduce.rigs import Rig
@@ -84,15 +84,17 @@ def test_descent_follows_the_gradient():
 def test_both_trainers_fit_and_regularisation_withstands_noise():
     rng = np.random.default_rng(1)
     points = rng.uniform(-1.5, 1.5, (600, 2))
-    bayes = train(points, smooth(points), hidden=(8,), trainer=trainers.bayesian_regularisation, epochs=60)
+    settings = TrainingSettings(hidden=(8,), trainer=trainers.bayesian_regularisation, epochs=60)
+    bayes = train(points, smooth(points), settings)
     assert np.sqrt(np.mean(bayes.test_errors**2)) < SMOOTH_FIT
-    descent = train(points, smooth(points), hidden=(8,), trainer=trainers.gradient_descent, epochs=100)
+    settings = TrainingSettings(hidden=(8,), trainer=trainers.gradient_descent, epochs=100)
+    descent = train(points, smooth(points), settings)
     assert descent.validation_rms.min() < descent.validation_rms[0] / DESCENT_GAIN
 
     few, clean = points[:150], rng.uniform(-1.4, 1.4, (500, 2))
     noisy = smooth(few) + 0.2 * rng.standard_normal((150, 2))
     fitted = [
-        train(few, noisy, hidden=(20,), trainer=trainer, epochs=60, patience=61)
+        train(few, noisy, TrainingSettings(trainer=trainer, epochs=60, patience=61))
         for trainer in (trainers.bayesian_regularisation, levenberg_marquardt)
     ]
     bayes_error, plain_error = (np.sqrt(np.mean((fit.network(clean) - smooth(clean)) ** 2)) for fit in fitted)

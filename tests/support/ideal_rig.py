@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lfpiv.geometry.optics import LensLattice, Optics
-from lfpiv.lightfield.microimage_layout import lay_out
+from lfpiv.lightfield.microimage_layout import microimages_of
 
 
 def rotation(yaw_deg, pitch_deg=0.0, roll_deg=0.0):
@@ -49,7 +49,7 @@ class IdealCamera:
 
     def __post_init__(self):
         self.gain = np.ones(self.optics.sensor_shape, np.float32)
-        self.microimages = lay_out(self.optics, self.lattice)
+        self.microimages = microimages_of(self.optics, self.lattice)
 
     def map(self, points, pupil):
         camera = np.asarray(points, float) @ self.pose.T

@@ -142,7 +142,7 @@ def make_summary(experiment: Experiment, calibration: Calibration, vectors: dict
         "settings": {"smart": {"iterations": 2}, "correlation": {"windows": None}},
         "timings_s": {"calibration": 1.0, "total": 2.0},
         "peak_memory_mib": 300.0,
-        "calibration": {name: dict(camera.report) for name, camera in calibration.cameras.items()},
+        "calibration": {name: camera.report.to_json() for name, camera in calibration.cameras.items()},
         "weights": {"method": "footprint", "memory_mib": 3.0, "form": {"left": "profiles"}, "count_check_l2": [0.01]},
         "pairs": pairs,
         "valid_fraction": float(np.mean([pair["valid_fraction"] for pair in pairs])),
