@@ -368,7 +368,7 @@ def test_named_source_files_exist(name):
         for path in re.findall(r"`([\w./]+\.(?:py|h)|(?:lfpiv\w*|tests|perf|docs)/[\w/]*)`", part):
             found = [folder / path for folder in folders if (folder / path).exists()]
             assert found, path
-            folders = (*folders[:3], found[0].parent)
+            folders = (*folders[:3], found[0] if found[0].is_dir() else found[0].parent)
         folders = folders[:3]
 
 
