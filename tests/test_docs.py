@@ -6,6 +6,7 @@ import doctest
 import importlib
 import importlib.resources
 import importlib.util
+import itertools
 import logging
 import re
 import shlex
@@ -370,6 +371,26 @@ def test_named_source_files_exist(name):
             assert found, path
             folders = (*folders[:3], found[0] if found[0].is_dir() else found[0].parent)
         folders = folders[:3]
+
+
+def test_the_picture_of_the_house_shows_every_package_below_those_that_import_it():
+    house = extension("house")
+    picture = house.svg()
+    assert all(
+        f">{path.name}</text>" in picture
+        for path in (ROOT / "lfpiv").iterdir()
+        if (path / "__init__.py").exists() and path.name not in house.GROUND
+    )
+    boxes = {
+        title: tuple(map(float, box))
+        for *box, title in re.findall(r'<rect x="(\S+)" y="(\S+)" width="(\S+)".*?/><text [^>]*>([^<]+)<', picture)
+    }
+    named = {", ".join(house.GROUND): "ground"}
+    place = {named.get(title, title): box for title, box in boxes.items()}
+    assert set(place) == set(house.rooms())
+    assert all(place[room][1] < place[other][1] for room, others in house.arrows().items() for other in others)
+    for (x, y, _), (other_x, other_y, width) in itertools.permutations(place.values(), 2):
+        assert y != other_y or x < other_x or x > other_x + width
 
 
 def test_sections_of_the_method_name_modules_that_exist():

@@ -2,8 +2,8 @@
 Reconstruct a volume and look at it
 ===================================
 
-Two images become one volume. Where the true particles are known, a look at them beside the volume tells ghosts from
-particles; the residual per iteration tells whether the images are explained.
+Two images become one volume. Where the true particles are known, a look at them beside the volume shows which
+spots are ghosts; the residual per iteration shows whether the images are explained.
 """
 
 from pathlib import Path

@@ -22,7 +22,7 @@ results = lfpiv.open_results(folder)
 print(dict(results.sizes), "pairs:", results.pair.values)
 
 # %%
-# A derived field knows which of its values rest on measured vectors alone.
+# The coordinate `valid` of a derived field marks the values that depend on measured vectors only.
 
 vectors = results.isel(pair=0)
 curl, divergence = derived.vorticity(vectors), derived.divergence(vectors)
