@@ -19,12 +19,10 @@ GROUND = ("errors", "files", "geometry", "progress", "version", "warn")
 """Rooms of the ground floor that every room imports: drawn as one box."""
 FACES = ("__init__", "__main__", "derived", "statistics")
 """Files that only hand public names on: not drawn."""
-BOX_WIDTH, GROUND_WIDTH, BOX_HEIGHT, STOREY = 128, 290, 44, 92
+BOX_WIDTH, GROUND_WIDTH, BOX_HEIGHT, STOREY = 104, 164, 52, 92
 """Widths of a room's box and of the ground's, their height, and the distance of floors [pixel]."""
-LANE, GAP = 6, 22
+LANE, GAP = 4, 12
 """Width of an arrow that passes a floor, and least distance of neighbours [pixel]."""
-LEAST_WIDTH = 620
-"""Width of the picture on narrow screens, where it can be moved sideways [pixel]."""
 SWEEPS = 24
 """Passes over the floors, down and up, that sort and place their boxes."""
 
@@ -82,15 +80,13 @@ def svg() -> str:
         for spot in row
     }
     parts = [_line([place[spot] for spot in way]) for way in ways]
-    parts += [_box(*place[room], ", ".join(GROUND) if room == "ground" else room, lines[room]) for room in found]
+    parts += [_box(*place[room], room, lines[room]) for room in found]
     left = min(across[spot] - _width(spot) / 2 for spot in across) - 4
     wide = max(across[spot] + _width(spot) / 2 for spot in across) + 4 - left
     tall = (top - 1) * STOREY + BOX_HEIGHT + 8
-    size = f"width:100%;min-width:{LEAST_WIDTH}px;max-width:{wide:.0f}px;height:auto"
     return (
-        f'<div style="overflow-x:auto"><svg class="house" viewBox="{left:.0f} 0 {wide:.0f} {tall}" role="img" '
-        f'aria-label="Packages and their imports" style="{size}" '
-        f'font-family="sans-serif" font-size="13">{"".join(parts)}</svg></div>'
+        f'<svg class="house" viewBox="{left:.0f} 0 {wide:.0f} {tall}" style="width:100%;max-width:{1.2 * wide:.0f}px" '
+        f'role="img" aria-label="Packages and their imports" font-family="sans-serif">{"".join(parts)}</svg>'
     )
 
 
@@ -206,14 +202,21 @@ def _line(spots: list[tuple[float, float]]) -> str:
     )
 
 
-def _box(x: float, y: float, title: str, lines: int) -> str:
-    half = (GROUND_WIDTH if "," in title else BOX_WIDTH) / 2
+def _box(x: float, y: float, room: str, lines: int) -> str:
+    wide, half = _width(room), len(GROUND) // 2
+    titles = [", ".join(GROUND[:half]) + ",", ", ".join(GROUND[half:])] if room == "ground" else [room]
+    texts = [(title, 13, 1) for title in titles] + [(f"{lines:,} lines", 11, 0.65)]
+    first = y + 4 - 8 * (len(texts) - 1)
     return (
-        f'<rect x="{x - half:.0f}" y="{y - BOX_HEIGHT / 2:.0f}" width="{2 * half:.0f}" height="{BOX_HEIGHT}" rx="5" '
-        'fill="var(--color-background-secondary, #f4f6f8)" stroke="currentColor" stroke-opacity=".6"/>'
-        f'<text x="{x:.0f}" y="{y - 2:.0f}" text-anchor="middle" fill="currentColor">{escape(title)}</text>'
-        f'<text x="{x:.0f}" y="{y + 14:.0f}" text-anchor="middle" fill="currentColor" fill-opacity=".65" '
-        f'font-size="11">{lines:,} lines</text>'
+        f'<g class="room-{room}"><rect x="{x - wide / 2:.0f}" y="{y - BOX_HEIGHT / 2:.0f}" width="{wide}" '
+        f'height="{BOX_HEIGHT}" rx="5" fill="var(--color-background-secondary, #f4f6f8)" stroke="currentColor" '
+        'stroke-opacity=".6"/>'
+        + "".join(
+            f'<text x="{x:.0f}" y="{first + 16 * number:.0f}" text-anchor="middle" fill="currentColor" '
+            f'fill-opacity="{opacity}" font-size="{size}">{escape(text)}</text>'
+            for number, (text, size, opacity) in enumerate(texts)
+        )
+        + "</g>"
     )
 
 
