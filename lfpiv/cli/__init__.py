@@ -1,1 +1,1 @@
-"""The command line."""
+"""Command line `lfpiv`: commands, their output on the terminal, the demonstration, and the self-test."""

@@ -1,9 +1,8 @@
-"""`lfpiv demo`: the whole job on a small simulated experiment, and its result held against the known flow."""
+"""`lfpiv demo`: all steps on a small simulated experiment, and a comparison of the result with the known flow."""
 
 from __future__ import annotations
 
 import importlib.resources
-import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from lfpiv.runs import pipeline
 from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.simulator import simulate
+from lfpiv.velocity.settings import CorrelationSettings
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 def run(
     out: str | Path, *, device: str | None = None, progress: Callable[[str, float], None] | None = None
 ) -> dict[str, Any]:
-    """Simulate the demo scene into ``out/experiment``, once, and run everything on it into `out`.
+    """Simulate the demo scene into ``out/experiment`` unless it exists, and run all steps on it into `out`.
 
     Parameters
     ----------
@@ -43,23 +43,26 @@ def run(
     InputError
         If the folder cannot be written.
     """
-    out, report = Path(out), progress or (lambda step, fraction: None)
+    out, update = Path(out), progress or (lambda step, fraction: None)
     with importlib.resources.as_file(importlib.resources.files("lfpiv.cli") / "demo_scene.toml") as path:
         scene = open_scene(path)
         experiment = out / "experiment" / "experiment.toml"
         if experiment.exists():
             log.info("simulated experiment: made before, kept")
         else:
-            simulate(scene, experiment.parent, progress=lambda what, done, total: report("simulation", done / total))
+            simulate(scene, experiment.parent, progress=lambda step, done, total: update("simulation", done / total))
     summary = pipeline.run(experiment, out, device=device, progress=progress)
     return summary | {"demo": compare_with_truth(scene, out)}
 
 
 def compare_with_truth(scene: Scene, out: Path) -> dict[str, float]:
-    """Compare the first pair's interior vectors with the flow averaged over each window [voxel]; NaN where none is."""
+    """Return the error of the first pair's interior vectors against the flow averaged over each window [voxel].
+
+    Errors are NaN if there is no vector.
+    """
     vectors = netcdf.read_vectors(Folder(out).vectors(0))
     voxel_mm = scene.volume.voxel_mm
-    window_mm = np.array(json.loads(vectors.attrs["passes"])[-1]["window"][::-1]) * voxel_mm
+    window_mm = np.array(CorrelationSettings.of(vectors).windows[-1][::-1]) * voxel_mm
     inner = vectors.isel({axis: slice(1, -1) for axis in "zyx" if vectors.sizes[axis] > 2})
     z, y, x = np.meshgrid(*(inner[axis].values for axis in "zyx"), indexing="ij")
     truth = window_mean(scene.flow_of(0), np.stack([x, y, z], axis=-1).reshape(-1, 3), tuple(window_mm)) / voxel_mm

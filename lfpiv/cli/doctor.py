@@ -1,11 +1,11 @@
-"""What a bug report needs: versions, devices, memory, and a self-test of the kernels on this machine."""
+"""`lfpiv doctor`: versions, devices and memory for a bug report, and a self-test of the kernels on this machine."""
 
 from __future__ import annotations
 
-import os
 import platform
 import time
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,58 +14,67 @@ from lfpiv.version import versions
 from lfpiv_kernels import runtime
 
 TOLERANCE_MAPPING = 1e-4
-"""Single precision through sums of 20 terms of size 1, with room for a device's own exp."""
+"""Largest error of the network on the device: rounding of sums of 20 terms of size 1, and of the device's exp."""
 
 TOLERANCE_SHIFT_VOXEL = 0.05
-"""The self-test's blobs are noise-free; a correct sub-voxel peak is well within this."""
+"""Largest error of the displacement in the self-test [voxel]; its particles are noise-free."""
 
 SHIFT_VOXEL = (0.7, -0.4, 1.3)
 """Displacement (z, y, x) of the self-test [voxel]."""
 
 
-def examine(device: str = "auto") -> Iterator[tuple[str, str, bool]]:
-    """Yield (item, finding, good) one after the other; the last items test the kernels and take some seconds.
+class Finding(NamedTuple):
+    """Result of one examined item."""
+
+    item: str
+    finding: str
+    good: bool
+    """False for a fault."""
+
+
+def examine(device: str = "auto") -> Iterator[Finding]:
+    """Yield the findings one by one. The last ones test the kernels and take some seconds.
 
     Parameters
     ----------
     device : {"auto", "cpu", "cuda"}
         Device to test.
     """
-    yield "system", f"{platform.system()} {platform.release()}, {platform.machine()}", True
+    yield Finding("system", f"{platform.system()} {platform.release()}, {platform.machine()}", True)
     for name, version in versions().items():
-        yield name, version, True
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield "CPU cores", str(cores), True
-    yield "memory available", f"{memory.available_bytes() / memory.GIB:.1f} GiB", True
+        yield Finding(name, version, True)
+    yield Finding("CPU cores", str(runtime.cores()), True)
+    yield Finding("memory available", f"{memory.available_bytes() / memory.GIB:.1f} GiB", True)
     try:
         running = runtime.start(device)
     except (RuntimeError, ValueError) as error:
-        yield "kernels", str(error), False
+        yield Finding("kernels", str(error), False)
         return
     yield from _cuda()
     reason = f" ({running.reason})" if running.reason else ""
-    yield "kernels run on", f"{running.kind}, {running.threads} threads{reason}", True
+    yield Finding("kernels run on", f"{running.kind}, {running.threads} threads{reason}", True)
     for name, test in (("ray mapping (Taichi)", _test_mapping), ("correlation (Warp)", _test_correlation)):
         start = time.perf_counter()
         try:
             finding, good = test()
-        except Exception as error:  # whatever breaks a kernel is the finding
+        except Exception as error:  # any failure of a kernel is the finding
             finding, good = f"{type(error).__name__}: {error}", False
-        yield name, f"{finding}, {time.perf_counter() - start:.1f} s with compilation", good
+        yield Finding(name, f"{finding}, {time.perf_counter() - start:.1f} s with compilation", good)
 
 
-def _cuda() -> Iterator[tuple[str, str, bool]]:
+def _cuda() -> Iterator[Finding]:
     import warp as wp
 
     devices = wp.get_cuda_devices()
     if not devices:
-        yield "CUDA", "no device visible", True
+        yield Finding("CUDA", "no device visible", True)
     for device in devices:
         free, total = device.free_memory / memory.GIB, device.total_memory / memory.GIB
-        yield f"CUDA {device.alias}", f"{device.name}, {free:.1f} of {total:.1f} GiB free", True
+        yield Finding(f"CUDA {device.alias}", f"{device.name}, {free:.1f} of {total:.1f} GiB free", True)
 
 
 def _blobs(shape: tuple[int, int, int], centres: np.ndarray) -> np.ndarray:
+    """Return a volume of Gaussian particles with a standard deviation of 1 voxel."""
     axes = np.ogrid[tuple(slice(n) for n in shape)]
     volume = np.zeros(shape, np.float32)
     for centre in centres:
@@ -74,7 +83,7 @@ def _blobs(shape: tuple[int, int, int], centres: np.ndarray) -> np.ndarray:
 
 
 def _test_mapping() -> tuple[str, bool]:
-    """Evaluate a random network on the device and in NumPy."""
+    """Compare a random network on the device with NumPy, and return the finding and whether it is good."""
     from lfpiv.calibration.network import Network
     from lfpiv_kernels.rays import mapping
 
@@ -93,7 +102,7 @@ def _test_mapping() -> tuple[str, bool]:
 
 
 def _test_correlation() -> tuple[str, bool]:
-    """Recover a known uniform shift of Gaussian blobs."""
+    """Correlate particles with a known shift, and return the finding and whether it is good."""
     from lfpiv.velocity.cross_correlation import correlate
 
     rng, shape = np.random.default_rng(0), (24, 32, 32)

@@ -1,4 +1,4 @@
-"""How the command line talks: log lines or bars on standard error, results or JSON on standard output."""
+"""Output of the command line: log lines or progress bars on standard error, results or JSON on standard output."""
 
 from __future__ import annotations
 
@@ -18,50 +18,56 @@ if TYPE_CHECKING:
 log = logging.getLogger("lfpiv")
 
 LOG_EVERY_S = 10.0
-"""Without a terminal a long step writes a log line at most this often [s]."""
+"""Shortest time between log lines of a step without a terminal [s]."""
 LEAST_FRACTION = 0.02
-"""Finished part of a step from which its time left is foretold."""
+"""Smallest finished fraction of a step for an estimate of its remaining time."""
 
-PAIRS_TOLD = 20
-"""Pairs named one by one at the end."""
-WARNINGS_TOLD = 20
-"""Warnings told at the end; `summary.json` holds all."""
+LISTED_PAIRS = 20
+"""Largest number of pairs listed at the end of a run."""
+LISTED_WARNINGS = 20
+"""Largest number of warnings listed at the end of a run. ``summary.json`` contains all."""
 
 Progress = Callable[[str, float], None]
+"""Called as ``progress(step, fraction)``, fraction from 0 to 1."""
 
 
 class Interrupted(Exception):
-    """Ctrl-C or a request to terminate, in a form the command line parser leaves alone."""
+    """Interruption by Ctrl-C or a signal, as an exception that the command line parser does not handle."""
 
 
 @dataclass
-class Voice:
-    """What a command says."""
+class Output:
+    """Options for the output of a command."""
 
     debug: bool = False
-    """Debug messages and tracebacks."""
+    """Show debug messages and tracebacks."""
     quiet: bool = False
-    """Warnings and errors only."""
+    """Show only warnings and errors."""
     json: bool = False
-    """The result as JSON in place of text."""
+    """Print the result as JSON instead of text."""
 
-    def answer(self, result: Any, tell: Callable[[], None]) -> None:
-        """Give a command's result: as JSON, as text by `tell`, or not at all."""
+    @property
+    def is_text(self) -> bool:
+        """Whether results are printed as text."""
+        return not (self.json or self.quiet)
+
+    def show(self, result: Any, print_text: Callable[[], None]) -> None:
+        """Print the result of a command: as JSON, as text by `print_text`, or not at all."""
         if self.json:
             from lfpiv.files import plain
 
             print(json.dumps(plain(result), indent=2, allow_nan=False))
-        elif not self.quiet:
-            tell()
+        elif self.is_text:
+            print_text()
 
     @contextlib.contextmanager
-    def speaking(self) -> Iterator[Progress]:
-        """Configure logging and give the progress callback: bars on an interactive terminal, log lines otherwise."""
+    def progress(self) -> Iterator[Progress]:
+        """Configure logging and yield the progress callback: bars on an interactive terminal, log lines otherwise."""
         from rich.console import Console
 
         console = Console(stderr=True)
         interactive = console.is_terminal and not self.quiet
-        handler = _handler(console) if interactive else _plain_handler()
+        handler = _rich_handler(console) if interactive else _plain_handler()
         loggers = [logging.getLogger(name) for name in ("lfpiv", "lfpiv_kernels")]
         level = logging.DEBUG if self.debug else logging.WARNING if self.quiet else logging.INFO
         for logger in loggers:
@@ -80,7 +86,7 @@ class Voice:
                 logger.removeHandler(handler)
 
 
-def _handler(console: Console) -> logging.Handler:
+def _rich_handler(console: Console) -> logging.Handler:
     from rich.logging import RichHandler
 
     handler = RichHandler(console=console, show_path=False, markup=False, highlighter=None)
@@ -112,8 +118,8 @@ def _bars(console: Console) -> Iterator[Progress]:
 
 
 def _log_lines() -> Progress:
-    began: dict[str, tuple[float, float]] = {}  # step -> time and fraction of its first report
-    last: dict[str, float] = {}
+    began: dict[str, tuple[float, float]] = {}  # time and fraction of the first report of each step
+    last: dict[str, float] = {}  # time of its last log line
 
     def update(step: str, fraction: float) -> None:
         now = time.monotonic()
@@ -128,38 +134,38 @@ def _log_lines() -> Progress:
 
 
 def duration(seconds: float) -> str:
-    """Return a time in words: 40 s, 5 min, 2 h 10 min."""
+    """Return a time as text: 40 s, 5 min, 2 h 10 min."""
     minutes = round(seconds / 60)
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def tell_run(summary: dict[str, Any], out: Path) -> None:
-    """Say what came of a run."""
-    tell_calibration(summary)
-    tell_vectors(summary, out)
+def print_run(summary: dict[str, Any], out: Path) -> None:
+    """Print calibration, vectors, warnings, time and memory of a run, and the path of its report."""
+    print_calibration(summary)
+    print_vectors(summary, out)
     warnings = summary["warnings"]
-    for text in warnings[:WARNINGS_TOLD]:
+    for text in warnings[:LISTED_WARNINGS]:
         print(f"warning: {text}")
-    if len(warnings) > WARNINGS_TOLD:
-        print(f"{len(warnings) - WARNINGS_TOLD:,} more warnings are in {out / 'summary.json'}")
+    if len(warnings) > LISTED_WARNINGS:
+        print(f"{len(warnings) - LISTED_WARNINGS:,} more warnings are in {out / 'summary.json'}")
     print(f"{summary['timings_s']['total']:.0f} s, peak memory {summary['peak_memory_mib']:.0f} MiB")
     print(f"report: {out / 'report.html'}")
 
 
-def tell_demo(summary: dict[str, Any], out: Path) -> None:
-    """Say what came of the demonstration."""
+def print_demo(summary: dict[str, Any], out: Path) -> None:
+    """Print the error of the demonstration against the simulated flow, and the result of its run."""
     truth = summary["demo"]
     print(
         f"against the simulated flow: mean error {truth['mean_error_voxel']:.2f} voxel, "
         f"where displacements reach {truth['largest_displacement_voxel']:.2f} voxel"
     )
-    tell_run(summary, out)
+    print_run(summary, out)
 
 
-def tell_case(key: str, result: dict[str, Any]) -> None:
-    """Say what a case of `lfpiv reproduce` found: ours, the paper's, the goal."""
+def print_case(key: str, result: dict[str, Any]) -> None:
+    """Print the result of a case of `lfpiv reproduce` beside the paper's value and the goal."""
     print(f"{key}: {result['title']}")
     for row in result["comparison"]:
         ours, paper = (
@@ -171,8 +177,8 @@ def tell_case(key: str, result: dict[str, Any]) -> None:
         print(f"  {row['what']}: {ours}{unit}, paper {paper}{goal}", flush=True)
 
 
-def tell_calibration(summary: dict[str, Any]) -> None:
-    """Say one line per camera."""
+def print_calibration(summary: dict[str, Any]) -> None:
+    """Print one line per camera."""
     for name, figures in summary["calibration"].items():
         print(
             f"{name}: {figures['dots_found']} of {figures['dots_expected']} dots, "
@@ -181,19 +187,19 @@ def tell_calibration(summary: dict[str, Any]) -> None:
         )
 
 
-def tell_vectors(summary: dict[str, Any], out: Path) -> None:
-    """Say one line per pair, of the first ones."""
+def print_vectors(summary: dict[str, Any], out: Path) -> None:
+    """Print one line per pair, up to `LISTED_PAIRS`."""
     pairs = summary["pairs"]
-    for pair in pairs[:PAIRS_TOLD]:
+    for pair in pairs[:LISTED_PAIRS]:
         print(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.0f} % valid vectors")
-    if len(pairs) > PAIRS_TOLD:
+    if len(pairs) > LISTED_PAIRS:
         print(f"{len(pairs)} pairs in all, {100 * summary['valid_fraction']:.0f} % valid vectors on average")
 
 
-def tell_failed(summary: dict[str, Any], where: TextIO) -> None:
-    """Name the pairs that failed, and count those that failed earlier and were not tried now."""
+def print_failed(summary: dict[str, Any], where: TextIO) -> None:
+    """List the pairs that failed, and print the number of pairs that failed in earlier runs and were not repeated."""
     failed = failed_now(summary)
-    for item in failed[:PAIRS_TOLD]:
+    for item in failed[:LISTED_PAIRS]:
         print(f"failed: pair {item['pair']}: {item['reason']}", file=where)
     total, earlier = summary["experiment"]["pairs"], len(summary["failed"]) - len(failed)
     if failed:
@@ -203,5 +209,5 @@ def tell_failed(summary: dict[str, Any], where: TextIO) -> None:
 
 
 def failed_now(summary: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the entries of the pairs that failed in the invocation which a summary is of."""
+    """Return the entries of the pairs that failed in this run."""
     return [item for item in summary["failed"] if not item.get("earlier")]

@@ -1,1 +1,1 @@
-"""The experiment file and the images it names, read and checked before any work."""
+"""Read and check the experiment file and the images that it names."""

@@ -1,8 +1,8 @@
-"""Images of LaVision's DaVis (.im7, .imx), read by LaVision's own library, which the extra ``davis`` installs.
+"""Read images of LaVision's DaVis (.im7, .imx) with LaVision's library lvpyio, which the extra ``davis`` installs.
 
-A DaVis buffer may hold several frames: both exposures of a pair, and several cameras. Which one is meant is said behind
-the file's name: ``B00001.im7#0`` is the first frame, ``B00001.im7#1.0`` the first exposure of the second camera in a
-buffer of double frames (frame 2 * 1 + 0). A buffer of a single frame needs no number.
+A DaVis buffer may hold several frames: both exposures of a pair, and several cameras. A number behind the file's name
+selects one: ``B00001.im7#0`` is the first frame, ``B00001.im7#1.0`` the first exposure of the second camera in a buffer
+of double frames (frame 2 * 1 + 0). A buffer of one frame needs no number.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ import numpy as np
 from lfpiv.errors import InputError
 
 SUFFIXES = (".im7", ".imx")
-"""Files of images."""
+"""Suffixes of image files."""
 VECTOR_SUFFIXES = (".vc7", ".vec")
-"""Files of vectors, which hold no image."""
+"""Suffixes of vector files."""
 
 _FRAME = re.compile(r"(?:(?P<camera>\d+)\.)?(?P<frame>\d+)")
 
 
 class NotOneImage(Exception):
-    """The file holds something else than one single-channel image; the text says what."""
+    """The file holds something other than one single-channel image, which the text names."""
 
 
 def split_frame(path: Path) -> tuple[Path, str]:
-    """Split what names an image into its file and the frame in it, "" where none is named.
+    """Split the path of an image into its file and the frame in it, "" where no frame is named.
 
     Examples
     --------
@@ -47,14 +47,14 @@ def split_frame(path: Path) -> tuple[Path, str]:
 
 
 def check(path: Path, place: str) -> None:
-    """Check what can be known of a DaVis image without decoding the buffer, all frames of which are decoded together.
+    """Check a DaVis image without decoding it: a buffer is decoded with all its frames.
 
     Raises
     ------
     InputError
         If the extra ``davis`` is missing.
     NotOneImage
-        If what is named behind ``#`` can be no frame.
+        If the text behind ``#`` cannot name a frame.
     ValueError
         If the file is empty.
     """
@@ -73,19 +73,19 @@ def read(path: Path, place: str) -> np.ndarray:
     path : Path
         The file, with the frame behind ``#`` where it holds several.
     place : str
-        What the image is, for messages.
+        Name of the image in messages.
 
     Returns
     -------
     ndarray, shape (rows, columns)
-        Grey values [counts], of the type they are stored in unless the buffer scales them.
+        Grey values [counts], of the stored type unless the buffer scales them.
 
     Raises
     ------
     InputError
         If the extra ``davis`` is missing.
     NotOneImage
-        If there is no such frame, or it is no single image of grey values.
+        If there is no such frame, or it is not one image of grey values.
     """
     file, fragment = split_frame(path)
     library = _library(place)
@@ -97,7 +97,7 @@ def read(path: Path, place: str) -> np.ndarray:
         raise NotOneImage(f"frame {number} without pixels, such as a vector field")
     if str(frame.attributes.get("RGBFrame", "0")) != "0":
         raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
-    masked = [int(np.size(mask) - np.count_nonzero(mask)) for mask in frame.masks]  # 1: a pixel that counts
+    masked = [int(np.size(mask) - np.count_nonzero(mask)) for mask in frame.masks]  # 1 marks a valid pixel
     if any(masked):
         raise NotOneImage(f"an image with {sum(masked)} masked pixels; save it as it was recorded")
     planes = frame.components["PIXEL"].planes
@@ -124,12 +124,12 @@ def _library(place: str) -> Any:
 
 @functools.lru_cache(maxsize=1)
 def _buffer(library: Any, file: str, changed_ns: int, size: int) -> Any:
-    """Read a buffer; the frames of one file are asked for one after the other, so the last one is kept."""
+    """Read a buffer; the last one is cached because the frames of a file are read one after the other."""
     return library.read_buffer(file)
 
 
 def _named_frame(fragment: str) -> int | None:
-    """Turn what is named behind ``#`` into the number of a frame; None where nothing is."""
+    """Return the number of the frame that the text behind ``#`` names; None for no text."""
     if not fragment:
         return None
     match = _FRAME.fullmatch(fragment)
@@ -143,7 +143,7 @@ def _named_frame(fragment: str) -> int | None:
 
 
 def _frame_number(fragment: str, count: int) -> int:
-    """Return the number of the frame that is named behind ``#`` in a buffer of `count` frames."""
+    """Return the number of the named frame in a buffer of `count` frames."""
     number = _named_frame(fragment)
     if number is None:
         if count == 1:

@@ -1,4 +1,4 @@
-"""The experiment file: TOML to a frozen value, everything it names checked before any work."""
+"""Open an experiment file: a TOML file in, a frozen `Experiment` out, with all its keys and images checked."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
 
 DECODED_PIXELS = 100_000_000
-"""Particle images decoded before the work starts [pixel], in order; the others are checked by header and length."""
+"""Particle images that are decoded before the work starts [pixel]; of the others only header and length are checked."""
 
 MICROLENS_SHARE = 0.2
-"""Largest focal length of the microlenses over the main lens's image distance; more is a slip in a unit."""
+"""Largest focal length of the microlenses over the main lens's image distance; more is a wrong unit."""
 
 FEWEST_LENSES = 3
-"""Microlenses a sensor must hold along each axis; fewer are a slip in the pitch or the pixel."""
+"""Least number of microlenses along each axis of a sensor; fewer are a wrong pitch or pixel size."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSetup:
-    """One camera: its name, nominal optics and white and dark image."""
+    """One camera of an experiment: its nominal optics, white image and dark image."""
 
     name: str
     optics: Optics
     """Nominal optics; ``sensor_shape`` is that of the white image."""
     nominal_angle_deg: float
-    """Angle about y [degree]; names the board's dots and serves the thin-lens mapping, never the network."""
+    """Angle about y [degree]; it names the board's dots and enters the thin-lens mapping, never the network."""
     image_flip: str
-    """How the camera's images are mirrored; undone on reading."""
+    """Mirroring of the camera's images, reversed on reading."""
     white_path: Path
     dark_path: Path | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """An experiment whose files exist and fit each other. Made by `open_experiment`."""
+    """An experiment with checked settings and images. Made by `open_experiment`."""
 
     path: Path
     name: str
@@ -76,65 +76,65 @@ class Experiment:
     """Path pattern of the particle images, relative to the experiment file."""
 
     def camera(self, name: str) -> CameraSetup:
-        """Return the camera called `name`; ValueError names the known ones."""
+        """Return the camera of that name; raise ValueError for an unknown name."""
         for camera in self.cameras:
             if camera.name == name:
                 return camera
         raise ValueError(f"camera: expected one of {', '.join(c.name for c in self.cameras)}, got {name!r}.")
 
     def white(self, name: str) -> np.ndarray:
-        """White image of a camera, float32 (rows, columns), dark not subtracted."""
+        """Return the white image of a camera [counts], dark image not subtracted, float32 (rows, columns)."""
         camera = self.camera(name)
         return _read(camera.white_path, f"white_image of camera {name!r}", camera)
 
     def dark(self, name: str) -> np.ndarray | None:
-        """Dark image of a camera, float32 (rows, columns), or None where the file names none."""
+        """Return the dark image of a camera [counts], float32 (rows, columns), or None where the file names none."""
         camera = self.camera(name)
         if camera.dark_path is None:
             return None
         return _read(camera.dark_path, f"dark_image of camera {name!r}", camera)
 
     def board_image(self, name: str, plane: int) -> np.ndarray:
-        """Board image of a camera at plane number `plane`, float32 (rows, columns)."""
+        """Return the board image of a camera at a plane [counts], float32 (rows, columns)."""
         return _read(self.board_path(name, plane), _board_label(name, plane), self.camera(name))
 
     def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
-        """Particle image of a camera, float32 (rows, columns); InputError where it is no such image, or even."""
+        """Return a particle image [counts], float32 (rows, columns); raise InputError if it has no contrast."""
         label, path = _particle_label(name, pair, frame), self.particle_path(name, pair, frame)
         image = _read(path, label, self.camera(name))
         images.require_contrast(image, path, label)
         return image
 
     def board_path(self, name: str, plane: int) -> Path:
-        """Path of a board image."""
+        """Return the path of a board image."""
         return self.path.parent / self.board.images.format(camera=name, plane=plane)
 
     def particle_path(self, name: str, pair: int, frame: str) -> Path:
-        """Path of a particle image."""
+        """Return the path of a particle image."""
         return self.path.parent / self.particle_images.format(camera=name, pair=pair, frame=frame)
 
     def calibration_paths(self) -> list[Path]:
-        """All images the calibration reads, in a fixed order."""
+        """Return the paths of all images that the calibration reads, in a fixed order."""
         paths = [path for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
         return paths + [self.board_path(c.name, p) for c in self.cameras for p in range(len(self.board.planes_mm))]
 
     @property
     def self_calibration_pairs(self) -> list[int]:
-        """Pairs whose particles tell how the cameras stand: as many as asked for, evenly spread."""
+        """Pairs used by the self-calibration, evenly spread over all."""
         count = min(self.self_calibration.pairs, self.pairs)
         return [(2 * number + 1) * self.pairs // (2 * count) for number in range(count)]
 
     def pair_paths(self, pair: int) -> list[Path]:
-        """All images of one pair, in a fixed order."""
+        """Return the paths of all images of one pair, in a fixed order."""
         return [self.particle_path(camera.name, pair, frame) for frame in self.frames for camera in self.cameras]
 
 
 def open_experiment(path: str | Path) -> Experiment:
-    """Read an experiment file and check everything it says and names, before any work.
+    """Read an experiment file and check all its keys and images.
 
-    White, dark and board images are decoded, and particle images up to `DECODED_PIXELS`; of the others the header and
-    the length are checked, of DaVis images only that they are there. `lfpiv.run` asks less: there only the first pair
-    must be whole, see `check_pairs`.
+    White, dark and board images are decoded, and particle images up to `DECODED_PIXELS`. Of the other particle images
+    the header and the length are checked; DaVis images must exist. `lfpiv.run` checks the particle images by
+    `check_pairs` instead and continues without damaged pairs.
 
     Parameters
     ----------
@@ -148,8 +148,8 @@ def open_experiment(path: str | Path) -> Experiment:
     Raises
     ------
     InputError
-        If a key is unknown, missing or out of range, an image is missing, damaged, or does not fit the others, or the
-        nominal cameras certainly see nothing of the volume.
+        If a key is unknown, missing or out of range, if an image is missing, damaged, or does not fit the others, or
+        if a nominal camera certainly sees nothing of the volume.
     """
     experiment = read_experiment(path)
     for _, reason in check_pairs(experiment, range(experiment.pairs)):
@@ -158,7 +158,7 @@ def open_experiment(path: str | Path) -> Experiment:
 
 
 def read_experiment(path: str | Path) -> Experiment:
-    """Read and check an experiment as `open_experiment` does, all but its particle images."""
+    """Read and check an experiment as `open_experiment` does, without its particle images."""
     path = Path(path)
     table = read_toml(path, ExperimentTable)
     names = [camera.name for camera in table.camera]
@@ -200,21 +200,21 @@ def read_experiment(path: str | Path) -> Experiment:
 
 
 def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:
-    """Check the particle images of some pairs; yield each pair that cannot be used, and why.
+    """Check the particle images of some pairs; yield each damaged pair with the reason.
 
     Parameters
     ----------
     experiment : Experiment
         From `read_experiment`.
     pairs : sequence of int
-        Pairs to check: decoded up to `DECODED_PIXELS`, the first one at any rate; the others by header and length (a
-        DaVis image must be there).
+        Pairs to check. The first is decoded, and the following up to `DECODED_PIXELS`; of the others the header and the
+        length are checked (a DaVis image must exist).
 
     Yields
     ------
     pair : int
     reason : str
-        Names the file, what was expected, what was found.
+        Message with the file, what was expected and what was found.
     """
     decoded = 0
     for number, pair in enumerate(pairs):
@@ -233,7 +233,7 @@ def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[
 
 
 def _check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any]) -> None:
-    """Refuse a path pattern that cannot be filled in, or that names one file for several images."""
+    """Refuse a path pattern with unknown fields, or with one path for several images."""
     known = ", ".join("{" + name + "}" for name in fields)
     try:
         used = {name for _, name, _, _ in string.Formatter().parse(pattern) if name is not None}
@@ -318,7 +318,7 @@ def _white_shape(path: Path, label: str) -> tuple[int, int]:
 
 
 def _check_calibration_images(experiment: Experiment) -> None:
-    """Check that every image of the calibration is there, fits its camera's white image and can be decoded."""
+    """Check that every image of the calibration exists, has its camera's shape and can be decoded."""
     for camera in experiment.cameras:
         if camera.dark_path is not None:
             _check_shape(camera.dark_path, f"dark_image of camera {camera.name!r}", camera)
@@ -340,7 +340,7 @@ def _check_calibration_images(experiment: Experiment) -> None:
 
 
 def _read(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
-    """Read an image of a camera, its mirroring undone; refused where it is of another shape than the white image."""
+    """Read an image of a camera and reverse its mirroring; refuse another shape than the white image's."""
     image = images.read_image(path, label, flip=camera.image_flip)
     _require_shape(image.shape, path, label, camera)
     return image
@@ -349,7 +349,7 @@ def _read(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
 def _check_shape(path: Path, label: str, camera: CameraSetup) -> None:
     """Refuse an image that is missing, damaged, or of another shape than its camera's white image.
 
-    A DaVis image must be there; what is in it is checked where it is decoded.
+    A DaVis image must exist; its content is checked when it is decoded.
     """
     header = images.read_header(path, label)
     if header is not None:

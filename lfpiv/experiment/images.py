@@ -1,4 +1,4 @@
-"""Single-channel camera images: headers checked without decoding, pixels read as float32."""
+"""Read single-channel camera images (TIFF, PNG, DaVis) as float32, and check their headers without decoding them."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ FLIPS = {
     "vertical": (slice(None, None, -1), slice(None)),
     "both": (slice(None, None, -1), slice(None, None, -1)),
 }
-"""Index that undoes each ``image_flip``: horizontal mirrors left and right."""
+"""Index that reverses each ``image_flip``; "horizontal" exchanges left and right."""
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
 class Header:
-    """What an image file says about itself."""
+    """Header of an image file."""
 
     shape: tuple[int, int]
     """(rows, columns)."""
@@ -37,20 +37,20 @@ class Header:
 
 
 def read_header(path: Path, label: str) -> Header | None:
-    """Check an image file as far as that goes without decoding its pixels.
+    """Check an image file without decoding its pixels.
 
     Parameters
     ----------
     path : Path
         A TIFF, PNG or DaVis image (see `lfpiv.experiment.davis`).
     label : str
-        What the file is, for messages: the key and the camera it belongs to.
+        Key and camera of the file, for messages.
 
     Returns
     -------
     Header or None
-        None for a DaVis image, which says nothing of itself before it is decoded: all that is known then is that it
-        is there, holds something, and can be decoded on this machine.
+        None for a DaVis image, which has no header that can be read separately. Then only the file's existence, its
+        length and the library that decodes it are checked.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def read_image(path: Path, label: str, *, flip: str = "none") -> np.ndarray:
     path, label
         As for `read_header`.
     flip : {"none", "horizontal", "vertical", "both"}
-        Mirroring to undo.
+        Mirroring to reverse.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def read_image(path: Path, label: str, *, flip: str = "none") -> np.ndarray:
     Raises
     ------
     InputError
-        If the file is unusable (see `read_header`), cannot be decoded, or holds numbers that are not finite.
+        If `read_header` refuses the file, or it cannot be decoded or holds values that are not finite.
     """
     header = read_header(path, label)
     place = f"{path} ({label})"
@@ -113,7 +113,7 @@ def read_image(path: Path, label: str, *, flip: str = "none") -> np.ndarray:
 
 
 def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
-    """Refuse an image that holds one value everywhere, such as an all-black one.
+    """Refuse an image with the same value everywhere, such as an all-black one.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
 
 @contextlib.contextmanager
 def _naming(place: str) -> Iterator[None]:
-    """Turn whatever a decoder raises into one message about the file."""
+    """Turn all exceptions of a decoder into an `InputError` that names the file."""
     try:
         yield
     except InputError:
@@ -137,7 +137,7 @@ def _naming(place: str) -> Iterator[None]:
         raise InputError(f"{place}: expected one single-channel image, found {error}.") from None
     except PermissionError:
         raise InputError(f"{place}: the file may not be read. Change its permissions.") from None
-    except Exception as error:  # decoders raise anything on damaged files
+    except Exception as error:  # decoders raise exceptions of many types on damaged files
         text = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
             f"{place}: expected a complete image file, found a truncated or damaged one ({text}). Copy it again."

@@ -1,4 +1,7 @@
-"""The tables of an experiment file: every key, its range and its default, in one place."""
+"""Tables of the experiment file as frozen models: every key with its range, its default and one sentence.
+
+The pages of settings show these sentences (`docs/_ext/tables.py`).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-# Text where a number belongs is refused, and so is `true`; an integer is a good number. TOML's lists become tuples.
+# Strict types refuse text and `true` in place of a number; an integer is a number. TOML's lists become tuples.
 Number = Annotated[float, Field(strict=True)]
 Whole = Annotated[int, Field(strict=True)]
 Positive = Annotated[float, Field(strict=True, gt=0)]
@@ -14,129 +17,129 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 Flag = Annotated[bool, Field(strict=True)]
 
 SMALLEST_WINDOW = 4
-"""Smallest edge of an interrogation window [voxel]; smaller ones hold no peak."""
+"""Smallest edge of an interrogation window that holds a correlation peak [voxel]."""
 
 Edge = Annotated[int, Field(strict=True, ge=SMALLEST_WINDOW)]
 Window = Edge | tuple[Edge, Edge, Edge]
 
 
 class Table(BaseModel):
-    """A table of the experiment file: frozen, unknown keys and infinite numbers refused."""
+    """Base of all tables: frozen, refuses unknown keys and infinite numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Smart(Table):
-    """Table ``[smart]``: the reconstruction (Eq. 5)."""
+    """Table ``[smart]``: settings of the reconstruction (Eq. 5)."""
 
     iterations: Count = 40
-    """Largest number of SMART iterations; `tolerance` usually ends them sooner."""
+    """Largest number of SMART iterations; `tolerance` usually stops them earlier."""
     relaxation: Annotated[float, Field(strict=True, gt=0, le=3)] = 1.0
-    """Relaxation mu of Eq. 5. Values near 3 diverge."""
+    """Relaxation mu of Eq. 5; values near 3 diverge."""
     normalisation: Literal["column", "paper"] = "column"
-    """Exponent divided by the voxel's column sum, or Eq. 5 as printed with weights scaled to a maximum of 1."""
+    """Exponent of Eq. 5: divided by the voxel's column sum, or as printed with weights scaled to a maximum of 1."""
     accelerate: Flag = True
-    """Nesterov's momentum in the volume's logarithm: the same limit in fewer iterations; the misfit never rises."""
+    """Whether Nesterov's momentum in the volume's logarithm reduces the number of iterations to the same limit."""
     smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
-    """Standard deviation of the Gaussian smoothing after each iteration [voxel]; 0 switches it off."""
+    """Standard deviation of a Gaussian smoothing of the volume after each iteration [voxel]; 0 switches it off."""
     floor_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1
-    """Least noise floor, as a share of the images' brightness; 0 takes the measured noise as it is."""
+    """Lower limit of the noise floor, as a share of the images' brightness; 0 takes the measured noise."""
     sieve_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] | Literal["auto"] = "auto"
-    """Standard deviation of the Gaussians that the volume is a sum of [voxel]; 0 for voxels of any brightness, "auto"
-    for what suits the particles, whose size the images tell: 0 where they are smaller than voxels."""
+    """Standard deviation of the Gaussians that make up the volume [voxel]; 0 lets voxels vary freely, "auto" takes the
+    particles' size from the images, or 0 where particles are smaller than voxels."""
     active_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
-    """Voxels below this share of the first guess's brightest are left out; 0 keeps all."""
+    """Share of the first guess's maximum below which voxels are left out; 0 keeps all."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
-    """Stop when an iteration lowers the misfit, a divergence, by less than this fraction; 0 runs all iterations."""
+    """Relative decrease of the misfit per iteration below which SMART stops; 0 runs all iterations."""
     motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
-    """How often the motion is measured and both frames reconstructed anew from what they share along it: errors of
-    displacement are smaller by about a sixth, and a wrong motion draws vectors along, which the uncertainty then tells.
-    0: each frame by itself."""
+    """Number of times the motion is measured and both frames are reconstructed again with the light they share along
+    it; 0 reconstructs each frame separately."""
 
     def of_one_frame(self) -> dict[str, Any]:
-        """Return the settings of `lfpiv.reconstruct`, which knows one frame only."""
+        """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame."""
         return self.model_dump(exclude={"motion_passes"})
 
 
 class Correlation(Table):
-    """Table ``[correlation]``: volumes to vectors."""
+    """Table ``[correlation]``: settings of the cross-correlation."""
 
     windows: Annotated[tuple[Window, ...], Field(min_length=1)] | None = None
-    """Window of each pass [voxel], one edge or (z, y, x); absent: ``vectors.DEFAULT_WINDOWS``, cut to the volume."""
+    """Window of each pass, one edge or (z, y, x) [voxel]; absent: 32, 16, 12, 12, cut to the volume."""
     overlap: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.5
     """Fraction by which neighbouring windows overlap."""
     max_displacement_voxel: Positive | None = None
-    """Largest displacement the first pass looks for [voxel]; absent: a quarter of its window."""
+    """Largest displacement that the first pass searches [voxel]; absent: a quarter of its window."""
     smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.5
-    """Standard deviation of a Gaussian applied to the volumes before correlation [voxel], less what SMART's sieve has
-    smoothed; 0 switches it off."""
+    """Standard deviation of a Gaussian applied to the volumes before correlation, SMART's sieve included [voxel]; 0
+    switches it off."""
     intensity_power: Annotated[float, Field(strict=True, gt=0, le=2)] = 0.5
-    """Power of the volumes' intensities that is correlated, after smoothing; 1 takes them as they are."""
+    """Exponent applied to the smoothed volumes' intensities before correlation; 1 leaves them unchanged."""
 
 
 class Network(Table):
-    """Table ``[network]``: the mapping of Eqs. 6-7 and the labels it is trained on."""
+    """Table ``[network]``: settings of the mapping of Eqs. 6-7 and of its labels."""
 
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (20,)
-    """Nodes of each hidden layer."""
+    """Number of nodes of each hidden layer."""
     epochs: Count = 300
-    """Largest number of training epochs; early stopping usually ends sooner."""
+    """Largest number of training epochs; early stopping usually ends the training earlier."""
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
-    """Seed of the random split and of the starting weights."""
+    """Seed of the random split of the dots and of the initial weights."""
     estimator: Literal["lens_integral", "gaussian"] = "lens_integral"
-    """Dot centres: a dot integrated over the microlenses, or the Gaussian fit of the paper."""
+    """Fit of the dots: a dot integrated over the microlenses, or the Gaussian of the paper."""
     baseline: Literal["none", "thin_lens"] = "thin_lens"
-    """Mapping the network corrects: nothing, as in the paper, or a thin lens fitted to the same dots, whose pose comes
-    out of the fit: better between the dots, and far better outside the board."""
+    """Mapping that the network corrects: none, as in the paper, or a thin lens fitted to the same dots, which is more
+    accurate between the dots and outside the board."""
 
 
 class Compute(Table):
-    """Table ``[compute]``: where and with how much the work is done."""
+    """Table ``[compute]``: device, threads, memory and form of the weights."""
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device of the kernels; "auto" takes CUDA where there is one."""
+    """Device of the kernels; "auto" takes CUDA where a device is visible."""
     threads: Annotated[int, Field(strict=True, ge=1, le=1024)] | None = None
-    """CPU threads; absent: the cores this process may use."""
+    """Number of CPU threads; absent: the cores available to the process."""
     weights: Literal["footprint", "count"] = "footprint"
-    """Weights integrated over voxel, microlens and pixel, or counted rays (Eq. 10 as printed)."""
+    """Computation of the weights: integrated over voxel, microlens and pixel, or by counted rays (Eq. 10)."""
     weights_form: Literal["auto", "profiles", "pixels"] = "auto"
-    """How footprints are stored: as products of profiles, for straight rays and square microlenses; pixel by pixel, for
-    any optics; "auto": as profiles for each camera where counted rays say that they serve."""
+    """Storage of footprints: products of profiles (straight rays, square microlenses), single pixels (any optics), or
+    for each camera the profiles if they agree with counted rays ("auto")."""
     memory_gib: Positive | None = None
-    """Memory the run may take [GiB]; absent: what the machine has available."""
+    """Memory that the run may use [GiB]; absent: the available memory."""
 
 
 class SelfCalibration(Table):
-    """Table ``[self_calibration]``: correction of the calibration for cameras that moved since the board."""
+    """Table ``[self_calibration]``: correction for cameras that moved after the board was recorded."""
 
     pairs: Annotated[int, Field(strict=True, ge=0)] = 0
-    """Pairs whose first frames tell by their particles how the cameras stand, evenly spread over all; 0: nothing is
-    corrected, and a warning says where it should be."""
+    """Number of pairs, evenly spread, whose particles correct the cameras' poses; 0 corrects nothing and warns of
+    cameras that moved."""
 
 
 class NominalCamera(Table):
-    """Keys of ``[[camera]]`` that a data sheet and the plan of the rig give; scenes of the simulator have them too."""
+    """Nominal keys of ``[[camera]]``, in experiments and in scenes of the simulator."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
-    """Name in file names and messages: letters, digits, '_', '-' and '.'."""
+    """Name of the camera in paths and messages, of letters, digits, '_', '-' and '.'."""
     focal_length_mm: Positive
     """Focal length of the main lens [mm]."""
     magnification: Number
-    """Magnification of the main lens, not 0; the sign does not matter."""
+    """Magnification of the main lens, other than 0, of either sign."""
     f_number: Positive
-    """f-number of the main lens as it was set."""
+    """f-number to which the main lens was set."""
     microlens_pitch_mm: Positive
-    """Distance of neighbouring microlenses [mm]."""
+    """Distance between neighbouring microlenses [mm]."""
     microlens_focal_length_mm: Positive
-    """Focal length of the microlenses [mm]; the sensor lies that far behind them."""
+    """Focal length of the microlenses, equal to their distance from the sensor [mm]."""
     pixel_um: Positive
     """Pixel pitch of the sensor [um]."""
     microlens_layout: Literal["square", "hexagonal"] = "square"
     """Arrangement of the microlenses."""
     nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
-    """Angle of the camera about y, to some ten degrees [degree]: names the board's dots, never enters the mapping."""
+    """Angle of the camera about y, correct to about 10, which names the board's dots but never enters the mapping
+    [degree]."""
     image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
-    """How the camera's images are mirrored."""
+    """Mirroring of the camera's images."""
 
     @field_validator("magnification")
     @classmethod
@@ -147,27 +150,27 @@ class NominalCamera(Table):
 
 
 class CameraTable(NominalCamera):
-    """Table ``[[camera]]``: nominal optics and images of one camera."""
+    """Table ``[[camera]]``: nominal optics and calibration images of one camera."""
 
     white_image: Annotated[str, Field(min_length=1)]
-    """Path of an image of an evenly lit white surface, which shows every microlens."""
+    """Path of an image of an evenly lit white surface."""
     dark_image: Annotated[str, Field(min_length=1)] | None = None
-    """Path of an image with the lens capped; absent: the gaps between the microimages give the dark level."""
+    """Path of an image with the lens capped; absent: the gaps between microimages give the dark level."""
 
 
 class Board(Table):
-    """Table ``[board]``: the dot board and the depths it was recorded at."""
+    """Table ``[board]``: the dot board and the depths of its planes."""
 
     dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
-    """Dots along x and y."""
+    """Number of dots along x and y."""
     spacing_mm: Positive
-    """Distance of neighbouring dots [mm]."""
+    """Distance between neighbouring dots [mm]."""
     dot_diameter_mm: Positive
-    """Diameter of a dot [mm]."""
+    """Diameter of a dot, less than their distance [mm]."""
     planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
-    """Depth z of each plane [mm]."""
+    """Depth z of each plane, all different [mm]."""
     images: Annotated[str, Field(min_length=1)]
-    """Path with ``{camera}`` and ``{plane}``, planes counted from 0."""
+    """Path of the board images with ``{camera}`` and ``{plane}``; planes count from 0."""
 
     @field_validator("planes_mm")
     @classmethod
@@ -184,12 +187,12 @@ class Board(Table):
 
 
 class Volume(Table):
-    """Table ``[volume]``: the grid to reconstruct on; (x, y, z) order."""
+    """Table ``[volume]``: the voxel grid, in the order (x, y, z)."""
 
     centre_mm: tuple[Number, Number, Number]
     """Centre (x, y, z) of the volume [mm]."""
     size_mm: tuple[Positive, Positive, Positive]
-    """Size (x, y, z) of the volume [mm]; at least 4 voxels along each axis."""
+    """Size (x, y, z) of the volume, at least 4 voxels along each axis [mm]."""
     voxel_mm: Positive
     """Edge of a voxel [mm]."""
 
@@ -198,11 +201,11 @@ class Particles(Table):
     """Table ``[particles]``: the image pairs."""
 
     images: Annotated[str, Field(min_length=1)]
-    """Path with ``{camera}``, ``{pair}`` and ``{frame}``, pairs counted from 0."""
+    """Path of the particle images with ``{camera}``, ``{pair}`` and ``{frame}``; pairs count from 0."""
     pairs: Count
     """Number of image pairs."""
     frames: tuple[Annotated[str, Field(min_length=1)], Annotated[str, Field(min_length=1)]] = ("a", "b")
-    """What ``{frame}`` stands for in the first and in the second image of a pair."""
+    """Text for ``{frame}`` in the first and second image of a pair."""
 
     @field_validator("frames")
     @classmethod
@@ -213,10 +216,10 @@ class Particles(Table):
 
 
 class ExperimentTable(Table):
-    """The whole file."""
+    """The whole experiment file."""
 
     name: Annotated[str, Field(min_length=1)]
-    """Title of the report."""
+    """Name of the experiment, title of its report."""
     dt_s: Positive
     """Time between the two frames of a pair [s]."""
     camera: Annotated[tuple[CameraTable, ...], Field(min_length=1)]

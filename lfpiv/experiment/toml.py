@@ -1,4 +1,4 @@
-"""TOML files into frozen models, with messages that name the key, what was expected and what was found."""
+"""Read TOML files into frozen models; messages name the key, what was expected and what was found."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def read_toml(path: Path, model: type[Model]) -> Model:
     Raises
     ------
     InputError
-        If the file cannot be read, is no TOML, or does not fit the model; the first problem in words, the keys of the
-        others by name.
+        If the file cannot be read, is not TOML, or does not fit the model. The message explains the first problem and
+        names the keys of the others.
     """
     try:
-        text = path.read_text("utf-8-sig")  # editors on Windows like to put a byte order mark first
+        text = path.read_text("utf-8-sig")  # editors on Windows may write a byte order mark
     except FileNotFoundError:
         raise InputError(f"{path}: expected a TOML file, found no such file. Check the path.") from None
     except IsADirectoryError:
@@ -68,7 +68,7 @@ def read_toml(path: Path, model: type[Model]) -> Model:
 
 
 def _explain(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> str:
-    # Unknown keys first: a misspelt key often leaves another one missing.
+    # Unknown keys first: a misspelt key is often also reported as missing.
     problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
     keys = list(dict.fromkeys(_key(problem["loc"], values) for problem in problems))
     more = f" Also look at: {', '.join(keys[1:])}." if len(keys) > 1 else ""
@@ -76,7 +76,7 @@ def _explain(error: ValidationError, model: type[BaseModel], values: Mapping[str
 
 
 def _key(location: tuple[int | str, ...], values: Any) -> str:
-    """Name a location in the file: ``camera 'cam1', f_number``, ``smart.iterations`` or ``volume.size_mm[2]``."""
+    """Return the name of a location: ``camera 'cam1', f_number``, ``smart.iterations`` or ``volume.size_mm[2]``."""
     key = ""
     for part in location:
         if isinstance(part, str) and isinstance(values, Mapping):
@@ -86,7 +86,7 @@ def _key(location: tuple[int | str, ...], values: Any) -> str:
             values = values[part] if part < len(values) else None
             name = values.get("name") if isinstance(values, Mapping) else None
             key += f" {name!r}, " if isinstance(name, str) else f"[{part}]"
-        # else: pydantic's tag for one form of a union, which is no key of the file
+        # else: pydantic's tag for one form of a union, which is not a key of the file
     return key.rstrip(", ")
 
 
@@ -136,7 +136,7 @@ def _show(value: Any) -> str:
 
 
 def _nearest(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
-    """Advice for an unknown key: the nearest known one, or all of its table."""
+    """Return advice for an unknown key: the most similar known key, or all keys of its table."""
     for part in location[:-1]:
         if isinstance(part, str) and part in model.model_fields:
             model = _table_of(model.model_fields[part].annotation) or model
@@ -146,7 +146,7 @@ def _nearest(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
 
 
 def _table_of(annotation: Any) -> type[BaseModel] | None:
-    """Find the model inside an annotation such as ``tuple[CameraTable, ...]``."""
+    """Return the model inside an annotation such as ``tuple[CameraTable, ...]``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next(filter(None, map(_table_of, getattr(annotation, "__args__", ()))), None)

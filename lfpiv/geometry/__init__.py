@@ -1,1 +1,1 @@
-"""Optics of a camera, grid of voxels, lattice of lenses: frozen values in millimetres, arrays ordered (z, y, x)."""
+"""Frozen geometry values in millimetres: optics of a camera, lattice of microlenses, grid of voxels."""

@@ -1,4 +1,4 @@
-"""The voxel grid of a volume: a frozen value in millimetres, axes ordered (z, y, x)."""
+"""Voxel grid of a volume, in millimetres, with its axes in the order (z, y, x)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Grid:
     """Centre of voxel (0, 0, 0) [mm], order (z, y, x)."""
 
     def __post_init__(self) -> None:
-        """Check the values: raises ValueError."""
+        """Check the values; raise ValueError."""
         whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 1 for n in self.shape)
         if not (len(self.shape) == 3 and whole):
             raise ValueError(f"shape: expected three whole numbers of voxels >= 1 (z, y, x), got {self.shape}.")
@@ -36,7 +36,14 @@ class Grid:
     def from_extent(
         cls, *, centre_mm: tuple[float, float, float], size_mm: tuple[float, float, float], voxel_mm: float
     ) -> Grid:
-        """Grid of n = round(size / voxel) voxels per axis around a centre; both in the order (x, y, z).
+        """Return a grid around a centre with n = round(size / voxel) voxels per axis.
+
+        Parameters
+        ----------
+        centre_mm, size_mm : (float, float, float)
+            Centre and size of the grid in the order (x, y, z) [mm].
+        voxel_mm : float
+            Voxel edge [mm].
 
         Raises
         ------
@@ -66,15 +73,15 @@ class Grid:
         return math.prod(self.shape)
 
     def axis_mm(self, axis: int) -> np.ndarray:
-        """Voxel centres along one axis (0: z, 1: y, 2: x) [mm]."""
+        """Return the voxel centres along one axis (0: z, 1: y, 2: x) [mm]."""
         return self.first_centre_mm[axis] + self.voxel_mm * np.arange(self.shape[axis])
 
     def centres_mm(self) -> np.ndarray:
-        """All voxel centres in C order of (z, y, x), as (x, y, z) points [mm], shape (voxel, 3)."""
+        """Return all voxel centres (x, y, z), in C order of the axes (z, y, x) [mm], shape (voxel, 3)."""
         z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in range(3)), indexing="ij")
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
     def centre_text(self) -> str:
-        """Return the centre (x, y, z) in words, for messages."""
+        """Return the centre (x, y, z) as text for messages."""
         centre = (round(float(self.axis_mm(axis).mean()), 6) + 0.0 for axis in (2, 1, 0))
         return f"({', '.join(f'{value:g}' for value in centre)}) mm"

@@ -1,4 +1,7 @@
-"""Frozen geometry values: optics, reconstruction grid, microlens lattice. Millimetres; arrays ordered (z, y, x)."""
+"""Nominal optics of a plenoptic camera, and the lattice of its microlens array, in millimetres.
+
+(u, v) is a point on the main lens's pupil, (s, t) a point on the microlens array.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +15,18 @@ LAYOUTS = ("square", "hexagonal")
 
 @dataclass(frozen=True, kw_only=True)
 class Optics:
-    """Nominal optics of one plenoptic camera: what a data sheet says (Table 2 of the paper)."""
+    """Nominal optics of one plenoptic camera, as data sheets state them (Table 2 of the paper)."""
 
     focal_length_mm: float
     """Main lens focal length f [mm]."""
     magnification: float
-    """Main lens magnification M; the sign (inverted image) does not matter here."""
+    """Main lens magnification M, of either sign."""
     f_number: float
     """Main lens f-number N."""
     microlens_pitch_mm: float
     """Microlens pitch p_m [mm]."""
     microlens_focal_length_mm: float
-    """Microlens focal length f_m [mm]; the sensor lies f_m behind the array."""
+    """Microlens focal length f_m, equal to the distance of the sensor behind the array [mm]."""
     pixel_mm: float
     """Pixel pitch [mm]."""
     sensor_shape: tuple[int, int]
@@ -33,12 +36,12 @@ class Optics:
 
     @property
     def object_distance_mm(self) -> float:
-        """Main lens to the focal plane, ``s_o = f (1 + 1/|M|)`` [mm]."""
+        """Distance of the focal plane from the main lens, ``s_o = f (1 + 1/|M|)`` [mm]."""
         return self.focal_length_mm * (1 + 1 / abs(self.magnification))
 
     @property
     def image_distance_mm(self) -> float:
-        """Main lens to the microlens array, ``s_i = f (1 + |M|)`` [mm]."""
+        """Distance of the microlens array from the main lens, ``s_i = f (1 + |M|)`` [mm]."""
         return self.focal_length_mm * (1 + abs(self.magnification))
 
     @property
@@ -62,17 +65,26 @@ class Optics:
         return self.microlens_pitch_mm * (1 + self.sensor_per_pupil) / self.pixel_mm
 
     def sensor_mm(self, position_px: np.ndarray) -> np.ndarray:
-        """Convert (column, row) positions [pixel, integer at a pixel's centre] to sensor millimetres.
+        """Return positions on the sensor [mm] from (column, row) [pixel], whole numbers at the pixels' centres.
 
-        The origin is the centre of the sensor; pixel i spans [i - n/2, i + 1 - n/2] * pixel.
+        The origin is the sensor's centre; pixel i spans [i - n/2, i + 1 - n/2] * pixel.
         """
         rows, columns = self.sensor_shape
         return (np.asarray(position_px, float) + 0.5 - np.array([columns, rows]) / 2) * self.pixel_mm
 
     def sensor_px(self, position_mm: np.ndarray) -> np.ndarray:
-        """Inverse of `sensor_mm`: sensor millimetres to (column, row) [pixel, integer at a pixel's centre]."""
+        """Return (column, row) [pixel] from positions on the sensor [mm]; inverse of `sensor_mm`."""
         rows, columns = self.sensor_shape
         return np.asarray(position_mm, float) / self.pixel_mm + np.array([columns, rows]) / 2 - 0.5
+
+
+def spread_over_pupil(radius_mm: float) -> np.ndarray:
+    """Return points spread evenly over the pupil: the centre and rings of 6, 12 and 18, shape (37, 2) [mm]."""
+    rings = [np.zeros((1, 2))]
+    for ring in (1, 2, 3):
+        angle = (np.arange(6 * ring) + 0.5 * (ring % 2)) * np.pi / (3 * ring)
+        rings.append(ring / 3 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return radius_mm * np.concatenate(rings)
 
 
 def float_pair(values: ArrayLike) -> tuple[float, float]:
@@ -83,13 +95,13 @@ def float_pair(values: ArrayLike) -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class LensLattice:
-    """The microlens array as a lattice in its own plane: lens (i, j) is centred at origin + i basis[0] + j basis[1].
+    """Lattice of a microlens array: lens (i, j) has its centre at origin + i basis[0] + j basis[1].
 
-    A ray belongs to the lens whose centre is nearest.
+    A ray belongs to the lens with the nearest centre.
     """
 
     origin_mm: tuple[float, float]
-    """Centre (s, t) of lens (0, 0) [mm], a lens near the sensor's centre."""
+    """Centre (s, t) of lens (0, 0), a lens near the sensor's centre [mm]."""
     basis_mm: tuple[tuple[float, float], tuple[float, float]]
     """Lattice vectors (s, t) to the neighbours (1, 0) and (0, 1) [mm]; 90 or 60 degrees apart."""
     layout: str = "square"
@@ -97,17 +109,17 @@ class LensLattice:
 
     @property
     def pitch_mm(self) -> float:
-        """Distance between neighbouring lenses, from the area of the lattice's cell [mm]."""
+        """Distance between neighbouring lenses, from the area of a lattice cell [mm]."""
         area = abs(np.linalg.det(np.asarray(self.basis_mm)))
         return float(np.sqrt(area * (2 / np.sqrt(3) if self.layout == "hexagonal" else 1)))
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
-        """Lens centres (s, t) [mm] of lattice indices (i, j), shape (..., 2)."""
+        """Return the lens centres (s, t) of lattice indices (i, j) [mm], shape (..., 2)."""
         centres: np.ndarray = np.asarray(self.origin_mm) + np.asarray(index, float) @ np.asarray(self.basis_mm)
         return centres
 
     def nearest(self, position_mm: np.ndarray) -> np.ndarray:
-        """Lattice index (i, j) of the lens nearest to each position (s, t) [mm], shape (..., 2).
+        """Return the lattice index (i, j) of the lens nearest to each position (s, t) [mm], shape (..., 2).
 
         Examples
         --------

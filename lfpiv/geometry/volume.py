@@ -1,4 +1,4 @@
-"""Points and volumes as a caller hands them to a measure: checked, and with the grid of their voxels."""
+"""Check points and volumes that a user passes to a public function; return plain arrays and the voxel grid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES, Grid
 
-_SPACING_TOLERANCE = 1e-3  # unevenness of coordinates written as float32 decimals, relative to the spacing
+VIEWS = "views"
+"""Name of a volume's coordinate with the number of cameras that see each voxel."""
+
+_SPACING_TOLERANCE = 1e-3  # largest unevenness of coordinates, relative to the spacing
 
 
 def checked_points(points: np.ndarray, name: str) -> np.ndarray:
@@ -24,7 +27,7 @@ def checked_points(points: np.ndarray, name: str) -> np.ndarray:
 
 
 def checked_volume(volume: xr.DataArray | np.ndarray, grid: Grid | None, name: str) -> tuple[np.ndarray, Grid]:
-    """Return a volume's finite values (z, y, x) and its grid, or raise ValueError."""
+    """Return the values (z, y, x) and the grid of a volume, or raise ValueError if a value is not finite."""
     values = np.asarray(volume)
     if values.ndim != 3 or 0 in values.shape or values.dtype.kind not in "fiub":
         raise ValueError(f"{name}: expected a volume of numbers (z, y, x), got {values.dtype} of shape {values.shape}.")
@@ -34,7 +37,7 @@ def checked_volume(volume: xr.DataArray | np.ndarray, grid: Grid | None, name: s
         raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
     if isinstance(volume, xr.DataArray):
         if grid is not None:
-            raise ValueError("grid: expected no value with a DataArray, whose coordinates tell it. Leave it out.")
+            raise ValueError("grid: expected no value with a DataArray, whose coordinates define it. Leave it out.")
         return values, _grid_of(volume, name)
     if grid is None or values.shape != tuple(grid.shape):
         fault = "no grid" if grid is None else f"a grid of shape {grid.shape}"
@@ -43,7 +46,7 @@ def checked_volume(volume: xr.DataArray | np.ndarray, grid: Grid | None, name: s
 
 
 def in_order(volume: xr.DataArray | np.ndarray, name: str) -> xr.DataArray | np.ndarray:
-    """Return a volume as it is, or raise ValueError where its named dimensions are in another order than (z, y, x)."""
+    """Return a volume unchanged, or raise ValueError if its named dimensions have another order than (z, y, x)."""
     if isinstance(volume, xr.DataArray) and volume.dims != AXES:
         raise ValueError(
             f"{name}: expected dims (z, y, x), got ({', '.join(map(str, volume.dims))}). Use .transpose('z', 'y', 'x')."
@@ -52,7 +55,7 @@ def in_order(volume: xr.DataArray | np.ndarray, name: str) -> xr.DataArray | np.
 
 
 def _grid_of(volume: xr.DataArray, name: str) -> Grid:
-    """Grid of a DataArray with coordinates in mm."""
+    """Return the grid of a DataArray with coordinates [mm]."""
     if volume.dims != AXES or any(axis not in volume.coords for axis in AXES):
         raise ValueError(
             f"{name}: expected dims (z, y, x) with coordinates [mm], got {dict(volume.sizes)} with coordinates "
@@ -71,15 +74,11 @@ def _grid_of(volume: xr.DataArray, name: str) -> Grid:
 
 
 def voxel_place(points_mm: np.ndarray, grid: Grid) -> np.ndarray:
-    """Points (x, y, z) [mm] as fractional voxel indices (z, y, x)."""
+    """Return points (x, y, z) [mm] as fractional voxel indices (z, y, x)."""
     place: np.ndarray = (points_mm[:, ::-1] - np.asarray(grid.first_centre_mm)) / grid.voxel_mm
     return place
 
 
-VIEWS = "views"
-"""Coordinate of a volume: how many cameras see each voxel. Volumes without it are seen by two or by the only one."""
-
-
 def is_finite(value: object) -> TypeGuard[float]:
-    """Whether a value is a finite real number."""
+    """Return whether a value is a finite real number."""
     return isinstance(value, numbers.Real) and math.isfinite(value)

@@ -1,6 +1,7 @@
-"""Figures of merit of weights, volumes, particles, dots and vectors, against the truth or against one another.
+"""Figures of merit of weights, volumes, particles, board dots and vectors, compared with the truth or each other.
 
-Equation numbers are the paper's.
+Equation numbers are the paper's. sigma_nor (Eq. 8) is `lfpiv.calibration.network.sigma_nor`, the swirl number (Eq. 17)
+is in `lfpiv.simulation.swirl`.
 """
 
 from lfpiv.metrics.images_and_volumes import DotError, dot_error, reconstruction_quality, relative_l2, weight_ssim

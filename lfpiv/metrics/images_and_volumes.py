@@ -1,8 +1,6 @@
-"""Figures of merit of weights, volumes, particles, dots and vectors, against the truth or against one another.
+"""Quality factor of volumes, similarity of images, and errors of reconstructed board dots.
 
-Equation numbers are the paper's; sigma_nor (Eq. 8) is `lfpiv.calibration.network.sigma_nor`, the swirl number (Eq. 17) belongs to
-the flows. Those about particles live in `lfpiv.metrics.particles`, those about vectors in
-`lfpiv.metrics.vector_fields`; both are reached from here as well.
+Equation numbers are the paper's.
 """
 
 from __future__ import annotations
@@ -19,11 +17,11 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import checked_volume
 
 SSIM_SIGMA = 1.5
-"""Standard deviation of the Gaussian window of the structural similarity [pixel]; it spans 11 x 11 pixels."""
+"""Standard deviation of the Gaussian window of the structural similarity [pixel]."""
 SSIM_WINDOW = 11
-"""Edge of that window [pixel]."""
+"""Edge of the Gaussian window [pixel]."""
 
-_POSITION_TOLERANCE_MM = 1e-4  # coordinates of two volumes that count as the same
+_POSITION_TOLERANCE_MM = 1e-4  # largest difference of equal coordinates
 
 
 # -- volumes and images ------------------------------------------------------------------------------------------------
@@ -32,19 +30,19 @@ _POSITION_TOLERANCE_MM = 1e-4  # coordinates of two volumes that count as the sa
 def reconstruction_quality(
     volume: xr.DataArray | np.ndarray, truth: xr.DataArray | np.ndarray, *, zero_mean: bool = False
 ) -> float:
-    """Quality factor Q of a reconstruction (Elsinga et al. 2006 [1]_, whose definition the paper uses).
+    """Compute the quality factor Q of a reconstruction, defined by Elsinga et al. 2006 [1]_ and used by the paper.
 
-    Q = sum(E E0) / sqrt(sum(E^2) sum(E0^2)) over all voxels, E the reconstruction and E0 the truth: 1 for proportional
-    volumes, insensitive to the scale of either. With `zero_mean` both have their mean subtracted first (the correlation
-    coefficient, -1 to 1), which a uniform haze does not improve; for sparse particles the two nearly agree.
-    Q depends on how large the true particles are drawn: see `truth_volume`.
+    Q = sum(E E0) / sqrt(sum(E^2) sum(E0^2)) over all voxels, with E the reconstruction and E0 the truth. It is 1 for
+    proportional volumes and independent of the scale of either. Q depends on the size of the true particles: see
+    `truth_volume`.
 
     Parameters
     ----------
     volume, truth : DataArray or ndarray, shape (z, y, x)
         Finite intensities on the same voxels.
     zero_mean : bool
-        See above; the paper's figures are without.
+        Subtract the mean of each volume first, which gives the correlation coefficient, -1 to 1. A uniform haze does
+        not raise it. The paper's figures are without. For sparse particles the two nearly agree.
 
     Returns
     -------
@@ -88,7 +86,7 @@ def reconstruction_quality(
 
 
 def relative_l2(image: np.ndarray, reference: np.ndarray) -> float:
-    """Relative L2 difference ||image - reference|| / ||reference||, of weights, images or volumes of any one shape.
+    """Compute the relative L2 difference ||image - reference|| / ||reference|| of two arrays of equal shape.
 
     Raises
     ------
@@ -102,24 +100,24 @@ def relative_l2(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def weight_ssim(first: np.ndarray, second: np.ndarray, *, crop: bool = True) -> float:
-    """Structural similarity of two images of a voxel's weights (Fig. 10), by scikit-image, as Wang et al. 2004 [1]_.
+    """Compute the structural similarity [1]_ of two images of a voxel's weights (Fig. 10) by scikit-image.
 
     Settings: Gaussian window of 1.5 pixel standard deviation (11 x 11), population covariance, K1 = 0.01, K2 = 0.03,
-    data range from 0 to the largest value of both images; mean over the bounding box of the pixels that either lights:
-    the dark rest of a sensor is alike in any two images and would bring every result close to 1. The paper does not
-    tell its settings. Symmetric in the two images and insensitive to their common scale.
+    data range from 0 to the largest value of both images. The paper does not state its settings. The result is the mean
+    over the bounding box of all lit pixels: the dark rest of the sensor is equal in any two images and would bring
+    every result close to 1. It is symmetric in the two images and independent of their common scale.
 
     Parameters
     ----------
     first, second : ndarray, shape (rows, columns)
         Finite weights or counts >= 0.
     crop : bool
-        False takes the mean over all of the image but a border of half a window.
+        Average over the bounding box. False averages over the whole image except a border of half a window.
 
     Returns
     -------
     float
-        At most 1, which means equal.
+        At most 1, for equal images.
 
     Raises
     ------
@@ -137,7 +135,7 @@ def weight_ssim(first: np.ndarray, second: np.ndarray, *, crop: bool = True) -> 
     lit = (first > 0) | (second > 0)
     if not lit.any():
         raise ValueError("first, second: expected some light, got none. Does the camera see the voxel?")
-    if crop:  # zeros are put around an image whose light touches its border
+    if crop:  # pad with zeros in case lit pixels touch the border
         half = SSIM_WINDOW // 2
         ends = [np.flatnonzero(lit.any(1 - axis))[[0, -1]] for axis in (0, 1)]
         box = tuple(slice(int(low), int(high) + 2 * half + 1) for low, high in ends)
@@ -172,22 +170,21 @@ class DotError:
     depth_mean_mm: float
     """Mean over all depth intervals [mm]."""
     found: int
-    """Dots that have a position."""
+    """Number of dots with a position."""
 
 
 def dot_error(positions_mm: np.ndarray, spacing_mm: float, planes_mm: Sequence[float]) -> DotError:
-    """Lateral and depth errors of reconstructed board dots, Eqs. 18 and 19.
+    """Compute lateral and depth errors of reconstructed board dots, Eqs. 18 and 19.
 
-    sigma_l is the mean of ``|l_r - l_t|``, l_r the distance in x and y between a dot and its neighbour along a row or a
-    column, l_t the true spacing; sigma_d the mean of ``|d_r - d_t|``, d_r the separation along z of a dot on adjacent
-    planes, d_t the true interval. Every pair counts once. Being differences, they do not see a shift of all dots. The
-    board is taken to lie parallel to x-y and to move along z, in the order of the planes.
+    sigma_l is the mean of ``|l_r - l_t|``, with l_r the distance in x and y between neighbours along a row or column
+    and l_t the true spacing. sigma_d is the mean of ``|d_r - d_t|``, with d_r the distance along z of a dot on adjacent
+    planes and d_t the true interval. Each pair of dots is used once. A common shift of all dots has no effect. The
+    board is assumed to be parallel to x-y and to move along z, in the order of the planes.
 
     Parameters
     ----------
     positions_mm : ndarray, shape (plane, row, column, 3)
-        Reconstructed dots (x, y, z) [mm], at least 2 x 2 per plane; all NaN for a dot that was not found, which is
-        left out.
+        Reconstructed dots (x, y, z) [mm], at least 2 x 2 per plane. Dots that were not found are NaN in all three.
     spacing_mm : float
         True distance of adjacent dots [mm].
     planes_mm : sequence of float
@@ -200,11 +197,11 @@ def dot_error(positions_mm: np.ndarray, spacing_mm: float, planes_mm: Sequence[f
     Raises
     ------
     ValueError
-        If shapes do not fit, a position is infinite or NaN in part, or no two neighbours were found at all.
+        If shapes do not match, a position is infinite or partly NaN, or no two neighbours were found.
 
     Examples
     --------
-    A board of 3 x 2 dots in two planes, reconstructed 2 % too large and 0.1 mm too far apart:
+    A board of 3 x 2 dots in two planes, 2 % too large and the planes 0.1 mm too far apart:
 
     >>> import numpy as np
     >>> from lfpiv import metrics
@@ -244,7 +241,7 @@ def dot_error(positions_mm: np.ndarray, spacing_mm: float, planes_mm: Sequence[f
 
 
 def _row_means(values: np.ndarray) -> np.ndarray:
-    """Mean of each row without its NaN; NaN where nothing is left."""
+    """Return the mean of each row without NaN; NaN for a row of NaN."""
     count = np.isfinite(values).sum(1)
     means = np.full(len(values), np.nan)
     np.divide(np.nansum(values, axis=1), count, out=means, where=count > 0)

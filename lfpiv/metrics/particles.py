@@ -1,7 +1,8 @@
-"""Particles in a volume: their true image on the grid, the peaks a reconstruction shows, and which of those are ghosts.
+"""Particles in a volume: true particles drawn on a grid, peaks of a reconstruction, and their comparison.
 
-A reconstructed particle is a local maximum of the volume. Figures of merit match those peaks with the true positions.
-Points are (x, y, z) [mm], volumes (z, y, x): DataArrays with coordinates in mm, or ndarrays with a `Grid`.
+A reconstructed particle is a local maximum of the volume. Peaks without a true particle are ghosts. Points are (x, y,
+z) [mm]. Volumes (z, y, x) are DataArrays with coordinates in mm, or ndarrays with a `Grid`. Equation numbers are the
+paper's.
 """
 
 from __future__ import annotations
@@ -17,18 +18,16 @@ from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import checked_points, checked_volume, voxel_place
 
 PEAK_SHARE = 0.1
-"""Threshold of a peak where none is given, as a part of the median brightness found at the true particles. A ghost at a
-tenth of a particle's brightness adds a hundredth of its square to a correlation."""
+"""Default threshold of a peak, as a part of the median brightness at the true particles."""
 
 LOWEST_NEIGHBOUR = 1e-3
-"""Least brightness of a peak's neighbours in the Gaussian fit, as a part of the peak: a single lit voxel then has a
-standard deviation of 0.27 voxel, about that of the voxel itself (1 / sqrt(12) = 0.29)."""
+"""Lower limit of the brightness of a peak's neighbours in the Gaussian fit, as a part of the peak."""
 
 BLOB_REACH = 5.0
-"""Distance at which Gaussian blobs are cut [standard deviations]; 6e-7 of the light lies beyond it along each axis."""
+"""Distance at which Gaussian blobs are cut off [standard deviations]."""
 
-_CHUNK = 1 << 22  # values of blobs that are computed at once
-# neighbours that come before a voxel in storage order: of equal neighbours the first one is the peak
+_CHUNK = 1 << 22  # values of blobs per batch
+# offsets (z, y, x) of the neighbours that come before a voxel in storage order
 _BEFORE = np.array([(z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if (z, y, x) < (0, 0, 0)])
 
 
@@ -42,7 +41,7 @@ class Particles:
     """Brightness of the voxel at the peak [unit of the volume], shape (particle,)."""
     sigma_voxel: np.ndarray
     """Standard deviation of the fitted Gaussian along (x, y, z) [voxel], shape (particle, 3). NaN along an axis where
-    the peak lies in the outermost voxel or its neighbours are as bright as itself."""
+    the peak is in the outermost voxel or both neighbours are as bright as the peak."""
 
     def __len__(self) -> int:
         return len(self.peaks)
@@ -50,7 +49,7 @@ class Particles:
 
 @dataclass(frozen=True, kw_only=True)
 class ParticleQuality:
-    """How well a volume shows the true particles; see `particle_quality`."""
+    """Agreement of the peaks of a volume with the true particles; see `particle_quality`."""
 
     true_count: int
     """True particles inside the grid, n_tr."""
@@ -71,27 +70,26 @@ class ParticleQuality:
     rms_mm: tuple[float, float, float]
     """Root mean square of found minus true position of the pairs along (x, y, z) [mm]; NaN without pairs."""
     elongation: float
-    """Median over the matched peaks of sigma_z / sqrt(sigma_x sigma_y); 1: as long as wide. NaN: none was fitted."""
+    """Median over the matched peaks of sigma_z / sqrt(sigma_x sigma_y), 1 for round particles; NaN without a fit."""
     threshold: float
-    """Brightness above which a peak counts [unit of the volume]."""
+    """Brightness that peaks exceed [unit of the volume]."""
 
 
 def truth_volume(
     positions_mm: np.ndarray, intensities: np.ndarray | float | None, grid: Grid, sigma_voxel: float = 0.7
 ) -> xr.DataArray:
-    """Light of true particles in each voxel of a grid: the truth of the quality factor Q.
+    """Draw true particles on a grid, as the truth of the quality factor Q.
 
-    Each particle is a Gaussian blob, integrated over the voxels, not sampled at their centres: a voxel of the weights
-    (Eq. 10) is a cube that shines evenly, so it stands for the light inside it; a particle's light is then the same
-    wherever it lies between the voxels, down to a point (sigma 0), which lights the voxel it lies in. At 0.7 voxel the
-    two definitions differ by 0.5 % in Q. Particles outside the grid light it with the part that reaches in.
+    Each particle is a Gaussian blob, integrated over each voxel. The light of a particle therefore does not depend on
+    its place between the voxels. With sigma 0 it lights one voxel. Particles outside the grid add the part of their
+    light that reaches in.
 
     Parameters
     ----------
     positions_mm : ndarray, shape (particle, 3)
         Positions (x, y, z) [mm].
     intensities : ndarray of shape (particle,) or float, optional
-        Light of each particle, >= 0; 1 where none is given.
+        Light of each particle, >= 0. Default: 1.
     grid : Grid
         Voxels.
     sigma_voxel : float
@@ -117,30 +115,9 @@ def truth_volume(
     light = np.broadcast_to(light, len(positions_mm))
     if not (np.isfinite(sigma_voxel) and sigma_voxel >= 0):
         raise ValueError(f"sigma_voxel: expected a number >= 0, got {sigma_voxel!r}.")
-    place = voxel_place(positions_mm, grid)
-    reach = int(np.ceil(BLOB_REACH * sigma_voxel + 0.5))
-    offset = np.arange(-reach, reach + 1)
-    shape = np.array(grid.shape)
-    near = ((place > -0.5 - reach) & (place < shape - 0.5 + reach)).all(1)
-    place, light = place[near], light[near]
-    volume = np.zeros(grid.size)
-    step = max(1, _CHUNK // len(offset) ** 3)
-    for first in range(0, len(place), step):
-        part = place[first : first + step]
-        middle = np.floor(part + 0.5).astype(int)
-        shares, indices = [], []
-        for axis in range(3):
-            index = middle[:, axis, None] + offset
-            edges = np.concatenate([index - 0.5, index[:, -1:] + 0.5], axis=1) - part[:, axis, None]
-            below = special.ndtr(edges / sigma_voxel) if sigma_voxel > 0 else (edges > 0).astype(float)
-            inside = (index >= 0) & (index < shape[axis])
-            shares.append(np.diff(below, axis=1) * inside)
-            indices.append(np.where(inside, index, 0))
-        flat = (indices[0][:, :, None, None] * shape[1] + indices[1][:, None, :, None]) * shape[2]
-        blobs = np.einsum("n,nz,ny,nx->nzyx", light[first : first + step], *shares)
-        np.add.at(volume, (flat + indices[2][:, None, None, :]).ravel(), blobs.ravel())
+    volume = _draw_blobs(voxel_place(positions_mm, grid), light, grid.shape, sigma_voxel)
     return xr.DataArray(
-        volume.reshape(grid.shape).astype(np.float32),
+        volume.astype(np.float32),
         dims=AXES,
         coords={name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")},
         name="intensity",
@@ -148,12 +125,36 @@ def truth_volume(
     )
 
 
+def _draw_blobs(place: np.ndarray, light: np.ndarray, shape: tuple[int, int, int], sigma: float) -> np.ndarray:
+    """Add up Gaussian blobs at fractional voxel indices (particle, 3), integrated over each voxel."""
+    reach = int(np.ceil(BLOB_REACH * sigma + 0.5))
+    offset = np.arange(-reach, reach + 1)
+    near = ((place > -0.5 - reach) & (place < np.array(shape) - 0.5 + reach)).all(1)
+    place, light = place[near], light[near]
+    volume = np.zeros(shape)
+    step = max(1, _CHUNK // len(offset) ** 3)
+    for first in range(0, len(place), step):
+        part = place[first : first + step]
+        shares, indices = [], []
+        for axis in range(3):
+            index = np.floor(part[:, axis, None] + 0.5).astype(int) + offset
+            edges = np.concatenate([index - 0.5, index[:, -1:] + 0.5], axis=1) - part[:, axis, None]
+            below = special.ndtr(edges / sigma) if sigma > 0 else (edges > 0).astype(float)
+            inside = (index >= 0) & (index < shape[axis])
+            shares.append(np.diff(below, axis=1) * inside)
+            indices.append(np.where(inside, index, 0))
+        blobs = np.einsum("n,nz,ny,nx->nzyx", light[first : first + step], *shares)
+        z, y, x = indices
+        np.add.at(volume, (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]), blobs)
+    return volume
+
+
 def find_particles(volume: xr.DataArray | np.ndarray, threshold: float, *, grid: Grid | None = None) -> Particles:
     """Find the particles of a volume: local maxima among the 26 neighbours, with sub-voxel positions and widths.
 
-    Along each axis a Gaussian goes through the peak and its two neighbours (three-point fit); of equal neighbours the
-    first in storage order is the peak. Assumes that particles are about as small as a voxel and do not overlap: what
-    merges into one maximum counts once.
+    A three-point Gaussian fit along each axis gives position and width. Of equal neighbours the first in storage order
+    is the peak. Particles are assumed to be about as small as a voxel. Those that merge into one maximum are found as
+    one.
 
     Parameters
     ----------
@@ -176,13 +177,8 @@ def find_particles(volume: xr.DataArray | np.ndarray, threshold: float, *, grid:
     values, grid = checked_volume(volume, grid, "volume")
     if not (np.isfinite(threshold) and threshold >= 0):
         raise ValueError(f"threshold: expected a number >= 0 in the unit of the volume, got {threshold!r}.")
-    highest = ndimage.maximum_filter(values, size=3, mode="nearest")
-    index = np.argwhere((values == highest) & (values > threshold))
-    padded = np.pad(values, 1, constant_values=-np.inf)
-    around = index[:, None] + 1 + _BEFORE
-    index = index[~(padded[tuple(np.moveaxis(around, -1, 0))] == values[tuple(index.T)][:, None]).any(1)]
+    index, padded = _peaks(values, threshold)
     peak = values[tuple(index.T)].astype(float)
-    index, peak = index[np.argsort(-peak, kind="stable")], np.sort(peak)[::-1]
     offset, sigma = np.zeros((len(peak), 3)), np.full((len(peak), 3), np.nan)
     for axis in range(3):
         step = np.eye(3, dtype=int)[axis]
@@ -197,8 +193,18 @@ def find_particles(volume: xr.DataArray | np.ndarray, threshold: float, *, grid:
     return Particles(positions_mm=positions[:, ::-1].copy(), peaks=peak, sigma_voxel=sigma[:, ::-1].copy())
 
 
+def _peaks(values: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the voxel indices (peak, 3) of local maxima, brightest first, and the volume padded by one voxel."""
+    highest = ndimage.maximum_filter(values, size=3, mode="nearest")
+    index = np.argwhere((values == highest) & (values > threshold))
+    padded = np.pad(values, 1, constant_values=-np.inf)
+    before = padded[tuple(np.moveaxis(index[:, None] + 1 + _BEFORE, -1, 0))]
+    index = index[~(before == values[tuple(index.T)][:, None]).any(1)]
+    return index[np.argsort(-values[tuple(index.T)].astype(float), kind="stable")], padded
+
+
 def match_particles(found_mm: np.ndarray, true_mm: np.ndarray, radius_mm: float) -> np.ndarray:
-    """Pair found with true particles one to one: as many pairs as possible, of the least total distance among those.
+    """Match found and true particles one to one: as many pairs as possible, then the least total distance.
 
     Parameters
     ----------
@@ -225,9 +231,9 @@ def match_particles(found_mm: np.ndarray, true_mm: np.ndarray, radius_mm: float)
         return np.empty((0, 2), int)
     rows, inverse = np.unique(near.row, return_inverse=True)
     count = len(rows)
-    # a column of its own lets a particle stay alone, at a price above all distances together; costs must not be zero
-    alone = (count + 1) * 2.0
-    cost = np.concatenate([1 + near.data / radius_mm, np.full(count, 1 + alone)])
+    # one more column per true particle leaves it unmatched, at a cost above the sum of all distances; no cost is zero
+    unmatched = (count + 1) * 2.0
+    cost = np.concatenate([1 + near.data / radius_mm, np.full(count, 1 + unmatched)])
     row = np.concatenate([inverse, np.arange(count)])
     column = np.concatenate([near.col, len(found_mm) + np.arange(count)])
     graph = sparse.csr_array((cost, (row, column)), shape=(count, len(found_mm) + count))
@@ -237,11 +243,11 @@ def match_particles(found_mm: np.ndarray, true_mm: np.ndarray, radius_mm: float)
 
 
 def reconstruction_accuracy(found_mm: np.ndarray, true_mm: np.ndarray, voxel_mm: float) -> float:
-    """R_acc = #VD / (#VD + #ID), Eq. 13: the part of the true particles around which exactly one peak lies.
+    """Compute R_acc = #VD / (#VD + #ID), Eq. 13: the part of the true particles with exactly one peak nearby.
 
-    A valid detection (VD) is a single peak within a chessboard distance of 1 voxel of a true particle, an invalid one
-    (ID) is none or several. Distances are between sub-voxel positions. A true neighbour within that distance makes a
-    detection invalid too, so dense seeding lowers R_acc even of a perfect reconstruction: at n particles per voxel to
+    A detection is valid (VD) if a single peak lies within a chessboard distance of 1 voxel of the true particle, and
+    invalid (ID) if there is none or several. Distances are between sub-voxel positions. The peak of a true neighbour
+    within that distance makes a detection invalid too: with n particles per voxel, a perfect reconstruction reaches
     about exp(-8 n).
 
     Parameters
@@ -277,21 +283,21 @@ def particle_quality(
 ) -> ParticleQuality:
     """Compare the peaks of a reconstructed volume with the true particles: R_acc, R_g, precision, recall and more.
 
-    R_acc and R_g are Eqs. 13 and 14. R_g counts every peak above the threshold, as the paper does: merged particles
-    lower it as ghosts raise it, so precision (1 minus the part of ghosts) and recall tell more. All depend on the
-    threshold, which the paper does not give.
+    R_acc and R_g are Eqs. 13 and 14. R_g counts every peak above the threshold, as the paper does: ghosts raise it and
+    merged particles lower it. Precision (1 minus the part of ghosts) and recall separate the two. All depend on the
+    threshold, which the paper does not state.
 
     Parameters
     ----------
     volume : DataArray or ndarray, shape (z, y, x)
         Reconstruction, finite.
     true_mm : ndarray, shape (particle, 3)
-        True positions (x, y, z) [mm]; those outside the grid are left out.
+        True positions (x, y, z) [mm]. Those outside the grid are ignored.
     grid : Grid, optional
         Voxels of an ndarray.
     threshold : float, optional
-        Brightness that a peak must exceed. Default: `PEAK_SHARE` of the median over the true particles of the brightest
-        of the 27 voxels around each.
+        Brightness that a peak must exceed. Default: `PEAK_SHARE` of the median brightness at the true particles, the
+        brightest of the 27 voxels around each.
     radius_voxel : float
         Largest distance of a matched pair [voxel], > 0.
 
@@ -319,7 +325,7 @@ def particle_quality(
     found = find_particles(values, threshold, grid=grid)
     pairs = match_particles(found.positions_mm, true_mm, radius_voxel * grid.voxel_mm)
     miss = found.positions_mm[pairs[:, 0]] - true_mm[pairs[:, 1]]
-    lost = (np.nan,) * 3
+    unknown = (np.nan,) * 3
     return ParticleQuality(
         true_count=len(true_mm),
         found_count=len(found),
@@ -328,18 +334,18 @@ def particle_quality(
         ghost_ratio=len(found) / len(true_mm),
         precision=len(pairs) / len(found) if len(found) else float("nan"),
         recall=len(pairs) / len(true_mm),
-        bias_mm=tuple(miss.mean(0).tolist()) if len(pairs) else lost,
-        rms_mm=tuple(np.sqrt((miss**2).mean(0)).tolist()) if len(pairs) else lost,
+        bias_mm=tuple(miss.mean(0).tolist()) if len(pairs) else unknown,
+        rms_mm=tuple(np.sqrt((miss**2).mean(0)).tolist()) if len(pairs) else unknown,
         elongation=elongation(found.sigma_voxel[pairs[:, 0]]),
         threshold=threshold,
     )
 
 
 def elongation(sigma_voxel: np.ndarray) -> float:
-    """Length of particles along depth over their width: the median of sigma_z / sqrt(sigma_x sigma_y).
+    """Compute the median of sigma_z / sqrt(sigma_x sigma_y): the length of particles along depth over their width.
 
-    `sigma_voxel` holds widths along (x, y, z), shape (particle, 3), as `Particles` does; rows with a NaN are left out.
-    NaN where none is complete.
+    `sigma_voxel` holds widths along (x, y, z), shape (particle, 3), as in `Particles`. Rows with NaN are ignored. The
+    result is NaN if no row remains.
     """
     sigma_voxel = np.asarray(sigma_voxel, float)
     if sigma_voxel.ndim != 2 or sigma_voxel.shape[1] != 3:

@@ -1,4 +1,4 @@
-"""Displacement fields against the truth.
+"""Errors of displacement fields against the truth, and their distribution.
 
 Arrays are ordered (z, y, x), components (x, y, z). Equation numbers are the paper's.
 """
@@ -13,11 +13,11 @@ import xarray as xr
 from lfpiv.geometry.grid import AXES
 
 PERCENTILES = (50, 75, 90, 95, 99)
-"""Percentiles of the displacement error that are reported."""
+"""Reported percentiles of the displacement error."""
 BELOW_VOXEL = 0.43
-"""The paper's bound of Fig. 14(b): it reports the part of the vectors whose error is smaller [voxel]."""
+"""Bound of Fig. 14(b) [voxel]: the paper reports the part of the vectors with a smaller error."""
 
-_POSITION_TOLERANCE_MM = 1e-4  # coordinates of two vector fields that count as the same
+_POSITION_TOLERANCE_MM = 1e-4  # largest difference of equal coordinates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class DisplacementError:
     below: float
     """Part of the vectors whose error is shorter than `below_voxel`."""
     below_voxel: float
-    """That bound."""
+    """Bound of `below`."""
     bias: tuple[float, float, float]
     """Mean of each component of the error."""
     mean_absolute: tuple[float, float, float]
@@ -49,7 +49,7 @@ class DisplacementError:
 def displacement_difference(
     vectors: xr.Dataset | np.ndarray, truth: xr.Dataset | np.ndarray, *, where: np.ndarray | None = None
 ) -> np.ndarray:
-    """Measured minus true displacement of each vector; the lengths of the rows are sigma_t, Eq. 15.
+    """Compute measured minus true displacement of each vector. The lengths of the rows are sigma_t, Eq. 15.
 
     Parameters
     ----------
@@ -57,9 +57,10 @@ def displacement_difference(
         From `correlate`; or an array (z, y, x, 3) of displacements (x, y, z) [voxel].
     truth : Dataset or ndarray
         The same for the truth: the correlation of the true particles, as in the paper, or the flow itself, averaged
-        over the windows (`lfpiv.simulation.flows.window_mean`) and divided by the voxel edge. Datasets on the same window centres.
+        over the windows (`lfpiv.simulation.flows.window_mean`) and divided by the voxel edge. Two datasets must have
+        the same window centres.
     where : ndarray of bool, shape (z, y, x), optional
-        Vectors that count; default: all, replaced ones included.
+        Vectors to compare. Default: all, including replaced ones.
 
     Returns
     -------
@@ -69,7 +70,7 @@ def displacement_difference(
     Raises
     ------
     ValueError
-        If shapes or window centres differ, or a vector that counts is not finite.
+        If shapes or window centres differ, or a compared vector is not finite.
     """
     fields = [_displacement(vectors, "vectors"), _displacement(truth, "truth")]
     if fields[0].shape != fields[1].shape:
@@ -78,10 +79,10 @@ def displacement_difference(
         for axis in AXES:
             if np.abs(vectors[axis].values - truth[axis].values).max() > _POSITION_TOLERANCE_MM:
                 raise ValueError(f"truth: expected the window centres of the vectors, got others along {axis}.")
-    counted = np.ones(fields[0].shape[:3], bool) if where is None else np.asarray(where)
-    if counted.shape != fields[0].shape[:3] or counted.dtype != bool:
-        raise ValueError(f"where: expected bool of shape {fields[0].shape[:3]}, got {counted.dtype} {counted.shape}.")
-    difference: np.ndarray = (fields[0] - fields[1])[counted]
+    selected = np.ones(fields[0].shape[:3], bool) if where is None else np.asarray(where)
+    if selected.shape != fields[0].shape[:3] or selected.dtype != bool:
+        raise ValueError(f"where: expected bool of shape {fields[0].shape[:3]}, got {selected.dtype} {selected.shape}.")
+    difference: np.ndarray = (fields[0] - fields[1])[selected]
     bad = len(difference) - int(np.isfinite(difference).all(1).sum())
     if bad or not len(difference):
         found = f"{bad} that are not" if bad else "no vector"
@@ -96,12 +97,12 @@ def displacement_error(
     where: np.ndarray | None = None,
     below_voxel: float = BELOW_VOXEL,
 ) -> DisplacementError:
-    """Errors of a displacement field: mean of sigma_t (Eqs. 15 and 16), its distribution, and errors per axis [voxel].
+    """Compute statistics of the displacement error: mean sigma_t (Eqs. 15 and 16), distribution, and errors per axis.
 
     Parameters and errors raised are those of `displacement_difference`, and
 
     below_voxel : float
-        Bound [voxel], >= 0: the part of the vectors with a smaller error is reported.
+        Bound [voxel], >= 0, of the errors counted in `DisplacementError.below`.
     """
     if not (np.isfinite(below_voxel) and below_voxel >= 0):
         raise ValueError(f"below_voxel: expected a number >= 0, got {below_voxel!r}.")
@@ -122,14 +123,14 @@ def displacement_error(
 
 
 def empirical_cdf(values: np.ndarray, at: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Empirical cumulative distribution of errors (Fig. 14(b)): the part of the values <= each abscissa.
+    """Compute the empirical cumulative distribution (Fig. 14(b)): the part of the values <= each abscissa.
 
     Parameters
     ----------
     values : ndarray
         Finite numbers of any shape, at least one.
     at : ndarray, optional
-        Abscissae; default: the sorted values, the steps of the distribution.
+        Abscissae. Default: the sorted values.
 
     Returns
     -------
@@ -144,7 +145,7 @@ def empirical_cdf(values: np.ndarray, at: np.ndarray | None = None) -> tuple[np.
 
 
 def _displacement(vectors: xr.Dataset | np.ndarray, name: str) -> np.ndarray:
-    """Displacements (z, y, x, 3), components (x, y, z) [voxel]."""
+    """Return displacements as an array (z, y, x, 3), components (x, y, z) [voxel]."""
     if not isinstance(vectors, xr.Dataset):
         return _checked_field(vectors, name)
     missing = [f"displacement_{axis}" for axis in "xyz" if f"displacement_{axis}" not in vectors]

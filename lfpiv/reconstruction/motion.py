@@ -1,16 +1,13 @@
-"""`reconstruct_pair`: both frames of a pair by SMART, each helped by what the other one shows of the same particles.
+"""`reconstruct_pair`: both frames of a pair by SMART, each corrected by what the other one shows of the same particles.
 
-Images of two cameras hardly tell particles from ghosts: SMART keeps whatever its first guess holds. Particles follow
+Images of two cameras hardly distinguish particles from ghosts: SMART keeps what its first guess holds. Particles follow
 the flow from one frame to the other; ghosts do so only where all particles around move alike. So both frames are
-reconstructed, the motion is measured, each volume is carried along it to the other's instant, and where the two
-disagree the volume is corrected: the first guess of a new reconstruction, as in motion tracking enhancement [1]_.
+reconstructed, the motion is measured, and each frame is reconstructed again from a first guess that both volumes share
+along the motion (`lfpiv.reconstruction.shared_light`), as in motion tracking enhancement [1]_. There both volumes are
+averaged; here only the brightness changes (docs/accuracy.md).
 
-There both volumes are averaged. Here a volume keeps its own particles in their own places, and only their brightness is
-changed, by the ratio of the two volumes after both were smoothed: a displacement that is wrong by a fraction of a voxel
-matters less then, and draws the next measurement less towards itself (docs/accuracy.md).
-
-Volumes that share their light are alike beyond what was measured, and their correlation no longer shows how much of it
-is noise. So the volumes of each frame by itself stay with them, and `unshared_quality` asks those for the uncertainty.
+Volumes that share their light have noise in common, which their correlation cannot show. So the volumes of each frame
+by itself stay with the result, and `unshared_quality` measures the uncertainty in those.
 
 .. [1] M. Novara, K. J. Batenburg, F. Scarano, "Motion tracking-enhanced MART for tomographic PIV", Meas. Sci. Technol.
    21 (2010) 035401, doi:10.1088/0957-0233/21/3/035401.
@@ -19,53 +16,163 @@ is noise. So the volumes of each frame by itself stay with them, and `unshared_q
 from __future__ import annotations
 
 import enum
-import json
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy import ndimage
 
-from lfpiv.reconstruction.volume import Stop, reconstruct
-from lfpiv.velocity.cross_correlation import LOWEST_RIVAL, REFINE_SEARCH, correlate, emphasise, missing_smoothing
-from lfpiv.velocity.predictor import Predictor
+from lfpiv.experiment.settings import Correlation
+from lfpiv.reconstruction.result import Reconstruction
+from lfpiv.reconstruction.settings import SmartSettings, require_whole
+from lfpiv.reconstruction.shared_light import MotionField, shared_guesses
+from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.multi_pass import peak_ratio
+from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings
+from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
+from lfpiv.velocity.windows import Windows
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.correlation import deform
-from lfpiv_kernels.correlation.correlate import correlate_windows, window_grid
+from lfpiv_kernels.correlation.correlate import correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 
 log = logging.getLogger(__name__)
 
-SMOOTHING_VOXEL = 0.7
-"""Standard deviation of the Gaussian that both volumes are smoothed by before they are compared [voxel]: about a
-particle's own size, and more than the measured displacement is usually off by."""
-DARK_SHARE = 0.02
-"""Light added to both before the ratio is taken, as a share of the smoothed volume's brightness, sum E^2 / sum E:
-voxels as dark as that agree whatever they hold."""
-LARGEST_GAIN = 3.0
-"""Largest factor by which the other frame brightens a voxel; particles come by light from their own images."""
-FAINTEST = 1e-6
-"""Least light of a voxel in the new first guess, as a share of the brightest: SMART can still bring it back."""
 ITERATION_SHARE = 0.4
-"""Iterations of a pass, as a share of those of the first reconstruction: it starts close to its end."""
+"""Iterations of a motion pass, as a share of those of the first reconstruction."""
 LEAST_VALID = 0.3
-"""Least part of valid vectors, of those that two cameras see: with fewer there is no motion to follow."""
-FOLLOWED = 4
-"""Steps of the fixed point that turns displacements midway in time into those of the particles of one frame."""
+"""Least share of valid vectors, of those that two cameras see, with which the motion is followed."""
 
 UNSHARED = "unshared"
-"""Coordinate of a volume that shares light with the other frame: the frame's volume by itself."""
+"""Coordinate of a volume that shares light with the other frame: the volume of the frame by itself."""
 
 
 class Motion(enum.Enum):
-    """What became of the motion; the text is the advice."""
+    """Whether the motion was followed; the text is the advice."""
 
     OFF = "each frame reconstructed by itself"
     FOLLOWED = "volumes reconstructed anew from what both frames show along the motion"
     LOST = "too few valid vectors to follow the motion: look at windows, seeding and displacements"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairResult:
+    """Reconstructions of both frames of a pair."""
+
+    frames: tuple[Reconstruction, Reconstruction]
+    """After all passes, with the history of all passes."""
+    unshared: tuple[Reconstruction, Reconstruction]
+    """Each frame by itself: the first reconstructions. The same as `frames` if no pass was made."""
+    motion: Motion
+    valid_fractions: tuple[float, ...]
+    """Share of valid vectors measured before each pass."""
+
+    def to_dataarrays(self) -> list[xr.DataArray]:
+        """Return both volumes with the attributes and coordinates that `reconstruct_pair` documents."""
+        volumes = []
+        for frame, before in zip(self.frames, self.unshared, strict=True):
+            volume = frame.to_dataarray()
+            volume.attrs |= {"motion": self.motion.value, "motion_valid": list(self.valid_fractions)}
+            if frame is not before:
+                about = {"units": "counts", "long_name": "particle intensity, this frame by itself"}
+                volume = volume.assign_coords({UNSHARED: (volume.dims, before.volume, about)})
+            volumes.append(volume)
+        return volumes
+
+
+class PairSolver:
+    """Reconstruction of image pairs of one rig with fixed settings.
+
+    Parameters
+    ----------
+    weights : Weights
+        The operator.
+    settings : SmartSettings
+        Settings of the first reconstruction. A motion pass has at most `ITERATION_SHARE` of its iterations.
+    motion_passes : int
+        How often the motion is measured and followed, >= 0.
+    correlation : mapping, optional
+        Settings of `correlate`, which measures the motion; default: those of an experiment without such a table.
+
+    Raises
+    ------
+    ValueError
+        If `motion_passes` is out of its range.
+    """
+
+    def __init__(
+        self,
+        weights: Weights,
+        settings: SmartSettings,
+        *,
+        motion_passes: int = 0,
+        correlation: Mapping[str, Any] | None = None,
+    ):
+        require_whole("motion_passes", motion_passes)
+        self.smart = SmartSolver(weights, settings)
+        self.motion_passes = motion_passes
+        self.correlation = Correlation().model_dump() if correlation is None else dict(correlation)
+
+    def solve(
+        self,
+        images: Sequence[Mapping[str, np.ndarray]],
+        floors: Sequence[float | Mapping[str, float] | None] = (None, None),
+        progress: Callable[[float], None] | None = None,
+    ) -> PairResult:
+        """Reconstruct both frames of a pair; arguments as of `reconstruct_pair`.
+
+        Raises
+        ------
+        ValueError
+            If there are not two frames, or `reconstruct` or `correlate` refuse their arguments.
+        """
+        if len(images) != 2 or len(floors) != 2:
+            raise ValueError(f"images, floor: expected two frames, got {len(images)} and {len(floors)}.")
+        iterations = self.smart.settings.iterations
+        restart = math.ceil(ITERATION_SHARE * iterations)
+        total, done = 2.0 * (iterations + self.motion_passes * restart), 0.0
+
+        def solve_frame(number: int, count: int, first: np.ndarray | None = None) -> Reconstruction:
+            nonlocal done
+
+            def step(fraction: float) -> None:
+                if progress is not None and total > 0:
+                    progress((done + fraction * count) / total)
+
+            found = self.smart.solve(images[number], floor=floors[number], iterations=count, first=first, progress=step)
+            done += count
+            return found
+
+        frames = []
+        for number in (0, 1):
+            try:
+                frames.append(solve_frame(number, iterations))
+            except ValueError as error:
+                raise ValueError(f"frame {number + 1} of the pair: {error}") from error
+        unshared, motion, valid = list(frames), Motion.OFF, list[float]()
+        for _ in range(self.motion_passes):
+            volumes = [frame.to_dataarray() for frame in frames]
+            vectors = correlate(*volumes, dt_s=1.0, **self.correlation)
+            valid.append(round(float(vectors.attrs["valid_fraction"]), 4))
+            if valid[-1] < LEAST_VALID * float(vectors.attrs["seen_fraction"]):
+                motion = Motion.LOST
+                log.warning("motion: %.0f %% of the vectors are valid; %s", 100 * valid[-1], motion.value)
+                break
+            motion = Motion.FOLLOWED
+            for number, guess in enumerate(shared_guesses(volumes, vectors)):
+                frames[number] = frames[number].continued_by(solve_frame(number, restart, guess))
+        if progress is not None:
+            progress(1.0)
+        return PairResult(
+            frames=(frames[0], frames[1]),
+            unshared=(unshared[0], unshared[1]),
+            motion=motion,
+            valid_fractions=tuple(valid),
+        )
 
 
 def reconstruct_pair(
@@ -81,10 +188,8 @@ def reconstruct_pair(
 ) -> list[xr.DataArray]:
     """Reconstruct the two volumes of an image pair, and again from what they share along the motion between them.
 
-    With E and E' the two volumes, d the displacement measured between them, G a Gaussian of `SMOOTHING_VOXEL` and e the
-    light of `DARK_SHARE`, a pass takes the first guess ``E min((G E'(x + d) + e) / (G E + e), LARGEST_GAIN)`` for the
-    one frame and the like for the other, both volumes scaled to the same light. Where vectors were replaced by the
-    validation, or particles left the volume, the volume's own light counts instead, in the logarithm.
+    The first guesses of a motion pass are those of `lfpiv.reconstruction.shared_light.shared_guesses`. For many pairs
+    make one `PairSolver`.
 
     Parameters
     ----------
@@ -97,7 +202,7 @@ def reconstruct_pair(
     floor : sequence of two
         Noise floor of each frame's images, as `reconstruct` takes it.
     correlation : mapping, optional
-        Settings of `correlate`, by which the motion is measured; default: those of an experiment without such a table.
+        Settings of `correlate`, which measures the motion; default: those of an experiment without such a table.
     iterations : int
         SMART iterations of the first reconstruction; a pass takes at most `ITERATION_SHARE` of them.
     progress : callable, optional
@@ -108,10 +213,10 @@ def reconstruct_pair(
     Returns
     -------
     list of two DataArrays, shape (z, y, x), float32
-        Volumes as `reconstruct` returns them; `residual`, `misfit` and `iterations` go through all passes, `stop` is
-        the first reconstruction's, unless a pass diverged. Attributes beyond those: `motion`, the verdict;
-        `motion_valid`, the part of valid vectors measured before each pass. Where a pass was made, the coordinate
-        `UNSHARED` holds what the first reconstruction gave: hand the vectors that `correlate` measures, and these
+        Volumes as `reconstruct` returns them. `residual`, `misfit` and `iterations` cover all passes; `stop` is that of
+        the first reconstruction, unless a pass diverged. Further attributes: `motion`, whether the motion was followed;
+        `motion_valid`, the share of valid vectors measured before each pass. If a pass was made, the coordinate
+        `UNSHARED` is the volume of the first reconstruction: pass the vectors that `correlate` measures, and these
         volumes, to `unshared_quality`.
 
     Raises
@@ -119,82 +224,28 @@ def reconstruct_pair(
     ValueError
         If an argument is out of its range, or `reconstruct` or `correlate` refuse theirs.
     """
-    for name, value in (("iterations", iterations), ("motion_passes", motion_passes)):
-        if not (isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0):
-            raise ValueError(f"{name}: expected a whole number >= 0, got {value!r}.")
-    if len(images) != 2 or len(floor) != 2:
-        raise ValueError(f"images, floor: expected two frames, got {len(images)} and {len(floor)}.")
     if "first" in smart:
         raise ValueError("first: expected no first guess, as each pass makes its own; use `reconstruct` for one.")
-    correlation = _default_correlation() if correlation is None else correlation
-    restart = math.ceil(ITERATION_SHARE * iterations)
-    total = 2.0 * (iterations + motion_passes * restart)
-    done = 0.0
-
-    def run(number: int, count: int, first: np.ndarray | None = None) -> xr.DataArray:
-        def step(fraction: float) -> None:
-            if progress is not None and total > 0:
-                progress((done + fraction * count) / total)
-
-        return reconstruct(
-            weights,
-            images[number],
-            floor=floor[number],
-            iterations=count,
-            first=first,
-            progress=step,
-            **smart,
-        )
-
-    volumes = []
-    for number in (0, 1):
-        try:
-            volumes.append(run(number, iterations))
-        except ValueError as error:
-            raise ValueError(f"frame {number + 1} of the pair: {error}") from error
-        done += iterations
-    alone = list(volumes)
-    verdict, valid = Motion.OFF, []
-    for _ in range(motion_passes):
-        vectors = correlate(*volumes, dt_s=1.0, **correlation)
-        valid.append(round(float(vectors.attrs["valid_fraction"]), 4))
-        if valid[-1] < LEAST_VALID * float(vectors.attrs["seen_fraction"]):
-            verdict = Motion.LOST
-            log.warning("motion: %.0f %% of the vectors are valid; %s", 100 * valid[-1], verdict.value)
-            break
-        verdict = Motion.FOLLOWED
-        guesses = shared_guesses(volumes, vectors)
-        for number, guess in enumerate(guesses):
-            again = run(number, restart, guess)
-            again.attrs |= _joined(volumes[number].attrs, again.attrs)
-            volumes[number] = again
-            done += restart
-    if progress is not None:
-        progress(1.0)
-    for number, (volume, before) in enumerate(zip(volumes, alone, strict=True)):
-        volume.attrs |= {"motion": verdict.value, "motion_valid": list(valid)}
-        if volume is not before:
-            about = {"units": "counts", "long_name": "particle intensity, this frame by itself"}
-            volumes[number] = volume.assign_coords({UNSHARED: (volume.dims, before.values, about)})
-    return volumes
+    settings = SmartSettings(iterations=iterations, **smart)
+    solver = PairSolver(weights, settings, motion_passes=motion_passes, correlation=correlation)
+    return solver.solve(images, floor, progress).to_dataarrays()
 
 
 def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dataset:
-    """State uncertainty, peak ratio and correlation of vectors by the volumes of each frame by itself.
+    """Measure uncertainty, peak ratio and correlation of vectors in the volumes of each frame by itself.
 
-    The statistics of `lfpiv_kernels.correlation.uncertainty`, by which `correlate` states it, take what two volumes do not have in
-    common for noise. Volumes that share their light have noise in common, too: they state two thirds of the random
-    error (docs/accuracy.md). Here the volumes of `UNSHARED`, whose noise is independent, are deformed onto each other
-    by the displacement given, and the same statistics are taken of them in the same windows, s. What these volumes
-    then show, correlated once more, is off the vector by d, be it that sharing bettered it, or that a wrong motion drew
-    it along. The uncertainty of each component is the larger one, ``max(s, |d|)``. Peak ratio and correlation, which
-    rise by sharing too, are those of this correlation.
+    `correlate` takes for noise what two volumes do not have in common (`lfpiv_kernels.correlation.uncertainty`).
+    Volumes that share their light have noise in common, so it states two thirds of the random error (docs/accuracy.md).
+    The volumes of `UNSHARED` have independent noise. Here they are deformed onto each other by the vectors'
+    displacements, and the same statistics are taken of them in the same windows: s. Correlated once more, they show a
+    displacement that differs from the vectors' by d: sharing corrected it, or a wrong motion biased it. The uncertainty
+    of each component is the larger one, ``max(s, |d|)``. Peak ratio and correlation are those of this correlation.
 
-    Without motion passes `correlate` states s: the random part, what would differ were the same flow recorded anew.
-    Ghosts move with the mean of the particles whose lines of sight cross in them [1]_, so they smooth the flow along
-    its gradients, alike in both frames and in every pair, and no statistics of noise know of it. In a uniform flow
-    there is no such error, and s is right; in the vortex ring of docs/accuracy.md it is larger than the random one.
-    Motion passes lower both, and d tells of what they took off.
+    Without motion passes `correlate` states s, the random error: the scatter if the same flow were recorded again.
+    Ghosts move with the mean of the particles whose lines of sight cross in them [1]_. So they smooth the flow along
+    its gradients in the same way in both frames and in every pair, which no statistics of noise show. A uniform flow
+    has no such error. In the vortex ring of docs/accuracy.md it is larger than the random one. Motion passes reduce
+    both errors, and d shows the reduction.
 
     Parameters
     ----------
@@ -217,127 +268,34 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     """
     if not all(UNSHARED in volume.coords for volume in volumes):
         if any(volume.attrs.get("motion") == Motion.FOLLOWED.value for volume in volumes):
-            log.warning("motion: volumes without what each frame shows by itself; the uncertainty is too small")
+            log.warning("motion: volumes without those of each frame by itself; the uncertainty is too small")
         return vectors
-    settings = json.loads(vectors.attrs["settings"])
-    if len(settings["windows"]) == 1 or not vectors["valid"].any():
+    settings = CorrelationSettings.of(vectors)
+    if len(settings.windows) == 1 or not vectors["valid"].any():
         return vectors
-    control, window = _Control(volumes[0], vectors), tuple(settings["windows"][-1])
-    missing = missing_smoothing(settings["smoothing_voxel"], *volumes)
-    alone = (volume[UNSHARED].values for volume in volumes)  # their scale does not matter
+    motion, window = MotionField(volumes[0], vectors), settings.windows[-1]
+    missing = missing_smoothing(settings.smoothing_voxel, *volumes)
+    unshared = (volume[UNSHARED].values for volume in volumes)  # their scale does not matter
     first, second = (
         deform.spline_coefficients(
-            emphasise((light - np.median(light)).astype(np.float32), missing, settings["intensity_power"])
+            preprocess((light - np.median(light)).astype(np.float32), missing, settings.intensity_power)
         )
-        for light in alone
+        for light in unshared
     )
-    first, second = deform.deform_pair(first, second, control.midway.field, control.midway.spacing)
-    step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(control.nodes, first.shape, strict=True))
-    origin, count = window_grid(first.shape, window, step)
-    scatter = displacement_deviation(first, second, window=window, origin=origin, step=step, count=count)
+    first, second = deform.deform_pair(first, second, motion.midway.field, motion.midway.spacing)
+    step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(motion.nodes, first.shape, strict=True))
+    windows = Windows.covering(first.shape, window, step)
+    scatter = displacement_deviation(
+        first, second, window=window, origin=windows.origin, step=step, count=windows.count
+    )
     search = (REFINE_SEARCH,) * 3
     left = correlate_windows(first, second, window=window, step=step, search=search, symmetric=True)
     measured = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
-    shown = control.midway.window_means(origin, step, count, window) + left.displacement
+    shown = motion.midway.window_means(windows) + left.displacement
     deviation = np.maximum(scatter, np.abs(shown - measured))
     deviation[~vectors["valid"].values] = np.nan
     stated = {f"uncertainty_{axis}": deviation[..., k] for k, axis in enumerate("zyx")}
     stated["uncertainty"] = np.sqrt((deviation**2).sum(-1))
     stated["correlation"] = left.correlation
-    ratio = left.correlation / np.maximum(left.rival, LOWEST_RIVAL)
-    stated["peak_ratio"] = np.where(left.correlation > 0, ratio, np.nan)
+    stated["peak_ratio"] = peak_ratio(left)
     return vectors.assign({name: vectors[name].copy(data=values.astype(np.float32)) for name, values in stated.items()})
-
-
-def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list[np.ndarray]:
-    """First guesses of both frames from what their volumes share along measured displacements.
-
-    Parameters
-    ----------
-    volumes : sequence of two DataArrays, shape (z, y, x)
-        Both frames, >= 0, with coordinates in mm.
-    vectors : Dataset
-        From `correlate` of the two: displacements midway in time.
-
-    Returns
-    -------
-    list of two ndarrays, shape (z, y, x), float32
-        See `reconstruct_pair`; each with the light of its volume, zero where that is.
-    """
-    values = [np.asarray(volume.values, np.float32) for volume in volumes]
-    light = [float(value.sum(dtype=np.float64)) for value in values]
-    coefficients = [deform.spline_coefficients(value) for value in values]
-    everywhere = deform.spline_coefficients(np.ones_like(values[0]))
-    control = _Control(volumes[0], vectors)
-    guesses = []
-    for number, own in enumerate(values):
-        field = control.displacement(1 if number == 0 else -1)
-        partner = control.carried(coefficients[1 - number], field)
-        partner *= np.float32(light[number] / light[1 - number])
-        trusted = control.trust * np.clip(control.carried(everywhere, field), 0, 1)
-        guess = own * _gain(own, np.maximum(partner, 0)) ** trusted
-        np.maximum(guess, FAINTEST * guess.max(), out=guess, where=own > 0)
-        guesses.append(guess * np.float32(light[number] / guess.sum(dtype=np.float64)))
-    return guesses
-
-
-def _gain(own: np.ndarray, partner: np.ndarray) -> np.ndarray:
-    """Factor by which the other frame's volume, carried to this instant, changes this one's brightness."""
-    own, partner = (ndimage.gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant") for volume in (own, partner))
-    dark = np.float32(DARK_SHARE * np.square(own, dtype=np.float64).sum() / own.sum(dtype=np.float64))
-    return np.minimum((partner + dark) / (own + dark), np.float32(LARGEST_GAIN))
-
-
-class _Control:
-    """The motion between two frames, midway in time, on the points between which a deformation is linear; [voxel]."""
-
-    def __init__(self, volume: xr.DataArray, vectors: xr.Dataset):
-        axes = [(volume[axis].values.astype(float), vectors[axis].values) for axis in "zyx"]
-        self.nodes = [(centres - own[0]) * (len(own) - 1) / (own[-1] - own[0]) for own, centres in axes]
-        """Places of the vectors along each axis [voxel]."""
-        nz, ny, nx = volume.shape
-        displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], axis=-1).astype(float)
-        self.midway = Predictor(displacement, self.nodes, (nz, ny, nx))
-        """Displacement of what is at a control point midway in time."""
-        trust = vectors["valid"].values.astype(float)
-        for axis, (nodes, count) in enumerate(zip(self.nodes, volume.shape, strict=True)):
-            trust = _linear(trust, nodes, np.arange(count), axis)
-        self.trust = trust.astype(np.float32)
-        """1 among valid vectors, 0 among replaced ones, on the voxels."""
-
-    def displacement(self, sign: int) -> np.ndarray:
-        """From the control points of one frame to the other: 1 from the first to the second, -1 back; (3, z, y, x)."""
-        points, spacing = self.midway.points, np.array(self.midway.spacing)[:, None, None, None]
-        start = np.stack(np.meshgrid(*points, indexing="ij")) - deform.OFFSET  # the kernel's field at x + OFFSET
-        middle = moved = np.moveaxis(self.midway.field.astype(float), -1, 0)
-        for _ in range(FOLLOWED):
-            halfway = (start + sign * moved / 2) / spacing
-            moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in middle])
-        return sign * moved
-
-    def carried(self, coefficients: np.ndarray, field: np.ndarray) -> np.ndarray:
-        """Sample a volume, given by its spline, at x + field(x) for all voxels x; 0 outside."""
-        half = np.moveaxis(2 * (field - deform.OFFSET), 0, -1)  # the kernel samples at x + OFFSET + half / 2
-        return deform.deform_pair(coefficients, coefficients, half.astype(np.float32), self.midway.spacing)[1]
-
-
-def _linear(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:
-    """Interpolate linearly between values at nodes along an axis, constant beyond the outer ones."""
-    matrix = np.stack([np.interp(points, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
-    return np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
-
-
-def _joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """History through a reconstruction and the one after it, whose first figure stands for the former's last.
-
-    A pass is meant to be short: why the first reconstruction stopped is what tells, unless the pass diverged.
-    """
-    histories = {name: [*before[name][:-1], *after[name]] for name in ("residual", "misfit")}
-    stop = after["stop"] if after["stop"] == Stop.DIVERGED.value else before["stop"]
-    return {**histories, "iterations": before["iterations"] + after["iterations"], "stop": stop}
-
-
-def _default_correlation() -> dict[str, Any]:
-    from lfpiv.experiment.settings import Correlation
-
-    return Correlation().model_dump()

@@ -1,62 +1,46 @@
-"""Images as SMART takes them: the light that voxels can show, its noise floor, and how bright each camera is.
+"""Preparation of the images for SMART: which pixels count, their noise floor, and the brightness of each camera.
 
-What no voxel lights, a reflection or particles beyond the volume, no volume can explain: it is left out, and its share
-stated. Cameras at unlike scattering angles, exposures or gains see the same particles at unlike brightness, which no
-volume can explain either: SMART would end halfway between them. The light of particles that all cameras see, over what
-each would see of an evenly lit volume, tells how bright they are, wherever in that volume the particles are. It becomes
-part of what a camera records per unit of light, so a dim camera counts by the light it has, not by its noise.
+Pixels that no voxel lights are left out: no volume can explain their light, which comes from reflections or from
+particles beyond the volume. Cameras with different scattering angles, exposures or gains record the same particles with
+different brightness, which no volume can explain either. The brightness of a camera is the light of particles that all
+cameras see, divided by the light it would record of an evenly lit volume. It becomes part of the camera's gain.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from lfpiv.geometry.volume import is_finite
 from lfpiv.weights.operator import Weights
 
-log = logging.getLogger(__name__)
-
 BRIGHTEST = 99.9
-"""Percentile of the counts above the noise at which they are cut, so that no hot pixel outweighs the rest. Even a lone
-particle lights some hundred pixels, and noise counts for nothing, so it is never the particles that are cut."""
+"""Percentile of the counts above the noise to which counts are limited, so that hot pixels have no weight."""
 NOISE_SIGMA = 3.0
-"""Standard deviations above which a count is no noise."""
+"""Least count that is no noise [standard deviation of the noise]."""
 LEAST_FLOOR, LEAST_GIVEN = 1e-4, 1e-6
-"""Least floor, as a share of an image's brightest counts, and least one that a caller may ask for: with none at all the
-misfit of a dark pixel is infinite, and no step lowers it."""
+"""Least noise floor, measured or given by the caller, as a share of an image's brightest counts."""
 GAIN_STEP = 1.25
-"""Brightnesses of cameras are powers of it: below half a step they cost nothing, and frames agree about them."""
+"""Cameras' brightnesses are rounded to powers of this number."""
 DIMMEST = 0.04
-"""Least brightness of a camera relative to the brightest one: below, its image is hardly that of the same particles."""
+"""Least brightness of a camera relative to the brightest one."""
 LEAST_LIGHT = 0.2
-"""Least mean count of a camera's image, over its noise, that tells its brightness: an image without its background
-still has some tenths of its noise."""
-WHOLLY_SEEN = 0.5
-"""Least sum of a voxel's weights in a camera that sees it wholly, as a share of the largest one in the volume."""
-SHARED_LIGHT = 0.95
-"""Least part of a pixel's light, of an evenly lit volume, from voxels that all cameras see wholly: it shows what all
-cameras do."""
-LEAST_SHARED = 0.25
-"""Least part of a camera's light in such pixels that tells its brightness."""
+"""Least mean count of an image, relative to its noise, for the camera's brightness to be measured."""
 GLARE = 10.0
-"""Counts beyond this many times the median above the noise tell nothing of a camera's brightness: hardly a particle has
-them, and a reflection would outweigh all particles."""
+"""Upper limit of counts used to compare cameras' brightness, as a multiple of the median count above the noise.
+Brighter pixels are reflections."""
 UNSURE = 2.0
-"""Ratio up to which cameras count as alike where not all see all voxels: where in the volume few particles are matters
-then, by up to 1.5."""
+"""Ratio of brightness up to which cameras count as equally bright if some voxels are not seen by all of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """What one camera recorded of a volume."""
+    """Image of one camera, prepared for SMART."""
 
     image: np.ndarray
-    """Counts >= 0, 0 where no voxel lights a pixel, shape (pixel,), float32."""
+    """Counts >= 0, shape (pixel,), float32; 0 where no voxel lights a pixel."""
     floor: float
     """Noise floor [counts]."""
     peak: float
@@ -74,12 +58,12 @@ def record(
     floor: float | Mapping[str, float] | None,
     floor_share: float,
 ) -> dict[str, Recording]:
-    """Take images for reconstruction; arguments as in `lfpiv.reconstruct`.
+    """Prepare the images of all cameras; arguments as of `lfpiv.reconstruct`.
 
     Returns
     -------
     dict of Recording
-        By camera.
+        By camera name.
 
     Raises
     ------
@@ -89,39 +73,29 @@ def record(
     if not isinstance(images, Mapping):
         raise ValueError(f"images: expected a mapping from camera names to images, got {type(images).__name__}.")
     given = _given_floors(floor, weights)
-    looks = {name: _Look(weights, images, name) for name in weights.cameras}
-    gains = _camera_gains(weights, looks)
+    lit = {name: _LitPixels(weights, images, name) for name in weights.cameras}
+    gains = _camera_gains(weights, lit)
     recordings = {}
-    for name, look in looks.items():
-        noise, least = (look.noise, LEAST_FLOOR) if given is None else (given[name], LEAST_GIVEN)
-        image = np.zeros(look.size, np.float32)
-        image[look.pixels] = np.maximum(look.counts, 0)
+    for name, seen in lit.items():
+        noise, least = (seen.noise, LEAST_FLOOR) if given is None else (given[name], LEAST_GIVEN)
+        image = np.zeros(seen.size, np.float32)
+        image[seen.pixels] = np.maximum(seen.counts, 0)
         recordings[name] = Recording(
             image=image,
-            floor=max(noise, least * look.peak, floor_share * look.brightness),
-            peak=look.peak,
+            floor=max(noise, least * seen.peak, floor_share * seen.brightness),
+            peak=seen.peak,
             camera_gain=gains[name],
-            light_outside=look.outside,
+            light_outside=seen.outside,
         )
     return recordings
 
 
-class _Look:
-    """One camera's image, checked, in the pixels that voxels light."""
+class _LitPixels:
+    """Counts of one camera's image in the pixels that voxels light, checked, and their figures."""
 
     def __init__(self, weights: Weights, images: Mapping[str, np.ndarray], name: str):
-        camera = weights.cameras[name]
-        if name not in images:
-            raise ValueError(f"images: camera {name!r} is missing; found {', '.join(map(str, images)) or 'none'}.")
-        image = np.asarray(images[name])
-        if image.dtype.kind not in "fiub":
-            raise ValueError(f"images[{name!r}]: expected an array of counts, got {image.dtype}.")
-        if image.shape != camera.optics.sensor_shape:
-            raise ValueError(f"images[{name!r}]: expected shape {camera.optics.sensor_shape}, got {image.shape}.")
-        image = image.astype(np.float32, copy=False).reshape(-1)
-        if not np.isfinite(image).all():
-            raise ValueError(f"images[{name!r}]: expected finite counts, got NaN or infinity.")
-        alive = np.asarray(camera.gain).reshape(-1) > 0
+        image = _checked_image(images, name, weights.cameras[name].optics.sensor_shape)
+        alive = np.asarray(weights.cameras[name].gain).reshape(-1) > 0
         if not (image[alive] > 0).any():
             raise ValueError(f"images[{name!r}]: expected some light, got no positive count; check the background.")
         lit = weights.projector(name).map.pixel
@@ -136,21 +110,37 @@ class _Look:
             )
         below = image[image < 0]
         self.noise = float(np.sqrt(np.mean(below**2))) if below.size else 0.0
-        """Of the background: root mean square of the negative counts."""
+        """Noise of the background: root mean square of the negative counts."""
         above = self.counts[self.counts > NOISE_SIGMA * self.noise]
         above = above if above.size else self.counts[self.counts > 0]
         self.peak = float(np.percentile(above, BRIGHTEST, method="higher"))
-        self.plain = np.minimum(self.counts, np.float32(min(self.peak, GLARE * float(np.median(above)))))
-        """The counts, cut where they are a reflection's, their noise as it is."""
+        self.without_glare = np.minimum(self.counts, np.float32(min(self.peak, GLARE * float(np.median(above)))))
+        """The counts, those of reflections limited."""
         positive = np.clip(self.counts, 0, self.peak)
         self.brightness = float(np.square(positive, dtype=np.float64).sum() / positive.sum(dtype=np.float64))
-        """Mean count, each weighted by itself: dark pixels do not count, nor do hot ones."""
+        """Mean count weighted by the counts. Dark and hot pixels have no weight."""
         whole = float(image[alive].sum(dtype=np.float64))
         inside = float(self.counts.sum(dtype=np.float64))
         self.outside = float(np.clip(1 - inside / whole, 0, 1)) if whole > 0 else 0.0
 
 
+def _checked_image(images: Mapping[str, np.ndarray], name: str, shape: tuple[int, int]) -> np.ndarray:
+    """Return a camera's image as float32, shape (pixel,), or raise ValueError."""
+    if name not in images:
+        raise ValueError(f"images: camera {name!r} is missing; found {', '.join(map(str, images)) or 'none'}.")
+    image = np.asarray(images[name])
+    if image.dtype.kind not in "fiub":
+        raise ValueError(f"images[{name!r}]: expected an array of counts, got {image.dtype}.")
+    if image.shape != shape:
+        raise ValueError(f"images[{name!r}]: expected shape {shape}, got {image.shape}.")
+    image = image.astype(np.float32, copy=False).reshape(-1)
+    if not np.isfinite(image).all():
+        raise ValueError(f"images[{name!r}]: expected finite counts, got NaN or infinity.")
+    return image
+
+
 def _given_floors(floor: float | Mapping[str, float] | None, weights: Weights) -> Mapping[str, float] | None:
+    """Return the caller's noise floors by camera name, or raise ValueError."""
     if floor is None:
         return None
     given = floor if isinstance(floor, Mapping) else dict.fromkeys(weights.cameras, floor)
@@ -162,67 +152,27 @@ def _given_floors(floor: float | Mapping[str, float] | None, weights: Weights) -
     return given
 
 
-# -- brightness of cameras
-
-
-@dataclass(frozen=True)
-class _Even:
-    """What a camera sees of an evenly lit volume."""
-
-    light: float
-    """In the pixels that count."""
-    shared: np.ndarray | None
-    """Pixels that see voxels which all cameras see, shape (pixel,), bool; None for all."""
-
-
-def _camera_gains(weights: Weights, looks: Mapping[str, _Look]) -> dict[str, float]:
-    """Brightness of each camera relative to the brightest; 1 for all where it cannot be told of one."""
-    alike = dict.fromkeys(looks, 1.0)
-    if len(looks) == 1:
-        return alike
-    even = _even.get(weights)
-    if even is None:
-        even = _even[weights] = _project_even(weights)
-    brightness, whole = {}, True
-    for name, look in looks.items():
+def _camera_gains(weights: Weights, lit: Mapping[str, _LitPixels]) -> dict[str, float]:
+    """Return the brightness of each camera relative to the brightest; 1 for all if that of one cannot be measured."""
+    equal = dict.fromkeys(lit, 1.0)
+    if len(lit) == 1:
+        return equal
+    even = weights.even_light
+    brightness, all_see_all = {}, True
+    for name, seen in lit.items():
         if name not in even:
-            return alike
-        seen, shared = look.plain, even[name].shared
+            return equal
+        counts, shared = seen.without_glare, even[name].shared
         if shared is not None:
-            seen, whole = seen[shared[look.pixels]], False
-        light = float(seen.sum(dtype=np.float64))  # in which noise and its negative counts cancel
-        if not light > LEAST_LIGHT * look.noise * len(seen):
-            return alike
+            counts, all_see_all = counts[shared[seen.pixels]], False
+        light = float(counts.sum(dtype=np.float64))  # positive and negative noise cancel in the sum
+        if not light > LEAST_LIGHT * seen.noise * len(counts):
+            return equal
         brightness[name] = light / even[name].light
     brightest = max(brightness.values())
     gains = {}
     for name, value in brightness.items():
         ratio = max(value / brightest, DIMMEST)
-        sure = whole or ratio < 1 / UNSURE
+        sure = all_see_all or ratio < 1 / UNSURE
         gains[name] = GAIN_STEP ** round(np.log(ratio) / np.log(GAIN_STEP)) if sure else 1.0
     return gains
-
-
-def _project_even(weights: Weights) -> dict[str, _Even]:
-    """Light of an evenly lit volume in each camera, in pixels that see what all do; nothing where too few do."""
-    gains = {name: np.asarray(camera.gain, np.float32).reshape(-1) for name, camera in weights.cameras.items()}
-    partly = np.zeros(weights.grid.size, bool)
-    for seen in weights.camera_sums:
-        partly |= seen < WHOLLY_SEEN * seen.max()
-    even = {}
-    for name, gain in gains.items():
-        projector, shared = weights.projector(name), None
-        image = projector.project(np.ones(weights.grid.size, np.float32), np.empty_like(gain))
-        if partly.any():
-            other = projector.project(partly.astype(np.float32), np.empty_like(gain))
-            shared = (image > 0) & (other <= (1 - SHARED_LIGHT) * image)
-        image *= gain
-        light = float(image.sum(dtype=np.float64, where=True if shared is None else shared))
-        if not light > LEAST_SHARED * float(image.sum(dtype=np.float64)):
-            log.info("%s: too little of the volume is seen by all cameras to compare their brightness", name)
-            return {}
-        even[name] = _Even(light, shared)
-    return even
-
-
-_even: WeakKeyDictionary[Weights, dict[str, _Even]] = WeakKeyDictionary()

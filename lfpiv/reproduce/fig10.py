@@ -15,7 +15,7 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.reproduce import page, plots
 from lfpiv.reproduce.rigs import VOXEL_MM, numerical_rig
 from lfpiv.reproduce.study import Progress
-from lfpiv.weights.blocks import count_voxels
+from lfpiv.weights.counting import count_voxels
 from lfpiv.weights.operator import COUNT_SAMPLES_ONE
 
 TITLE = "Fig. 10: weights of one voxel"

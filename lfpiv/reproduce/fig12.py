@@ -15,7 +15,7 @@ from lfpiv.metrics.particles import PEAK_SHARE
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import page, plots, rigs, store
 from lfpiv.reproduce.study import Progress
-from lfpiv.velocity.cross_correlation import emphasise, missing_smoothing
+from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.weights.operator import Weights
 
 TITLE = "Fig. 12: reconstructed particles; Fig. 11: at 0.1 particles per microlens"
@@ -221,7 +221,7 @@ def _judge(
     return {
         "q": metrics.reconstruction_quality(result, truth),
         "q_as_correlated": metrics.reconstruction_quality(
-            result.copy(data=emphasise(result.values, missing_smoothing(CORRELATED_VOXEL, result), 1.0)), truth
+            result.copy(data=preprocess(result.values, missing_smoothing(CORRELATED_VOXEL, result), 1.0)), truth
         ),
         "q_zero_mean": metrics.reconstruction_quality(result, truth, zero_mean=True),
         "accuracy": quality.accuracy,

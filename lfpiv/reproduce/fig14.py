@@ -21,7 +21,8 @@ from lfpiv.reproduce import angles, page, plots, rigs, store
 from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.flows import Ring
 from lfpiv.velocity import derived
-from lfpiv.velocity.cross_correlation import DEFAULT_WINDOWS, correlate
+from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.settings import DEFAULT_WINDOWS
 from lfpiv.weights.operator import Weights
 
 TITLE = "Fig. 14: displacement of a ring vortex; Fig. 13: its vorticity at 0.5 particles per microlens"

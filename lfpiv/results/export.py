@@ -1,6 +1,6 @@
-"""`export_results`: vectors of a run in the forms other programs read. ParaView (vti), one NetCDF, CSV, pivpy.
+"""`export_results`: vectors of a run in formats of other programs: ParaView (vti), one NetCDF file, CSV, pivpy.
 
-Every file appears under its name only when it is complete; one that is there already is replaced as a whole.
+A file appears under its name only when it is complete. Existing files are replaced as a whole.
 """
 
 from __future__ import annotations
@@ -34,17 +34,20 @@ log = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
 """Called as ``progress(step, fraction)``, fraction from 0 to 1."""
 
+Update = Callable[[int, int], None]
+"""Called as ``update(done, total)``."""
+
 FOLDER = "export"
-"""Folder inside that of the run where exports go unless another one is named."""
+"""Default folder of exports inside the folder of the run."""
 
 CSV_DIGITS = 9
-"""Significant digits in text: as many as single precision can hold."""
+"""Significant digits in text, enough for single precision."""
 
 _MM_PER_M = 1000.0
 
 
 class Format(enum.Enum):
-    """What vectors can be exported to; the text says what is written."""
+    """Formats of exported vectors. The text describes the files."""
 
     VTI = "one .vti image per pair and one per kept volume, with .pvd collections over the pairs: ParaView, pyvista"
     NETCDF = "vectors.nc, one NetCDF4 file over all pairs: xarray, MATLAB"
@@ -62,42 +65,42 @@ def export_results(
     interval_s: float | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write the vectors of a run in a form that other programs read.
+    """Write the vectors of a run in a format that other programs read.
 
     Parameters
     ----------
     folder : str or Path
         Folder of the run.
     to : {"vti", "netcdf", "csv", "pivpy"}
-        The form, see `Format` and docs/conventions.md.
+        The format, see `Format` and docs/conventions.md.
     out : str or Path, optional
         Folder to write to. Default: `FOLDER` inside `folder`.
     pairs : tuple, optional
-        (A, B): pairs A to B - 1 only; B may be None.
+        (A, B): only pairs A to B - 1; B may be None.
     depth_mm : float, optional
         For "pivpy": only the plane of vectors nearest to this z [mm]. Default: all planes.
     interval_s : float, optional
-        Time between the first frames of successive pairs [s]: times in "vti", "netcdf" and "pivpy" are seconds then.
-        Default: the number of the pair stands for the time.
+        Time between the first frames of successive pairs [s], which makes times in "vti", "netcdf" and "pivpy" seconds.
+        Default: the number of the pair is used as time.
     progress : callable, optional
         Called as ``progress("export", fraction)``.
 
     Returns
     -------
     list of Path
-        The files to open: the collections for "vti", else all that were written.
+        The files to open: the collections for "vti", otherwise all written files.
 
     Raises
     ------
     InputError
-        If an argument is out of range, the folder holds no vectors that belong together, or `out` is no folder that can
+        If an argument is out of range, the folder has no vectors, its pairs differ in settings or axes, or `out` cannot
         be written.
     StorageError
-        If the disk is full, or writing fails otherwise. What is finished is whole.
+        If the disk is full or writing fails. Finished files are complete.
 
     Examples
     --------
-    Here the files are written first, which `lfpiv run` does otherwise:
+    This example writes the vectors itself. Usually `lfpiv run` has written them.
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -122,31 +125,32 @@ def export_results(
     if interval_s is not None and not (math.isfinite(interval_s) and interval_s > 0):
         raise InputError(f"interval: expected a time above 0 s between pairs, found {interval_s!r}.")
     results = open_results(folder, pairs=pairs)
-    chosen = results["z"].values if depth_mm is None else _nearest(results["z"], depth_mm)
+    planes = results["z"].values if depth_mm is None else _nearest(results["z"], depth_mm)
     target = Path(folder) / FOLDER if out is None else Path(out)
     made = make_writable(target)
-    tick = _ticker(progress)
+    update = _pair_progress(progress)
     try:
         with writing(target):
             if form is Format.VTI:
-                return _write_vti(results, Folder(Path(folder)), target, interval_s, tick)
+                return _write_vti(results, Folder(Path(folder)), target, interval_s, update)
             if form is Format.NETCDF:
-                return _write_netcdf(results, target, interval_s, tick)
+                return _write_netcdf(results, target, interval_s, update)
             if form is Format.CSV:
-                return _write_csv(results, target, tick)
-            return _write_pivpy(results, chosen, target, interval_s, tick)
+                return _write_csv(results, target, update)
+            return _write_pivpy(results, planes, target, interval_s, update)
     finally:
         for path in made:
             if path.is_dir() and not any(path.iterdir()):
                 path.rmdir()
 
 
-def _ticker(progress: Progress | None) -> Callable[[int, int], None]:
+def _pair_progress(progress: Progress | None) -> Update:
+    """Return a function that reports finished parts as a fraction of the export."""
     return (lambda done, total: None) if progress is None else (lambda done, total: progress("export", done / total))
 
 
 def _nearest(depths: xr.DataArray, depth_mm: float) -> np.ndarray:
-    """Depth of the plane of vectors nearest to a depth, which must lie within half a spacing of them."""
+    """Return the depth of the nearest plane of vectors, as an array of one. It must be within half a spacing."""
     planes = depths.values
     half = abs(planes[-1] - planes[0]) / max(len(planes) - 1, 1) / 2 if len(planes) > 1 else math.inf
     nearest = planes[np.abs(planes - depth_mm).argmin()] if math.isfinite(depth_mm) else math.nan
@@ -158,29 +162,29 @@ def _nearest(depths: xr.DataArray, depth_mm: float) -> np.ndarray:
 
 
 def _times(results: xr.Dataset, interval_s: float | None) -> np.ndarray:
-    """Time of each pair: [s] where the interval is known, else its number."""
+    """Return the time of each pair [s], or its number if the interval is not known."""
     return results["pair"].values * (1.0 if interval_s is None else interval_s)
 
 
-def _each_pair(results: xr.Dataset, tick: Callable[[int, int], None]) -> Iterator[tuple[int, xr.Dataset]]:
-    """Load one pair after the other."""
+def _each_pair(results: xr.Dataset, update: Update) -> Iterator[tuple[int, xr.Dataset]]:
+    """Load and yield one pair after the other."""
     total = results.sizes["pair"]
     for done in range(total):
-        tick(done, total)
+        update(done, total)
         yield int(results["pair"][done]), results.isel(pair=done, drop=True).load()
-    tick(total, total)
+    update(total, total)
 
 
 # -- ParaView ----------------------------------------------------------------------------------------------------------
 
 
 def _write_vti(
-    results: xr.Dataset, folder: Folder, target: Path, interval_s: float | None, tick: Callable[[int, int], None]
+    results: xr.Dataset, folder: Folder, target: Path, interval_s: float | None, update: Update
 ) -> list[Path]:
     times = dict(zip(results["pair"].values.tolist(), _times(results, interval_s).tolist(), strict=True))
     collections: dict[str, dict[Path, float]] = {}
-    strange: list[Path] = []
-    for pair, vectors in _each_pair(results, tick):
+    mismatched: list[Path] = []
+    for pair, vectors in _each_pair(results, update):
         path = target / f"pair_{pair:04d}.vti"
         _write_image(_vector_arrays(vectors), vectors, path)
         collections.setdefault("vectors", {})[path] = times[pair]
@@ -188,19 +192,19 @@ def _write_vti(
             stored = folder.volume(pair, frame)
             if not stored.is_file():
                 continue
-            if not _belongs(stored, folder.vectors(pair)):
-                strange.append(stored)
+            if not _same_origin(stored, folder.vectors(pair)):
+                mismatched.append(stored)
                 continue
             volume = netcdf.read_volume(stored)
             path = target / f"volume_{pair:04d}_{name}.vti"
             _write_image({"intensity": volume.values}, volume, path)
             collections.setdefault(f"volumes_{name}", {})[path] = times[pair]
-    if strange:
+    if mismatched:
         log.warning(
             "%s%s: not exported, made with other settings or images than the vectors. Run `lfpiv run` with "
             "--keep-volumes for volumes that fit",
-            strange[0],
-            f" and {len(strange) - 1} other volumes" if len(strange) > 1 else "",
+            mismatched[0],
+            f" and {len(mismatched) - 1} other volumes" if len(mismatched) > 1 else "",
         )
     written = []
     for name, files in collections.items():
@@ -210,15 +214,15 @@ def _write_vti(
     return written
 
 
-def _belongs(volume: Path, vectors: Path) -> bool:
-    """Whether a volume was made as the vectors were: of what both depend on nothing differs; raw images may be gone."""
+def _same_origin(volume: Path, vectors: Path) -> bool:
+    """Return whether a volume and vectors were made from equal settings and images, as far as both files state them."""
     one, other = (json.loads(netcdf.read_attributes(path).get("depends_on", "{}")) for path in (volume, vectors))
     known = (name for name in one.keys() & other.keys() if name != "images" or None not in (one[name], other[name]))
     return all(one[name] == other[name] for name in known)
 
 
 def _vector_arrays(vectors: xr.Dataset) -> dict[str, Any]:
-    """Arrays of an image by their name: vectors as tuples of components, scalars as they are; order (z, y, x)."""
+    """Return the point data of an image by name, in (z, y, x) order; vectors are tuples of three components."""
     arrays: dict[str, Any] = {
         "velocity": tuple(vectors[name].values for name in "uvw"),
         "displacement": tuple(vectors[f"displacement_{axis}"].values for axis in "xyz"),
@@ -237,12 +241,12 @@ def _write_image(arrays: dict[str, Any], places: xr.Dataset | xr.DataArray, path
     """Write point data on an even grid [mm] as VTK image data."""
     axes = [np.asarray(places[axis], float) for axis in "xyz"]
     steps = [(axis[-1] - axis[0]) / (len(axis) - 1) if len(axis) > 1 else math.nan for axis in axes]
-    single = next((step for step in steps if math.isfinite(step)), 1.0)  # a lone layer is as thick as others are apart
+    single = next((step for step in steps if math.isfinite(step)), 1.0)  # thickness of a single layer
     spacing = tuple(float(step if math.isfinite(step) else single) for step in steps)
 
     def ordered(values: np.ndarray) -> np.ndarray:
         kind = np.uint8 if values.dtype == bool else np.float32
-        return np.ascontiguousarray(values, kind).transpose(2, 1, 0)  # VTK wants (x, y, z), x fastest
+        return np.ascontiguousarray(values, kind).transpose(2, 1, 0)  # VTK order (x, y, z), x fastest
 
     points = {
         name: tuple(map(ordered, item)) if isinstance(item, tuple) else ordered(item) for name, item in arrays.items()
@@ -254,7 +258,7 @@ def _write_image(arrays: dict[str, Any], places: xr.Dataset | xr.DataArray, path
 
 
 def _write_collection(files: dict[Path, float], path: Path) -> None:
-    """Write a ParaView collection: files and their times, named relative to it."""
+    """Write a ParaView collection of files, with relative paths, and their times."""
     with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as scratch:
         group = VtkGroup(str(Path(scratch) / "collection"))
         for file, time in files.items():
@@ -266,9 +270,7 @@ def _write_collection(files: dict[Path, float], path: Path) -> None:
 # -- NetCDF, text, pivpy -----------------------------------------------------------------------------------------------
 
 
-def _write_netcdf(
-    results: xr.Dataset, target: Path, interval_s: float | None, tick: Callable[[int, int], None]
-) -> list[Path]:
+def _write_netcdf(results: xr.Dataset, target: Path, interval_s: float | None, update: Update) -> list[Path]:
     path = target / "vectors.nc"
     if interval_s is not None:
         attributes = {
@@ -277,15 +279,15 @@ def _write_netcdf(
             "long_name": "first frame of the pair after that of pair 0",
         }
         results = results.assign_coords(time=("pair", _times(results, interval_s), attributes))
-    tick(0, 1)
+    update(0, 1)
     netcdf.write_dataset(results, path, attributes={"versions": versions()})
-    tick(1, 1)
+    update(1, 1)
     return [path]
 
 
-def _write_csv(results: xr.Dataset, target: Path, tick: Callable[[int, int], None]) -> list[Path]:
+def _write_csv(results: xr.Dataset, target: Path, update: Update) -> list[Path]:
     written = []
-    for pair, vectors in _each_pair(results, tick):
+    for pair, vectors in _each_pair(results, update):
         units = {name: vectors[name].attrs.get("units", "1") for name in vectors.variables}
         names = ["x", "y", "z", *vectors.data_vars]
         titles = [str(name) if units[name] == "1" else f"{name} [{units[name]}]" for name in names]
@@ -304,20 +306,20 @@ def _write_pivpy(
     depths: Sequence[float] | np.ndarray,
     target: Path,
     interval_s: float | None,
-    tick: Callable[[int, int], None],
+    update: Update,
 ) -> list[Path]:
     written = []
     for number, depth in enumerate(depths):
-        tick(number, len(depths))
+        update(number, len(depths))
         path = target / f"plane_z{depth:+.3f}mm.nc"
         netcdf.write_dataset(_plane(results.sel(z=depth), interval_s), path)
         written.append(path)
-    tick(1, 1)
+    update(1, 1)
     return written
 
 
 def _plane(results: xr.Dataset, interval_s: float | None) -> xr.Dataset:
-    """Put one plane of vectors into pivpy's form: dims y, x, t; u, v [mm/s], so that derivatives over mm are right."""
+    """Return one plane of vectors in pivpy's form: dims y, x, t, velocities in mm/s because lengths are in mm."""
     dims = ("y", "x", "t")
     names = {"u": "u", "v": "v", "w": "velocity_z"}  # pivpy keeps derived scalars in w
     variables: dict[str, Any] = {}

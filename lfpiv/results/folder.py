@@ -1,4 +1,4 @@
-"""The output folder of a run: where its files lie, that they can be written, and that one run at a time writes them."""
+"""The output folder of a run: paths of its files, a check that it can be written, and a lock for one run at a time."""
 
 from __future__ import annotations
 
@@ -20,46 +20,46 @@ from lfpiv.warn import Code, Warning, warn
 log = logging.getLogger(__name__)
 
 FRAME_NAMES = "ab"
-"""Names of the two frames in output files, whatever the images call them."""
+"""Names of the two frames in output files, independent of the names of the images."""
 
 RETIRED = ".outdated"
-"""Suffix, in place of ``.nc``, of results of a pair that failed since its images changed."""
+"""Suffix, in place of ``.nc``, of older results of a pair that failed after its images changed."""
 
 
 @dataclass(frozen=True)
 class Folder:
-    """Where a run keeps its files."""
+    """Paths of the files of a run."""
 
     path: Path
 
     @property
     def calibration(self) -> Path:
-        """The calibration of all cameras."""
+        """Calibration of all cameras."""
         return self.path / "calibration.h5"
 
     @property
     def self_calibration(self) -> Path:
-        """The calibration corrected for movements of the cameras."""
+        """Calibration corrected for movements of the cameras."""
         return self.path / "self_calibration.h5"
 
     @property
     def summary(self) -> Path:
-        """Machine-readable figures of the run."""
+        """Figures of the run as JSON."""
         return self.path / "summary.json"
 
     @property
     def report(self) -> Path:
-        """The page for people."""
+        """Report of the run as HTML."""
         return self.path / "report.html"
 
     @property
     def lock(self) -> Path:
-        """Held by the run that writes here; names it."""
+        """Lock file of the run that writes here. It contains the process."""
         return self.path / ".lock"
 
     @property
     def shared(self) -> Path:
-        """What the workers of a run share while it lasts."""
+        """Files that the workers of a run share; removed at its end."""
         return self.path / ".shared"
 
     def vectors(self, pair: int) -> Path:
@@ -71,7 +71,7 @@ class Folder:
         return self.path / "volumes" / f"pair_{pair:04d}_{FRAME_NAMES[frame]}.nc"
 
     def sweep(self) -> None:
-        """Remove what a killed run left: half-written files and what its workers shared. Only under the lock."""
+        """Remove half-written and shared files of a run that was killed. The caller must hold the lock."""
         for place in (self.path, self.vectors(0).parent, self.volume(0, 0).parent):
             for path in place.glob(".*.tmp"):
                 path.unlink(missing_ok=True)
@@ -79,25 +79,25 @@ class Folder:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Keep every other run from writing here; the lock ends with the process, however that ends.
+        """Lock the folder against other runs. The lock ends with the process at the latest.
 
         Raises
         ------
         InputError
-            If another run holds the folder; names its process.
+            If another run holds the folder. The message names its process.
         """
-        file = _locked(self.lock)
+        file = _lock(self.lock)
         try:
             yield
         finally:
             if file is not None:
-                with contextlib.suppress(OSError):  # while it is held: nobody else can have it open and locked
+                with contextlib.suppress(OSError):  # while locked: no other run has the file open and locked
                     self.lock.unlink()
                 os.close(file)
 
 
-def _locked(path: Path) -> int | None:
-    """Open and lock a file; None where the file system knows no locks."""
+def _lock(path: Path) -> int | None:
+    """Open and lock a file, and return its descriptor; None if the file system has no locks."""
     import fcntl
 
     while True:
@@ -111,8 +111,9 @@ def _locked(path: Path) -> int | None:
                 warn(log, Warning(code=Code.NO_LOCKS, subject=str(path.parent)))
                 return None
             raise InputError(
-                f"{path.parent}: expected a folder that no other run writes to, found it held by {_named(holder)}. "
-                "Wait for its end, stop it, or choose another --out. `lfpiv report` may look at it meanwhile."
+                f"{path.parent}: expected a folder that no other run writes to, found it held by "
+                f"{_process_name(holder)}. Wait for its end, stop it, or choose another --out. `lfpiv report` may look "
+                "at it meanwhile."
             ) from None
         try:
             same = os.path.samestat(os.fstat(file), os.stat(path))
@@ -120,28 +121,29 @@ def _locked(path: Path) -> int | None:
             same = False
         if same:
             break
-        os.close(file)  # its holder removed it between our opening and locking it
+        os.close(file)  # its holder removed it after this process opened it
     os.ftruncate(file, 0)
     since = time.strftime("%Y-%m-%d %H:%M:%S")
     os.pwrite(file, json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": since}).encode(), 0)
     return file
 
 
-def _named(holder: bytes) -> str:
+def _process_name(holder: bytes) -> str:
+    """Return the process that holds a lock, from the content of the lock file."""
     try:
         found = json.loads(holder)
         return f"process {found['process']} on {found['host']} since {found['since']}"
-    except (ValueError, KeyError, TypeError):  # it is about to write its name
+    except (ValueError, KeyError, TypeError):  # the holder has not written its name yet
         return "another process"
 
 
 def retire(path: Path) -> Path:
-    """Rename a result so that nobody takes it for one, and return its new path; the next success removes it."""
+    """Rename an outdated result and return its new path. The next result of the pair removes it."""
     return path.replace(path.with_suffix(RETIRED))
 
 
 def make_writable(path: Path) -> list[Path]:
-    """Make a folder and check that it can be written; return the folders made, innermost first."""
+    """Make a folder and check that it can be written. Return the new folders, innermost first."""
     made = []
     try:
         for parent in (path, *path.parents):

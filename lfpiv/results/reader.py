@@ -1,4 +1,4 @@
-"""`open_results`: the vectors of all pairs of a run as one dataset that reads from the files what is asked for."""
+"""`open_results`: the vectors of all pairs of a run as one dataset that reads its files lazily."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib.util
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,10 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.results import netcdf
 
 CHUNK_BYTES = 8 << 20
-"""With dask a chunk holds as many pairs of one variable as fit into this many bytes, at least one."""
+"""Largest size of a dask chunk, which holds one variable of at least one pair [byte]."""
 
 COMMON = ("dt_s", "voxel_mm", "smart", "correlation", "settings")
-"""Attributes that must be equal in all pairs, with all that is stamped on the files but the images of each."""
+"""Attributes that must be equal in all pairs, as must be everything that the vectors depend on except the images."""
 
 _NAME = re.compile(r"pair_(\d+)\.nc")
 
@@ -31,32 +32,32 @@ _NAME = re.compile(r"pair_(\d+)\.nc")
 def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = None) -> xr.Dataset:
     """Open the vectors of all finished pairs in the folder of a run.
 
-    Of every file only the attributes and the axes are read, about a millisecond each; values when they are asked for.
-    With dask installed the variables are dask arrays, chunked along pair; without it they are read from the files when
-    they are used, whole or in part. No file is kept open.
+    Only attributes and axes of each file are read at once, in about a millisecond. With dask installed, the variables
+    are dask arrays with chunks along pair. Without dask, values are read from the files when they are used. No file
+    stays open.
 
     Parameters
     ----------
     folder : str or Path
-        What `lfpiv run` got as ``--out``.
+        Output folder of `lfpiv run`, its ``--out``.
     pairs : tuple, optional
-        (A, B): pairs A to B - 1 only; B may be None. Missing numbers in between are left out.
+        (A, B): only pairs A to B - 1; B may be None. Missing pairs are skipped.
 
     Returns
     -------
     Dataset
         The variables of the vector files (docs/conventions.md) over pair, z, y, x. Coordinate ``pair``: numbers of the
-        pairs. Attributes: what all pairs share.
+        pairs. Attributes: those that all pairs share.
 
     Raises
     ------
     InputError
-        If there are no vectors, a file is no vector file, or two pairs were made with different settings or on
-        different axes: the message names both files.
+        If there are no vectors, a file is not a vector file, or two pairs differ in settings or axes. The message names
+        both files.
 
     Examples
     --------
-    Here the files are written first, which `lfpiv run` does otherwise:
+    This example writes the files itself. Usually `lfpiv run` has written them.
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -77,9 +78,9 @@ def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = N
     files = _files(Path(folder), pairs)
     numbers, paths = list(files), list(files.values())
     first = netcdf.read_vectors(paths[0])
-    reference = _Signature(paths[0])
+    reference = _read_signature(paths[0])
     for path in paths[1:]:
-        reference.compare(path)
+        _check_equal(_read_signature(path), reference)
     shape = tuple(first.sizes[axis] for axis in AXES)
     variables = {}
     for name in dict.fromkeys([*netcdf.VECTOR_UNITS, *map(str, first.data_vars)]):
@@ -88,15 +89,15 @@ def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = N
         stack = _Stack(paths, name, (len(paths), *shape), first[name].dtype)
         variables[name] = xr.Variable(("pair", *AXES), indexing.LazilyIndexedArray(stack), first[name].attrs)
     place = {"pair": ("pair", np.array(numbers), {"long_name": "number of the image pair", "units": "1"})}
-    kept = {key: first.attrs[key] for key in ("title", "experiment", *COMMON) if key in first.attrs}
-    results = xr.Dataset(variables, {**place, **{axis: first[axis] for axis in AXES}}, kept)
+    shared = {key: first.attrs[key] for key in ("title", "experiment", *COMMON) if key in first.attrs}
+    results = xr.Dataset(variables, {**place, **{axis: first[axis] for axis in AXES}}, shared)
     if importlib.util.find_spec("dask") is None:
         return results
     return results.chunk(pair=max(1, CHUNK_BYTES // first["u"].nbytes))
 
 
 def _files(folder: Path, pairs: tuple[int, int | None] | None) -> dict[int, Path]:
-    """Vector files in the folder by the number of their pair, in order."""
+    """Return the vector files of the chosen pairs in the folder, by number and in order."""
     vectors = folder / "vectors"
     if not vectors.is_dir():
         what = "no such folder" if not folder.exists() else "a file" if folder.is_file() else "no vectors in it"
@@ -116,49 +117,57 @@ def _text(pairs: tuple[int, int | None]) -> str:
     return f"{pairs[0]}:{'' if pairs[1] is None else pairs[1]}"
 
 
+@dataclass(frozen=True, kw_only=True)
 class _Signature:
-    """What all pairs must share: settings, axes, the shape of the variables. Read without decoding the file."""
+    """Properties of a vector file that all pairs must share."""
 
-    def __init__(self, path: Path):
-        self.path = path
-        self.attributes, self.axes, self.names = _read_signature(path)
-
-    def compare(self, path: Path) -> None:
-        """Refuse a file whose settings, axes or variables differ from the first one's."""
-        attributes, axes, names = _read_signature(path)
-        for key in {**self.attributes, **attributes}:
-            expected, found = self.attributes.get(key, ""), attributes.get(key, "")
-            if not np.array_equal(expected, found):
-                raise self._refusal(path, _difference(key, expected, found))
-        for axis in AXES:
-            if not np.array_equal(axes[axis], self.axes[axis]):
-                raise self._refusal(path, f"other vector positions along {axis}")
-        if names != self.names:
-            raise self._refusal(path, f"other variables: {', '.join(sorted(names ^ self.names))}")
-
-    def _refusal(self, path: Path, found: str) -> InputError:
-        return InputError(
-            f"{path}: expected vectors made as those of {self.path}, found {found}. "
-            "Run `lfpiv run` on all pairs again, or choose pairs that belong together."
-        )
+    path: Path
+    attributes: dict[str, Any]
+    """Attributes of `COMMON`, and as JSON everything that the vectors depend on except the images."""
+    axes: dict[str, np.ndarray]
+    """Vector positions along z, y, x [mm]."""
+    names: set[str]
+    """Names of the variables."""
 
 
-def _read_signature(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], set[str]]:
+def _read_signature(path: Path) -> _Signature:
+    """Read the signature of a file without its values."""
     try:
         with h5py.File(path, "r") as file:
             version = int(np.ravel(file.attrs.get("schema_version", 0))[0])
             attributes = {key: file.attrs[key] for key in COMMON if key in file.attrs}
-            stamp = json.loads(file.attrs.get("depends_on", "{}"))
+            depends_on = json.loads(file.attrs.get("depends_on", "{}"))
             axes = {axis: file[axis][...] for axis in AXES}
             names = set(file) - {*AXES, netcdf.RECONSTRUCTION}
     except (OSError, KeyError, ValueError) as error:
         raise InputError(_unreadable(path, error)) from None
-    attributes |= {key: json.dumps(value, sort_keys=True) for key, value in stamp.items() if key != "images"}
+    attributes |= {key: json.dumps(value, sort_keys=True) for key, value in depends_on.items() if key != "images"}
     if not 1 <= version <= netcdf.SCHEMA_VERSION:
         raise InputError(
             f"{path}: expected schema version 1 to {netcdf.SCHEMA_VERSION}, found {version}. Update lfpiv."
         )
-    return attributes, axes, names
+    return _Signature(path=path, attributes=attributes, axes=axes, names=names)
+
+
+def _check_equal(signature: _Signature, reference: _Signature) -> None:
+    """Refuse a file whose settings, axes or variables differ from those of the first file."""
+    for key in {**reference.attributes, **signature.attributes}:
+        expected, found = reference.attributes.get(key, ""), signature.attributes.get(key, "")
+        if not np.array_equal(expected, found):
+            raise _unequal(signature, reference, _difference(key, expected, found))
+    for axis in AXES:
+        if not np.array_equal(signature.axes[axis], reference.axes[axis]):
+            raise _unequal(signature, reference, f"other vector positions along {axis}")
+    if signature.names != reference.names:
+        differing = ", ".join(sorted(signature.names ^ reference.names))
+        raise _unequal(signature, reference, f"other variables: {differing}")
+
+
+def _unequal(signature: _Signature, reference: _Signature, found: str) -> InputError:
+    return InputError(
+        f"{signature.path}: expected vectors made as those of {reference.path}, found {found}. "
+        "Run `lfpiv run` on all pairs again, or choose pairs that belong together."
+    )
 
 
 def _unreadable(path: Path, error: Exception) -> str:
@@ -167,7 +176,7 @@ def _unreadable(path: Path, error: Exception) -> str:
 
 
 def _difference(key: str, expected: Any, found: Any) -> str:
-    """Name what differs in an attribute: a setting of a JSON object, or the value itself."""
+    """Describe the difference of an attribute: the first setting of a JSON object that differs, or the value."""
     try:
         one, other = json.loads(expected), json.loads(found)
         name = next(name for name in {**one, **other} if one.get(name) != other.get(name))
@@ -178,7 +187,7 @@ def _difference(key: str, expected: Any, found: Any) -> str:
 
 
 class _Stack(BackendArray):
-    """One variable of many files as an array (pair, z, y, x); an element is read when it is asked for."""
+    """One variable of many files as a lazy array (pair, z, y, x)."""
 
     def __init__(self, paths: Sequence[Path], name: str, shape: tuple[int, ...], dtype: np.dtype):
         self.paths = tuple(str(path) for path in paths)
@@ -210,7 +219,7 @@ class _Stack(BackendArray):
 
 
 def _part(values: np.ndarray, where: tuple[Any, ...]) -> np.ndarray:
-    """Take an outer index of an array, from the last axis on, so that a dropped axis moves no other."""
+    """Apply an outer index to an array. It starts with the last axis, because a dropped axis shifts those after it."""
     for axis in reversed(range(values.ndim)):
         values = values[(slice(None),) * axis + (where[axis],)]
     return values

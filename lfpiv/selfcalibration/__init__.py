@@ -1,1 +1,1 @@
-"""Self-calibration: how far apart cameras show the same particles, and the cameras' movements that explain it."""
+"""Self-calibration: measure how far apart cameras show the same particles, and the movements that explain it."""

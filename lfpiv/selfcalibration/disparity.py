@@ -1,14 +1,14 @@
-"""Disparity: how far apart two cameras show the same particles, in parts of a volume.
+"""Disparity: distance between the positions at which two cameras show the same particles, in parts of a volume.
 
-Each camera alone shows every particle, drawn out along its own view; where two cameras' volumes match best is their
-disparity.
+The volume reconstructed from the images of a single camera shows every particle, elongated along the camera's line of
+sight. The displacement at which the volumes of two cameras correlate best is their disparity. Input: weights and
+particle images of some instants. Output: a `Disparity` per pair of cameras and part of the volume.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -16,32 +16,32 @@ import numpy as np
 import scipy.fft
 from scipy.ndimage import gaussian_filter
 
-from lfpiv.reconstruction.volume import reconstruct
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.solver import SmartSolver
 
 if TYPE_CHECKING:
     from lfpiv.geometry.grid import Grid
     from lfpiv.weights.operator import Weights
 
 ITERATIONS = 10
-"""SMART iterations of each camera's own volume: lateral positions are there after a few."""
+"""SMART iterations of the volume of a single camera."""
 SMOOTHING_VOXEL = 1.0
-"""Standard deviation of the Gaussian that volumes are smoothed by before they are correlated [voxel]."""
+"""Standard deviation of the Gaussian that smooths volumes before they are correlated [voxel]."""
 SEARCH_VOXEL = 16
-"""Largest disparity searched for along each axis [voxel]."""
+"""Largest disparity along each axis [voxel]."""
 MIDDLE_VOXEL = 128
-"""Largest edge of the middle of the volume, which is asked first, all of it where it is smaller."""
+"""Largest edge of the middle part of the volume, which is correlated first [voxel]."""
 NEAR_VOXEL = 4
-"""Largest distance of a window's disparity from that of the middle along each axis: a chance peak elsewhere is no match
-[voxel]."""
+"""Largest distance of a window's disparity from that of the middle part along each axis [voxel]. Peaks farther away are
+chance peaks."""
 WINDOW_VOXEL, MOST_WINDOWS = 12, 3
-"""Least edge of the windows into which the volume is cut, and how many there are along an axis at most: a rigid
-movement needs no more."""
+"""Least edge of the windows into which the volume is cut [voxel], and their largest number along an axis."""
 LEAST_OVERLAP = 0.6
-"""Least part of a window that must lie within the other volume at a lag."""
+"""Least share of a window that must lie within the other volume at a lag."""
 FIT_REACH = 2
-"""Lags to either side of the highest one that a peak's paraboloid is fitted to."""
+"""Lags on either side of the highest one to which a peak's paraboloid is fitted."""
 SIGNIFICANT = 1.5
-"""Least height of a peak over the highest one where one volume is mirrored, which no particle explains."""
+"""Least ratio of a peak to the highest coefficient with one volume mirrored, which particles cannot explain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,26 +52,26 @@ class Disparity:
     centre_mm: np.ndarray
     """Centre of the part, shape (3,) [mm]."""
     shift_mm: np.ndarray
-    """Where the second camera shows what the first one shows at 0, shape (3,) [mm]."""
+    """Position at which the second camera shows what the first one shows at 0, shape (3,) [mm]."""
     sharpness: np.ndarray
-    """Curvature of the peak over its height, shape (3, 3) [1/mm^2]: large where the views cross, small along both."""
+    """Curvature of the peak over its height, shape (3, 3) [1/mm^2]: small along the lines of sight, large across."""
     peak: float
     """Correlation coefficient."""
     rival: float
     """Highest coefficient with one volume mirrored."""
 
-    @cached_property
+    @property
     def weight(self) -> np.ndarray:
-        """What a direction counts for, at most 1, shape (3, 3).
+        """Weight of each direction in a fit, at most 1, shape (3, 3): the square of the relative sharpness.
 
-        The error of a peak grows with its width, and faster: along the views particles disturb each other's.
+        The error of a peak grows faster than its width, because elongated particles disturb each other's peaks.
         """
         relative = self.sharpness / np.linalg.eigvalsh(self.sharpness)[-1]
         weight: np.ndarray = relative @ relative
         return weight
 
-    def told_mm(self, shift_mm: np.ndarray) -> float:
-        """Length of the part of a shift that the views tell [mm]."""
+    def observable_mm(self, shift_mm: np.ndarray) -> float:
+        """Return the length of the part of a shift that the cameras can observe [mm]."""
         return float(np.sqrt(shift_mm @ self.weight @ shift_mm))
 
 
@@ -80,12 +80,12 @@ def disparities(
     images: Sequence[Mapping[str, np.ndarray]],
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Disparity, ...]:
-    """Measure the disparities of all pairs of cameras in the parts of a volume, but for those that nothing tells.
+    """Measure the disparities of all pairs of cameras in the parts of a volume, without those that have no clear peak.
 
     Parameters
     ----------
     weights : Weights
-        Of two cameras or more.
+        The operator of two or more cameras.
     images : sequence of dict
         Particle images of some instants, camera name -> image (rows, columns), background removed.
     progress : callable, optional
@@ -94,25 +94,25 @@ def disparities(
     Returns
     -------
     tuple of Disparity
-        Empty where no part of the volume shows the same particles in any two cameras.
+        Empty if no two cameras show the same particles in any part of the volume.
     """
     names, grid = list(weights.cameras), weights.grid
-    alone: dict[str, list[np.ndarray]] = {}
+    by_camera: dict[str, list[np.ndarray]] = {}
     for number, name in enumerate(names):
-        one, alone[name] = weights.of_camera(name), []
+        solver, by_camera[name] = SmartSolver(weights.of_camera(name), SmartSettings(iterations=ITERATIONS)), []
         for place, instant in enumerate(images):
             if progress is not None:
                 progress((number + place / len(images)) / len(names))
-            volume = reconstruct(one, {name: instant[name]}, ITERATIONS).values
-            alone[name].append(gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant"))
+            volume = solver.solve({name: instant[name]}).volume
+            by_camera[name].append(gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant"))
     found = []
     middle = tuple(slice((n - m) // 2, (n + m) // 2) for n in grid.shape for m in [min(n, MIDDLE_VOXEL)])
     for pair in combinations(names, 2):
-        volumes = alone[pair[0]], alone[pair[1]]
-        of_all = _disparity(volumes, middle, grid, pair)
-        if of_all is not None:
-            parts = [_disparity(volumes, window, grid, pair, near_mm=of_all.shift_mm) for window in _windows(grid)]
-            found += [part for part in parts if part is not None] or [of_all]
+        volumes = by_camera[pair[0]], by_camera[pair[1]]
+        in_middle = _disparity(volumes, middle, grid, pair)
+        if in_middle is not None:
+            parts = [_disparity(volumes, window, grid, pair, near_mm=in_middle.shift_mm) for window in _windows(grid)]
+            found += [part for part in parts if part is not None] or [in_middle]
     return tuple(found)
 
 
@@ -123,7 +123,7 @@ def unlinked(found: Sequence[Disparity], cameras: Iterable[str]) -> list[str]:
 
 
 def _windows(grid: Grid) -> list[tuple[slice, ...]]:
-    """Parts of the volume, (z, y, x)."""
+    """Cut the volume into windows, (z, y, x)."""
     counts = [int(np.clip(edge // WINDOW_VOXEL, 1, MOST_WINDOWS)) for edge in grid.shape]
     edges = [np.linspace(0, edge, count + 1).astype(int) for edge, count in zip(grid.shape, counts, strict=True)]
     return [
@@ -139,10 +139,13 @@ def _disparity(
     cameras: tuple[str, str],
     near_mm: np.ndarray | None = None,
 ) -> Disparity | None:
-    """Disparity of two cameras' volumes in a window, near another one where given; None where no peak tells it."""
+    """Measure the disparity of two cameras' volumes in a window; None if there is no clear peak.
+
+    `near_mm` limits the search to `NEAR_VOXEL` around another disparity.
+    """
     first, second = volumes
-    coefficient = _coefficients(first, second, window)
-    mirrored = _coefficients(first, [volume[:, ::-1] for volume in second], _mirror(window, grid.shape[1]))
+    coefficient = masked_correlation(first, second, window)
+    mirrored = masked_correlation(first, [volume[:, ::-1] for volume in second], _mirror(window, grid.shape[1]))
     low, high = np.zeros(3, int), np.full(3, 2 * SEARCH_VOXEL)
     if near_mm is not None:
         centre = np.rint(near_mm[::-1] / grid.voxel_mm).astype(int) + SEARCH_VOXEL
@@ -175,16 +178,34 @@ def _disparity(
 
 
 def _mirror(window: tuple[slice, ...], edge: int) -> tuple[slice, ...]:
-    """Window on the same voxels of a volume that is mirrored along y."""
+    """Return the window of the same voxels in a volume that is mirrored along y."""
     z, y, x = window
     return z, slice(edge - y.stop, edge - y.start), x
 
 
-def _coefficients(first: Sequence[np.ndarray], second: Sequence[np.ndarray], window: tuple[slice, ...]) -> np.ndarray:
-    """Correlation coefficient of a window of some volumes with others at every lag, shape (z, y, x).
+def masked_correlation(
+    first: Sequence[np.ndarray], second: Sequence[np.ndarray], window: tuple[slice, ...]
+) -> np.ndarray:
+    """Correlate a window of volumes with other volumes at every lag: masked normalised cross-correlation [1]_.
 
-    Outside the volume nothing is known: each lag counts the voxels only that both know (masked normalised
-    cross-correlation, Padfield 2012).
+    At each lag only voxels count that both volumes have.
+
+    Parameters
+    ----------
+    first, second : sequence of ndarray, shape (z, y, x)
+        Volumes of some instants. Their products are summed over the instants.
+    window : tuple of slice
+        Voxels of `first`.
+
+    Returns
+    -------
+    ndarray, shape (2 SEARCH_VOXEL + 1,) * 3
+        Correlation coefficients, lag -`SEARCH_VOXEL` first; 0 where less than `LEAST_OVERLAP` of the window counts.
+
+    References
+    ----------
+    .. [1] D. Padfield, "Masked object registration in the Fourier domain", IEEE Trans. Image Process. 21 (2012)
+       2706-2718, doi:10.1109/TIP.2011.2181402.
     """
     reach = SEARCH_VOXEL
     inner = tuple(part.stop - part.start for part in window)

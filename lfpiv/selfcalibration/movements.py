@@ -1,13 +1,12 @@
-"""Volume self-calibration: the particles tell whether the cameras still stand as they did before the board.
+"""Volume self-calibration: correct a calibration for cameras that moved since the board was recorded [1]_.
 
-Each camera alone shows every particle, drawn out along its own view. Where two cameras' volumes match best is their
-disparity [1]. A camera that was knocked has moved as a rigid body, so six numbers per camera explain the disparities of
-the whole volume; what all cameras share cannot be told from a moved volume and stays as the board had it.
-Triangulation, which does this for focused images, does not work for light-field images; correlating volumes does.
+Input: a calibration, the grid, and particle images of some instants. The disparities of the cameras
+(`lfpiv.selfcalibration.disparity`) are explained by rigid movements, six numbers per camera. A movement of all cameras
+together cannot be distinguished from a moved volume; it is set to zero. Output: the corrected calibration, the
+movements and their standard errors. Focused images allow triangulation instead; light-field images do not.
 
-References
-----------
-[1] Wieneke, Volume self-calibration for 3D particle image velocimetry, Exp. Fluids 45, 549 (2008).
+.. [1] B. Wieneke, "Volume self-calibration for 3D particle image velocimetry", Exp. Fluids 45 (2008) 549-556,
+   doi:10.1007/s00348-008-0521-5.
 """
 
 from __future__ import annotations
@@ -24,25 +23,29 @@ from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, Disparity, disparities
 from lfpiv.weights.operator import build_weights
 
 PRIOR_MM, PRIOR_RAD = 0.3, 0.02
-"""Movements that count as one standard deviation: what the particles do not tell stays near none."""
+"""Standard deviations of the prior: shift [mm] and rotation [rad]. Movements that no disparity shows stay near zero."""
 LEAST_STD_VOXEL, ASSUMED_STD_VOXEL = 0.02, 0.1
-"""Least standard deviation of a disparity in its sharpest direction, and the one assumed where too few tell it."""
+"""Least standard deviation of a disparity in its sharpest direction, and the one assumed if too few are known
+[voxel]."""
 CONVERGED_VOXEL = 0.05
-"""A round that moves cameras against each other by less, as far as their views tell, ends the self-calibration."""
+"""Observable movement of the cameras against each other below which the self-calibration ends [voxel]."""
 ROUNDS = 4
-FITS, OUTLIER = 10, 2.0
-"""Solutions of a fit, and how many times as far off as most a disparity counts a quarter."""
+"""Largest number of corrections."""
+FITS = 10
+"""Number of reweighted solutions of a fit."""
+OUTLIER = 2.0
+"""Residual at which a disparity's weight is a quarter, as a multiple of 1.5 times the median residual."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Movement:
-    """How a camera moved since its calibration, as a rigid movement of the points that it sees.
+    """Movement of a camera since its calibration, expressed as a rigid movement of the points that it sees.
 
-    What lies at x it sees where its mapping has ``rotation (x - centre) + centre + shift``.
+    The camera sees a point x where its mapping has ``rotation (x - centre) + centre + shift``.
     """
 
     shift_mm: np.ndarray
-    """Along x, y, z, shape (3,) [mm]."""
+    """Shift along x, y, z, shape (3,) [mm]."""
     rotation_rad: np.ndarray
     """Rotation vector about `centre_mm`, shape (3,) [rad]."""
     centre_mm: np.ndarray
@@ -52,7 +55,7 @@ class Movement:
 
     @property
     def affine(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation matrix R and shift t [mm] of the same movement as ``R x + t``."""
+        """Rotation matrix R and shift t [mm] of the same movement, ``R x + t``."""
         rotation = Rotation.from_rotvec(self.rotation_rad).as_matrix()
         return rotation, self.centre_mm + self.shift_mm - rotation @ self.centre_mm
 
@@ -64,11 +67,11 @@ class Movement:
 
     @classmethod
     def none(cls, grid: Grid) -> Movement:
-        """Return that of a camera that stands still."""
+        """Return the movement of a camera that did not move."""
         return cls(shift_mm=np.zeros(3), rotation_rad=np.zeros(3), centre_mm=_centre_mm(grid), std=np.zeros(6))
 
     def after(self, step: Movement) -> Movement:
-        """Return the movement that begins with a step and goes on with this one."""
+        """Return the movement that applies `step` first, then this one."""
         outer, inner = (Rotation.from_rotvec(one.rotation_rad) for one in (self, step))
         shift = self(step(self.centre_mm[None]))[0] - self.centre_mm
         return replace(self, shift_mm=shift, rotation_rad=(outer * inner).as_rotvec())
@@ -76,18 +79,18 @@ class Movement:
 
 @dataclass(frozen=True, kw_only=True)
 class SelfCalibration:
-    """What particles tell of a calibration, and the calibration that explains them."""
+    """Corrected calibration, and the disparities before and after."""
 
     calibration: Calibration
-    """Corrected."""
+    """The corrected calibration."""
     movements: dict[str, Movement]
-    """Camera name -> how it moved; the mean of all cameras is none."""
+    """Camera name -> its movement; the mean of all cameras is zero."""
     before: tuple[Disparity, ...]
-    """Disparities with the calibration as it was."""
+    """Disparities with the original calibration."""
     after: tuple[Disparity, ...]
-    """Disparities with the corrected one."""
+    """Disparities with the corrected calibration."""
     apart_mm: tuple[float, ...]
-    """How far apart the cameras were, as `explained_mm` has it: before, and after each correction."""
+    """Root mean square of the explained disparities [mm], see `explained_mm`: before, and after each correction."""
 
 
 def self_calibrate(
@@ -97,18 +100,18 @@ def self_calibrate(
     *,
     progress: Callable[[float], None] | None = None,
 ) -> SelfCalibration:
-    """Correct a calibration for movements of its cameras, by images of particles.
+    """Correct a calibration for movements of its cameras, using images of particles.
 
     Parameters
     ----------
     calibration : Calibration
-        Of two cameras or more.
+        Calibration of two or more cameras.
     grid : Grid
         The volume.
     images : sequence of dict
         Particle images of some instants, camera name -> image (rows, columns), background removed.
     progress : callable, optional
-        Called with the finished fraction of the most rounds that there may be.
+        Called with the finished fraction of the largest number of rounds.
 
     Returns
     -------
@@ -129,15 +132,15 @@ def self_calibrate(
     found, apart = [], list[float]()
     for number in range(ROUNDS + 1):
 
-        def tell(fraction: float, number: int = number) -> None:
+        def step(fraction: float, number: int = number) -> None:
             if progress is not None:
                 progress((number + fraction) / (ROUNDS + 1))
 
-        found.append(disparities(build_weights(corrected, grid), images, tell))
-        alone = unlinked(found[-1], movements)
-        if alone:
+        found.append(disparities(build_weights(corrected, grid), images, step))
+        lost = unlinked(found[-1], movements)
+        if lost:
             raise ValueError(
-                f"images: expected particles that {' and '.join(alone)} and another camera show within {SEARCH_VOXEL} "
+                f"images: expected particles that {' and '.join(lost)} and another camera show within {SEARCH_VOXEL} "
                 "voxels of each other, found none: it moved by more, its images are of other instants, or show too few."
             )
         steps = fit_movements(found[-1], list(movements), grid)
@@ -158,31 +161,33 @@ def self_calibrate(
 
 
 def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid) -> dict[str, Movement]:
-    """Find the rigid movements of cameras that explain disparities, by weighted least squares.
+    """Fit the rigid movements of cameras that explain disparities, by reweighted least squares.
 
-    A disparity is the difference of two cameras' movements; its weight is its peak's sharpness, so directions that the
-    views do not tell hardly count, and its scale is what the fit leaves over. Where no disparity tells movements, they
-    are held near none by `PRIOR_MM` and `PRIOR_RAD`; so the mean of all cameras, which none tells, is none.
+    A disparity is the difference of two cameras' movements. Its weight is its `Disparity.weight` over the variance of
+    the residuals. Outliers get less weight (Geman and McClure). A weak prior keeps movements that no disparity shows
+    near zero, among them the mean of all cameras.
     """
     rows = [_row(one, cameras, grid) for one in found]
     count, least = len(cameras), LEAST_STD_VOXEL * grid.voxel_mm
     prior = np.diag(np.tile(np.repeat([PRIOR_MM**-2.0, PRIOR_RAD**-2.0], 3), count))
     variance, trust = (ASSUMED_STD_VOXEL * grid.voxel_mm) ** 2, np.ones(len(found))
-    for _ in range(FITS):  # each solution tells the variance, and which disparities are chance peaks
+    for _ in range(FITS):  # each solution gives the variance, and the weights of outliers
         information, pull = prior.copy(), np.zeros(6 * count)
         for one, row, part in zip(found, rows, trust / variance, strict=True):
             information += part * row.T @ one.weight @ row
             pull += part * row.T @ one.weight @ one.shift_mm
         covariance = np.linalg.inv(information)
         values = covariance @ pull
-        left = np.array([one.told_mm(one.shift_mm - row @ values) for one, row in zip(found, rows, strict=True)])
-        scale = max(1.5 * float(np.median(left)), least)
-        trust = (1 + (left / (OUTLIER * scale)) ** 2) ** -2.0  # Geman and McClure
+        residual = np.array(
+            [one.observable_mm(one.shift_mm - row @ values) for one, row in zip(found, rows, strict=True)]
+        )
+        scale = max(1.5 * float(np.median(residual)), least)
+        trust = (1 + (residual / (OUTLIER * scale)) ** 2) ** -2.0
         free = 3 * trust.sum() - 6 * (count - 1)
         if free > 0:
-            variance = max(float(trust @ left**2) / free, least**2)
-    apart = np.kron(np.eye(count) - 1 / count, np.eye(6))  # errors of what all cameras share: none, by definition
-    std = np.sqrt(np.diag(apart @ covariance @ apart.T)).reshape(-1, 6)
+            variance = max(float(trust @ residual**2) / free, least**2)
+    relative = np.kron(np.eye(count) - 1 / count, np.eye(6))  # the mean of all cameras has no error, by definition
+    std = np.sqrt(np.diag(relative @ covariance @ relative.T)).reshape(-1, 6)
     centre = _centre_mm(grid)
     return {
         name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=centre, std=std[number])
@@ -191,14 +196,14 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
 
 
 def explained_mm(found: Sequence[Disparity], movements: Mapping[str, Movement], grid: Grid) -> float:
-    """Return the root mean square of the disparities that movements explain, as far as the views tell [mm]."""
+    """Return the root mean square of the observable disparities that movements explain [mm]."""
     values = np.concatenate([np.append(move.shift_mm, move.rotation_rad) for move in movements.values()])
-    told = [one.told_mm(_row(one, list(movements), grid) @ values) for one in found]
-    return float(np.sqrt(np.mean(np.square(told))))
+    explained = [one.observable_mm(_row(one, list(movements), grid) @ values) for one in found]
+    return float(np.sqrt(np.mean(np.square(explained))))
 
 
 def _row(disparity: Disparity, cameras: Sequence[str], grid: Grid) -> np.ndarray:
-    """Disparity as a linear function of all cameras' shifts and rotations, shape (3, 6 cameras)."""
+    """Return the matrix from all cameras' shifts and rotations to a disparity, shape (3, 6 cameras)."""
     x, y, z = disparity.centre_mm - _centre_mm(grid)
     movement = np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
     row = np.zeros((3, 6 * len(cameras)))

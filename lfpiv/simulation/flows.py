@@ -1,8 +1,8 @@
-"""Flows with known displacement: what a simulated pair of frames moves by, and its mean over interrogation windows.
+"""Flows with known displacement, and their mean over interrogation windows.
 
-A flow is a frozen value called with points (n, 3) [mm]; it returns the displacement (n, 3) [mm] from the first frame to
-the second of a particle that passes the point midway in time. Frames at point -+ displacement/2 are therefore
-consistent with the flow to second order. Points and displacements are ordered (x, y, z).
+A flow is a frozen value that is called with points (n, 3) [mm]. It returns the displacement (n, 3) [mm] from the first
+frame to the second of particles that are at these points midway in time. Frames at point -+ displacement/2 are
+therefore consistent with the flow to second order. Points and displacements are ordered (x, y, z).
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from scipy.spatial import cKDTree
 
 from lfpiv.experiment.settings import Flag, Number, Positive, Table
 from lfpiv.simulation.swirl import injector_profiles
-from lfpiv.simulation.tracers import TracerMap, interpolate, load_tracers
+from lfpiv.simulation.tracers import TracerScaling, TracerSet, load_tracers
 from lfpiv.simulation.turbulence import TurbulentFlow
 
 Point = tuple[Number, Number, Number]
 Axis = Literal["x", "y", "z"]
 
 LAMB_OSEEN = 1.2564312086261697
-"""Root a of exp(a) = 1 + 2 a: with it the tangential displacement of a Lamb-Oseen vortex peaks at the core radius."""
+"""Root a of exp(a) = 1 + 2 a. It places the largest displacement of a Lamb-Oseen vortex at the core radius."""
 
 CHUNK = 20_000
-"""Points evaluated at once, which bounds the memory of quadratures."""
+"""Points in one batch of a quadrature."""
 
 
 class Uniform(Table):
-    """The same displacement everywhere."""
+    """Uniform displacement."""
 
     kind: Literal["uniform"] = "uniform"
     displacement_mm: Point
     """Displacement (x, y, z) [mm]."""
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) at points (n, 3) [mm]."""
+        """Return the displacement (n, 3) at points (n, 3) [mm]."""
         return np.broadcast_to(np.asarray(self.displacement_mm, float), _points(points_mm).shape).copy()
 
 
@@ -48,7 +48,7 @@ class Shear(Table):
     along: Axis
     """Axis of the displacement."""
     across: Axis
-    """Axis along which it grows."""
+    """Axis along which the displacement grows."""
     rate: Number
     """Displacement per distance [mm/mm]."""
     centre_mm: Point = (0.0, 0.0, 0.0)
@@ -61,7 +61,7 @@ class Shear(Table):
         return self
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) at points (n, 3) [mm]."""
+        """Return the displacement (n, 3) at points (n, 3) [mm]."""
         points_mm = _points(points_mm)
         across, along = "xyz".index(self.across), "xyz".index(self.along)
         displacement = np.zeros(points_mm.shape)
@@ -70,9 +70,9 @@ class Shear(Table):
 
 
 class Ring(Table):
-    """Ring vortex whose core line is a circle parallel to the x-y plane; the fluid inside the ring moves along -z.
+    """Ring vortex with its core line parallel to the x-y plane. The fluid inside the ring moves along -z.
 
-    The magnitude is peak (r/core) exp(1 - r/core), r the distance from the core line; a negative peak turns it round.
+    The magnitude is peak (r/core) exp(1 - r/core), with r the distance from the core line. A negative peak reverses it.
     """
 
     kind: Literal["ring"] = "ring"
@@ -86,7 +86,7 @@ class Ring(Table):
     """Centre of the ring (x, y, z) [mm]."""
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) at points (n, 3) [mm]."""
+        """Return the displacement (n, 3) at points (n, 3) [mm]."""
         x, y, z = (_points(points_mm) - self.centre_mm).T
         from_axis = np.hypot(x, y)
         outward = from_axis - self.radius_mm
@@ -105,18 +105,18 @@ class Swirl(Table):
     core_mm: Positive
     """Core radius [mm]."""
     profile: Literal["lamb_oseen", "solid"] = "lamb_oseen"
-    """Lamb-Oseen vortex, which peaks at the core radius and decays; or solid-body rotation, which grows everywhere."""
+    """Lamb-Oseen vortex, which peaks at the core radius and decays, or solid-body rotation."""
     axis: Axis = "y"
     """Direction of the axis of rotation."""
     centre_mm: Point = (0.0, 0.0, 0.0)
     """A point on the axis (x, y, z) [mm]."""
     axial_mm: Number = 0.0
-    """Displacement of the jet along the axis, on the axis [mm]."""
+    """Displacement along the axis, on the axis [mm]."""
     axial_core_mm: Positive | None = None
-    """Distance from the axis at which the jet has fallen to 1/e [mm]; absent: the core radius."""
+    """Distance from the axis at which the jet falls to 1/e [mm]; absent: the core radius."""
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) at points (n, 3) [mm]."""
+        """Return the displacement (n, 3) at points (n, 3) [mm]."""
         arm = _points(points_mm) - self.centre_mm
         axis = "xyz".index(self.axis)
         arm[:, axis] = 0
@@ -133,18 +133,18 @@ class Swirl(Table):
 
 
 class SwirlingJet(Table):
-    """Mean flow of a low-swirl injector: a jet that turns and spreads, free of divergence.
+    """Mean flow of a low-swirl injector: a rotating, spreading jet without divergence.
 
-    At the outlet it has the profiles of `lfpiv.simulation.swirl.injector_profiles`. Stream surfaces are r / delta = constant with
-    delta^2 = 1 + (spreading y / R)^2, y the distance from the outlet; along them the axial velocity falls as
-    1 / delta^2, volume flow and circulation are kept, and the radial velocity is r delta' / delta times the axial one.
-    The defaults are the paper's injector: S = 0.55, D = 34 mm, central channel of 12 mm radius; 37 degree vanes give
-    that swirl number with a mass ratio of 0.42 (Eq. 17).
+    At the outlet it has the profiles of `lfpiv.simulation.swirl.injector_profiles`. Stream surfaces are r / delta =
+    constant with delta^2 = 1 + (spreading y / R)^2 and y the distance from the outlet. Along them the axial velocity
+    falls as 1 / delta^2, volume flow and circulation are constant, and the radial velocity is r delta' / delta times
+    the axial one. The defaults are the paper's injector: S = 0.55, D = 34 mm, central channel of 12 mm radius, and a
+    mass ratio of 0.42, which gives that swirl number with 37 degree vanes (Eq. 17).
     """
 
     kind: Literal["swirling_jet"] = "swirling_jet"
     bulk_mm: Number
-    """Displacement at the bulk velocity, volume flow over the nozzle's area [mm]; negative: against the axis."""
+    """Displacement at the bulk velocity (volume flow over nozzle area) [mm]; negative: against the axis."""
     swirl_number: Number = 0.55
     """Swirl number S at the outlet; positive: right-handed about the axis."""
     nozzle_radius_mm: Positive = 17.0
@@ -154,9 +154,9 @@ class SwirlingJet(Table):
     mass_ratio: Annotated[float, Field(strict=True, ge=0, le=20)] = 0.42
     """Mass flow of the central channel over that of the swirled annulus."""
     shear_layer_mm: Positive = 1.7
-    """Half thickness of the tanh-shaped shear layers [mm]."""
+    """Half thickness of the shear layers, which are tanh profiles [mm]."""
     spreading: Annotated[float, Field(strict=True, ge=0, le=2)] = 0.5
-    """Tangent of the half angle at which the jet's edge spreads, far from the outlet."""
+    """Tangent of the half angle of spreading far from the outlet."""
     axis: Axis = "y"
     """Direction of the jet's axis."""
     centre_mm: Point = (0.0, 0.0, 0.0)
@@ -169,7 +169,7 @@ class SwirlingJet(Table):
         return self
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) at points (n, 3) [mm]."""
+        """Return the displacement (n, 3) at points (n, 3) [mm]."""
         radius, axis = self.nozzle_radius_mm, "xyz".index(self.axis)
         arm = (_points(points_mm) - self.centre_mm) / radius
         along = np.eye(3)[axis]
@@ -184,36 +184,36 @@ class SwirlingJet(Table):
             self.swirl_number,
         )
         outward = axial / spread * self.spreading**2 * height / spread  # radial velocity over radius
-        turning = spin / spread  # azimuthal velocity over radius: circulation is kept
+        turning = spin / spread  # azimuthal velocity over radius: circulation is constant
         displacement = outward[:, None] * arm + turning[:, None] * np.cross(along, arm)
         displacement[:, axis] = axial / spread
         return self.bulk_mm * displacement
 
 
 class Tracers(Table):
-    """Flow given by tracers followed from one instant to another, mapped into a box of the volume.
+    """Flow given by tracer positions at two instants, mapped into a box of the volume.
 
-    Between the tracers the displacement is a weighted linear fit to the nearest ones; outside their bounding box it is
-    that of the box's nearest point. Axes may be stretched differently; displacements are stretched with them.
+    Between tracers the displacement is a weighted linear fit to the nearest ones. Outside their bounding box it is that
+    of the nearest point of the box. Displacements are stretched with the axes, each of which has its own factor.
     """
 
     kind: Literal["tracers"] = "tracers"
     file: Annotated[str, Field(min_length=1)]
-    """A .npz file; relative to the scene file."""
+    """A .npz file, relative to the scene file."""
     first: str = "t0"
     """Array (tracer, >= 3) in the file whose first columns are x, y, z at the first instant, in any unit."""
     second: str = "t1"
     """Array of the same tracers, in the same order, at the second instant."""
     size_mm: tuple[Positive, Positive, Positive]
-    """Size (x, y, z) of the box the tracers fill [mm]."""
+    """Size (x, y, z) of the box of tracers [mm]."""
     centre_mm: Point = (0.0, 0.0, 0.0)
-    """Centre of that box (x, y, z) [mm]."""
+    """Centre (x, y, z) of the box [mm]."""
     box: tuple[Point, Point] | None = None
-    """The same box in the file's unit, two opposite corners; absent: the tracers' own extent."""
+    """Two opposite corners of the box in the unit of the file; absent: the extent of the tracers."""
     peak_mm: Positive | None = None
-    """Scale the displacement so that its largest magnitude is this [mm]; absent: as in the file."""
+    """Largest magnitude of the scaled displacement [mm]; absent: as in the file."""
     as_given: Flag = False
-    """Render the file's own tracers as particles; else place particles at random and interpolate."""
+    """Render the tracers as particles. False places particles at random and interpolates."""
 
     @model_validator(mode="after")
     def _box_open(self) -> Tracers:
@@ -222,29 +222,28 @@ class Tracers(Table):
         return self
 
     def tracers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tracers' positions midway in time and their displacements, each (n, 3) [mm].
+        """Return tracer positions midway in time and displacements, each of shape (n, 3) [mm].
 
         Raises
         ------
         InputError
-            If the file is missing or does not hold the two arrays.
+            If the file is missing or does not contain the two arrays.
         """
-        position, displacement, _ = load_tracers(self.file, self.first, self.second, self._map())
-        return position, displacement
+        loaded = self._loaded()
+        return loaded.position_mm, loaded.displacement_mm
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) at points (n, 3) [mm]."""
-        points_mm = _points(points_mm)
-        position, displacement, tree = load_tracers(self.file, self.first, self.second, self._map())
-        return interpolate(tree, displacement, np.clip(points_mm, position.min(0), position.max(0)))
+        """Return the displacement (n, 3) at points (n, 3) [mm]."""
+        return self._loaded().interpolate(_points(points_mm))
 
-    def _map(self) -> TracerMap:
-        return self.size_mm, self.centre_mm, self.box, self.peak_mm
+    def _loaded(self) -> TracerSet:
+        scaling = TracerScaling(size_mm=self.size_mm, centre_mm=self.centre_mm, box=self.box, peak_mm=self.peak_mm)
+        return load_tracers(self.file, self.first, self.second, scaling)
 
 
 Flow = Uniform | Shear | Ring | Swirl | SwirlingJet | Tracers
 KINDS = {model.model_fields["kind"].default: model for model in (Uniform, Shear, Ring, Swirl, SwirlingJet, Tracers)}
-"""The flows by the ``kind`` a scene file names."""
+"""Flows by their ``kind`` in a scene file."""
 
 
 def _points(points_mm: np.ndarray) -> np.ndarray:
@@ -268,18 +267,19 @@ def window_mean(
     *,
     order: int = 6,
 ) -> np.ndarray:
-    """Mean displacement of a flow over interrogation windows: what an ideal correlation would measure.
+    """Average a flow over interrogation windows, as an ideal correlation would.
 
     Parameters
     ----------
     flow : callable
-        Points (n, 3) to displacements (n, 3) [mm]. The fluctuating part of a `TurbulentFlow` is averaged exactly.
+        Function of points (n, 3) that returns displacements (n, 3) [mm]. The fluctuation of a `TurbulentFlow` is
+        averaged exactly.
     centres_mm : ndarray, shape (n, 3)
         Window centres (x, y, z) [mm].
     window_mm : float or tuple of float
         Edges of the windows, one or (x, y, z) [mm].
     order : int
-        Gauss-Legendre nodes per axis; exact for polynomials of degree 2 order - 1.
+        Gauss-Legendre nodes per axis, exact for polynomials of degree 2 order - 1.
 
     Returns
     -------
@@ -288,7 +288,7 @@ def window_mean(
 
     Examples
     --------
-    A window of 1 mm rounds off the peak of a vortex with a core of 0.5 mm:
+    A window of 1 mm lowers the peak of a vortex with a core of 0.5 mm:
 
     >>> from lfpiv.simulation.flows import Swirl, window_mean
     >>> vortex = Swirl(peak_mm=0.2, core_mm=0.5, axis="z")
@@ -320,7 +320,7 @@ def average_truth(
     centres_mm: np.ndarray,
     window_mm: float | tuple[float, float, float],
 ) -> np.ndarray:
-    """Mean displacement of the particles in each interrogation window, for flows known at particles only.
+    """Average the displacement of the particles in each interrogation window, for flows known at particles only.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ def average_truth(
     Returns
     -------
     ndarray, shape (n, 3)
-        Mean displacement [mm]; NaN where a window holds no particle.
+        Mean displacement [mm]; NaN where a window contains no particle.
     """
     points_mm, displacement_mm, centres_mm = _points(points_mm), _points(displacement_mm), _points(centres_mm)
     if points_mm.shape != displacement_mm.shape:

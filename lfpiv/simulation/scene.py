@@ -1,4 +1,4 @@
-"""Scene files of the simulator: what cameras, board, particles and flow truly are, as frozen models."""
+"""Scene files of the simulator: cameras, board, particles and flow with their true values, as frozen models."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lfpiv.simulation.flows import KINDS, Flow, Tracers
 from lfpiv.simulation.scene_camera import Aberrations, NonNegative, Point, SceneCamera, Windows, true_mapping
 from lfpiv.simulation.turbulence import Turbulence, TurbulentFlow
 
-__all__ = ["Aberrations", "Scene", "SceneCamera", "Windows", "open_scene", "true_mapping"]
+__all__ = ["Scene", "SceneCamera", "open_scene", "true_mapping"]
 
 
 class SceneBoard(Table):
@@ -57,22 +57,22 @@ class SceneVolume(Table):
 
 
 class SceneParticles(Table):
-    """Table ``[particles]``: how many, how bright, how large."""
+    """Table ``[particles]``: number, intensity and size of the particles."""
 
     per_microlens: Positive | None = None
-    """Particles per microlens of the seeded region's x-y face (the paper's ppm); give this or `count`."""
+    """Particles per microlens of the seeded region's x-y face (the paper's ppm). Alternative to `count`."""
     count: Count | None = None
     """Particles of each pair."""
     pairs: Count = 1
     """Number of image pairs, each with particles of its own."""
     fill: Positive = 1.0
-    """Edges of the seeded region relative to the volume's; above 1 there are particles outside the volume too."""
+    """Edges of the seeded region relative to the volume's. Above 1, particles are outside the volume too."""
     intensity_sd: NonNegative = 0.0
     """Standard deviation of the particles' intensity about 1."""
     sigma_mm: Positive | None = None
     """Standard deviation of Gaussian particles [mm]."""
     radius_mm: Positive | None = None
-    """Radius of spheres that shine evenly from their volume [mm]; without either, particles are points."""
+    """Radius of spheres that emit evenly from their volume [mm]. Without `sigma_mm` and this, particles are points."""
 
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneParticles:
@@ -84,29 +84,29 @@ class SceneParticles(Table):
 
 
 class Exposure(Table):
-    """Table ``[exposure]``: brightness as the level of a pixel above the background [count]."""
+    """Table ``[exposure]``: levels of pixels above the background [count]."""
 
     white_counts: Positive = 2700.0
-    """A pixel wholly inside a microimage of the white image."""
+    """Level of a pixel that is completely inside a microimage of the white image."""
     dot_counts: Positive = 3500.0
-    """A pixel of a microlens that sees nothing but the bright part of the board."""
+    """Level of a pixel of a microlens that only the bright part of the board lights."""
     particle_counts: Positive = 600.0
-    """A pixel lit by one point-like particle of intensity 1 (its light fills as many pixels as one microimage)."""
+    """Level of a pixel lit by one point-like particle of intensity 1, whose light covers the area of a microimage."""
 
 
 class Noise(Table):
-    """Table ``[noise]``: the camera's noise."""
+    """Table ``[noise]``: noise of the cameras."""
 
     background: NonNegative = 40.0
     """Level without light [count]."""
     read_noise: NonNegative = 3.0
     """Standard deviation of the read-out [count]."""
     full_well_e: NonNegative = 10_000.0
-    """Electrons at full scale, which set the shot noise; 0 switches it off."""
+    """Electrons at full scale, which determine the shot noise; 0 switches it off."""
 
 
 class Quality(Table):
-    """Table ``[quality]``: rays of the renderer, rounded up to powers of two."""
+    """Table ``[quality]``: numbers of rays, rounded up to powers of two."""
 
     particle_rays: Count = 32_768
     """Rays of each particle."""
@@ -117,26 +117,26 @@ class Quality(Table):
 
 
 class Scene(Table):
-    """The whole scene file. `smart`, `correlation`, `network`, `compute` are copied into the experiment file."""
+    """Scene file. `smart`, `correlation`, `network` and `compute` are copied into the experiment file."""
 
     name: Annotated[str, Field(min_length=1)]
     """Name of the experiment."""
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
-    """Whole number that every random draw derives from."""
+    """Seed of all random numbers."""
     dt_s: Positive
     """Time between the two frames of a pair [s]."""
     camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1)]
     window: Windows = ()
-    """Windows of the cameras that name none of their own."""
+    """Windows of the cameras without windows of their own."""
     aberrations: Aberrations | None = None
-    """Aberrations of the cameras that name none of their own."""
+    """Aberrations of the cameras without aberrations of their own."""
     board: SceneBoard
     volume: SceneVolume
     particles: SceneParticles
     flow: Annotated[Flow, Field(discriminator="kind")]
-    """Displacement between the two frames, the same for every pair: with turbulence, its mean."""
+    """Displacement between the two frames, equal for all pairs. With turbulence it is the mean."""
     turbulence: Turbulence | None = None
-    """Fluctuation added to the flow, another one for every pair."""
+    """Fluctuation added to the flow, different for each pair."""
     exposure: Exposure = Exposure()
     noise: Noise = Noise()
     quality: Quality = Quality()
@@ -190,7 +190,7 @@ class Scene(Table):
         return table
 
     def flow_of(self, pair: int) -> Flow | TurbulentFlow:
-        """Return the flow of one pair, mean and turbulence: points (n, 3) to displacements (n, 3) [mm]."""
+        """Return the flow of one pair, mean and turbulence, as a function of points (n, 3) [mm]."""
         if self.turbulence is None:
             return self.flow
         return TurbulentFlow(self.flow, self.turbulence.realisation(seed=(self.seed, 7, pair)))
@@ -202,7 +202,7 @@ def open_scene(path: str | Path) -> Scene:
     Parameters
     ----------
     path : str or Path
-        TOML file with the tables of `Scene`; a tracer file is looked up relative to it.
+        TOML file with the tables of `Scene`. The path of a tracer file is relative to it.
 
     Returns
     -------
@@ -217,6 +217,6 @@ def open_scene(path: str | Path) -> Scene:
     scene = read_toml(path, Scene)
     if isinstance(scene.flow, Tracers):
         flow = scene.flow.model_copy(update={"file": str((path.parent / scene.flow.file).absolute())})
-        flow.tracers()  # a missing or unsuitable file is refused here, before any work
+        flow.tracers()  # refuses a missing or unsuitable file before any work
         scene = scene.model_copy(update={"flow": flow})
     return scene

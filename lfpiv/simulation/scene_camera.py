@@ -1,4 +1,4 @@
-"""Cameras of a simulated scene: nominal optics, true pose, windows, aberrations, and the true rays they see."""
+"""Cameras of a simulated scene: nominal optics, true pose, windows and aberrations, and the true mapping of rays."""
 
 from __future__ import annotations
 
@@ -15,32 +15,31 @@ from lfpiv_kernels.rendering import real_optics
 NonNegative = Annotated[float, Field(strict=True, ge=0)]
 Pair = tuple[Number, Number]
 Point = tuple[Number, Number, Number]
-
-
 Pitches = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Index = Annotated[float, Field(strict=True, ge=1, le=4)]
 
-
-FOCUS_STEPS, FOCUS_MM = 200, 1e-11
-"""Steps at most that move a camera until it is in focus through its windows, and the last one's length [mm]."""
+FOCUS_STEPS = 200
+"""Largest number of steps that move a camera into focus through its windows."""
+FOCUS_MM = 1e-11
+"""Length of a step at which the camera is in focus [mm]."""
 
 
 class Window(Table):
-    """Table ``[window]`` or ``[camera.window]``: a plane-parallel plate between particles and lens; several in a row.
+    """Table ``[window]`` or ``[camera.window]``: plane-parallel plates between particles and lens.
 
-    Rays are refracted exactly (Snell's law); losses by reflection are left out.
+    Rays are refracted exactly (Snell's law). Reflection losses are neglected.
     """
 
     point_mm: Point
     """A point of the surface on the particles' side (x, y, z) [mm]."""
     normal: Point
-    """Normal of the surfaces (x, y, z), of any length and either sense."""
+    """Normal of the surfaces (x, y, z), of any length and sign."""
     thickness_mm: NonNegative
-    """Thickness [mm]; 0 is a bare interface, such as a liquid's free surface."""
+    """Thickness [mm]; 0 for an interface, such as the free surface of a liquid."""
     index: Index
     """Refractive index of the plate (about 1.46 fused silica, 1.52 crown glass, 1.49 acrylic)."""
     medium_index: Index = 1.0
-    """Refractive index of what surrounds the particles (1.333 water); only in the window next to them."""
+    """Refractive index of the medium around the particles (1.333 water); only in the window next to them."""
 
     @field_validator("normal")
     @classmethod
@@ -66,12 +65,13 @@ Windows = Annotated[tuple[Window, ...], BeforeValidator(_as_list), AfterValidato
 class Aberrations(Table):
     """Table ``[aberrations]`` or ``[camera.aberrations]``: third-order (Seidel) aberrations of the main lens.
 
-    Each is the transverse ray aberration on the microlens array at the edge of the pupil, the edge of the field being
-    the sensor's corner: see `lfpiv_kernels.rendering.real_optics.aberration_mm` for the polynomial. One pitch is one microlens.
+    Each value is the transverse ray aberration on the microlens array at the edge of the pupil, in microlens pitches.
+    The edge of the field is the sensor's corner. The polynomial is in
+    `lfpiv_kernels.rendering.real_optics.aberration_mm`.
     """
 
     spherical_pitch: Pitches = 0.0
-    """Spherical aberration, the same over the field; grows with the cube of the pupil radius [pitch]."""
+    """Spherical aberration, uniform over the field; it grows with the cube of the pupil radius [pitch]."""
     coma_pitch: Pitches = 0.0
     """Tangential coma at the edge of the field, three times the sagittal one [pitch]."""
     astigmatism_pitch: Pitches = 0.0
@@ -81,12 +81,12 @@ class Aberrations(Table):
     distortion_percent: Annotated[float, Field(strict=True, ge=-10, le=10)] = 0.0
     """Radial displacement of the chief ray at the edge of the field; positive: pincushion [% of the field's radius]."""
     centre_mm: Pair = (0.0, 0.0)
-    """Where on the array (s, t) the field's aberrations vanish: off the sensor's centre for a decentred lens, which
-    then has coma on its axis [mm]."""
+    """Point (s, t) of the array where the field's aberrations vanish [mm]. Outside the sensor's centre for a decentred
+    lens, which then has coma on its axis."""
 
 
 class SceneCamera(NominalCamera):
-    """Table ``[[camera]]``: nominal optics, which the user is told, and what is true, which the user is not."""
+    """Table ``[[camera]]``: nominal optics, which the experiment file contains, and the truth, which it does not."""
 
     sensor_width_px: Count
     """Columns of the sensor."""
@@ -99,8 +99,7 @@ class SceneCamera(NominalCamera):
     true_roll_deg: Number = 0.0
     """Right-handed rotation about the camera's z axis, after the pitch [degree]."""
     true_offset_mm: Point = (0.0, 0.0, 0.0)
-    """World point imaged in focus at the sensor's centre (x, y, z) [mm], as if the camera had been set up through its
-    windows."""
+    """World point in focus at the sensor's centre (x, y, z) [mm], through the windows if there are any."""
     true_array_roll_deg: Number = 0.0
     """Rotation of the microlens array on the sensor [degree]."""
     true_array_offset_mm: Pair = (0.0, 0.0)
@@ -108,15 +107,15 @@ class SceneCamera(NominalCamera):
     true_microlens_pitch_mm: Positive | None = None
     """True pitch of the array [mm]; absent: the nominal one."""
     blur_px: NonNegative = 0.4
-    """Standard deviation of the sensor's Gaussian point spread [pixel]."""
+    """Standard deviation of the sensor's Gaussian point spread function [pixel]."""
     vignetting: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
-    """Fraction of the light lost in the sensor's corners; the loss grows with the square of the distance."""
+    """Fraction of the light lost in the sensor's corners. The loss grows with the square of the distance."""
     lens_gain_sd: Annotated[float, Field(strict=True, ge=0, lt=0.5)] = 0.0
     """Standard deviation of the microlenses' transmission."""
     dark_image: Flag = False
-    """Whether a dark image is recorded."""
+    """Record a dark image."""
     window: Windows | None = None
-    """Windows this camera looks through, from the particles outwards; absent: the scene's."""
+    """Windows of this camera, from the particles outwards; absent: the scene's."""
     aberrations: Aberrations | None = None
     """Aberrations of this camera's main lens; absent: the scene's."""
 
@@ -142,7 +141,7 @@ class SceneCamera(NominalCamera):
         return self
 
     def with_optics(self, window: tuple[Window, ...], aberrations: Aberrations | None) -> SceneCamera:
-        """Return this camera with a scene's windows and aberrations where it has none of its own."""
+        """Return this camera with the scene's windows and aberrations in place of missing ones."""
         own = {name: getattr(self, name) for name in type(self).model_fields}
         for name, shared in (("window", window), ("aberrations", aberrations)):
             own[name] = shared if own[name] is None else own[name]
@@ -164,7 +163,7 @@ class SceneCamera(NominalCamera):
 
     @property
     def rotation(self) -> np.ndarray:
-        """World to camera, Rz Rx Ry with Ry the rotation of Eqs. 1-3, shape (3, 3)."""
+        """Rotation from world to camera, Rz Rx Ry with Ry the rotation of Eqs. 1-3, shape (3, 3)."""
         yaw = self.nominal_angle_deg if self.true_yaw_deg is None else self.true_yaw_deg
         (cy, sy), (cx, sx), (cz, sz) = (
             (np.cos(angle), np.sin(angle)) for angle in np.radians([yaw, self.true_pitch_deg, self.true_roll_deg])
@@ -179,7 +178,8 @@ class SceneCamera(NominalCamera):
     def axis_point_mm(self) -> np.ndarray:
         """World point at the object distance on the camera's axis (x, y, z) [mm]: origin of the camera's frame.
 
-        Without windows it is the point in focus; with windows the camera stands where it sees that point in focus.
+        Without windows it is the point in focus. With windows the camera is moved until that point is in focus. Raise
+        ValueError if no such position is found.
         """
         focused = np.asarray(self.true_offset_mm, float)
         if not self.window:
@@ -188,16 +188,21 @@ class SceneCamera(NominalCamera):
         radius, so = optics.pupil_radius_mm / np.sqrt(2), optics.object_distance_mm
         pupil = radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         for _ in range(FOCUS_STEPS):
-            seen = np.broadcast_to((focused - axis_point) @ self.rotation.T, (5, 3))
-            seen = real_optics.apparent_points(seen, pupil, so, self._plates(axis_point))
-            # where the five rays cross the focal plane: at the chief ray's place, and spread by the mean defocus
-            crossing = (seen[:, :2] * so - pupil * seen[:, 2:]) / (so - seen[:, 2:])
+            local = np.broadcast_to((focused - axis_point) @ self.rotation.T, (5, 3))
+            apparent = real_optics.apparent_points(local, pupil, so, self._plates(axis_point))
+            # the five rays cross the focal plane around the chief ray's point, at distances given by the mean defocus
+            crossing = (apparent[:, :2] * so - pupil * apparent[:, 2:]) / (so - apparent[:, 2:])
             defocus = so * (crossing * pupil).sum() / (pupil**2).sum()
             step = np.array([*crossing[0], -defocus])
             axis_point += step @ self.rotation
             if np.abs(step).max() < FOCUS_MM:
                 return axis_point
         raise ValueError(f"camera {self.name!r}: window: no place found from which true_offset_mm is in focus.")
+
+    def local_mm(self, points_mm: np.ndarray) -> np.ndarray:
+        """Return points (n, 3) in the camera's frame, shape (n, 3) [mm]."""
+        local: np.ndarray = (points_mm - self.axis_point_mm) @ self.rotation.T
+        return local
 
     def _plates(self, axis_point_mm: np.ndarray) -> np.ndarray:
         windows = self.window or ()
@@ -212,12 +217,12 @@ class SceneCamera(NominalCamera):
 
     @property
     def plates(self) -> np.ndarray:
-        """The windows in the camera's frame, as `raytrace.pack_plates` gives them, shape (window, 7)."""
+        """Windows in the camera's frame, in the form of `real_optics.pack_plates`, shape (window, 7)."""
         return self._plates(self.axis_point_mm)
 
     @property
     def seidel(self) -> np.ndarray:
-        """The aberrations as `raytrace.Aberrations` lists them, shape (9,)."""
+        """Aberrations in the form of `real_optics.Aberrations`, shape (9,)."""
         optics, lens = self.optics, self.aberrations or Aberrations()
         field = float(np.hypot(*optics.sensor_shape)) * optics.pixel_mm / 2
         edge = (lens.spherical_pitch, lens.coma_pitch, lens.astigmatism_pitch, lens.field_curvature_pitch)
@@ -227,7 +232,7 @@ class SceneCamera(NominalCamera):
 
     @property
     def lattice(self) -> LensLattice:
-        """The true microlens array in its own plane."""
+        """True microlens array in its own plane."""
         pitch = self.true_microlens_pitch_mm or self.microlens_pitch_mm
         roll = np.radians(self.true_array_roll_deg)
         second = np.radians(60 if self.microlens_layout == "hexagonal" else 90)
@@ -249,7 +254,7 @@ def true_mapping(camera: SceneCamera | Mapping[str, Any]) -> Callable[[np.ndarra
     -------
     callable
         ``(points_mm (n, 3), pupil_mm (n, 2)) -> (s, t) (n, 2)`` [mm], origin at the sensor's centre: s = k u - m x_c of
-        the point's apparent place behind the windows, plus the lens's aberrations.
+        the apparent point behind the windows, plus the aberrations of the lens.
     """
     if not isinstance(camera, SceneCamera):
         camera = SceneCamera.model_validate(camera)
@@ -257,12 +262,12 @@ def true_mapping(camera: SceneCamera | Mapping[str, Any]) -> Callable[[np.ndarra
     plates, seidel = camera.plates, camera.seidel
 
     def mapping(points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
-        seen = (np.asarray(points_mm, float) - axis_point) @ rotation.T
+        local = (np.asarray(points_mm, float) - axis_point) @ rotation.T
         if len(plates):
-            seen = real_optics.apparent_points(seen, pupil_mm, optics.object_distance_mm, plates)
-        m = optics.image_distance_mm / (optics.object_distance_mm - seen[..., 2:])
-        k = m * seen[..., 2:] / optics.object_distance_mm
-        array: np.ndarray = k * np.asarray(pupil_mm, float) - m * seen[..., :2]
+            local = real_optics.apparent_points(local, pupil_mm, optics.object_distance_mm, plates)
+        m = optics.image_distance_mm / (optics.object_distance_mm - local[..., 2:])
+        k = m * local[..., 2:] / optics.object_distance_mm
+        array: np.ndarray = k * np.asarray(pupil_mm, float) - m * local[..., :2]
         if np.any(seidel[4:]):
             array += real_optics.aberration_mm(array, pupil_mm, seidel)
         return array

@@ -1,8 +1,7 @@
-"""Simulated experiments: a scene file to white, board and particle images with their truth, in the contract's form.
+"""Simulated experiments: a scene file to white, board and particle images with their truth, as a complete data set.
 
-The model is main lens, microlens array and sensor of a misaligned camera (Eqs. 1-3 and 9), with windows in front of it
-and third-order aberrations where the scene has them, rendered by rays, then blurred, exposed and read out with noise to
-12 bits.
+A camera consists of main lens, microlens array and sensor, misaligned as the scene states (Eqs. 1-3 and 9), with
+windows and third-order aberrations. Images are rendered by rays, blurred, exposed, and read out with noise to 12 bits.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tifffile
@@ -22,34 +21,45 @@ from scipy.ndimage import gaussian_filter
 
 from lfpiv.errors import InputError
 from lfpiv.simulation.flows import Tracers
-from lfpiv.simulation.scene import Noise, Scene, SceneCamera, open_scene, true_mapping
+from lfpiv.simulation.scene import Noise, Scene, open_scene
+from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
 from lfpiv_kernels.rendering import collect, real_optics, render
-
-__all__ = ["DEMO_SCENE", "open_scene", "place_particles", "render_camera", "simulate", "true_mapping"]
 
 log = logging.getLogger(__name__)
 
-Placed = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Positions, displacements [mm] and intensities of one pair's particles."""
-
-Progress = Callable[[str, int, int], None]
-"""Called as ``progress(what, done, total)``."""
-
-DEMO_SCENE = Path(__file__).with_name("demo_scene.toml")
-"""The scene of the demonstration."""
+FRAMES = ("a", "b")
+"""Names of the two frames of a pair."""
 
 FULL_SCALE = 4095
 """Largest count of the simulated 12-bit cameras."""
 
 AREA_STEP_MM = 1e-3
-"""Step of the differences that give the area of a dot's image."""
+"""Step of the differences that give the area of a dot's image [mm]."""
 
 LEAST_INTENSITY = 0.3
-"""Particles scatter at least this much of the mean, however wide their intensities spread."""
+"""Lower limit of a particle's intensity, relative to the mean."""
+
+Progress = Callable[[str, int, int], None]
+"""Called as ``progress(step, done, total)``."""
+
+
+class PlacedParticles(NamedTuple):
+    """Particles of one image pair."""
+
+    position_mm: np.ndarray
+    """Positions midway between the frames (x, y, z) [mm], shape (particle, 3)."""
+    displacement_mm: np.ndarray
+    """Displacements from the first to the second frame [mm], shape (particle, 3)."""
+    intensity: np.ndarray
+    """Intensities relative to the mean, shape (particle,)."""
+
+    def at_frame(self, frame: str) -> np.ndarray:
+        """Return the positions in frame "a" or "b", shape (particle, 3) [mm]."""
+        return self.position_mm + (-0.5 if frame == "a" else 0.5) * self.displacement_mm
 
 
 def render_camera(camera: SceneCamera, *, seed: int | list[int] = 0) -> render.RenderCamera:
-    """Return a scene's camera as the renderer takes it; `seed` fixes the transmission of its microlenses."""
+    """Return the renderer's form of a camera. `seed` determines the transmission of its microlenses."""
     optics, lattice = camera.optics, camera.lattice
     half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
     corners = (half + 3 * lattice.pitch_mm) * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
@@ -79,13 +89,14 @@ def render_camera(camera: SceneCamera, *, seed: int | list[int] = 0) -> render.R
 
 
 def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
-    """Area on the array per area of a plane of constant z, at points (n, 3) [mm], mean over the pupil, shape (n,)."""
+    """Return the area on the array per area of a plane of constant z, averaged over the pupil.
+
+    Points have shape (n, 3) [mm], the result has shape (n,).
+    """
     optics, points_mm = camera.optics, np.asarray(points_mm, float)
     if not camera.window and camera.aberrations is None:
-        seen = (points_mm - camera.axis_point_mm) @ camera.rotation.T
-        scale: np.ndarray = (
-            abs(camera.rotation[2, 2]) * (optics.image_distance_mm / (optics.object_distance_mm - seen[:, 2])) ** 2
-        )
+        distance = optics.object_distance_mm - camera.local_mm(points_mm)[:, 2]
+        scale: np.ndarray = abs(camera.rotation[2, 2]) * (optics.image_distance_mm / distance) ** 2
         return scale
     ring, angle = np.meshgrid(np.sqrt((np.arange(4) + 0.5) / 4), 2 * np.pi * np.arange(8) / 8)
     pupil = optics.pupil_radius_mm * np.stack([ring * np.cos(angle), ring * np.sin(angle)], -1).reshape(-1, 2)
@@ -97,7 +108,7 @@ def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
     return mean
 
 
-def place_particles(scene: Scene, pair: int) -> Placed:
+def place_particles(scene: Scene, pair: int) -> PlacedParticles:
     """Place the particles of one image pair.
 
     Parameters
@@ -105,19 +116,16 @@ def place_particles(scene: Scene, pair: int) -> Placed:
     scene : Scene
         The scene.
     pair : int
-        Number of the pair, from 0; each pair has its own particles.
+        Number of the pair, from 0. Each pair has its own particles.
 
     Returns
     -------
-    position_mm, displacement_mm : ndarray, shape (particle, 3)
-        Position midway between the frames and displacement from the first to the second (x, y, z) [mm].
-    intensity : ndarray, shape (particle,)
-        Relative intensity, about 1.
+    PlacedParticles
 
     Raises
     ------
     InputError
-        If not even one particle would be placed.
+        If the scene has less than one particle.
     """
     rng = np.random.default_rng([scene.seed, 1, pair])
     particles, volume = scene.particles, scene.volume
@@ -125,7 +133,7 @@ def place_particles(scene: Scene, pair: int) -> Placed:
     count = particles.count
     if count is None:
         first = scene.camera[0]
-        cell = abs(np.linalg.det(first.lattice.basis_mm)) / first.magnification**2  # one microlens, seen in the volume
+        cell = abs(np.linalg.det(first.lattice.basis_mm)) / first.magnification**2  # area of a microlens in the volume
         count = round(particles.per_microlens * size[0] * size[1] / cell)
     if count < 1:
         raise InputError(
@@ -143,7 +151,7 @@ def place_particles(scene: Scene, pair: int) -> Placed:
         position = np.asarray(volume.centre_mm) + rng.uniform(-0.5, 0.5, (count, 3)) * size
         displacement = scene.flow_of(pair)(position)
     intensity = np.maximum(LEAST_INTENSITY, 1 + particles.intensity_sd * rng.standard_normal(len(position)))
-    return position, displacement, intensity
+    return PlacedParticles(position, displacement, intensity)
 
 
 def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress | None = None) -> Path:
@@ -154,9 +162,9 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     scene : Scene, str or Path
         The scene or its file.
     out : str or Path
-        Folder to write, absent or empty; it appears complete or not at all.
+        Folder to write, absent or empty. It appears only when it is complete.
     progress : callable, optional
-        Called as ``progress(what, done, total)``.
+        Called as ``progress(step, done, total)``.
 
     Returns
     -------
@@ -166,13 +174,13 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     Raises
     ------
     InputError
-        If the scene file is bad, or the folder is not empty or cannot be written.
+        If the scene file is invalid, or the folder is not empty or cannot be written.
     """
     if not isinstance(scene, Scene):
         scene = open_scene(scene)
     pairs = [place_particles(scene, pair) for pair in range(scene.particles.pairs)]
     for camera in scene.camera:
-        _check_view(scene, camera, pairs)
+        _check_positions(scene, camera, pairs)
     out = Path(out)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: expected an empty or absent folder to write to, found files. Name another folder.")
@@ -182,7 +190,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     except OSError as error:
         raise InputError(f"{out}: the folder cannot be written ({error.strerror}). Name another folder.") from None
     try:
-        _write(scene, pairs, scratch, progress or (lambda what, done, total: None))
+        _write(scene, pairs, scratch, progress or (lambda step, done, total: None))
         scratch.chmod(0o755)
         os.replace(scratch, out)
     except BaseException:
@@ -191,55 +199,55 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     return out / "experiment.toml"
 
 
-def _check_view(scene: Scene, camera: SceneCamera, pairs: list[Placed]) -> None:
-    """Refuse what lies too near the lens; log how much the sensor sees."""
+def _check_positions(scene: Scene, camera: SceneCamera, pairs: list[PlacedParticles]) -> None:
+    """Refuse dots and particles too near the lens, and log what part of them is in the field of view."""
     optics = camera.optics
     half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
     dots = np.concatenate([scene.board.dots_mm(depth) for depth in scene.board.planes_mm])
-    ends = [position + sign * displacement for position, displacement, _ in pairs for sign in (-0.5, 0.5)]
-    groups = (("board.planes_mm", "the dots", dots), ("volume.size_mm", "the particles", np.concatenate(ends)))
-    for what, label, points in groups:
+    particles = np.concatenate([placed.at_frame(frame) for placed in pairs for frame in FRAMES])
+    for key, label, points in (("board.planes_mm", "the dots", dots), ("volume.size_mm", "the particles", particles)):
         _check_windows(camera, label, points)
-        nearest = ((points - camera.axis_point_mm) @ camera.rotation.T)[:, 2].max()
+        nearest = camera.local_mm(points)[:, 2].max()
         if not nearest < optics.object_distance_mm / 2:
             raise InputError(
-                f"{what}: expected everything within {optics.object_distance_mm / 2:g} mm of the plane camera "
+                f"{key}: expected everything within {optics.object_distance_mm / 2:g} mm of the plane camera "
                 f"{camera.name!r} focuses on, found a point {nearest:g} mm in front of it. Use a smaller extent."
             )
         chief = true_mapping(camera)(points, np.zeros((len(points), 2)))
-        seen = float((np.abs(chief) <= half).all(1).mean())
-        level = logging.INFO if seen > 0.5 else logging.WARNING
-        log.log(level, "camera %s sees %.1f %% of %s", camera.name, 100 * seen, label)
+        share = float((np.abs(chief) <= half).all(1).mean())
+        level = logging.INFO if share > 0.5 else logging.WARNING
+        log.log(level, "camera %s sees %.1f %% of %s", camera.name, 100 * share, label)
 
 
 def _check_windows(camera: SceneCamera, label: str, points: np.ndarray) -> None:
-    """Refuse windows that do not stand between the points and the lens, or that rays only graze."""
+    """Refuse windows that are not between the points and the lens, or that rays meet at grazing incidence."""
     so, radius = camera.optics.object_distance_mm, camera.optics.pupil_radius_mm
     try:
-        seen = (points - camera.axis_point_mm) @ camera.rotation.T
-    except ValueError as error:  # windows so thick or so far out that nothing is in focus through them
+        local = camera.local_mm(points)
+    except ValueError as error:  # no camera position is in focus through these windows
         raise InputError(f"camera {camera.name!r}: {error}") from None
     edge = radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     pupil = np.column_stack([edge, np.full(len(edge), so)])
     for number, (normal, level, thickness) in enumerate((p[:3], p[3], p[4]) for p in camera.plates):
-        where = f"camera {camera.name!r}, window[{number}]"
-        inside, beyond = (seen @ normal).max() - level, level + thickness - (pupil @ normal).min()
+        key = f"camera {camera.name!r}, window[{number}]"
+        inside, beyond = (local @ normal).max() - level, level + thickness - (pupil @ normal).min()
         if inside >= 0 or beyond >= 0:
-            what, over = (label, inside) if inside >= 0 else ("the lens's pupil", beyond)
+            name, distance = (label, inside) if inside >= 0 else ("the lens's pupil", beyond)
             raise InputError(
-                f"{where}: expected a plate between {label} and the lens, found {what} {over:.3g} mm on the wrong side "
-                "of it. Check point_mm (a point of the surface nearer to the particles), normal and thickness_mm."
+                f"{key}: expected a plate between {label} and the lens, found {name} {distance:.3g} mm on the wrong "
+                "side of it. Check point_mm (a point of the surface nearer to the particles), normal and thickness_mm."
             )
-        ray = pupil[:, None] - seen
+        ray = pupil[:, None] - local
         steepest = ((ray @ normal) / np.linalg.norm(ray, axis=-1)).min()
         if steepest < real_optics.STEEPEST:
             raise InputError(
-                f"{where}: expected rays that enter it, found an angle of incidence of "
+                f"{key}: expected rays that enter it, found an angle of incidence of "
                 f"{np.degrees(np.arccos(steepest)):.0f} degrees. Turn its normal towards the camera."
             )
 
 
-def _write(scene: Scene, pairs: list[Placed], folder: Path, progress: Progress) -> None:
+def _write(scene: Scene, pairs: list[PlacedParticles], folder: Path, progress: Progress) -> None:
+    """Write images, truth and experiment file."""
     total = len(scene.camera) * (1 + len(scene.board.planes_mm) + 2 * len(pairs))
     total += sum(camera.dark_image for camera in scene.camera)
     done = 0
@@ -251,39 +259,45 @@ def _write(scene: Scene, pairs: list[Placed], folder: Path, progress: Progress) 
             progress("simulated images", done, total)
     (folder / "truth").mkdir()
     truth: dict[str, Any] = {}
-    for pair, (position, displacement, intensity) in enumerate(pairs):
-        truth[f"pair_{pair:04d}_positions_mm"] = position
-        truth[f"pair_{pair:04d}_displacement_mm"] = displacement
-        truth[f"pair_{pair:04d}_velocity_m_s"] = displacement / scene.dt_s / 1000
-        truth[f"pair_{pair:04d}_intensity"] = intensity
+    for pair, placed in enumerate(pairs):
+        truth[f"pair_{pair:04d}_positions_mm"] = placed.position_mm
+        truth[f"pair_{pair:04d}_displacement_mm"] = placed.displacement_mm
+        truth[f"pair_{pair:04d}_velocity_m_s"] = placed.displacement_mm / scene.dt_s / 1000
+        truth[f"pair_{pair:04d}_intensity"] = placed.intensity
     np.savez_compressed(folder / "truth" / "particles.npz", **truth)
     spec = scene.model_dump(mode="json", exclude={"smart", "correlation", "network", "compute"}, exclude_none=True)
     (folder / "truth" / "spec.json").write_text(json.dumps(spec, indent=1) + "\n", "utf-8")
     (folder / "experiment.toml").write_text(_experiment_text(scene), "utf-8")
 
 
-def _images(scene: Scene, number: int, pairs: list[Placed]) -> Iterator[tuple[str, np.ndarray]]:
+def _images(scene: Scene, number: int, pairs: list[PlacedParticles]) -> Iterator[tuple[str, np.ndarray]]:
     """Yield path and noise-free image [count] of everything one camera records."""
-    camera, exposure, quality = scene.camera[number], scene.exposure, scene.quality
-    eye = render_camera(camera, seed=[scene.seed, 3, number])
+    camera = scene.camera[number]
+    renderer = render_camera(camera, seed=[scene.seed, 3, number])
     seed = int(np.random.default_rng([scene.seed, 4, number]).integers(2**31))
     if camera.dark_image:
-        yield f"dark/{camera.name}.tif", np.zeros(eye.sensor_shape)
-    yield (
-        f"white/{camera.name}.tif",
-        exposure.white_counts * collect.render_white(eye, samples=quality.pixel_rays, seed=seed),
-    )
+        yield f"dark/{camera.name}.tif", np.zeros(renderer.sensor_shape)
+    white = collect.render_white(renderer, samples=scene.quality.pixel_rays, seed=seed)
+    yield f"white/{camera.name}.tif", scene.exposure.white_counts * white
+    yield from _board_images(scene, number, renderer, seed)
+    yield from _particle_images(scene, number, renderer, seed + 1, pairs)
 
+
+def _board_images(
+    scene: Scene, number: int, renderer: render.RenderCamera, seed: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield path and image [count] of each plane of the board."""
+    camera, board, exposure, quality = scene.camera[number], scene.board, scene.exposure, scene.quality
     rays = render.ray_table(quality.dot_rays, "disc", seed)
-    for plane, depth in enumerate(scene.board.planes_mm):
+    for plane, depth in enumerate(board.planes_mm):
         path = f"board/{camera.name}/plane_{plane:02d}.tif"
-        if scene.board.inverted:
+        if board.inverted:
             image = collect.render_board(
-                eye,
+                renderer,
                 depth,
-                dots=scene.board.dots,
-                spacing_mm=scene.board.spacing_mm,
-                dot_diameter_mm=scene.board.dot_diameter_mm,
+                dots=board.dots,
+                spacing_mm=board.spacing_mm,
+                dot_diameter_mm=board.dot_diameter_mm,
                 dot_light=0.0,
                 board_light=1.0,
                 samples=quality.pixel_rays,
@@ -291,27 +305,32 @@ def _images(scene: Scene, number: int, pairs: list[Placed]) -> Iterator[tuple[st
             )
             yield path, exposure.dot_counts * image
             continue
-        dots = scene.board.dots_mm(depth)
-        # microlenses the image of a dot covers; a covered lens lights its whole microimage
-        lenses = np.pi / 4 * scene.board.dot_diameter_mm**2 * image_area(camera, dots)
-        lenses /= abs(np.linalg.det(eye.basis_mm))
+        dots = board.dots_mm(depth)
+        # microlenses that the image of a dot covers: each lights its whole microimage
+        lenses = np.pi / 4 * board.dot_diameter_mm**2 * image_area(camera, dots)
+        lenses /= abs(np.linalg.det(renderer.basis_mm))
         rng = np.random.default_rng([scene.seed, 5, number, plane])
-        counts = exposure.dot_counts * eye.microimage_px * lenses
-        yield path, render.render_sources(eye, dots, counts, scene.board.dot_diameter_mm / 2, rays, rng=rng)
+        counts = exposure.dot_counts * renderer.microimage_px * lenses
+        yield path, render.render_sources(renderer, dots, counts, board.dot_diameter_mm / 2, rays, rng=rng)
 
-    particles = scene.particles
-    rays = render.ray_table(quality.particle_rays, "ball" if particles.sigma_mm is None else "gaussian", seed + 1)
+
+def _particle_images(
+    scene: Scene, number: int, renderer: render.RenderCamera, seed: int, pairs: list[PlacedParticles]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield path and image [count] of both frames of each pair."""
+    particles, name = scene.particles, scene.camera[number].name
+    rays = render.ray_table(scene.quality.particle_rays, "ball" if particles.sigma_mm is None else "gaussian", seed)
     size = particles.sigma_mm or particles.radius_mm or 0.0
-    for pair, (position, displacement, intensity) in enumerate(pairs):
-        counts = exposure.particle_counts * eye.microimage_px * intensity
-        for sign, frame in ((-0.5, "a"), (0.5, "b")):
+    for pair, placed in enumerate(pairs):
+        counts = scene.exposure.particle_counts * renderer.microimage_px * placed.intensity
+        for frame in FRAMES:
             rng = np.random.default_rng([scene.seed, 6, number, pair, frame == "b"])
-            image = render.render_sources(eye, position + sign * displacement, counts, size, rays, rng=rng)
-            yield f"particles/{camera.name}/pair_{pair:04d}_{frame}.tif", image
+            image = render.render_sources(renderer, placed.at_frame(frame), counts, size, rays, rng=rng)
+            yield f"particles/{name}/pair_{pair:04d}_{frame}.tif", image
 
 
 def expose(image: np.ndarray, camera: SceneCamera, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """Turn light [count] into what the camera stores: blurred, with noise, 12 bits, mirrored if the camera does."""
+    """Turn light [count] into a stored image: blurred, with noise, 12 bits, flipped as the camera does."""
     if camera.blur_px > 0:
         image = gaussian_filter(image, camera.blur_px)
     if noise.full_well_e > 0:
@@ -335,7 +354,7 @@ def _write_image(path: Path, image: np.ndarray) -> None:
 
 
 def _experiment_text(scene: Scene) -> str:
-    """Compose the experiment file: only what a user would know."""
+    """Return the text of the experiment file. It contains nominal values only, none of the truth."""
     lines = [
         "# Light-field PIV experiment: what the user knows. Paths are relative to this file.",
         "",
@@ -356,7 +375,7 @@ def _experiment_text(scene: Scene) -> str:
     particles = {
         "images": "particles/{camera}/pair_{pair:04d}_{frame}.tif",
         "pairs": scene.particles.pairs,
-        "frames": ["a", "b"],
+        "frames": FRAMES,
     }
     tables = {"board": board, "volume": scene.volume.model_dump(), "particles": particles}
     for name in ("smart", "correlation", "network", "compute"):

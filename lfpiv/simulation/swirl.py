@@ -1,7 +1,7 @@
-"""Swirling jets: the swirl number of measured or stated profiles, that of a low-swirl injector, and its mean profiles.
+"""Swirling jets: swirl number of profiles, swirl number of a low-swirl injector, and its mean profiles.
 
-The swirl number is S = G_theta / (R G_x), the axial flux of angular momentum over the axial flux of axial momentum and
-the nozzle's radius, both without pressure and turbulence: integrals of U W r^2 and of U^2 r over the radius.
+The swirl number is S = G_theta / (R G_x): the axial flux of angular momentum over the axial flux of axial momentum and
+the nozzle radius. Pressure and turbulence are neglected, so the fluxes are integrals of U W r^2 and of U^2 r.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ import functools
 import numpy as np
 
 QUADRATURE = 400
-"""Gauss-Legendre nodes over the jet's radius; its shear layers are resolved down to a hundredth of the radius."""
+"""Gauss-Legendre nodes over the radius of the jet."""
 
 
 def swirl_number(radius: np.ndarray, axial: np.ndarray, azimuthal: np.ndarray, *, nozzle_radius: float) -> float:
-    """Swirl number of profiles given at some radii, by the trapezoidal rule.
+    """Compute the swirl number of profiles by the trapezoidal rule.
 
     Parameters
     ----------
     radius : array_like, shape (n,)
-        Radii, rising, from the axis outwards; any unit of length.
+        Increasing radii in any unit of length.
     axial, azimuthal : array_like, shape (n,)
-        Axial and azimuthal velocity (or displacement) there, both in one unit.
+        Axial and azimuthal velocity or displacement, both in the same unit.
     nozzle_radius : float
         Radius R of the nozzle, in the unit of `radius`.
 
@@ -34,7 +34,7 @@ def swirl_number(radius: np.ndarray, axial: np.ndarray, azimuthal: np.ndarray, *
     Raises
     ------
     ValueError
-        If the profiles do not fit together, radii do not rise from 0 or more, or there is no axial flow.
+        If the shapes differ, radii are negative or decrease, or there is no axial flow.
     """
     radius, axial, azimuthal = (np.asarray(value, float) for value in (radius, axial, azimuthal))
     if radius.ndim != 1 or len(radius) < 2 or axial.shape != radius.shape or azimuthal.shape != radius.shape:
@@ -53,12 +53,12 @@ def swirl_number(radius: np.ndarray, axial: np.ndarray, azimuthal: np.ndarray, *
 
 
 def injector_swirl_number(vane_angle_deg: float, radius_ratio: float, mass_ratio: float) -> float:
-    """Swirl number of a low-swirl injector with flat profiles, Eq. 17.
+    """Compute the swirl number of a low-swirl injector with flat profiles, Eq. 17.
 
     Parameters
     ----------
     vane_angle_deg : float
-        Angle of the flow in the swirled annulus to the axis [degree].
+        Angle between the axis and the flow in the swirled annulus [degree].
     radius_ratio : float
         Radius of the central channel over that of the injector, r.
     mass_ratio : float
@@ -83,27 +83,28 @@ def injector_swirl_number(vane_angle_deg: float, radius_ratio: float, mass_ratio
 def injector_profiles(
     square: np.ndarray, radius_ratio: float, mass_ratio: float, shear_layer: float, swirl: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean profiles at the outlet of a low-swirl injector: Eq. 17's two streams with smooth shear layers between.
+    """Compute mean profiles at the outlet of a low-swirl injector: the two streams of Eq. 17 with shear layers.
 
-    A slow, straight stream from the central channel, a fast, swirled one from the annulus at a nearly constant flow
-    angle, rest outside; layers of tanh shape. Smooth on the axis, because they are functions of the radius squared.
+    The central channel gives a slow stream without swirl. The annulus gives a fast stream with swirl at a nearly
+    constant flow angle. The fluid outside is at rest. Shear layers have tanh profiles. The profiles are functions of
+    the squared radius, so they are smooth on the axis.
 
     Parameters
     ----------
     square : ndarray
-        Squared radius over the nozzle's radius.
+        Square of the radius over the nozzle radius.
     radius_ratio, mass_ratio : float
         As for `injector_swirl_number`.
     shear_layer : float
-        Half thickness of the shear layers over the nozzle's radius.
+        Half thickness of the shear layers over the nozzle radius.
     swirl : float
         Swirl number of the profiles.
 
     Returns
     -------
     axial, spin : ndarray
-        Axial velocity over the bulk velocity (volume flow over the nozzle's area), and azimuthal velocity over bulk
-        velocity and relative radius.
+        Axial velocity over the bulk velocity (volume flow over nozzle area), and azimuthal velocity over bulk velocity
+        and relative radius.
     """
     axial, spin = _raw_profiles(np.asarray(square, float), radius_ratio, mass_ratio, shear_layer)
     bulk, raw_swirl = _profile_scales(radius_ratio, mass_ratio, shear_layer)
@@ -121,9 +122,9 @@ def _raw_profiles(
 
 @functools.lru_cache(maxsize=16)
 def _profile_scales(radius_ratio: float, mass_ratio: float, shear_layer: float) -> tuple[float, float]:
-    """Bulk velocity and swirl number of the raw profiles."""
+    """Return the bulk velocity and swirl number of the raw profiles."""
     node, weight = np.polynomial.legendre.leggauss(QUADRATURE)
-    outer = 1 + 12 * shear_layer  # where the jet has faded below 1e-10
+    outer = 1 + 12 * shear_layer  # the jet is below 1e-10 there
     radius, weight = outer * (node + 1) / 2, outer * weight / 2
     axial, spin = _raw_profiles(radius**2, radius_ratio, mass_ratio, shear_layer)
     momentum = (weight * axial**2 * radius).sum()

@@ -1,8 +1,9 @@
-"""Tracers followed from one instant to another: read from a file, scaled into a box, interpolated between."""
+"""Tracer positions at two instants: read from a file, scaled into a box, and interpolated."""
 
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +12,56 @@ from scipy.spatial import cKDTree
 from lfpiv.errors import InputError
 
 Point = tuple[float, float, float]
-TracerMap = tuple[Point, Point, tuple[Point, Point] | None, float | None]
-"""Size and centre of the box that tracers fill, the same box in their file, and their peak displacement."""
-
 NEIGHBOURS = 16
-"""Tracers of each local linear fit: four per unknown. Fewer follow noise, more blur what the tracers resolve."""
+"""Tracers of each local linear fit."""
 
 CHUNK = 20_000
-"""Points evaluated at once, which bounds the memory of local fits."""
+"""Points in one batch of local fits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TracerScaling:
+    """Map from the unit of a tracer file to a box of the volume; fields as in `lfpiv.simulation.flows.Tracers`."""
+
+    size_mm: Point
+    centre_mm: Point
+    box: tuple[Point, Point] | None
+    peak_mm: float | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TracerSet:
+    """Tracers in the volume."""
+
+    position_mm: np.ndarray
+    """Positions midway in time (x, y, z) [mm], shape (tracer, 3)."""
+    displacement_mm: np.ndarray
+    """Displacements between the two instants [mm], shape (tracer, 3)."""
+    tree: cKDTree
+    """Search tree of the positions."""
+
+    def interpolate(self, points_mm: np.ndarray) -> np.ndarray:
+        """Return the displacement at points (n, 3), shape (n, 3) [mm]. Points outside the tracers move to their box."""
+        points = np.clip(points_mm, self.position_mm.min(0), self.position_mm.max(0))
+        parts = [self._fit(points[first : first + CHUNK]) for first in range(0, len(points), CHUNK)]
+        return np.concatenate([np.empty((0, 3)), *parts])
+
+    def _fit(self, points: np.ndarray) -> np.ndarray:
+        """Fit a weighted linear field to the nearest tracers of each point, and evaluate it there."""
+        distance, index = self.tree.query(points, k=NEIGHBOURS + 1)
+        reach = np.maximum(distance[:, -1:], 1e-300)
+        index, weight = index[:, :-1], (1 - (distance[:, :-1] / reach) ** 2) ** 2 + 1e-6
+        arm = (self.tree.data[index] - points[:, None]) / reach[..., None]
+        design = np.concatenate([np.ones((*index.shape, 1)), arm], axis=2)
+        weighted = (design * weight[..., None]).transpose(0, 2, 1)
+        normal = weighted @ design
+        normal += 1e-10 * normal[:, :1, :1] * np.eye(4)
+        return np.linalg.solve(normal, weighted @ self.displacement_mm[index])[:, 0]
 
 
 @functools.lru_cache(maxsize=4)
-def load_tracers(file: str, first: str, second: str, mapping: TracerMap) -> tuple[np.ndarray, np.ndarray, cKDTree]:
-    """Read the tracers of a file, and scale them.
+def load_tracers(file: str, first: str, second: str, scaling: TracerScaling) -> TracerSet:
+    """Read the tracers of a .npz file and scale them into a box.
 
     Parameters
     ----------
@@ -31,22 +69,35 @@ def load_tracers(file: str, first: str, second: str, mapping: TracerMap) -> tupl
         A .npz file.
     first, second : str
         Arrays (tracer, >= 3) of the same tracers at two instants.
-    mapping : tuple
-        How they are scaled, see `TracerMap`.
+    scaling : TracerScaling
+        Box and largest displacement.
 
     Returns
     -------
-    position, displacement : ndarray, shape (tracer, 3)
-        Positions midway in time, and displacements [mm].
-    tree : cKDTree
-        Of the positions.
+    TracerSet
 
     Raises
     ------
     InputError
-        If the file is missing or does not hold the two arrays.
+        If the file is missing or does not contain the two arrays.
     """
-    size, centre, box, peak = mapping
+    start, end = _read(file, first, second)
+    middle, displacement = (start + end) / 2, end - start
+    corners = scaling.box if scaling.box is not None else (middle.min(0), middle.max(0))
+    low, high = (np.asarray(corner, float) for corner in corners)
+    if not (high > low).all():
+        raise InputError(f"{file}: expected tracers that fill a volume, found them in a plane. Set flow.box.")
+    scale = np.asarray(scaling.size_mm) / (high - low)
+    position = (middle - (low + high) / 2) * scale + scaling.centre_mm
+    displacement = displacement * scale
+    largest = np.linalg.norm(displacement, axis=1).max()
+    if scaling.peak_mm is not None and largest > 0:
+        displacement *= scaling.peak_mm / largest
+    return TracerSet(position_mm=position, displacement_mm=displacement, tree=cKDTree(position))
+
+
+def _read(file: str, first: str, second: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions of the tracers at both instants, each (tracer, 3), in the unit of the file."""
     try:
         with np.load(Path(file), allow_pickle=False) as data:
             missing = [name for name in (first, second) if name not in data]
@@ -69,33 +120,4 @@ def load_tracers(file: str, first: str, second: str, mapping: TracerMap) -> tupl
     start, end = start[:, :3], end[:, :3]
     if not (np.isfinite(start).all() and np.isfinite(end).all()):
         raise InputError(f"{file}: expected finite tracer positions, found NaN or infinity. Remove those tracers.")
-    middle, displacement = (start + end) / 2, end - start
-    low, high = (np.asarray(corner, float) for corner in (box if box is not None else (middle.min(0), middle.max(0))))
-    if not (high > low).all():
-        raise InputError(f"{file}: expected tracers that fill a volume, found them in a plane. Set flow.box.")
-    scale = np.asarray(size) / (high - low)
-    position = (middle - (low + high) / 2) * scale + centre
-    displacement = displacement * scale
-    largest = np.linalg.norm(displacement, axis=1).max()
-    if peak is not None and largest > 0:
-        displacement *= peak / largest
-    return position, displacement, cKDTree(position)
-
-
-def interpolate(tree: cKDTree, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Values at points (n, 3) between the tracers, shape (n, 3): a weighted linear fit to the nearest ones."""
-    parts = [_local_fit(tree, values, points[first : first + CHUNK]) for first in range(0, len(points), CHUNK)]
-    return np.concatenate([np.empty((0, 3)), *parts])
-
-
-def _local_fit(tree: cKDTree, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Weighted linear fit to the nearest tracers, evaluated at each point: exact where the field is linear."""
-    distance, index = tree.query(points, k=NEIGHBOURS + 1)
-    reach = np.maximum(distance[:, -1:], 1e-300)
-    index, weight = index[:, :-1], (1 - (distance[:, :-1] / reach) ** 2) ** 2 + 1e-6
-    arm = (tree.data[index] - points[:, None]) / reach[..., None]
-    design = np.concatenate([np.ones((*index.shape, 1)), arm], axis=2)
-    weighted = (design * weight[..., None]).transpose(0, 2, 1)
-    normal = weighted @ design
-    normal += 1e-10 * normal[:, :1, :1] * np.eye(4)
-    return np.linalg.solve(normal, weighted @ values[index])[:, 0]
+    return start, end

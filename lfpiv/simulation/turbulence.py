@@ -1,6 +1,7 @@
 """Turbulence for simulated flows: homogeneous, isotropic, divergence-free fluctuations as a sum of Fourier modes [1]_.
 
-Every pair of frames gets a realisation of its own, frozen between the two frames; its mean over realisations is zero.
+Each pair of frames has its own realisation, which is constant between the two frames. The mean over realisations is
+zero.
 
 .. [1] R. H. Kraichnan, "Diffusion by a random velocity field", Physics of Fluids 13 (1970) 22-31.
 """
@@ -13,33 +14,34 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import brentq
 
 from lfpiv.experiment.settings import Count, Positive, Table
 
 SPECTRUM_NODES = 4000
-"""Wave numbers, evenly spread in their logarithm, on which the spectrum is tabulated."""
+"""Number of tabulated wave numbers, evenly spaced in their logarithm."""
 LOWEST = 1e-3
-"""Lowest tabulated wave number times the spectrum's length; the energy below it is 1e-15."""
+"""Lowest tabulated wave number times the length scale of the spectrum."""
 CHUNK = 20_000
-"""Points evaluated at once, which bounds the memory."""
+"""Points in one batch."""
 
 
 class Turbulence(Table):
     """Table ``[turbulence]``: homogeneous isotropic fluctuations with von Karman's energy spectrum.
 
-    E(k) ~ (k l)^4 / (1 + (k l)^2)^(17/6) up to 2 pi / smallest_mm, zero beyond; l is chosen so that the longitudinal
-    integral length scale, 3 pi / 4 times the mean of 1/k over the energy, is the stated one.
+    E(k) ~ (k l)^4 / (1 + (k l)^2)^(17/6) up to 2 pi / smallest_mm, zero beyond. The length l follows from the
+    longitudinal integral length scale, which is 3 pi / 4 times the mean of 1/k over the energy.
     """
 
     rms_mm: Positive
-    """Root mean square of each component of the fluctuating displacement [mm]; velocity is this over the time step."""
+    """Root mean square of each component of the fluctuating displacement [mm]."""
     integral_scale_mm: Positive
     """Longitudinal integral length scale [mm]."""
     smallest_mm: Positive = 0.5
     """Shortest wavelength [mm]."""
     modes: Count = Field(default=300, ge=20)
-    """Fourier modes; more come closer to a Gaussian random field, and cost as much more."""
+    """Number of Fourier modes. More modes come closer to a Gaussian random field, at proportional cost."""
 
     @model_validator(mode="after")
     def _scales_apart(self) -> Turbulence:
@@ -48,15 +50,15 @@ class Turbulence(Table):
         return self
 
     def realisation(self, *, seed: int | Sequence[int]) -> Fluctuation:
-        """Draw one realisation; the same seed gives the same."""
+        """Draw one realisation, determined by the seed."""
         rng = np.random.default_rng(seed)
         wave_number, energy = _spectrum(self.integral_scale_mm, self.smallest_mm)
-        # equal shares of the energy for all modes: one wave number from each part of the cumulative spectrum
+        # all modes have equal energy: draw one wave number from each part of the cumulative spectrum
         quantile = (rng.permutation(self.modes) + rng.random(self.modes)) / self.modes
         length = np.interp(quantile, energy, wave_number)
         direction = rng.standard_normal((self.modes, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        across = np.cross(direction, rng.standard_normal((self.modes, 3)))  # velocity across the wave: no divergence
+        across = np.cross(direction, rng.standard_normal((self.modes, 3)))  # normal to the wave vector: no divergence
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         return Fluctuation(
             wave=length[:, None] * direction,
@@ -67,21 +69,21 @@ class Turbulence(Table):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fluctuation:
-    """One realisation: the sum over modes of amplitude cos(wave . x + phase), called with points (n, 3) [mm]."""
+    """Realisation: the sum over modes of amplitude cos(wave . x + phase), called with points (n, 3) [mm]."""
 
     wave: np.ndarray
     """Wave vectors (x, y, z) [rad/mm], shape (mode, 3)."""
     amplitude_mm: np.ndarray
-    """Displacement amplitudes (x, y, z) [mm], across the wave vectors, shape (mode, 3)."""
+    """Displacement amplitudes (x, y, z) [mm], normal to the wave vectors, shape (mode, 3)."""
     phase: np.ndarray
     """Phases [rad], shape (mode,)."""
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) at points (n, 3) [mm]."""
+        """Return the displacement (n, 3) at points (n, 3) [mm]."""
         return self._sum(points_mm, self.amplitude_mm)
 
     def window_mean(self, centres_mm: np.ndarray, window_mm: float | tuple[float, float, float]) -> np.ndarray:
-        """Mean displacement over boxes of edges `window_mm` (x, y, z) [mm], exactly, shape (n, 3) [mm]."""
+        """Return the exact mean displacement over boxes of edges `window_mm` (x, y, z) [mm], shape (n, 3) [mm]."""
         half = np.broadcast_to(np.asarray(window_mm, float), 3) / 2
         damping = np.sinc(self.wave * half / np.pi).prod(axis=1)
         return self._sum(centres_mm, self.amplitude_mm * damping[:, None])
@@ -98,32 +100,30 @@ class Fluctuation:
 
 @dataclass(frozen=True)
 class TurbulentFlow:
-    """A mean flow with one realisation of turbulence on top, called with points (n, 3) [mm]."""
+    """Sum of a mean flow and one realisation of turbulence, called with points (n, 3) [mm]."""
 
     mean: Callable[[np.ndarray], np.ndarray]
-    """The mean flow."""
     fluctuation: Fluctuation
-    """The realisation."""
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) at points (n, 3) [mm]."""
+        """Return the displacement (n, 3) at points (n, 3) [mm]."""
         moved: np.ndarray = self.mean(points_mm) + self.fluctuation(points_mm)
         return moved
 
 
 @functools.lru_cache(maxsize=16)
 def _spectrum(integral_scale_mm: float, smallest_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Wave numbers [rad/mm] and the part of the energy below each."""
+    """Return wave numbers [rad/mm] and the part of the energy below each."""
 
     def table(length: float) -> tuple[np.ndarray, np.ndarray, float]:
         k = np.geomspace(LOWEST / length, max(2 * np.pi / smallest_mm, 2 * LOWEST / length), SPECTRUM_NODES)
         square = (k * length) ** 2
         density = square**2 * (1 + square) ** (-17 / 6)
-        energy = np.concatenate([[0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(k))])
+        energy = cumulative_trapezoid(density, k, initial=0)
         inverse = float(np.trapezoid(density / k, k) / energy[-1])
         return k, energy / energy[-1], 3 * np.pi / 4 * inverse
 
-    # the untruncated spectrum has an integral scale of 0.747 l; cutting off short waves raises it
+    # the integral scale is 0.747 l for the full spectrum, and larger for the truncated one
     low, high = 1e-3 * smallest_mm, 10 * integral_scale_mm
     length = brentq(lambda value: table(value)[2] - integral_scale_mm, low, high)
     return table(length)[:2]

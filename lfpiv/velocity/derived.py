@@ -1,15 +1,13 @@
 """Fields derived from vectors: velocity gradient, vorticity, divergence, Q-criterion, strain rate.
 
-Vectors are datasets as `lfpiv.correlate` returns them or `lfpiv.open_results` opens them: ``u``, ``v``, ``w`` [m/s]
-over z, y, x [mm], with any further dimensions such as ``pair``. Nothing is smoothed. Where the vectors are dask arrays,
-nothing is computed before it is asked for.
+Vectors are datasets as `lfpiv.correlate` returns or `lfpiv.open_results` opens: ``u``, ``v``, ``w`` [m/s] over z, y, x
+[mm], with any further dimensions such as ``pair``. Dask arrays stay lazy.
 
-Derivatives are differences of second order, central inside and one-sided at the border, of all vectors there are.
-Replaced ones (``valid`` false) take part: they are what their neighbours predict, and leaving them out would tear holes
-three vectors wide. What rests on them is told by the coordinate ``valid`` of every derived field: true where the vector
-and all its neighbours in the differences were measured, so ``field.where(field.valid)`` rests on measurement alone.
-Not-a-number passes on to the neighbours. Over the spacing h, vectors of uncorrelated standard deviation s give
-derivatives of 0.7 s/h inside and 2.5 s/h at the border; windows that overlap are correlated, which lowers both.
+Derivatives are second-order differences, central inside and one-sided at the border. Nothing is smoothed. Replaced
+vectors (``valid`` false) take part. The coordinate ``valid`` of a derived field is true where the vector and all its
+neighbours in the differences were measured: ``field.where(field.valid)`` depends on measured vectors only. NaN spreads
+to the neighbours. Uncorrelated noise of standard deviation s in the vectors gives derivatives a noise of 0.7 s/h inside
+and 2.5 s/h at the border, with h the spacing. Windows that overlap have correlated noise, which lowers both.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ _PER_MILLIMETRE = 1e3  # a velocity [m/s] over a length [mm], in 1/s
 
 
 def velocity_gradient(vectors: xr.Dataset) -> xr.DataArray:
-    """Velocity gradient tensor.
+    """Compute the velocity gradient tensor.
 
     Parameters
     ----------
@@ -40,8 +38,8 @@ def velocity_gradient(vectors: xr.Dataset) -> xr.DataArray:
     Returns
     -------
     DataArray, dims (component, direction, ..., z, y, x)
-        d(component)/d(direction) [1/s]; component: u, v, w, direction: x, y, z. Times ``dt_s``: voxel per voxel.
-        Coordinate ``valid``: see the head of this module.
+        d(component)/d(direction) [1/s] for components u, v, w and directions x, y, z. Multiplied by ``dt_s`` it is in
+        voxel per voxel. Coordinate ``valid``: true where all vectors in the differences were measured.
 
     Raises
     ------
@@ -73,7 +71,7 @@ def velocity_gradient(vectors: xr.Dataset) -> xr.DataArray:
 
 
 def vorticity(vectors: xr.Dataset) -> xr.Dataset:
-    """Vorticity, the curl of the velocity: twice the rate of rotation.
+    """Compute the vorticity, the curl of the velocity.
 
     Parameters and errors are those of `velocity_gradient`.
 
@@ -105,7 +103,7 @@ def vorticity(vectors: xr.Dataset) -> xr.Dataset:
 
 
 def divergence(vectors: xr.Dataset) -> xr.DataArray:
-    """Divergence of the velocity: zero in incompressible flow, so what is found there is measurement error.
+    """Compute the divergence of the velocity. In incompressible flow it is zero, so any other value is an error.
 
     Parameters and errors are those of `velocity_gradient`.
 
@@ -131,11 +129,11 @@ def divergence(vectors: xr.Dataset) -> xr.DataArray:
 
 
 def q_criterion(vectors: xr.Dataset) -> xr.DataArray:
-    """Q-criterion, (||Omega||^2 - ||S||^2) / 2: positive where rotation outweighs strain, inside vortices.
+    """Compute the Q-criterion, (||Omega||^2 - ||S||^2) / 2, which is positive inside vortices.
 
-    Omega and S are the antisymmetric and the symmetric part of the velocity gradient; the trace is not removed, so in a
-    field with divergence Q is that of Hunt's definition, not the second invariant. Parameters and errors are those of
-    `velocity_gradient`.
+    Omega and S are the antisymmetric and the symmetric part of the velocity gradient. The trace is not removed: in a
+    field with divergence, Q follows Hunt's definition and is not the second invariant. Parameters and errors are those
+    of `velocity_gradient`.
 
     Returns
     -------
@@ -162,7 +160,7 @@ def q_criterion(vectors: xr.Dataset) -> xr.DataArray:
 
 
 def strain_rate(vectors: xr.Dataset) -> xr.Dataset:
-    """Strain-rate tensor S, the symmetric part of the velocity gradient.
+    """Compute the strain-rate tensor S, the symmetric part of the velocity gradient.
 
     Parameters and errors are those of `velocity_gradient`.
 
@@ -214,30 +212,27 @@ def _total(parts: Iterable[xr.DataArray]) -> xr.DataArray:
 
 
 def _places(vectors: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Coordinates of a derived field: those of the vectors, and where all that a difference needs was measured."""
-    kept = {axis: vectors[axis] for axis in AXES}
+    """Return the coordinates of a derived field: the axes of the vectors, and ``valid``."""
+    axes = {axis: vectors[axis] for axis in AXES}
     if "valid" not in vectors:
-        return kept
-    valid = vectors["valid"].astype(bool)
-    measured, gaps = (
-        valid,
-        xr.zeros_like(valid, float).where(valid),
-    )  # NaN spreads exactly as far as the differences reach
+        return axes
+    measured = vectors["valid"].astype(bool)
+    gaps = xr.zeros_like(measured, float).where(measured)  # NaN spreads exactly as far as the differences reach
     for axis in AXES:
         measured = measured & gaps.differentiate(axis, edge_order=2).notnull()
     text = "the vector and all its neighbours in the differences were measured"
-    return kept | {"valid": measured.assign_attrs(long_name=text)}
+    return axes | {"valid": measured.assign_attrs(long_name=text)}
 
 
 def _field(values: xr.DataArray, places: Mapping[str, xr.DataArray], name: str, units: str, text: str) -> xr.DataArray:
-    """Put a derived field into its form: axes last, coordinates, name, unit."""
+    """Return a derived field with its axes last, and with coordinates, name and unit."""
     field = values.assign_coords(places).transpose(..., *AXES).rename(name)
     field.attrs = {"units": units, "long_name": text}
     return field
 
 
 def _check(vectors: xr.Dataset) -> None:
-    """Refuse what is no field of vectors to be differentiated."""
+    """Raise ValueError if vectors cannot be differentiated."""
     check_velocity(vectors)
     for axis in AXES:
         if vectors.sizes[axis] < 3:
@@ -248,12 +243,12 @@ def _check(vectors: xr.Dataset) -> None:
 
 
 def check_velocity(vectors: xr.Dataset) -> None:
-    """Refuse what does not hold velocities u, v, w [m/s] over z, y, x [mm].
+    """Check that a dataset holds velocities u, v, w [m/s] over z, y, x [mm].
 
     Raises
     ------
     ValueError
-        If it is no Dataset, a component or a coordinate is missing, or one has another unit or other dimensions.
+        If it is not a Dataset, or a component or coordinate is missing or has another unit or other dimensions.
     """
     if not isinstance(vectors, xr.Dataset):
         raise ValueError(

@@ -1,10 +1,9 @@
-"""Statistics over pairs: mean, its standard error, RMS, Reynolds stresses, turbulent kinetic energy.
+"""Statistics over pairs: mean and its standard error, RMS, Reynolds stresses, turbulent kinetic energy.
 
-Vectors are datasets as `lfpiv.open_results` opens them: ``u``, ``v``, ``w`` [m/s] over pair, z, y, x [mm]. Place by
-place, those vectors count that are valid (``valid`` true, or all where there is no such flag) and finite; where fewer
-count than a figure needs, it is NaN. Fluctuations are taken from the mean over the pairs. They hold the measurement's
-noise with the flow's own: noise of standard deviation s in u adds s^2 to ``uu``.
-Where the vectors are dask arrays, nothing but `standard_error` computes before it is asked to.
+Vectors are datasets as `lfpiv.open_results` opens: ``u``, ``v``, ``w`` [m/s] over pair, z, y, x [mm]. At each position
+only vectors that are finite and valid (``valid`` true, or all without such a flag) are used. A result is NaN where too
+few vectors remain. Fluctuations are deviations from the mean over the pairs. They contain the measurement noise: noise
+of standard deviation s in u adds s^2 to ``uu``. Dask arrays stay lazy, except in `standard_error`.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ STRESSES = ("uu", "vv", "ww", "uv", "uw", "vw")
 """Components of the Reynolds stress tensor, which is symmetric."""
 
 LARGEST_PART = 0.75
-"""Largest part of all pairs of pairs whose correlation is summed up: those farther apart are too few to tell it."""
+"""Largest part of all products between pairs that enters the summed correlation, nearest pairs first."""
 
-_TRANSFORM_SIZE = 1 << 22  # numbers that are transformed at once
+_TRANSFORM_SIZE = 1 << 22  # numbers in one Fourier transform
 
 
 def mean(vectors: xr.Dataset) -> xr.Dataset:
-    """Mean velocity over the pairs.
+    """Compute the mean velocity over the pairs.
 
     Parameters
     ----------
@@ -35,13 +34,13 @@ def mean(vectors: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset
-        ``u``, ``v``, ``w`` [m/s] over z, y, x: vectors again, so `lfpiv.derived` takes them; ``pairs_counted``;
-        ``valid``: whether any pair counts.
+        ``u``, ``v``, ``w`` [m/s] over z, y, x, which `lfpiv.derived` accepts; ``pairs_counted``: number of pairs used;
+        ``valid``: true where at least one pair is used.
 
     Raises
     ------
     ValueError
-        If there is no dimension pair, or components or coordinates are missing or in another unit.
+        If the dimension pair is missing, or components or coordinates are missing or in another unit.
 
     Examples
     --------
@@ -65,7 +64,7 @@ def mean(vectors: xr.Dataset) -> xr.Dataset:
 
 
 def rms(vectors: xr.Dataset) -> xr.Dataset:
-    """Root mean square of the velocity's fluctuations about its mean over the pairs, divided by n - 1.
+    """Compute the root mean square of the velocity fluctuations over the pairs, with n - 1 as divisor.
 
     Parameters and errors are those of `mean`.
 
@@ -92,14 +91,14 @@ def rms(vectors: xr.Dataset) -> xr.Dataset:
 
 
 def reynolds_stresses(vectors: xr.Dataset) -> xr.Dataset:
-    """Reynolds stresses over density: covariances of the velocity components over the pairs, divided by n - 1.
+    """Compute Reynolds stresses over density: covariances of the velocity components, with n - 1 as divisor.
 
-    The stress itself is minus density times these. Parameters and errors are those of `mean`.
+    The stress itself is minus density times the result. Parameters and errors are those of `mean`.
 
     Returns
     -------
     Dataset
-        ``uu``, ``vv``, ``ww``, ``uv``, ``uw``, ``vw`` [m^2/s^2] over z, y, x; NaN where fewer than two pairs count.
+        ``uu``, ``vv``, ``ww``, ``uv``, ``uw``, ``vw`` [m^2/s^2] over z, y, x; NaN where fewer than two pairs are used.
 
     Examples
     --------
@@ -124,7 +123,7 @@ def reynolds_stresses(vectors: xr.Dataset) -> xr.Dataset:
 
 
 def turbulent_kinetic_energy(vectors: xr.Dataset) -> xr.DataArray:
-    """Turbulent kinetic energy per mass, (uu + vv + ww) / 2 of `reynolds_stresses`.
+    """Compute the turbulent kinetic energy per mass, (uu + vv + ww) / 2 of `reynolds_stresses`.
 
     Parameters and errors are those of `mean`.
 
@@ -149,25 +148,23 @@ def turbulent_kinetic_energy(vectors: xr.Dataset) -> xr.DataArray:
 
 
 def standard_error(vectors: xr.Dataset) -> xr.Dataset:
-    """Estimate the standard error of the mean velocity: few of many correlated pairs are independent.
+    """Estimate the standard error of the mean velocity, allowing for correlation between successive pairs.
 
-    The variance of the mean of n correlated pairs is V = sigma^2 (1 + 2 sum (n_k / n) rho_k) / n, n_k the number of
-    pairs k apart. Their products about the mean of the pairs themselves, averaged over the volume, each lack that V
-    [2]_, which is added: the sum is linear in V and solved for it. It goes up to where the correlation is not positive,
-    and counts none as higher than one before [1]_.
+    The variance of the mean of n correlated pairs is V = sigma^2 (1 + 2 sum (n_k / n) rho_k) / n, with n_k the number
+    of products between pairs k apart and rho_k their correlation. Products are averaged over the volume. Because they
+    are taken about the mean of the same pairs, each is too small by V [2]_; V is added, and the linear equation solved
+    for it. The sum ends where the correlation is no longer positive, and no term exceeds the one before [1]_.
 
-    A series not much longer than its correlation hides it. With rho_k = rho^k the error comes out as 0.9 to 1.1 of the
-    true one for rho = 0.5 and 10 pairs or more, and for rho = 0.8 and 50; as 0.8 to 0.9 for rho = 0.8 and 20 pairs, 0.7
-    for 10. Of independent pairs it is 1.0 where the flow differs from place to place; where all vectors move as one,
-    1.2 for 10 pairs and 1.1 for 50. One component of all pairs is held in memory.
+    The estimate is too small for series that are not much longer than their correlation (docs/notebook/velocity.md).
+    One component of all pairs is held in memory.
 
     Parameters and errors are those of `mean`.
 
     Returns
     -------
     Dataset
-        ``standard_error_u``, ``_v``, ``_w`` [m/s] over z, y, x, NaN where fewer than two pairs count. Their attribute
-        ``pairs_per_independent`` is that bracket.
+        ``standard_error_u``, ``_v``, ``_w`` [m/s] over z, y, x, NaN where fewer than two pairs are used. Their
+        attribute ``pairs_per_independent`` is the bracket in the equation above.
 
     References
     ----------
@@ -205,7 +202,7 @@ def standard_error(vectors: xr.Dataset) -> xr.Dataset:
 
 
 def _measured(vectors: xr.Dataset) -> xr.Dataset:
-    """Velocities in double precision, NaN where they do not count."""
+    """Return velocities in double precision, NaN where they are not used."""
     check_velocity(vectors)
     short = [name for name in COMPONENTS if "pair" not in vectors[name].dims]
     if short:
@@ -215,10 +212,10 @@ def _measured(vectors: xr.Dataset) -> xr.Dataset:
         )
     velocity = vectors[list(COMPONENTS)].astype(float)
     velocity = velocity.drop_vars([name for name in velocity.coords if name not in velocity.dims])
-    counts = (velocity["u"] + velocity["v"] + velocity["w"]).notnull()
+    used = (velocity["u"] + velocity["v"] + velocity["w"]).notnull()
     if "valid" in vectors:
-        counts = counts & vectors["valid"].astype(bool).drop_vars("valid", errors="ignore")
-    return velocity.where(counts)
+        used = used & vectors["valid"].astype(bool).drop_vars("valid", errors="ignore")
+    return velocity.where(used)
 
 
 def _count(measured: xr.Dataset) -> xr.DataArray:
@@ -231,63 +228,72 @@ def _mean(measured: xr.Dataset) -> xr.Dataset:
 
 
 def _with_axes(result: xr.Dataset, vectors: xr.Dataset) -> xr.Dataset:
-    """Give a result the axes of the vectors with their units; no attributes of theirs."""
+    """Return a result with the axes of the vectors and their units, without attributes."""
     result = result.assign_coords({axis: vectors[axis] for axis in AXES})
     result.attrs = {}
     return result
 
 
 def _correlated(series: np.ndarray, order: np.ndarray) -> tuple[float, float]:
-    """Sum up the correlation over all pairs of pairs, 1 + 2 sum (n_k / n) rho_k, n_k of them k apart.
+    """Sum up the correlation between pairs, 1 + 2 sum (n_k / n) rho_k.
 
     Parameters
     ----------
     series : ndarray, shape (pair, ...)
-        One component, NaN where it does not count.
+        One component, NaN where it is not used.
     order : ndarray of int, shape (pair,)
-        Numbers of the pairs; gaps are pairs that are missing.
+        Numbers of the pairs, which may have gaps.
 
     Returns
     -------
     pairs_per_independent : float
-        That sum.
+        The sum.
     factor : float
-        n times the variance of a mean over the variance seen about it: the sum, and what is not seen.
+        n times the variance of the mean over the observed variance about it.
     """
-    flat = series.reshape(len(series), -1)
-    place = order - order.min()
-    length = int(place.max()) + 1
-    step = max(1, _TRANSFORM_SIZE // length)
-    products, pairs, places = np.zeros(length), np.zeros(length), 0
-    for start in range(0, flat.shape[1], step):
-        part = flat[:, start : start + step]
-        counts = np.isfinite(part)
-        counts &= counts.sum(0) > 1
-        means = np.where(counts, part, 0).sum(0) / np.maximum(counts.sum(0), 1)
-        products += _sums_apart(np.where(counts, part - means, 0), place, length)
-        pairs += _sums_apart(counts, place, length)
-        places += int(counts.any(0).sum())
+    products, pairs, positions = _autocovariance(series.reshape(len(series), -1), order - order.min())
     if not products[0] > 0:
         return 1.0, 1.0
-    occurs = pairs > 0.5  # distances that there are, not hidden by gaps
-    seen = np.minimum.accumulate(products[occurs] / pairs[occurs])
+    occurs = pairs > 0.5  # distances that the gaps do not remove
+    observed = np.minimum.accumulate(products[occurs] / pairs[occurs])
     share = 2 * pairs[occurs] / pairs[0]
     share[0] = 1
-    count = pairs[0] / places
+    count = pairs[0] / positions
     farthest = np.flatnonzero(share.cumsum() <= LARGEST_PART * count)[-1] + 1
-    lost = seen[0] / (count - 1)
-    for _ in range(2):  # the variance of the mean tells where the correlation ends, and that tells it better
-        ends = np.flatnonzero(seen[:farthest] + lost <= 0)
+    mean_variance = observed[0] / (count - 1)
+    for _ in range(2):  # the variance of the mean and the end of the correlation depend on each other
+        ends = np.flatnonzero(observed[:farthest] + mean_variance <= 0)
         stop = ends[0] if len(ends) else farthest
-        lost = (share * seen)[:stop].sum() / (count - share[:stop].sum())
-    total = (share * (seen + lost))[:stop].sum() / (seen[0] + lost)
-    return float(total), float(total * (seen[0] + lost) * (count - 1) / (count * seen[0]))
+        mean_variance = (share * observed)[:stop].sum() / (count - share[:stop].sum())
+    variance = observed[0] + mean_variance
+    total = (share * (observed + mean_variance))[:stop].sum() / variance
+    return float(total), float(total * variance * (count - 1) / (count * observed[0]))
 
 
-def _sums_apart(values: np.ndarray, place: np.ndarray, length: int) -> np.ndarray:
-    """Sum the products of values 0, 1, ... `length` - 1 apart along the first axis, over everything else."""
+def _autocovariance(series: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Sum the products of deviations from the mean over pairs 0, 1, ... apart and over all positions.
+
+    `series` has shape (pair, position). Return the sums, the number of products in each, and the number of positions
+    with at least two pairs.
+    """
+    length = int(place.max()) + 1
+    step = max(1, _TRANSFORM_SIZE // length)
+    products, pairs, positions = np.zeros(length), np.zeros(length), 0
+    for start in range(0, series.shape[1], step):
+        part = series[:, start : start + step]
+        used = np.isfinite(part)
+        used &= used.sum(0) > 1
+        means = np.where(used, part, 0).sum(0) / np.maximum(used.sum(0), 1)
+        products += _lagged_sums(np.where(used, part - means, 0), place, length)
+        pairs += _lagged_sums(used, place, length)
+        positions += int(used.any(0).sum())
+    return products, pairs, positions
+
+
+def _lagged_sums(values: np.ndarray, place: np.ndarray, length: int) -> np.ndarray:
+    """Sum the products of values 0, 1, ... `length` - 1 apart along the first axis, over all positions."""
     spread = np.zeros((length, values.shape[1]))
     spread[place] = values
-    power = np.abs(np.fft.rfft(spread, 2 * length, axis=0)) ** 2  # twice as long: ends do not meet
+    power = np.abs(np.fft.rfft(spread, 2 * length, axis=0)) ** 2  # padding to twice the length avoids wrap-around
     sums: np.ndarray = np.fft.irfft(power.sum(1))[:length]
     return sums

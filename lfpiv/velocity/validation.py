@@ -1,11 +1,13 @@
-"""Vector validation: the normalised median test of Westerweel & Scarano (2005) [1]_, replacement and filling.
+"""Vector validation by the normalised median test of Westerweel & Scarano (2005) [1]_, with replacement.
 
-Fields are arrays (z, y, x, 3) of displacements [voxel]; neighbours are the 26 grid points around one. A vector passes
-if it agrees with their median, or with their median after each was moved along the local gradient: in a steep gradient,
-and at the edges of the grid where neighbours lie on one side only, the first alone makes outliers of good vectors.
-Where the flow bends from window to window, and few layers of vectors tell so, good vectors agree with neither. There
-a field known from a pass before helps: a vector with a clear peak also passes if its step from that field agrees with
-its neighbours' steps. Without a clear peak that proves nothing: a wrong field confirms itself.
+Fields are arrays (z, y, x, 3) of displacements [voxel]. Neighbours are the 26 grid points around a vector. A vector
+passes if it agrees with one of these predictions:
+
+- the median of its neighbours;
+- the median of its neighbours after each was moved to the vector's place along the local gradient, which suits steep
+  gradients and the edges of the grid;
+- only if its peak is clear: the field of the pass before, plus the median of the neighbours' steps from that field,
+  which suits flows that bend from window to window. Without a clear peak a wrong field would confirm itself.
 
 References
 ----------
@@ -18,23 +20,21 @@ from __future__ import annotations
 import numpy as np
 import scipy.ndimage
 
+from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation.neighbours import Prediction, predict
 
 THRESHOLD = 2.0
-"""Largest normalised residual of a good vector, the value of [1]_."""
+"""Largest normalised residual of a valid vector, the value of [1]_."""
 NOISE_VOXEL = 0.1
-"""Displacement noise that is no outlier wherever the neighbours agree perfectly (epsilon of [1]_) [voxel]."""
+"""Displacement noise that is always accepted, epsilon of [1]_ [voxel]."""
 LARGEST_PART = 0.5
-"""Largest accepted difference from the neighbours, as a part of the search range. Peaks of noise lie anywhere in that
-range: neighbours that scatter like them prove nothing."""
+"""Largest accepted difference from a prediction, as a part of the search range."""
 CLEAR_RATIO = 2.0
-"""Peak ratio of a peak that is no chance: in noise 8 voxel windows reach 1.5 now and then, hardly ever 2."""
+"""Smallest peak ratio of a clear peak."""
 MIN_NEIGHBOURS = 3
-"""A vector with fewer good neighbours cannot be judged and is rejected, unless the grid itself has no more."""
-
+"""Smallest number of valid neighbours of a valid vector, or as many as the grid has."""
 LEAST_SEEN = 0.75
-"""Least part of a window that two cameras see. What one camera sees has hardly any depth, and pulls the displacement
-along it towards the mean of all depths, by as much as it is part of the window."""
+"""Smallest part of a window's voxels that two cameras must see."""
 
 _ROUNDS = 5
 _CUBE = np.ones((3, 3, 3), bool)
@@ -50,29 +50,29 @@ def validate(
     predicted: np.ndarray | None = None,
     peak_ratio: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Test the displacement of the highest peaks, try the second peak where it fails, fill what remains.
+    """Test the displacement of the highest peaks, try the second peak where it fails, and fill the remaining gaps.
 
     Parameters
     ----------
     first, second : ndarray, shape (z, y, x, 3)
         Displacement of the highest and of the second peak [voxel]; NaN where there is none.
     measured : ndarray of bool, shape (z, y, x)
-        Where `first` may be trusted at all.
+        True where `first` is a peak to test.
     search : tuple of float
         Largest lag at which peaks were searched, order (z, y, x) [voxel].
     seen : ndarray of bool, shape (z, y, x), optional
-        Where there is anything to measure; all else is no part of the grid. Default: everywhere.
+        True where two cameras see enough of the window. Other grid points are ignored. Default: everywhere.
     predicted : ndarray, shape (z, y, x, 3), optional
-        Displacement known before, around which peaks were searched [voxel].
+        Displacement around which peaks were searched [voxel].
     peak_ratio : ndarray, shape (z, y, x), optional
-        Highest coefficient over its rival; needed with `predicted`.
+        Highest coefficient over its rival; required with `predicted`.
 
     Returns
     -------
     field : ndarray, shape (z, y, x, 3)
-        Displacement at every grid point: measured, or predicted by its neighbours; NaN only if no vector is valid.
+        Displacement at every grid point: measured, or predicted from its neighbours; NaN if no vector is valid.
     valid : ndarray of bool, shape (z, y, x)
-        True where `field` is a measured peak that passed the test.
+        True where `field` is a measured peak that passed.
     """
     seen = np.ones(measured.shape, bool) if seen is None else seen
     measured = measured & seen
@@ -81,7 +81,7 @@ def validate(
     valid, judged = measured.copy(), np.zeros(measured.shape, bool)
     second_agrees = np.zeros(measured.shape, bool)
     todo = np.ones(measured.shape, bool)
-    for _ in range(_ROUNDS):  # what was rejected is no neighbour any more, so other vectors may pass again
+    for _ in range(_ROUNDS):  # rejected vectors are no longer neighbours, which changes the predictions
         prediction = predict(first, valid, todo)
         judged = prediction.count >= needed[todo]
         agrees = _agrees(first[todo], prediction, search)
@@ -100,36 +100,20 @@ def validate(
     return fill(np.where(rescued[..., None], second, first), valid | rescued), valid | rescued
 
 
-def seen_windows(
-    seen: np.ndarray,
-    window: tuple[int, int, int],
-    origin: tuple[int, int, int],
-    step: tuple[int, int, int],
-    count: tuple[int, int, int],
-) -> np.ndarray:
-    """Whether at least `LEAST_SEEN` of a window's voxels are seen.
+def seen_windows(seen: np.ndarray, windows: Windows) -> np.ndarray:
+    """Return whether at least `LEAST_SEEN` of each window's voxels are seen, shape (z, y, x).
 
-    Parameters
-    ----------
-    seen : ndarray of bool, shape (z, y, x)
-        Voxels that enough cameras see.
-    window, origin, step, count : tuple of int
-        Edges of the windows, first voxel of the first one, distance and number of them along z, y, x.
-
-    Returns
-    -------
-    ndarray of bool, shape `count`
+    `seen` is true where two cameras see the voxel, shape (z, y, x).
     """
     share = seen.astype(float)
-    for axis, (edge, first, distance, number) in enumerate(zip(window, origin, step, count, strict=True)):
+    for axis, (edge, start) in enumerate(zip(windows.window, windows.first_voxels, strict=True)):
         below = np.insert(share.cumsum(axis), 0, 0, axis)
-        start = first + distance * np.arange(number)
         share = (below.take(start + edge, axis) - below.take(start, axis)) / edge
-    return share >= LEAST_SEEN * (1 - 1e-9)  # sums of shares are rounded
+    return share >= LEAST_SEEN * (1 - 1e-9)  # the shares have rounding errors
 
 
 def _agrees(field: np.ndarray, prediction: Prediction, search: tuple[float, float, float]) -> np.ndarray:
-    """Whether vectors (vector, 3) are within the threshold of one of the two predictions, in every component."""
+    """Return whether each vector (vector, 3) agrees with one of its two predictions in every component."""
     agrees = np.zeros(len(field), bool)
     pairs = ((prediction.median, prediction.scatter), (prediction.level, prediction.level_scatter))
     for median, scatter in pairs:
@@ -140,12 +124,12 @@ def _agrees(field: np.ndarray, prediction: Prediction, search: tuple[float, floa
 
 
 def fill(field: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Replace vectors that are not valid by what their neighbours predict, from the rim of each hole inwards."""
+    """Replace vectors that are not valid by predictions from their neighbours, from the rim of each gap inwards."""
     filled = np.where(valid[..., None], field, np.nan)
     known = valid.copy()
     while known.any() and not known.all():
         rim = ~known & scipy.ndimage.binary_dilation(known, _CUBE)
         prediction = predict(filled, known, rim)
-        filled[rim] = np.clip(prediction.level, prediction.lowest, prediction.highest)  # no gradient may run away
+        filled[rim] = np.clip(prediction.level, prediction.lowest, prediction.highest)  # do not extrapolate gradients
         known |= rim
     return filled

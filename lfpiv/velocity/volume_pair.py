@@ -1,10 +1,12 @@
-"""Two volumes as a caller hands them to `correlate`: checked, prepared, and the places of their voxels."""
+"""Two volumes as a caller gives them to `lfpiv.correlate`: check, normalise, smooth, and locate their voxels."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
+import scipy.ndimage
 import xarray as xr
 from scipy import fft
 
@@ -12,18 +14,31 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import VIEWS, is_finite
 
 LARGEST_BLOCK = 128
-"""Largest edge of the block in the middle of two volumes that tells how far they moved as a whole [voxel]."""
+"""Largest edge of the central block that is correlated as a whole [voxel]."""
 CLEAR_SHARE = 2.0
-"""Correlation beyond the lags searched, over the highest within them, that tells of particles which move that far."""
+"""Smallest clear peak beyond the searched lags, as a multiple of the highest peak within them."""
 CLEAR_SIGMA = 8.0
-"""The same over the standard deviation of all lags: of a few million, chance brings one to 5 or 6."""
+"""Smallest clear peak beyond the searched lags, as a multiple of the standard deviation over all lags."""
 
-_BACKGROUND_SAMPLES = 100_000  # voxels whose median is taken for the background
-_SPACING_TOLERANCE = 1e-3  # coordinates written as decimal numbers of float32 are that even, relative to the spacing
+_BACKGROUND_SAMPLES = 100_000  # voxels whose median is the background
+_SPACING_TOLERANCE = 1e-3  # unevenness of coordinates written as float32 decimals, relative to the spacing
 
 
-def prepared(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
-    """Background-free copy of a volume as float32, scaled to a largest magnitude of 1."""
+@dataclass(frozen=True, kw_only=True)
+class VoxelAxes:
+    """Voxel centres of a volume."""
+
+    centres_mm: tuple[np.ndarray, ...]
+    """Voxel centres along z, y, x [mm]."""
+    spacing_mm: tuple[float, float, float]
+    """Distance of voxels along z, y, x [mm]."""
+
+
+def normalise(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
+    """Return a copy of a volume as float32, without background and scaled to a largest magnitude of 1.
+
+    The background is the median of the voxels. Raise ValueError if the volume is not three-dimensional or not finite.
+    """
     try:
         values = np.asarray(volume)
     except ValueError:  # rows of unequal length
@@ -41,22 +56,44 @@ def prepared(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
         bad = values.size - int(np.isfinite(values).sum())
         raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
     background = np.median(values.ravel()[:: 1 + values.size // _BACKGROUND_SAMPLES])
-    values = values - background  # a copy
-    values /= max(highest - float(background), float(background) - lowest, float(np.finfo(np.float32).tiny))
-    checked: np.ndarray = values
-    return checked
+    normalised: np.ndarray = values - background
+    normalised /= max(highest - float(background), float(background) - lowest, float(np.finfo(np.float32).tiny))
+    return normalised
+
+
+def missing_smoothing(smoothing_voxel: float, *volumes: xr.DataArray | np.ndarray) -> float:
+    """Return the smoothing that volumes still need to reach a requested one [voxel].
+
+    Volumes that consist of Gaussians have the attribute ``sieve_voxel``, their standard deviation. It counts as
+    smoothing: sqrt(smoothing_voxel^2 - sieve_voxel^2) is missing.
+    """
+    sieve = min(
+        float(volume.attrs.get("sieve_voxel", 0.0)) if isinstance(volume, xr.DataArray) else 0.0 for volume in volumes
+    )
+    return math.sqrt(max(smoothing_voxel**2 - sieve**2, 0.0)) if sieve > 0 else smoothing_voxel
+
+
+def preprocess(volume: np.ndarray, smoothing_voxel: float, intensity_power: float) -> np.ndarray:
+    """Smooth a volume without background by a Gaussian and raise its intensities to a power, negative ones as 0.
+
+    The result is float32 like the volume, shape (z, y, x). A power of 1 leaves negative intensities.
+    """
+    if smoothing_voxel > 0:
+        volume = scipy.ndimage.gaussian_filter(volume, smoothing_voxel, mode="constant")
+    return volume if intensity_power == 1 else np.maximum(volume, 0) ** np.float32(intensity_power)
 
 
 def voxel_axes(
     volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np.ndarray, voxel_mm: float | None
-) -> tuple[list[np.ndarray], tuple[float, float, float]]:
-    """Voxel centres [mm] along z, y, x and their spacing [mm]."""
+) -> VoxelAxes:
+    """Return the voxel centres of two volumes; raise ValueError if the volumes differ in shape, kind or place."""
     if np.shape(volume_a) != np.shape(volume_b):
         raise ValueError(f"volume_b: expected the shape of volume_a, {np.shape(volume_a)}, got {np.shape(volume_b)}.")
     if not isinstance(volume_a, xr.DataArray) and not isinstance(volume_b, xr.DataArray):
         if not (is_finite(voxel_mm) and voxel_mm > 0):
             raise ValueError(f"voxel_mm: expected the voxel edge [mm] > 0, which arrays need, got {voxel_mm!r}.")
-        return [voxel_mm * np.arange(n) for n in np.shape(volume_a)], (voxel_mm, voxel_mm, voxel_mm)
+        centres = tuple(voxel_mm * np.arange(n) for n in np.shape(volume_a))
+        return VoxelAxes(centres_mm=centres, spacing_mm=(voxel_mm, voxel_mm, voxel_mm))
     if not isinstance(volume_a, xr.DataArray) or not isinstance(volume_b, xr.DataArray):
         one, other = ("volume_b", "volume_a") if isinstance(volume_b, xr.DataArray) else ("volume_a", "volume_b")
         raise ValueError(
@@ -64,29 +101,30 @@ def voxel_axes(
             "hand over both as arrays, with voxel_mm."
         )
     if voxel_mm is not None:
-        raise ValueError("voxel_mm: expected no value with DataArrays, whose coordinates tell it. Leave it out.")
-    axes, spacing = [], []
-    for axis in AXES:
-        for name, volume in (("volume_a", volume_a), ("volume_b", volume_b)):
-            if volume.dims != AXES or axis not in volume.coords or volume.sizes[axis] < 2:
-                raise ValueError(
-                    f"{name}: expected dims (z, y, x) with coordinates [mm] and at least 2 voxels each, got "
-                    f"{dict(volume.sizes)} with coordinates {list(volume.coords)}."
-                )
-        centres = np.asarray(volume_a[axis], float)
-        distance = (centres[-1] - centres[0]) / (len(centres) - 1)
-        if not distance > 0 or np.abs(np.diff(centres) - distance).max() > _SPACING_TOLERANCE * distance:
-            raise ValueError(f"volume_a: expected increasing, evenly spaced coordinates {axis} [mm], got {centres}.")
-        if np.abs(np.asarray(volume_b[axis], float) - centres).max() > _SPACING_TOLERANCE * distance:
-            raise ValueError(f"volume_b: expected the coordinates {axis} of volume_a, got others.")
-        axes.append(centres)
-        spacing.append(float(distance))
-    z, y, x = spacing
-    return axes, (z, y, x)
+        raise ValueError("voxel_mm: expected no value with DataArrays, whose coordinates state it. Leave it out.")
+    z, y, x = (_common_axis(volume_a, volume_b, axis) for axis in AXES)
+    return VoxelAxes(centres_mm=(z[0], y[0], x[0]), spacing_mm=(z[1], y[1], x[1]))
 
 
-def seen(volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np.ndarray) -> np.ndarray | None:
-    """Whether two cameras see a voxel, shape (z, y, x); None where the volumes do not say so."""
+def _common_axis(volume_a: xr.DataArray, volume_b: xr.DataArray, axis: str) -> tuple[np.ndarray, float]:
+    """Return the voxel centres of two volumes along one axis, and their distance [mm]."""
+    for name, volume in (("volume_a", volume_a), ("volume_b", volume_b)):
+        if volume.dims != AXES or axis not in volume.coords or volume.sizes[axis] < 2:
+            raise ValueError(
+                f"{name}: expected dims (z, y, x) with coordinates [mm] and at least 2 voxels each, got "
+                f"{dict(volume.sizes)} with coordinates {list(volume.coords)}."
+            )
+    centres = np.asarray(volume_a[axis], float)
+    distance = float((centres[-1] - centres[0]) / (len(centres) - 1))
+    if not distance > 0 or np.abs(np.diff(centres) - distance).max() > _SPACING_TOLERANCE * distance:
+        raise ValueError(f"volume_a: expected increasing, evenly spaced coordinates {axis} [mm], got {centres}.")
+    if np.abs(np.asarray(volume_b[axis], float) - centres).max() > _SPACING_TOLERANCE * distance:
+        raise ValueError(f"volume_b: expected the coordinates {axis} of volume_a, got others.")
+    return centres, distance
+
+
+def seen_by_two(volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np.ndarray) -> np.ndarray | None:
+    """Return the flags of the voxels that two cameras see, shape (z, y, x); None if the volumes do not count views."""
     views = [
         volume[VIEWS] for volume in (volume_a, volume_b) if isinstance(volume, xr.DataArray) and VIEWS in volume.coords
     ]
@@ -100,7 +138,10 @@ def seen(volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np.ndarra
 
 
 def moves_beyond(first: np.ndarray, second: np.ndarray, search: tuple[int, int, int]) -> bool:
-    """Whether two volumes (z, y, x), as wholes, clearly correlate farther apart than lags up to `search` reach."""
+    """Return whether two volumes (z, y, x) as a whole clearly correlate at larger lags than `search` reaches.
+
+    The central blocks of both volumes are correlated with wrap-around.
+    """
     middle = tuple(slice(max(n - LARGEST_BLOCK, 0) // 2, (n + min(n, LARGEST_BLOCK)) // 2) for n in first.shape)
     spectrum, other = (fft.rfftn(volume[middle] - volume[middle].mean()) for volume in (first, second))
     shape = first[middle].shape

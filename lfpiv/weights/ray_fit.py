@@ -1,4 +1,8 @@
-"""Local polynomials of a calibrated mapping in the pupil point: what the weight kernels take instead of the mapping."""
+"""Ray models: polynomials of the pupil point that approximate a calibrated mapping near a voxel.
+
+The weight kernels take them in place of the mapping. Input: a camera and voxel centres [mm]. Output: coefficients of
+the point (s, t) on the microlens array [mm], and those of the voxel's projected edges.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +19,15 @@ if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
 RINGS = ((0.0, 1), (0.5, 6), (0.97, 12))
-"""Pupil points at which the mapping is evaluated: (radius / pupil radius, points on the ring)."""
+"""Pupil points at which the mapping is evaluated: (radius / pupil radius, number of points on the ring)."""
 CHUNK_POINTS = 100_000
-"""Object points per evaluation: bounds the scratch memory."""
+"""Object points per evaluation: limits the scratch memory."""
 STEPS = (8, 4, 2, 1)
-"""Voxels from one fit to the next on a grid, the widest that serves first."""
+"""Distances between fits on a grid that are tried, widest first [voxel]."""
 PROBES = 256
-"""Random voxels in which interpolated fits are compared with their own."""
+"""Number of random voxels in which interpolated fits are compared with direct ones."""
 NEAR_PITCH = 3e-4
-"""Largest difference of rays there [microlens pitch]; the mapping in single precision is known to 2e-4."""
+"""Largest difference between interpolated and direct rays [microlens pitch]."""
 
 
 def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) -> np.ndarray:
@@ -49,15 +53,15 @@ def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) ->
     terms = np.stack([unit[:, 0] ** a * unit[:, 1] ** b for a, b in powers], axis=1)
     solve = np.linalg.pinv(terms) / np.array([radius ** (a + b) for a, b in powers])[:, None]
     pupil = (unit * radius).astype(np.float32)
-    both = np.zeros((len(unit), 2, 2, len(powers)), np.float32)  # one product for s and t: their rays lie side by side
+    both = np.zeros((len(unit), 2, 2, len(powers)), np.float32)  # one matrix product for s and t
     both[:, 0, 0], both[:, 1, 1] = solve.T, solve.T
     product = both.reshape(2 * len(unit), -1)
     out = np.empty((len(points_mm), 2, len(powers)), np.float32)
     for first in range(0, len(points_mm), CHUNK_POINTS):
         part = points_mm[first : first + CHUNK_POINTS]
-        rays = camera.map_fan(part, pupil).reshape(len(part), -1)  # s and t by turns
+        rays = camera.map_fan(part, pupil).reshape(len(part), -1)  # s and t alternate
         middle = rays[:, :2].copy()
-        for axis in range(2):  # differences keep single precision where it matters
+        for axis in range(2):  # fit differences: float32 loses digits in large values
             rays[:, axis::2] -= middle[:, axis, None]
         out[first : first + len(part)] = (rays @ product).reshape(-1, 2, len(powers))
         out[first : first + len(part), :, 0] += middle
@@ -65,7 +69,7 @@ def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) ->
 
 
 def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
-    """Ray models of voxels for the footprint kernels, see ``lfpiv_kernels.weights.ray_model.MODEL_SIZE``.
+    """Return ray models of single voxels, see ``lfpiv_kernels.weights.ray_model.MODEL_SIZE``.
 
     The projected edges are differences of the mapping between opposite faces of the voxel.
 
@@ -90,10 +94,11 @@ def grid_models(
     centres_mm: Callable[[np.ndarray], np.ndarray],
     axes: tuple[int, int, int],
 ) -> Iterator[np.ndarray]:
-    """Ray models of a grid's voxels, plane by plane of its outermost axis.
+    """Yield ray models of a grid's voxels, plane by plane of its outermost axis.
 
-    The mapping is far smoother than a voxel is small: fits at every `STEPS`-th voxel, the widest step that serves, are
-    interpolated by cubic splines. The projected edges are half the differences between a voxel's neighbours.
+    The mapping varies little over several voxels. So it is fitted at every n-th voxel only, n the widest of `STEPS`
+    that is accurate enough, and the fits are interpolated by cubic splines. The projected edges are half the
+    differences between a voxel's neighbours.
 
     Parameters
     ----------
@@ -102,10 +107,10 @@ def grid_models(
     shape : tuple of int
         Voxels along the three axes, outermost first.
     centres_mm : callable
-        Takes indices along the three axes, shape (point, 3), whole or not, also one outside the grid; returns
-        (x, y, z) [mm].
+        Takes indices along the three axes, shape (point, 3), that may be fractional and one voxel outside the grid.
+        Returns (x, y, z) [mm].
     axes : tuple of int
-        Which of x, y, z (0, 1, 2) each axis of the grid is.
+        World axis (x, y, z: 0, 1, 2) of each axis of the grid.
 
     Yields
     ------
@@ -141,9 +146,10 @@ def grid_models(
 def _interpolated(
     camera: CalibratedCamera, shape: tuple[int, int, int], centres_mm: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Fits at the nodes of a coarser grid, shape (nodes, nodes, nodes, 12), and what interpolates them.
+    """Fit at the nodes of a coarser grid, shape (nodes, nodes, nodes, 12), and return the interpolation matrices.
 
-    That is one matrix per axis, shape (voxels + 2, nodes), float32: a voxel before the grid, its own, one behind.
+    There is one matrix per axis, shape (voxels + 2, nodes), float32. Its rows are one voxel before the grid, those of
+    the grid, and one voxel behind it.
     """
     rng = np.random.default_rng(0)
     probes = np.column_stack([rng.integers(0, n, PROBES) for n in shape])
@@ -166,7 +172,7 @@ def _interpolated(
 
 
 def _spline_matrix(nodes: np.ndarray, voxels: int) -> np.ndarray:
-    """Matrix that takes values at nodes to those at -1, 0, ..., `voxels`."""
+    """Return the matrix that interpolates values at nodes to -1, 0, ..., `voxels`."""
     wanted = np.arange(-1, voxels + 1)
     if len(nodes) == len(wanted):
         return np.eye(len(nodes), dtype=np.float32)
@@ -175,6 +181,6 @@ def _spline_matrix(nodes: np.ndarray, voxels: int) -> np.ndarray:
 
 
 def _finite(model: np.ndarray) -> np.ndarray:
-    """Send a voxel in the lens's own plane far off the sensor."""
+    """Replace infinite coefficients, of a voxel in the lens's plane, by a point far off the sensor."""
     finite: np.ndarray = np.nan_to_num(model, copy=False, nan=1e9, posinf=1e9, neginf=-1e9)
     return finite

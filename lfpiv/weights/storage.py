@@ -1,7 +1,7 @@
-"""Weights as files that several processes map into their memory: built once, kept in memory once.
+"""Weights as files that several processes map into their memory, so that a machine holds them once.
 
-A folder with one ``.npy`` file per array and ``weights.json``, which is written last. The files are read where and when
-a kernel reads them; processes of one machine share the pages.
+A folder has one ``.npy`` file per array and the header ``weights.json``, which is written last. Pages of the files are
+read when a kernel reads them.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
-from lfpiv.weights.blocks import StoredGrid
 from lfpiv.weights.operator import Weights
-from lfpiv_kernels.reconstruction.projector import Blocks
+from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels.reconstruction.projector import Blocks, Projector
 from lfpiv_kernels.weights.microimages import Microimages
 
 if TYPE_CHECKING:
@@ -29,16 +29,17 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = 1
 _HEADER = "weights.json"
-_HASHED_BYTES = 1 << 24  # hashed at once
+_HASHED_BYTES = 1 << 24
+"""Size of the pieces in which arrays are hashed [byte]."""
 
 
 def save_weights(weights: Weights, folder: Path) -> str:
-    """Write weights, built where they are not yet, into a folder that is made or replaced file by file.
+    """Write weights into a folder. Its files are replaced if they exist.
 
     Parameters
     ----------
     weights : Weights
-        From `build_weights`.
+        From `build_weights`. Weights that are not counted yet are counted first.
     folder : Path
         Target.
 
@@ -55,7 +56,7 @@ def save_weights(weights: Weights, folder: Path) -> str:
     digest = hashlib.blake2b(digest_size=16)
 
     def put(name: str, value: Any) -> Any:
-        """Write an array, or the arrays in a dataclass; return what the header says of it."""
+        """Write an array, or the arrays of a dataclass; return its entry of the header."""
         if dataclasses.is_dataclass(value):
             return {
                 field.name: put(f"{name}.{field.name}", getattr(value, field.name))
@@ -91,16 +92,16 @@ def save_weights(weights: Weights, folder: Path) -> str:
 
 
 def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content: str | None = None) -> Weights:
-    """Map weights that `save_weights` wrote into memory, for reading only.
+    """Map the weights of a folder into memory, read-only.
 
     Parameters
     ----------
     folder : Path
-        Where they lie.
+        Folder that `save_weights` wrote.
     cameras : mapping of str to CalibratedCamera
-        The cameras they were built for.
+        The cameras that the weights were built for.
     content : str, optional
-        What `save_weights` returned; weights of another content are refused.
+        Hash that `save_weights` returned. Weights with another hash are refused.
 
     Returns
     -------
@@ -125,17 +126,17 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
         camera_sums = np.load(folder / header["camera_sums"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
-    return Weights.from_blocks(
-        cameras, StoredGrid(grid, _tuple(header["order"])), header["method"], blocks, camera_sums
-    )
+    stored = StoredGrid(grid, _tuple(header["order"]))
+    projectors = {name: Projector(part) for name, part in blocks.items()}
+    return Weights(stored, cameras, projectors, header["method"], camera_sums=camera_sums)
 
 
 _PARTS = {"microimages": Microimages}
-"""Fields that are dataclasses of arrays themselves."""
+"""Fields of `Blocks` that are dataclasses."""
 
 
 def _take(kind: type, folder: Path, entry: Mapping[str, Any]) -> Any:
-    """Make a dataclass of what the header says of it; its arrays stay in their files."""
+    """Make a dataclass from its entry of the header; arrays stay in their files."""
     values = {}
     for field in dataclasses.fields(kind):
         value = entry[field.name]
@@ -151,7 +152,7 @@ def _take(kind: type, folder: Path, entry: Mapping[str, Any]) -> Any:
 def _map(path: Path) -> np.ndarray:
     try:
         array: np.ndarray = np.load(path, mmap_mode="r")
-    except ValueError:  # nothing in it: there is nothing to map
+    except ValueError:  # an empty array cannot be mapped
         array = np.load(path)
     return np.asarray(array)
 

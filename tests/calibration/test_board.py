@@ -9,40 +9,40 @@ import tifffile
 from scipy.spatial import cKDTree
 
 from lfpiv.calibration.board.board import DotBoard, measure_board
-from lfpiv.calibration.board.detect import _on_lattice
-from lfpiv.calibration.board.dot_model import BENDS, TERMS, DotFit, LensIntegral, ray_terms
-from lfpiv.calibration.board.dot_shared import Shared, update_bend
-from lfpiv.calibration.board.edges import MARGIN, outline, require_stated
-from lfpiv.calibration.board.pose import BIN_PITCHES, search_radius_mm
+from lfpiv.calibration.board.detect import on_lattice, search_radius_mm
+from lfpiv.calibration.board.dot_fit import DotFit
+from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
+from lfpiv.calibration.board.dot_shared import estimate_bend, follow_bend
+from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated
+from lfpiv.calibration.board.planes import HELD_BYTES, Planes
+from lfpiv.calibration.board.pose import BIN_PITCHES
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.lightfield.decoder import LightFieldDecoder
 
 COUNTS_PER_PHOTON = 6.0
 WHITE_PHOTONS = 160  # per pixel
-WHITE_EXPOSURE = 0.6  # of the white image, against the boards
+WHITE_EXPOSURE = 0.6  # exposure of the white image over that of the boards
 READ_NOISE = 2.0  # counts
 DARK_LEVEL = 30.0  # counts
 
 # All in microlens pitches. Gaussian fits are off by 0.04-0.07, and biased by as much within a lens.
-MEAN_ERROR = 0.012  # photon noise of 8 % per pixel leaves 0.006-0.008 in these scenes; a doubled error fails
-DARK_DOT_ERROR = 0.04  # a bright board's photons drown dark dots three times deeper
+MEAN_ERROR = 0.012  # photon noise of 8 % per pixel gives 0.006-0.008 in these scenes
+DARK_DOT_ERROR = 0.04  # dark dots have three times the noise, from the bright board's photons
 BIAS = 0.006  # mean error in any fifth of a lens: a tenth of the peak locking of Gaussian fits
 WRONG_NAME_PITCHES = 2.0  # a dot named wrongly is off by its spacing, at least 4 pitches in these scenes
-SAMPLE_ERROR = 0.005  # measured 0.0026: half of what the mapping needs
-HONEST = (0.5, 2.0)  # true over stated error; small model errors are shared by all labels of a dot
-DIAMETER_ERROR = 0.04  # 20 % cost 0.03 pitch in the labels, so 4 % cost what noise does
-SHARE_ERROR = 0.1  # scatter of the white image that is response; a tenth changes no weight noticeably
-GRADIENT_ERROR = 0.03  # the gradient has kinks; differences over 2 % of a lens round them off
-FALSE_BENDS = (
-    0.03  # one in a thousand where all dots tell as much as another; five unequal ones are told from noise less well
-)
+SAMPLE_ERROR = 0.005  # measured: 0.0026
+HONEST = (0.5, 2.0)  # limits of true over stated error; model errors are common to all labels of a dot
+DIAMETER_ERROR = 0.04  # 20 % cost 0.03 pitch in the labels, so 4 % cost as much as the noise
+SHARE_ERROR = 0.1  # a tenth hardly changes the weights
+GRADIENT_ERROR = 0.03  # differences over 2 % of a lens smooth the gradient's kinks
+FALSE_BENDS = 0.03  # 0.001 for many dots of equal information; more for five unequal ones
 F_ERROR = 5 * 0.5 / np.sqrt(20_000)  # five standard deviations of a count of 20,000 rays
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A camera and a board as they are, beside what the user believes."""
+    """A true camera and board, and the values that the user states."""
 
     nominal_angle_deg: float
     yaw_deg: float
@@ -63,9 +63,9 @@ class Scene:
     missing: tuple = ()  # (plane, column, row)
     false_mm: tuple = ()  # (plane, x, y)
     full_well: float = 65535.0  # counts
-    stated_diameter: float = 1.0  # what the user says over what is true
+    stated_diameter: float = 1.0  # stated over true diameter
     response_sd: float = 0.0  # pixel response
-    spherical_pitch: float = 0.0  # where a ray through the pupil's edge misses
+    spherical_pitch: float = 0.0  # displacement of a ray through the pupil's edge
     coma_pitch: float = 0.0  # the same for tangential coma along t, everywhere in the field
     focal_length_mm: float = 60.0
     pixel_mm: float = 0.0065
@@ -107,7 +107,7 @@ class Scene:
         image_distance = self.optics.image_distance_mm
         focus = 1 / (1 / f - 1 / image_distance) / self.magnification
         slope = (pupil - camera[:, :2]) / (focus - camera[:, 2])[:, None]
-        power = 1 / image_distance + 1 / focus  # a camera whose magnification differs is focused there all the same
+        power = 1 / image_distance + 1 / focus  # the camera is focused there whatever its magnification
         p = pupil / self.optics.pupil_radius_mm
         pp = (p**2).sum(1, keepdims=True)
         aberration = self.spherical_pitch * pp * p + self.coma_pitch / 3 * (pp * [0, 1] + 2 * p[:, 1:] * p)
@@ -126,7 +126,7 @@ class Renderer:
         self.response = 1 + scene.response_sd * self.random.standard_normal(scene.sensor_shape)
 
     def expected_white(self):
-        """Photons per pixel of an even scene: part of each pixel inside the images of the pupil, by 4 x 4 points."""
+        """Return the photons per pixel of an even scene, by the share of 4 x 4 points inside the pupil's images."""
         optics, (rows, columns) = self.optics, self.scene.sensor_shape
         radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
         steps = np.arange(4 * (int(2 * radius) + 4)) / 4 - 0.375
@@ -143,7 +143,7 @@ class Renderer:
         return WHITE_PHOTONS * padded[30:-30, 30:-30]
 
     def dot_photons(self, points):
-        """Photons of dots at `points`, counted per pixel; as bright as the white image."""
+        """Count the photons of dots per pixel; the dots are as bright as the white image."""
         optics, scene = self.optics, self.scene
         cell = abs(np.linalg.det(np.array(scene.lattice.basis_mm)))
         per_lens = WHITE_PHOTONS * np.pi * (optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm) ** 2
@@ -171,7 +171,7 @@ class Renderer:
         ).astype(np.uint16)
 
     def images(self):
-        """White image and the images of all planes."""
+        """Return the white image and the images of all planes."""
         scene, white = self.scene, self.expected_white()
         images = []
         for plane in range(len(scene.planes_mm)):
@@ -195,7 +195,7 @@ SCENES = {
         array_roll_deg=-0.4,
         array_offset_mm=(0.02, -0.03),
         stated_diameter=1.2,
-        full_well=1000,  # a third of the pixels that see nothing but a dot reach it
+        full_well=1000,  # a third of the pixels that see only a dot reach it
         missing=((0, 2, 2), (1, 0, 4), (2, 3, 1)),
         false_mm=((0, 0.4, 0.37), (1, 2.3, 0.1), (2, -1.1, -0.9)),
     ),
@@ -217,7 +217,7 @@ SCENES = {
         nominal_angle_deg=38,
         yaw_deg=41,
         roll_deg=0.7,
-        spherical_pitch=0.4,  # left out of the dots' rays it would leave 0.07
+        spherical_pitch=0.4,  # labels without the bend would be off by 0.07
         coma_pitch=0.3,
         dots=(4, 4),
         planes_mm=(-0.9, 0.8),
@@ -238,12 +238,12 @@ def measured(scene):
 
 
 def label_errors(scene, dots):
-    """Labels minus true rays [pitch]."""
+    """Return labels minus true rays [pitch]."""
     return (dots.array_mm - scene.array_position(dots.points_mm, dots.pupil_mm)) / scene.optics.microlens_pitch_mm
 
 
 def label_sub_lens(scene, dots):
-    """Where each label lies within its lens's cell, along (s, t) [pitch]."""
+    """Return the position of each label in its lens's cell, along (s, t) [pitch]."""
     lattice = scene.lattice
     return (dots.array_mm - lattice.centres_mm(lattice.nearest(dots.array_mm))) / lattice.pitch_mm
 
@@ -278,7 +278,7 @@ def test_labels_follow_the_true_rays(name):
 
 @pytest.mark.slow
 def test_gaussian_fits_are_biased_to_lens_centres_and_the_integral_is_not():
-    """The reason for the better estimator; Gaussian fits keep to the figures measured on other renderings."""
+    """Gaussian fits have the errors that were measured on other renderings."""
     scene = replace(SCENES["hexagonal, steep"], layout="square")
     white, images = Renderer(scene).images()
     decoder = LightFieldDecoder.from_white(scene.optics, scene.lattice, white)
@@ -299,16 +299,16 @@ def test_dots_outside_the_field_are_missing_and_overlapping_ones_are_not_biased(
     scene = replace(SCENES["square, rolled camera, wrong angle"], planes_mm=(-4.5, 0.0, 4.5), missing=(), false_mm=())
     dots = measured(scene)
     assert dots.found[1] == 25 and (dots.found[[0, 2]] < 25).all() and (dots.found > 10).all()
-    assert (dots.expected - dots.found <= 1).all()  # one dot on the very edge may be in the field and still refused
+    assert (dots.expected - dots.found <= 1).all()  # a dot on the edge of the field may be refused
     assert np.hypot(*label_errors(scene, dots).T).mean() < MEAN_ERROR
     outline = dots.outlines_px(scene.optics)
     rows, columns = scene.sensor_shape
     centre = outline.mean(1)
-    assert ((centre > -20) & (centre < [columns + 20, rows + 20])).all()  # half of the light is seen, so the middle
+    assert ((centre > -20) & (centre < [columns + 20, rows + 20])).all()  # half of the light is on the sensor
 
 
 def slope_at(theta, pupil):
-    """Derivative of the ray model over pupil points in radii, by differences; shape (n, 2, 2)."""
+    """Return the derivative of the ray model over pupil points in radii, by differences, shape (n, 2, 2)."""
     steps = 1e-5 * np.eye(2)
     ahead, behind = ([ray_terms(pupil + sign * step, 1.0) @ theta for step in steps] for sign in (1, -1))
     return np.stack([(a - b) / 2e-5 for a, b in zip(ahead, behind, strict=True)], axis=-1)
@@ -316,12 +316,15 @@ def slope_at(theta, pupil):
 
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
 def test_light_of_a_pixel_against_counted_rays(layout):
-    """F of the dot model: rays of a tilted dot towards one pixel behind one lens, counted."""
+    """Compare F with counted rays of a tilted dot towards one pixel behind one lens."""
     random, optics = np.random.default_rng(5), SCENES["hexagonal, steep"].optics
     scene = replace(SCENES["hexagonal, steep"], layout=layout, sensor_shape=(200, 200))
-    decoder = LightFieldDecoder.from_white(scene.optics, scene.lattice, Renderer(scene).images()[0])
     bend = 1e-3 * random.normal(size=(BENDS, 2))
-    model = LensIntegral(decoder, 0.12, 0.4, bend, 1.0, 1.0)
+
+    def model(diameter, blur):
+        shared = SharedParameters(diameter_mm=diameter, blur_px=blur, bend_mm=bend)
+        return LensIntegral(scene.optics, scene.lattice, shared)
+
     jacobian = np.array([[-0.7, 0.02], [0.03, -1.05]])
     tilt = np.zeros((2, 2, 2))
     tilt[0, 0, 0], tilt[1, 0, 1] = 0.06, 0.06
@@ -333,7 +336,7 @@ def test_light_of_a_pixel_against_counted_rays(layout):
     here = slope_at(np.vstack([theta, bend]), pupil) / optics.pupil_radius_mm
     image = np.linalg.inv(np.eye(2) - here) @ here * optics.pupil_pixel_mm  # of each pixel on the array
     pixel_mm2 = np.stack([(image[:, a] * image[:, b]).sum(1) for a, b in ((0, 0), (0, 1), (1, 1))], axis=1)
-    share, gradient, growth = model.table(jacobian, tilt, theta)(offset, pupil, pixel_mm2)
+    share, gradient, growth = model(0.12, 0.4).table(jacobian, tilt, theta)(offset, pupil, pixel_mm2)
 
     count = 20_000
     radius, angle = 0.06 * np.sqrt(random.random(count)), 2 * np.pi * random.random(count)
@@ -347,7 +350,7 @@ def test_light_of_a_pixel_against_counted_rays(layout):
         )
         counted = (lattice.nearest(landed) == 0).all(1).mean()
         assert abs(share[k] - counted) < F_ERROR
-    table, step = model.table(jacobian, tilt, theta), 2e-3
+    table, step = model(0.12, 0.4).table(jacobian, tilt, theta), 2e-3
     same = np.tile(table.pixel_mm2, (len(offset), 1))
     _, gradient, growth = table(offset, 0 * pupil, same)
     for axis in (0, 1):
@@ -356,17 +359,17 @@ def test_light_of_a_pixel_against_counted_rays(layout):
         assert np.sqrt((miss**2).mean()) < GRADIENT_ERROR * np.abs(gradient).max()
     for column, steps in enumerate([(0.05, 0), (0, 0.05)]):
         up, down = (
-            LensIntegral(
-                decoder, 0.12 * np.exp(sign * steps[0]), np.sqrt(0.16 + sign * steps[1]), bend, 1.0, 1.0
-            ).table(jacobian, tilt, theta)(offset, 0 * pupil, same)[0]
+            model(0.12 * np.exp(sign * steps[0]), np.sqrt(0.16 + sign * steps[1])).table(jacobian, tilt, theta)(
+                offset, 0 * pupil, same
+            )[0]
             for sign in (1, -1)
         )
         miss = (up - down) / 0.1 - growth[:, column]
         assert np.sqrt((miss**2).mean()) < GRADIENT_ERROR * np.abs(growth[:, column]).max()
 
 
-def dots_that_say(bend, count, scatter, start, random):
-    """Fits, by the bend `start`, of dots that all tell one bend but for errors `scatter` times the stated ones."""
+def fits_with_bend(bend, count, scatter, start, random):
+    """Return fits by the bend `start` of dots with a common bend, and errors `scatter` times the stated ones."""
     size, fits = 2 * BENDS, []
     following = random.normal(size=(2 * TERMS, size + 2))
     for _ in range(count):
@@ -380,39 +383,59 @@ def dots_that_say(bend, count, scatter, start, random):
 
 
 @pytest.mark.parametrize("count", [5, 60])
-def test_a_bend_is_found_by_all_dots_together_and_none_is_made_of_noise(count):
-    """Errors of each dot as large as the bend, and twice what the dots state."""
-    random, pitch = np.random.default_rng(7), 30.0  # so large that the prior has no say
+def test_a_bend_is_found_in_all_dots_and_none_is_found_in_noise(count):
+    """The error of each dot is as large as the bend, and twice the stated one."""
+    random, pitch = np.random.default_rng(7), 30.0  # so large that the prior has no effect
     none = np.zeros((BENDS, 2))
-    start = Shared(diameter_mm=0.1, blur_px=0.3, bend_mm=0.5 * random.normal(size=(BENDS, 2)))
+    start = SharedParameters(diameter_mm=0.1, blur_px=0.3, bend_mm=0.5 * random.normal(size=(BENDS, 2)))
     found = [
-        update_bend(start, [None, *dots_that_say(none, count, 2.0, start.bend_mm, random)[0]], pitch)[0].bend_mm
+        estimate_bend(start, [None, *fits_with_bend(none, count, 2.0, start.bend_mm, random)[0]], pitch).bend_mm
         for _ in range(200)
     ]
     assert np.mean([bend.any() for bend in found]) < FALSE_BENDS
     true = 2.5 * random.normal(size=(BENDS, 2))
-    fits, following = dots_that_say(true, count, 2.0, start.bend_mm, random)
-    shared, moved = update_bend(start, fits, pitch)
-    assert np.abs(shared.bend_mm - true).max() < 5 * 2 / np.sqrt(count) * 1.5  # five standard errors, and thin dots
+    fits, following = fits_with_bend(true, count, 2.0, start.bend_mm, random)
+    shared = estimate_bend(start, fits, pitch)
+    assert (
+        np.abs(shared.bend_mm - true).max() < 5 * 2 / np.sqrt(count) * 1.5
+    )  # five standard errors, and a half for dots of little information
+    moved = follow_bend([None, *fits], shared.bend_mm - start.bend_mm)
+    assert moved[0] is None
     change = following[:, 2:] @ (shared.bend_mm - start.bend_mm).T.ravel()
-    assert np.allclose(moved[0].coefficients.T.ravel(), change)
+    assert np.allclose(moved[1].coefficients.T.ravel(), change)
 
 
 @pytest.mark.parametrize("spacing_pitches", [3.2, 4.5, 7.0])
-def test_fine_boards_in_focus_are_told_from_chance(spacing_pitches):
-    """A lens hides where in it a focused dot lies, so dots scatter by half a lens; blobs by chance lie anywhere."""
+def test_fine_boards_in_focus_are_distinguished_from_chance(spacing_pitches):
+    """Focused dots scatter by half a lens, chance blobs over the whole search radius."""
     random, pitch = np.random.default_rng(2), 0.1
     board = DotBoard(dots=(7, 7), spacing_mm=spacing_pitches * pitch, diameter_mm=0.1, planes_mm=(0.0,))
     places = board.points_mm(0)[:, :2]
     focused = random.uniform(-pitch / 2, pitch / 2, places.shape)
-    angle, radius = 2 * np.pi * random.random(49), search_radius_mm(board.spacing_mm) * np.sqrt(random.random(49))
+    angle, radius = 2 * np.pi * random.random(49), search_radius_mm(board) * np.sqrt(random.random(49))
     anywhere = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert _on_lattice(focused, places, board, BIN_PITCHES * pitch)
-    assert not _on_lattice(anywhere, places, board, BIN_PITCHES * pitch)
+    assert on_lattice(focused, places, board, BIN_PITCHES * pitch)
+    assert not on_lattice(anywhere, places, board, BIN_PITCHES * pitch)
+
+
+def test_board_images_are_held_as_far_as_memory_allows():
+    rng, asked = np.random.default_rng(0), []
+    whole = rng.integers(0, 4096, (12, 6, 7)).astype(np.float32)
+    whole[1] += 0.5  # not whole counts
+
+    def read(plane):
+        asked.append(plane)
+        return whole[plane]
+
+    planes = Planes(read, len(whole))
+    for _ in range(3):
+        assert all(np.array_equal(image, true) for image, true in zip(planes, whole, strict=True))
+    held = HELD_BYTES // 2
+    assert [asked.count(plane) for plane in range(12)] == [1, 3, *[1] * (held - 1), *[3] * (11 - held)]
 
 
 def seen_board(true, stated, view, offset=(0, 0), planes=3, hidden=()):
-    """Places found and in view on the lattice of a stated board; `view` and `offset` in its columns and rows.
+    """Return the sites found and in view on the lattice of a stated board; `view` and `offset` in its columns and rows.
 
     The true board's first dot is named `offset`; the camera sees the names `view` = (first, last) of columns and rows.
     """
@@ -430,23 +453,25 @@ ALL = ((-9, 20), (-9, 20))
 
 
 def test_the_outline_names_the_dots():
-    """Whole in view, cut on one side, cut on both: the names follow the edges in view and nothing else."""
+    """The names follow the edges in view: of a whole board, a board cut on one side, and one cut on both."""
     for offset in ((0, 0), (1, -1), (-2, 0)):
-        columns, rows = outline(*seen_board((7, 7), (7, 7), ALL, offset), (7, 7))
+        columns, rows = find_extents(*seen_board((7, 7), (7, 7), ALL, offset), (7, 7))
         assert (columns.shift, rows.shift) == offset and columns.fits and rows.fits
-    columns, _ = outline(*seen_board((7, 7), (7, 7), ((-9, 4), (-9, 20)), (1, 0)), (7, 7))  # its right side is cut
+    columns, _ = find_extents(*seen_board((7, 7), (7, 7), ((-9, 4), (-9, 20)), (1, 0)), (7, 7))  # its right side is cut
     assert columns.starts and not columns.ends and columns.shift == 1 and columns.fits
-    columns, _ = outline(*seen_board((7, 7), (7, 7), ((3, 20), (-9, 20)), (-1, 0)), (7, 7))  # its left side
+    columns, _ = find_extents(*seen_board((7, 7), (7, 7), ((3, 20), (-9, 20)), (-1, 0)), (7, 7))  # its left side
     assert columns.ends and not columns.starts and columns.shift == -1 and columns.fits
-    columns, rows = outline(*seen_board((9, 9), (20, 20), ((5, 12), (5, 12)), (4, 4)), (20, 20))
-    assert columns.open and rows.open and columns.shift == 0 and columns.fits  # nothing tells: the nominal axis stands
+    columns, rows = find_extents(*seen_board((9, 9), (20, 20), ((5, 12), (5, 12)), (4, 4)), (20, 20))
+    assert (
+        columns.open and rows.open and columns.shift == 0 and columns.fits
+    )  # no edge: the nominal axis names the dots
 
 
 @pytest.mark.parametrize("stated", [(8, 8), (7, 8), (6, 6), (5, 7), (12, 7)])
 def test_another_number_of_dots_than_stated_is_refused(stated):
     offset = tuple((n - 7) // 2 for n in stated)
     found, in_view = seen_board((7, 7), stated, ALL, offset)
-    extents = outline(found, in_view, stated)
+    extents = find_extents(found, in_view, stated)
     with pytest.raises(InputError, match=r"planes 0-2: 7 x 7.* Set dots = \[7, 7\]"):
         require_stated(extents, found)
 
@@ -454,9 +479,9 @@ def test_another_number_of_dots_than_stated_is_refused(stated):
 def test_a_hidden_edge_is_refused_and_a_hidden_middle_is_not():
     found, in_view = seen_board((7, 7), (7, 7), ALL, hidden=(0,))
     with pytest.raises(InputError, match="6 columns"):
-        require_stated(outline(found, in_view, (7, 7)), found)
+        require_stated(find_extents(found, in_view, (7, 7)), found)
     found, in_view = seen_board((7, 7), (7, 7), ALL, hidden=(3,))
-    require_stated(outline(found, in_view, (7, 7)), found)
+    require_stated(find_extents(found, in_view, (7, 7)), found)
 
 
 def test_bad_boards_are_refused():
@@ -485,7 +510,7 @@ def test_bad_boards_are_refused():
 @pytest.mark.sample_data
 @pytest.mark.parametrize("number", [0, 1])
 def test_labels_of_the_sample_experiment(sample_data, number):
-    """Every dot of every third plane, against the true rays of an independent ray tracer's camera."""
+    """Compare every dot of every third plane with the true rays of an independent ray tracer's camera."""
     folder = sample_data / "ring-vortex-2cam"
     spec = json.loads((folder / "truth" / "spec.json").read_text())
     camera, board = spec["camera"][number], spec["board"]

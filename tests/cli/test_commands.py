@@ -1,4 +1,4 @@
-"""The command line: exit status, one message for what the user can mend, nothing left behind."""
+"""The command line: exit status, one message per user error, no files after a failure."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from lfpiv.runs import memory, pipeline
 
 
 def run(*arguments):
-    """A real process: status, standard output, standard error."""
+    """Run a process; return status, standard output and standard error."""
     command = [sys.executable, "-m", "lfpiv", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "80"})
     return done.returncode, done.stdout, done.stderr
@@ -84,28 +84,28 @@ def test_bad_input_is_status_2_with_one_line_and_nothing_left(tiny_experiment, t
     before = sorted(tmp_path.rglob("*"))
     pairs = ["--pairs", "1:3"] if case == "no such pair" else []
     status = commands.call(["run", str(tiny_experiment), "--out", str(tmp_path / "new" / "out"), *pairs])
-    written, said = capfd.readouterr()
+    written, message = capfd.readouterr()
     assert status == 2 and written == ""
-    assert said.count("\n") == 1 and said.startswith("lfpiv: ") and named in said, said
-    assert "Traceback" not in said
+    assert message.count("\n") == 1 and message.startswith("lfpiv: ") and named in message, message
+    assert "Traceback" not in message
     assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_many_warnings_are_counted(capfd, tmp_path):
-    texts = [f"camera {number} sleeps" for number in range(terminal.WARNINGS_TOLD + 1234)]
+    texts = [f"camera {number} sleeps" for number in range(terminal.LISTED_WARNINGS + 1234)]
     summary = {"calibration": {}, "pairs": [], "warnings": texts, "timings_s": {"total": 1.0}, "peak_memory_mib": 1.0}
-    terminal.tell_run(summary, tmp_path)
-    said = capfd.readouterr().out.splitlines()
-    assert sum(line.startswith("warning: camera") for line in said) == terminal.WARNINGS_TOLD
-    assert f"1,234 more warnings are in {tmp_path / 'summary.json'}" in said
+    terminal.print_run(summary, tmp_path)
+    lines = capfd.readouterr().out.splitlines()
+    assert sum(line.startswith("warning: camera") for line in lines) == terminal.LISTED_WARNINGS
+    assert f"1,234 more warnings are in {tmp_path / 'summary.json'}" in lines
 
 
 @pytest.mark.parametrize("command", ["run", "calibrate", "reconstruct", "correlate", "report"])
 def test_every_step_refuses_a_folder_it_cannot_write(tiny_experiment, tmp_path, capfd, command):
     (tmp_path / "file").write_text("not a folder")
     status = commands.call([command, str(tiny_experiment), "--out", str(tmp_path / "file" / "out")])
-    said = capfd.readouterr().err
-    assert status == 2 and said.count("\n") == 1 and str(tmp_path / "file" / "out") in said
+    message = capfd.readouterr().err
+    assert status == 2 and message.count("\n") == 1 and str(tmp_path / "file" / "out") in message
 
 
 @pytest.mark.parametrize(("name", "make"), [("vectors", "file"), ("volumes", "file"), ("calibration.h5", "folder")])
@@ -117,8 +117,8 @@ def test_a_place_for_results_that_is_taken_is_refused_before_work(tiny_experimen
     else:
         place.mkdir()
     status = commands.call(["run", str(tiny_experiment), "--out", str(place.parent)])
-    said = capfd.readouterr().err
-    assert status == 2 and said.count("\n") == 1 and str(place) in said and "expected a" in said
+    message = capfd.readouterr().err
+    assert status == 2 and message.count("\n") == 1 and str(place) in message and "expected a" in message
 
 
 @pytest.mark.parametrize(
@@ -136,8 +136,8 @@ def test_a_place_for_results_that_is_taken_is_refused_before_work(tiny_experimen
 def test_wrong_usage_is_status_2_with_one_line(tmp_path, monkeypatch, capfd, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert commands.call(arguments) == 2
-    said = capfd.readouterr().err
-    assert said.count("\n") == 1 and all(word in said for word in words), said
+    message = capfd.readouterr().err
+    assert message.count("\n") == 1 and all(word in message for word in words), message
     assert not any(tmp_path.iterdir())
 
 
@@ -156,8 +156,8 @@ def test_a_failure_inside_is_one_line_and_a_traceback_only_on_request(monkeypatc
 
     monkeypatch.setattr(pipeline, "run", fail)
     assert commands.call(["run", "x.toml", "--out", "x"]) == status
-    said = capfd.readouterr().err
-    assert said.count("\n") == 1 and all(word in said for word in words), said
+    message = capfd.readouterr().err
+    assert message.count("\n") == 1 and all(word in message for word in words), message
     assert commands.call(["run", "x.toml", "--out", "x", "--debug"]) == status
     assert "Traceback" in capfd.readouterr().err
 
@@ -165,18 +165,18 @@ def test_a_failure_inside_is_one_line_and_a_traceback_only_on_request(monkeypatc
 def test_real_processes_end_with_the_same_status(tiny_experiment, tmp_path):
     assert run("--version") == (0, f"lfpiv {lfpiv.__version__}\n", "")
     (tiny_experiment.parent / "white/left.tif").unlink()
-    status, written, said = run("run", tiny_experiment, "--out", tmp_path / "out")
-    assert status == 2 and written == "" and said.count("\n") == 1 and "white/left.tif" in said
+    status, written, message = run("run", tiny_experiment, "--out", tmp_path / "out")
+    assert status == 2 and written == "" and message.count("\n") == 1 and "white/left.tif" in message
     assert not (tmp_path / "out").exists()
 
 
-def test_json_is_the_whole_of_standard_output_and_quiet_says_nothing(monkeypatch, tmp_path, capfd):
+def test_json_is_all_of_standard_output_and_quiet_prints_nothing(monkeypatch, tmp_path, capfd):
     summary = {"failed": [{"pair": 1, "reason": "dark"}], "experiment": {"pairs": 2}, "value": np.float32("nan")}
     monkeypatch.setattr(pipeline, "run", lambda *args, **options: summary)
     command = ["run", "x.toml", "--out", str(tmp_path)]
     assert commands.call([*command, "--json"]) == 3
-    written, said = capfd.readouterr()
-    assert json.loads(written) == {**summary, "value": None} and "failed: pair 1: dark" in said
+    written, message = capfd.readouterr()
+    assert json.loads(written) == {**summary, "value": None} and "failed: pair 1: dark" in message
     monkeypatch.setattr(pipeline, "run", lambda *args, **options: {**summary, "failed": []})
     assert commands.call([*command, "--quiet"]) == 0 and capfd.readouterr() == ("", "")
 
@@ -206,10 +206,10 @@ def test_the_shell_completes_commands():
     assert done.stdout.split() == ["reconstruct", "report", "reproduce"]
 
 
-def test_log_lines_tell_the_time_left(caplog, monkeypatch):
+def test_log_lines_state_the_remaining_time(caplog, monkeypatch):
     clock = iter([0.0, 5.0, 60.0, 120.0])
     monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
-    with terminal.Voice().speaking() as progress, caplog.at_level("INFO", "lfpiv"):
+    with terminal.Output().progress() as progress, caplog.at_level("INFO", "lfpiv"):
         for fraction in (0.0, 0.05, 0.25, 1.0):
             progress("step", fraction)
     assert [record.getMessage() for record in caplog.records] == ["step: 0 %", "step: 25 %, about 3 min left"]

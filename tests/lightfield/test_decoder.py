@@ -121,9 +121,7 @@ def test_background_is_read_between_the_microimages(camera):
     """It needs neither a dark image nor a dark frame."""
     level, sigma = camera.background(white_image(camera.optics, camera.lattice, seed=9))
     count = camera.gaps.sum()
-    assert (
-        abs(level - DARK_LEVEL) < 5 * 1.2533 * READ_NOISE / np.sqrt(count) + 0.05
-    )  # errors of median and rounding
+    assert abs(level - DARK_LEVEL) < 5 * 1.2533 * READ_NOISE / np.sqrt(count) + 0.05  # errors of median and rounding
     assert abs(sigma / READ_NOISE - 1) < 0.15
 
 

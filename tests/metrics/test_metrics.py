@@ -1,4 +1,4 @@
-"""Figures of merit against analytic cases, brute force and invariances; none needs weights or kernels."""
+"""Figures of merit against analytic cases, brute force and invariances."""
 
 import itertools
 
@@ -21,7 +21,7 @@ def box(shape=(12, 14, 16), voxel_mm=0.1, first=(-0.3, 0.2, 1.0)):
 
 
 def points_in(grid, count, rng, margin=0.0):
-    """Random points (x, y, z) [mm] at least `margin` voxels inside the grid's faces."""
+    """Return random points (x, y, z) [mm] at least `margin` voxels inside the faces of the grid."""
     place = rng.uniform(margin - 0.5, np.array(grid.shape) - 0.5 - margin, (count, 3))
     return (np.asarray(grid.first_centre_mm) + place * grid.voxel_mm)[:, ::-1]
 
@@ -30,7 +30,7 @@ def points_in(grid, count, rng, margin=0.0):
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 0.7, 1.5])
-def test_a_blob_keeps_its_light_and_place_wherever_it_lies(sigma):
+def test_light_of_a_blob_does_not_depend_on_its_place_between_voxels(sigma):
     grid, rng = box((40, 42, 44)), np.random.default_rng(1)
     for point in points_in(grid, 5, rng, margin=5 * 1.5 + 2):
         blob = metrics.truth_volume(point[None], 3.0, grid, sigma).astype(float)
@@ -208,7 +208,7 @@ def test_relative_l2():
 
 
 def slow_ssim(a, b):
-    """Wang et al. 2004, window by window."""
+    """Compute the structural similarity of Wang et al. 2004 window by window."""
     place = np.arange(-5, 6)
     window = np.exp(-(place[:, None] ** 2 + place**2) / (2 * 1.5**2))
     window /= window.sum()
@@ -225,7 +225,7 @@ def slow_ssim(a, b):
     return np.mean(values)
 
 
-def test_ssim_equals_its_definition_wherever_the_light_falls():
+def test_ssim_equals_its_definition():
     rng = np.random.default_rng(9)
     first = np.zeros((60, 70))
     first[20:33, 30:47] = rng.uniform(1e-3, 0.1, (13, 17))

@@ -12,7 +12,7 @@ import run
 import sweeps
 
 from lfpiv.reproduce.study import compute
-from lfpiv.weights import choice as weightcheck
+from lfpiv.weights import counting
 
 SEED = 3
 PPM = 0.3
@@ -51,7 +51,7 @@ def tiny(tmp_path_factory):
         (choices, "CHOICES", {key: choices.CHOICES[key] for key in FEW}),
         (optics, "DEFAULT", pair),
         (optics, "OPTICS", {key: optics.OPTICS[key] for key in ("window",)}),
-        (weightcheck, "VOXELS", 1),  # the check by counted rays has tests of its own
+        (counting, "VOXELS", 1),  # the check by counted rays has tests of its own
     ):
         patch.setattr(module, name, value)
     out = tmp_path_factory.mktemp("beyond")

@@ -11,7 +11,7 @@ from support.ideal_rig import optics, two_cameras
 
 import lfpiv
 from lfpiv import metrics
-from lfpiv.reconstruction import motion
+from lfpiv.reconstruction import motion, shared_light
 from lfpiv.results import netcdf
 from lfpiv.runs import pipeline
 from lfpiv.simulation.flows import Shear, Swirl, window_mean
@@ -76,7 +76,7 @@ def shear():
 def test_particles_stay_where_and_as_they_are_and_ghosts_fade(shear):
     flow, particles, ghosts, first, second = shear
     assert len(ghosts) >= 10
-    guess, _ = motion.shared_guesses([first, second], vectors_of(flow))
+    guess, _ = shared_light.shared_guesses([first, second], vectors_of(flow))
     ratio = guess / np.maximum(first.values, 1e-6)
     kept, faded = light_around(ratio, particles), light_around(ratio, ghosts)
     scale = np.median(kept)  # the light of the ghosts is shared out among the particles
@@ -98,19 +98,19 @@ def test_guesses_are_the_ratio_of_the_smoothed_volumes_along_the_exact_motion(sh
         at = np.stack([z + sign * moved, y, x])
         inside = ((at >= 0) & (at <= np.array(GRID.shape).reshape(3, 1, 1, 1) - 1)).all(0)
         partner = np.maximum(ndimage.map_coordinates(other * own.sum() / other.sum(), at, order=3), 0)
-        a, b = (ndimage.gaussian_filter(v, motion.SMOOTHING_VOXEL, mode="constant") for v in (own, partner))
-        dark = motion.DARK_SHARE * (a**2).sum() / a.sum()
-        expected = own * np.where(inside, np.minimum((b + dark) / (a + dark), motion.LARGEST_GAIN), 1)
-        guess = motion.shared_guesses([first, second], vectors_of(flow))[number]
+        a, b = (ndimage.gaussian_filter(v, shared_light.SMOOTHING_VOXEL, mode="constant") for v in (own, partner))
+        dark = shared_light.DARK_SHARE * (a**2).sum() / a.sum()
+        expected = own * np.where(inside, np.minimum((b + dark) / (a + dark), shared_light.LARGEST_GAIN), 1)
+        guess = shared_light.shared_guesses([first, second], vectors_of(flow))[number]
         gap = guess / guess.sum() - expected / expected.sum()
         assert np.linalg.norm(gap) < TOLERANCE_SPLINE * np.linalg.norm(expected / expected.sum()) * 3
 
 
 def test_neither_the_frames_order_nor_their_light_matters(shear):
     flow, _, _, first, second = shear
-    guesses = motion.shared_guesses([first, second], vectors_of(flow))
-    back = motion.shared_guesses([second, first], vectors_of(lambda points: -flow(points)))
-    dimmer = motion.shared_guesses([first, second * 0.3], vectors_of(flow))
+    guesses = shared_light.shared_guesses([first, second], vectors_of(flow))
+    back = shared_light.shared_guesses([second, first], vectors_of(lambda points: -flow(points)))
+    dimmer = shared_light.shared_guesses([first, second * 0.3], vectors_of(flow))
     for got, expected in [
         *zip(back[::-1], guesses, strict=True),
         (dimmer[0], guesses[0]),
@@ -122,12 +122,12 @@ def test_neither_the_frames_order_nor_their_light_matters(shear):
 def test_where_nothing_is_known_of_the_motion_a_volume_stays(shear):
     flow, _, _, first, second = shear
     for guess, own in zip(
-        motion.shared_guesses([first, second], vectors_of(flow, valid=False)), (first, second), strict=True
+        shared_light.shared_guesses([first, second], vectors_of(flow, valid=False)), (first, second), strict=True
     ):
         assert np.abs(guess - own.values).max() < TOLERANCE_F32 * float(own.max())
     # particles that left the volume have no partner either
     far = vectors_of(lambda points: np.full(points.shape, 40 * VOXEL_MM))
-    guess, _ = motion.shared_guesses([first, second], far)
+    guess, _ = shared_light.shared_guesses([first, second], far)
     assert np.abs(guess - first.values).max() < TOLERANCE_F32 * float(first.max())
 
 
@@ -239,7 +239,7 @@ def test_who_follows_a_wrong_motion_is_unsure(pair, reconstructed):
     wrong["displacement_x"] += 1.5
     drawn = [
         volume.copy(data=guess).assign_coords({motion.UNSHARED: volume})
-        for volume, guess in zip(alone, motion.shared_guesses(alone, wrong), strict=True)
+        for volume, guess in zip(alone, shared_light.shared_guesses(alone, wrong), strict=True)
     ]
     vectors = measured(drawn)
     assert overconfidence(vectors, pair[0]) > FOOLED
@@ -299,7 +299,7 @@ def test_a_run_tells_which_pairs_followed_the_motion(small_run, tmp_path, monkey
     assert [pair["followed"] for pair in told] == [True, False]
     assert told[0]["valid_fraction"] == [calls[0].attrs["valid_fraction"]] and told[1]["valid_fraction"] == [0.1]
     warnings = [text for text in summary["warnings"] if text.startswith("pair")]
-    assert warnings == [f"pair 1, motion pass 1: 10 % valid; {verdicts[1]}"]
+    assert warnings == [f"pair 1: motion pass 1: 10 % valid; {verdicts[1]}"]
     page = html.unescape((out / "report.html").read_text("utf-8"))
     assert "the motion was followed in 1 pair of 2" in page and warnings[0] in page
 

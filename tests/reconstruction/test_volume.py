@@ -15,10 +15,10 @@ from support.ideal_rig import IdealCamera, IdealRig, optics, two_cameras
 import lfpiv
 from lfpiv.calibration import coverage
 from lfpiv.lightfield.microimage_layout import plain
-from lfpiv.reconstruction import particle_size, smart
+from lfpiv.reconstruction import momentum, particle_size, sieve, smart, steps
 from lfpiv.results import netcdf
-from lfpiv.weights.blocks import StoredGrid
 from lfpiv.weights.operator import Weights
+from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import reference, runtime
 from lfpiv_kernels.reconstruction import update as kernels
 from lfpiv_kernels.reconstruction.projector import Blocks, Projector
@@ -37,9 +37,7 @@ def random_system(seed, voxels=(3, 4, 5), rows=4, lit=0.4):
     runtime.device()
     rng = np.random.default_rng(seed)
     grid = lfpiv.Grid(shape=voxels, voxel_mm=1.0, first_centre_mm=(0.0, 0.0, 0.0))
-    weights = Weights.__new__(Weights)
-    weights.grid, weights.method = grid, "footprint"
-    weights.stored, weights.cameras, weights._projectors = StoredGrid(grid, (1, 0, 2)), {}, {}
+    cameras, projectors = {}, {}
     for name in ("one", "two"):
         value = rng.integers(1, 256, (grid.size * rows, 8)) * (rng.random((grid.size * rows, 8)) < lit)
         value[::rows, 0] = 100  # every voxel lights something
@@ -55,18 +53,15 @@ def random_system(seed, voxels=(3, 4, 5), rows=4, lit=0.4):
             microimages=plain((rows, 8)),
         )
         optics = SimpleNamespace(sensor_shape=(rows, 8))
-        weights.cameras[name] = SimpleNamespace(optics=optics, gain=np.ones((rows, 8), np.float32))
-        weights._projectors[name] = Projector(blocks)
-    return weights
+        cameras[name] = SimpleNamespace(optics=optics, gain=np.ones((rows, 8), np.float32))
+        projectors[name] = Projector(blocks)
+    return Weights(StoredGrid(grid, (1, 0, 2)), cameras, projectors, "footprint")
 
 
 def matrix_of(weights):
     """Dense matrix of all cameras on voxels in (z, y, x) order, padding left out."""
     order = weights.stored.restore(np.arange(weights.grid.size)).ravel()
-    parts = []
-    for projector in weights._projectors.values():
-        parts.append(reference.dense(projector.blocks)[:, order])
-    return np.concatenate(parts)
+    return np.concatenate([reference.dense(weights.projector(name).blocks)[:, order] for name in weights.cameras])
 
 
 def images_of(weights, stacked):
@@ -91,7 +86,7 @@ def accelerated_twin(matrix, image, first, *, iterations, floor):
         following = reference.smart(matrix, image, point, iterations=1, floor=floor)
         later = (1 + np.sqrt(1 + 4 * time**2)) / 2
         ratio = np.clip(following / last, 1 / kernels.LARGEST_LEAP, kernels.LARGEST_LEAP)
-        ahead = following * ratio ** min((time - 1) / later, smart.MOMENTUM)
+        ahead = following * ratio ** min((time - 1) / later, momentum.MOMENTUM)
         if divergence(matrix, image, ahead, floor) > misfit:
             point, time, restarts = following, 1.0, restarts + 1
         else:
@@ -189,7 +184,7 @@ def test_momentum_that_only_harms_leaves_plain_smart(monkeypatch):
         last[:] = volume * (1.0 if exponent == 0 else 1e3)
 
     plain = lfpiv.reconstruct(weights, images, iterations=12, accelerate=False)
-    monkeypatch.setattr(smart, "extrapolate", spoil)
+    monkeypatch.setattr(momentum, "extrapolate", spoil)
     spoilt = lfpiv.reconstruct(weights, images, iterations=12)
     assert spoilt.values.tobytes() == plain.values.tobytes()
     assert spoilt.misfit == plain.misfit
@@ -208,7 +203,7 @@ def noisy_images(weights, seed):
 def test_comparison_equals_its_twin_far_from_the_minimum_and_at_it(distance):
     """With gains, dead pixels and pixels no voxel lights; and so near the minimum that log(I / P) loses its digits."""
     weights, rng = random_system(7, rows=40, lit=0.03), np.random.default_rng(7)
-    projector = weights._projectors["one"]
+    projector = weights.projector("one")
     matrix, floor = reference.dense(projector.blocks), 0.2
     volume = rng.uniform(0.5, 2.0, matrix.shape[1]).astype(np.float32)
     gain = rng.uniform(0.5, 1.5, len(matrix)).astype(np.float32) * (rng.random(len(matrix)) > 0.1)
@@ -345,7 +340,7 @@ def test_a_sieve_is_smart_on_blurred_voxels():
     size = weights.grid.size
     blur = np.array(
         [
-            ndimage.gaussian_filter(row.reshape(first.shape), 0.6, mode="constant", truncate=smart.TRUNCATE).ravel()
+            ndimage.gaussian_filter(row.reshape(first.shape), 0.6, mode="constant", truncate=sieve.TRUNCATE).ravel()
             for row in np.eye(size)
         ]
     )
@@ -369,7 +364,7 @@ def test_sharp_steps_reach_the_images_in_half_the_iterations(seed):
     """With a sieve, plain momentum and sharp steps solve W G c = I; sharp ones are faster and leave solutions alone."""
     weights = random_system(seed, voxels=(6, 6, 6))
     shape, (truth, start) = weights.grid.shape, np.random.default_rng(seed).uniform(0.5, 2.0, (2, 216))
-    blur = smart.gaussian(0.6, weights.stored.shape)
+    blur = sieve.Sieve(0.6, weights.stored.shape)
     order = weights.stored.store(truth.reshape(shape).astype(np.float32))
     volume = weights.stored.restore(blur(order))
     keywords = {"floor": 1e-3, "floor_share": 0.0, "sieve_voxel": 0.6}
@@ -381,48 +376,41 @@ def test_sharp_steps_reach_the_images_in_half_the_iterations(seed):
 
 def _misfits(weights, images, first, sharp):
     """Misfits of 60 iterations with a sieve and momentum, with sharp steps or without."""
-    views = [
-        smart.View(image=images[name].reshape(-1), gain=camera.gain.reshape(-1), floor=1e-3, projector=projector)
-        for (name, camera), projector in zip(weights.cameras.items(), weights._projectors.values(), strict=True)
-    ]
-    shape = weights.stored.shape
-    blur, total = smart.gaussian(0.6, shape), weights.stored.store(weights.column_sum)
-    steps = smart.iterate(
-        views,
-        weights.stored.store(first.astype(np.float32)),
-        1 / blur(total),
-        iterations=60,
-        accelerate=True,
-        sieve=blur,
-        smooth=lambda volume: volume,
-        sharp=(lambda exponent: smart.sharpen(exponent / total, shape)) if sharp else None,
+    blur, total = sieve.Sieve(0.6, weights.stored.shape), weights.stored.store(weights.column_sum)
+    sharpened = (steps.SharpenedStep(1 / total, blur.shape),) if sharp else ()
+    guess = weights.stored.store(first.astype(np.float32))
+    state = smart.State(guess, momentum.Momentum(guess), (*sharpened, steps.SmartStep(1 / blur(total), blur)))
+    states = smart.iterate(equations_of(weights, images, 1e-3), state, blur, iterations=60)
+    return [misfit.divergence for _, misfit in states]
+
+
+def equations_of(weights, images, floor):
+    return smart.ImageEquations(
+        [
+            smart.CameraEquation(
+                image=images[name].reshape(-1),
+                gain=weights.gain(name),
+                floor=floor,
+                projector=weights.projector(name),
+            )
+            for name in weights.cameras
+        ]
     )
-    return [misfit.divergence for _, misfit in steps]
 
 
 @pytest.mark.parametrize("gain", [-1.0, 30.0])
 def test_a_sharp_step_that_raises_the_misfit_is_taken_back(gain):
     weights = random_system(12)
     images, image = noisy_images(weights, 12)
-    view = smart.View(image=images["one"].reshape(-1), gain=np.ones(32, np.float32), floor=0.2, projector=None)
-    views = [
-        smart.View(**{**vars(view), "image": images[name].reshape(-1), "projector": weights._projectors[name]})
-        for name in images
-    ]
-    blur, total = smart.gaussian(0.6, weights.stored.shape), weights.stored.store(weights.column_sum)
-    misfits = [
-        misfit.divergence
-        for _, misfit in smart.iterate(
-            views,
-            np.ones_like(total),
-            1 / blur(total),
-            iterations=40,
-            accelerate=True,
-            sieve=blur,
-            smooth=lambda volume: volume,
-            sharp=lambda exponent: np.clip(gain * exponent / total, -3, 3),
-        )
-    ]
+    blur, total = sieve.Sieve(0.6, weights.stored.shape), weights.stored.store(weights.column_sum)
+
+    def sharp(coefficients, exponent):
+        return coefficients * np.exp(np.clip(gain * exponent / total, -3, 3))
+
+    first = np.ones_like(total)
+    state = smart.State(first, momentum.Momentum(first), (sharp, steps.SmartStep(1 / blur(total), blur)))
+    states = smart.iterate(equations_of(weights, images, 0.2), state, blur, iterations=40)
+    misfits = [misfit.divergence for _, misfit in states]
     assert (np.diff(misfits) <= TOLERANCE_MISFIT * image.sum()).all()
     assert misfits[-1] < 0.7 * misfits[0]
 
@@ -466,7 +454,7 @@ def test_images_tell_how_large_particles_are(small_volume, sigma_voxel, ppm, cou
     rng = np.random.default_rng([round(10 * sigma_voxel), round(10 * ppm)])
     positions = rng.uniform(-0.5, 0.5, (round(400 * ppm), 3)) * (2.0, 2.0, 1.8)
     images = traced_images(rig, positions, sigma_voxel * 0.1, 1, counts=counts)
-    size = particle_size.particle_size(weights, images)
+    size = particle_size.ParticleSizer(weights).size(images)
     assert size == pytest.approx(np.sqrt(max(sigma_voxel**2 - 1 / 12, 0)), abs=TOLERANCE_SIZE)
     volume = lfpiv.reconstruct(weights, images, iterations=1, sieve_voxel="auto")
     if sigma_voxel:
@@ -479,8 +467,8 @@ def test_images_tell_how_large_particles_are(small_volume, sigma_voxel, ppm, cou
 def test_images_of_noise_ask_for_no_sieve(small_volume):
     rig, weights = small_volume
     images = traced_images(rig, np.zeros((1, 3)), 0.1, 2, counts=0.0)
-    assert particle_size.particle_size(weights, images) is None
-    assert particle_size.matching_sieve(weights, images) == 0.0
+    sizer = particle_size.ParticleSizer(weights)
+    assert sizer.size(images) is None and sizer.matching_sieve(images) == 0.0
 
 
 def test_volumes_made_of_gaussians_are_smoothed_less_before_they_are_correlated():
@@ -674,7 +662,8 @@ def test_a_volume_tells_what_fewer_than_two_cameras_see(tmp_path, caplog):
     np.testing.assert_array_equal(weights.column_sum, weights.T(ones))
     alone = round(100 * (views < 2).mean())
     assert 30 < alone < 70 and f"{alone} % of the volume is seen by fewer than two cameras" in caplog.text
-    (said,) = coverage.sight_warnings(half_seen_rig(), grid)  # of a sample of eight planes each way, before any weights
+    (warned,) = coverage.sight_warnings(half_seen_rig(), grid)
+    said = warned.sentence  # of a sample of eight planes each way, before any weights
     assert re.match(r"about \d\d % of the volume is seen by fewer than two cameras; vectors there are not valid", said)
     assert abs(int(said.split()[1]) - alone) <= 2 * 100 / coverage.SAMPLES  # a plane at either end
 

@@ -1,10 +1,8 @@
-"""Exports read back by the programs they are for, and LaVision images as input."""
+"""Exports, read back by the programs that they are made for."""
 
 import csv
-import importlib.util
 import json
 import logging
-import sys
 import types
 from pathlib import Path
 
@@ -17,8 +15,7 @@ import lfpiv
 from lfpiv import derived
 from lfpiv.cli import commands
 from lfpiv.errors import StorageError
-from lfpiv.experiment import davis, images
-from lfpiv.results import export, netcdf, provenance
+from lfpiv.results import export, netcdf
 
 NUMBERS = (0, 2, 3)
 SINGLE = 1e-6  # relative rounding of single precision, in which images are stored
@@ -28,7 +25,7 @@ INTERVAL_S = 0.25
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Folder of a run with one kept pair of volumes, not to be changed, and the vectors in it."""
+    """Return the folder of a run with the volumes of one pair, and its vectors. Tests must not change it."""
     folder = tmp_path_factory.mktemp("run")
     written = write_run(folder, NUMBERS)
     places = {
@@ -42,7 +39,7 @@ def run(tmp_path_factory):
 
 
 def at_points(image, name):
-    """An array of a VTK image as (z, y, x[, component])."""
+    """Return an array of a VTK image as (z, y, x[, component])."""
     values = np.asarray(image.point_data[name])
     return values.reshape(*image.dimensions[::-1], *values.shape[1:])
 
@@ -84,7 +81,7 @@ def test_a_single_layer_of_vectors_is_an_image_too(tmp_path):
     np.testing.assert_array_equal(at_points(image, "valid"), written[0].valid)
 
 
-def test_volumes_of_other_settings_are_not_put_beside_vectors(tmp_path, caplog):
+def test_volumes_of_other_settings_are_not_exported(tmp_path, caplog):
     def depends_on(voxel_mm, images, **more):
         return json.dumps({"volume": {"voxel_mm": voxel_mm}, "calibration": "cafe", "images": images, **more})
 
@@ -214,186 +211,26 @@ def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
     assert not any((tmp_path / "new").iterdir())
 
 
-def test_a_full_disk_is_noticed_before_the_library_that_cannot_bear_it(run, tmp_path, monkeypatch):
+def test_a_full_disk_is_refused_before_the_netcdf_library_writes(run, tmp_path, monkeypatch):
     free = lfpiv.open_results(run[0]).nbytes // 2  # a plane takes less than that, all pairs take more
-    monkeypatch.setattr(netcdf.shutil, "disk_usage", lambda path: Plain(free=free))
+    monkeypatch.setattr(netcdf.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
     with pytest.raises(StorageError, match=r"(?i)no space left"):
         lfpiv.export_results(run[0], "netcdf", out=tmp_path)
     assert not any(tmp_path.iterdir())
     assert lfpiv.export_results(run[0], "pivpy", out=tmp_path)
 
 
-def test_the_command_writes_and_says_where(run, tmp_path, capfd):
+def test_the_command_writes_and_prints_the_path(run, tmp_path, capfd):
     folder, _ = run
     assert commands.call(["export", str(folder), "--to", "csv", "--out", str(tmp_path / "a"), "--pairs", "0:3"]) == 0
     assert capfd.readouterr().out == f"export: 2 files in {tmp_path / 'a'}\n"
     plane = ["export", str(folder), "--to", "pivpy", "--out", str(tmp_path / "a"), "--depth", "-0.9", "--interval", "2"]
     assert commands.call(plane) == 0
-    said = capfd.readouterr().out
-    path = Path(said.removeprefix("export: ").strip())
+    message = capfd.readouterr().out
+    path = Path(message.removeprefix("export: ").strip())
     with xr.open_dataset(path) as opened:
         assert opened.t.values.tolist() == [0, 4, 6] and float(opened.z) == -1.0
     for wrong, word in (([str(tmp_path), "--to", "csv"], "no vectors"), ([str(folder), "--to", "xls"], "--to")):
         assert commands.call(["export", *wrong]) == 2
-        said = capfd.readouterr().err
-        assert said.count("\n") == 1 and word in said
-
-
-# -- LaVision images ---------------------------------------------------------------------------------------------------
-
-PAIRS_RECORDED = 50
-
-
-class Plain(types.SimpleNamespace):
-    """Something with attributes."""
-
-
-def frame(pixels, *, mask=None, slope=1.0, offset=0.0, component="PIXEL", planes=1, **attributes):
-    """A frame with the interface of lvpyio's."""
-    scales = Plain(i=Plain(slope=slope, offset=offset))
-    masks = [np.ones(pixels.shape, np.uint8) if mask is None else mask]
-    return Plain(
-        components={component: Plain(planes=[pixels] * planes)}, scales=scales, attributes=attributes, masks=masks
-    )
-
-
-class Buffers(dict):
-    """Frames of each file, and the files that were decoded, in order."""
-
-    def __init__(self):
-        super().__init__()
-        self.decoded = []
-
-
-@pytest.fixture
-def lvpyio(monkeypatch):
-    """A stand-in for LaVision's library; buffers by the stem of their file, which notes what it decodes."""
-    buffers = Buffers()
-
-    def read_buffer(path):
-        buffers.decoded.append(Path(path).stem)
-        if Path(path).stem not in buffers:
-            raise RuntimeError("Invalid header.")
-        return buffers[Path(path).stem]
-
-    module = types.ModuleType("lvpyio")
-    module.read_buffer = read_buffer
-    monkeypatch.setitem(sys.modules, "lvpyio", module)
-    davis._buffer.cache_clear()
-    yield buffers
-    davis._buffer.cache_clear()
-
-
-def test_frames_of_a_buffer_are_images(lvpyio, tmp_path):
-    rng = np.random.default_rng(0)
-    pixels = [rng.integers(0, 4096, (5, 7), np.uint16) for _ in range(4)]
-    lvpyio["double"] = [frame(part) for part in pixels]
-    lvpyio["single"] = [frame(pixels[3], slope=2.0, offset=-1.0)]
-    for name in ("double.im7", "single.imx"):
-        (tmp_path / name).write_bytes(b"packed")
-    for number, part in enumerate(pixels):
-        for path in (tmp_path / f"double.im7#{number}", tmp_path / f"double.im7#{number // 2}.{number % 2}"):
-            image = images.read_image(path, "test", flip="both")
-            np.testing.assert_array_equal(image, part[::-1, ::-1])
-            assert image.dtype == np.float32 and image.flags.c_contiguous
-    np.testing.assert_array_equal(images.read_image(tmp_path / "single.imx", "test"), 2.0 * pixels[3] - 1.0)
-    assert lvpyio.decoded == ["double", "single"]  # each once, however many of its frames are asked for
-
-
-@pytest.mark.parametrize(
-    ("name", "buffer", "words"),
-    [
-        ("a.im7", [frame(np.ones((2, 3)))] * 4, "4 frames; name one.*#0 to #3"),
-        ("a.im7#4", [frame(np.ones((2, 3)))] * 4, "4 frames, none of them #4"),
-        ("a.im7#2.0", [frame(np.ones((2, 3)))] * 4, "none of them #2.0"),
-        ("a.im7#0.2", [frame(np.ones((2, 3)))] * 4, "exposures 0 and 1"),
-        ("a.im7#left", [frame(np.ones((2, 3)))] * 4, "'left'.*by number"),
-        ("a.im7", [frame(np.ones((2, 3)), component="U0")], "without pixels"),
-        ("a.im7", [frame(np.ones((2, 3)), mask=np.eye(2, 3))], "4 masked pixels"),
-        ("a.im7", [frame(np.ones((2, 3)), planes=2)], "2 planes"),
-        ("a.im7", [frame(np.ones((2, 3)), RGBFrame="1")], "colour filter"),
-        ("a.im7", [frame(np.ones((2, 3), complex))], "complex128"),
-        ("a.im7", None, r"damaged one \(Invalid header"),
-        ("a.vc7", None, "a file of vectors"),
-    ],
-)
-def test_what_is_no_single_image_is_refused_by_name(lvpyio, tmp_path, name, buffer, words):
-    (tmp_path / name.partition("#")[0]).write_bytes(b"packed")
-    if buffer is not None:
-        lvpyio["a"] = buffer
-    with pytest.raises(lfpiv.InputError, match=rf"(?s){name.partition('#')[0]}.*white_image.*{words}"):
-        images.read_image(tmp_path / name, "white_image of camera 'left'")
-
-
-@pytest.mark.parametrize(("name", "words"), [("a.im7#left", "'left'.*by number"), ("a.im7#0.2", "exposures 0 and 1")])
-def test_a_frame_that_cannot_be_is_refused_without_decoding(lvpyio, tmp_path, name, words):
-    (tmp_path / "a.im7").write_bytes(b"packed")
-    with pytest.raises(lfpiv.InputError, match=words):
-        images.read_header(tmp_path / name, "white_image of camera 'left'")
-    assert lvpyio.decoded == []
-
-
-def test_a_missing_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "lvpyio", None)  # as where it is not installed
-    (tmp_path / "a.im7").touch()
-    with pytest.raises(lfpiv.InputError, match=r"a\.im7#0.*lvpyio.*pip install 'lfpiv\[davis\]'"):
-        images.read_image(tmp_path / "a.im7#0", "white_image of camera 'left'")
-
-
-@pytest.fixture
-def recorded(lvpyio, tiny_experiment, monkeypatch):
-    """Experiment of many pairs, both exposures of both cameras of each in one buffer; the rest of it as it was."""
-    monkeypatch.setattr("lfpiv.experiment.experiment.DECODED_PIXELS", 4 * 2 * (48 * 64 + 56 * 40))  # four pairs
-    rng = np.random.default_rng(1)
-    shapes = {"left": (48, 64), "right": (56, 40)}
-    for pair in range(PAIRS_RECORDED):
-        name = f"B{pair:05d}"
-        lvpyio[name] = [frame(rng.integers(0, 4096, shapes[camera], np.uint16)) for camera in shapes for _ in "ab"]
-        (tiny_experiment.parent / f"{name}.im7").write_bytes(b"pixels of pair %d" % pair)
-    text = tiny_experiment.read_text("utf-8").replace('"left"', '"0"').replace('"right"', '"1"')
-    text = text.replace("pairs = 2", f"pairs = {PAIRS_RECORDED}").replace(
-        'images = "particles/{camera}/{pair:04d}{frame}.tif"',
-        'images = "B{pair:05d}.im7#{camera}.{frame}"\nframes = ["0", "1"]',
-    )
-    tiny_experiment.write_text(text, "utf-8")
-    for number, camera in enumerate(shapes):
-        (tiny_experiment.parent / "board" / camera).rename(tiny_experiment.parent / "board" / str(number))
-    return tiny_experiment
-
-
-def test_an_experiment_of_buffers_opens(lvpyio, recorded):
-    """Opening decodes the first pairs alone, however many there are; each frame of a file is an image of its own."""
-    experiment = lfpiv.open_experiment(recorded)
-    assert lvpyio.decoded == [f"B{pair:05d}" for pair in range(4)]
-    last = PAIRS_RECORDED - 1
-    np.testing.assert_array_equal(
-        experiment.particle_image("1", last, "0"), lvpyio[f"B{last:05d}"][2].components["PIXEL"].planes[0]
-    )
-    hashes = {provenance.content_hash([path]) for pair in range(2) for path in experiment.pair_paths(pair)}
-    assert len(hashes) == 8
-
-
-def test_a_bad_buffer_is_named_at_once_where_it_can_be_and_where_it_is_used_otherwise(lvpyio, recorded):
-    lvpyio["B00020"][3] = frame(np.ones((48, 64), np.uint16))  # of the other camera's size
-    del lvpyio["B00030"]  # damaged
-    experiment = lfpiv.open_experiment(recorded)
-    for pair, words in ((20, r"expected \(56, 40\) pixels.*found \(48, 64\)"), (30, "damaged one")):
-        with pytest.raises(lfpiv.InputError, match=rf"B000{pair}\.im7#1\.1 \(.*pair {pair}.*{words}"):
-            experiment.particle_image("1", pair, "1")
-    (recorded.parent / "B00040.im7").write_bytes(b"")
-    with pytest.raises(lfpiv.InputError, match=r"B00040\.im7#0\.0.*the file is empty"):
-        lfpiv.open_experiment(recorded)
-    (recorded.parent / "B00040.im7").unlink()
-    with pytest.raises(lfpiv.InputError, match=r"B00040\.im7#0\.0.*no such file"):
-        lfpiv.open_experiment(recorded)
-
-
-@pytest.mark.skipif(importlib.util.find_spec("lvpyio") is None, reason="the extra davis is not installed")
-def test_lavisions_own_library_writes_what_is_read(tmp_path):
-    import lvpyio
-
-    rng = np.random.default_rng(0)
-    pixels = [rng.integers(0, 4096, (48, 64), np.uint16) for _ in range(2)]
-    lvpyio.write_buffer(lvpyio.arrays_to_buffer(pixels), str(tmp_path / "B00001.im7"))
-    for number, part in enumerate(pixels):
-        np.testing.assert_array_equal(images.read_image(tmp_path / f"B00001.im7#{number}", "test"), part)
+        message = capfd.readouterr().err
+        assert message.count("\n") == 1 and word in message

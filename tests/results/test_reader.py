@@ -1,6 +1,7 @@
-"""What a run leaves behind, opened by xarray alone and by `open_results`: complete, lazy, refused where it differs."""
+"""Results of a run, opened by xarray and by `open_results`: complete, lazy, and refused if pairs differ."""
 
 import importlib.util
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -9,14 +10,14 @@ import xarray as xr
 from support.vector_sets import random_vectors, write_run
 
 import lfpiv
-from lfpiv.results import netcdf, reader
+from lfpiv.results import netcdf
 
 NUMBERS = (0, 1, 3, 7)  # pairs may be missing
 
 
 @pytest.fixture(params=["dask", "no dask"])
 def dask(request, monkeypatch):
-    """Whether dask is there; without it xarray's own indexing reads the files."""
+    """Return whether dask is installed. Without it the indexing of xarray reads the files."""
     if request.param == "dask":
         pytest.importorskip("dask")
     else:
@@ -26,7 +27,7 @@ def dask(request, monkeypatch):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Folder of a run, not to be changed, and the vectors in it."""
+    """Return the folder of a run and its vectors. Tests must not change it."""
     folder = tmp_path_factory.mktemp("run")
     return folder, write_run(folder, NUMBERS)
 
@@ -55,7 +56,7 @@ def test_all_pairs_are_one_dataset(run, dask):
         {"pair": [], "y": 1, "x": [0, 2]},
     ],
 )
-def test_any_part_is_what_numpy_would_take(run, dask, index):
+def test_indexing_equals_numpy(run, dask, index):
     folder, written = run
     whole = xr.concat([vectors.u for vectors in written.values()], xr.IndexVariable("pair", list(NUMBERS)))
     part = lfpiv.open_results(folder).u.isel(index)
@@ -63,25 +64,26 @@ def test_any_part_is_what_numpy_would_take(run, dask, index):
     assert part.dims == whole.isel(index).dims
 
 
-def test_values_are_read_when_they_are_asked_for(tmp_path, dask, monkeypatch):
+def test_values_are_read_lazily(tmp_path, dask, monkeypatch):
     written = write_run(tmp_path, NUMBERS)
     opened = lfpiv.open_results(tmp_path)
-    read, inner = [], reader._Stack._pair
+    read, get = [], h5py.Group.__getitem__
 
-    def pair(self, number, where):
-        read.append((self.name, number))
-        return inner(self, number, where)
+    def record(group, name):
+        read.append((Path(group.file.filename).name, name))
+        return get(group, name)
 
-    monkeypatch.setattr(reader._Stack, "_pair", pair)
+    monkeypatch.setattr(h5py.Group, "__getitem__", record)
     assert float(opened.w.isel(pair=2, z=0, y=1, x=2)) == float(written[3].w[0, 1, 2])
-    assert read == [("w", 2)]
+    assert read == [("pair_0003.nc", "w")]
+    monkeypatch.setattr(h5py.Group, "__getitem__", get)
     (tmp_path / "vectors" / "pair_0007.nc").write_bytes(b"damaged since")
     assert np.isfinite(opened.u.isel(pair=slice(0, 3)).values).all()
     with pytest.raises(lfpiv.InputError, match=r"pair_0007\.nc.*damaged"):
         opened.u.values  # noqa: B018
 
 
-def test_opening_decodes_one_file_and_of_the_others_only_the_axes(run, monkeypatch):
+def test_opening_decodes_one_file_and_reads_the_axes_of_the_others(run, monkeypatch):
     folder, _ = run
     decoded, named, inner, get = [], [], netcdf.read_vectors, h5py.Group.__getitem__
     monkeypatch.setattr(netcdf, "read_vectors", lambda path: decoded.append(path.name) or inner(path))
@@ -123,7 +125,7 @@ def test_pairs_on_other_axes_or_with_other_variables_are_refused(tmp_path):
         lfpiv.open_results(tmp_path)
 
 
-def test_what_is_no_finished_run_is_refused_in_one_sentence(tmp_path):
+def test_a_folder_without_a_finished_run_is_refused(tmp_path):
     with pytest.raises(lfpiv.InputError, match="no such folder"):
         lfpiv.open_results(tmp_path / "nothing")
     with pytest.raises(lfpiv.InputError, match="no vectors in it"):
@@ -160,7 +162,7 @@ def test_what_is_no_finished_run_is_refused_in_one_sentence(tmp_path):
         (lambda v: v.z.attrs.pop("units"), "coordinate z in mm, found it in no unit"),
     ],
 )
-def test_velocities_that_their_displacements_belie_are_refused(tmp_path, spoil, words):
+def test_velocities_that_contradict_their_displacements_are_refused(tmp_path, spoil, words):
     vectors = random_vectors(0)
     vectors["u"].values[0, 0, 0] = vectors["displacement_x"].values[0, 0, 0] = np.nan  # both unknown: that is fine
     netcdf.write_vectors(vectors, tmp_path / "good.nc", attributes={})
@@ -179,8 +181,8 @@ def volume(seed):
     return xr.DataArray(rng.random((3, 4, 5), np.float32), places, ("z", "y", "x"), attrs=attributes)
 
 
-def test_xarray_alone_opens_every_file(tmp_path):
-    """No engine, no group, no settings: what a user types first."""
+def test_plain_xarray_opens_every_file(tmp_path):
+    """Open files without engine, group or settings."""
     written, frames = random_vectors(0), {"a": volume(1), "b": volume(2)}
     path = tmp_path / "pair_0000.nc"
     netcdf.write_vectors(written, path, attributes={}, reconstruction=netcdf.build_reconstruction(frames))

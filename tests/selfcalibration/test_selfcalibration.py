@@ -95,7 +95,7 @@ def test_coefficients_are_those_of_the_overlap(monkeypatch):
     rng = np.random.default_rng(3)
     first, second = ([rng.gamma(0.3, size=(5, 7, 6)) for _ in range(2)] for _ in range(2))
     window = slice(0, 4), slice(3, 7), slice(1, 5)
-    found = disparity._coefficients(first, second, window)
+    found = disparity.masked_correlation(first, second, window)
     assert np.abs(found - naive_coefficients(first, second, window, 2)).max() < SUMS
     assert (found == 0).any() and (np.abs(found) > 0.1).any()
 
@@ -136,9 +136,9 @@ def test_shift_along_the_views_counts_for_little():
         peak=0.5,
         rival=0.1,
     )
-    assert one.told_mm(np.array([0, 0.3, 0])) == pytest.approx(0.3)
-    assert one.told_mm(np.array([0.3, 0, 0])) == pytest.approx(0.003)
-    assert one.told_mm(np.array([0, 0, 0.3])) == pytest.approx(0.012)
+    assert one.observable_mm(np.array([0, 0.3, 0])) == pytest.approx(0.3)
+    assert one.observable_mm(np.array([0.3, 0, 0])) == pytest.approx(0.003)
+    assert one.observable_mm(np.array([0, 0, 0.3])) == pytest.approx(0.012)
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +209,7 @@ def test_library_call_recovers_a_known_movement(small_run):
     found = lfpiv.self_calibrate(Calibration(moved), experiment.grid, images)
     relative = found.movements["left"].shift_mm - found.movements["right"].shift_mm
     assert relative[1] == pytest.approx(2.5 * KNOCK_MM, abs=LATERAL_MM)
-    told = [np.median([one.told_mm(one.shift_mm) for one in some]) for some in (found.before, found.after)]
+    told = [np.median([one.observable_mm(one.shift_mm) for one in some]) for some in (found.before, found.after)]
     assert told[1] < 0.2 * told[0]
 
 

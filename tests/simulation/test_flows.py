@@ -25,12 +25,12 @@ def points(count, seed=0, half=3.0):
 
 
 def gradient(flow, at):
-    """Displacement gradient [i, j] = d displacement_i / d x_j by central differences."""
+    """Return the displacement gradient [i, j] = d displacement_i / d x_j by central differences."""
     step = DIFFERENCE_STEP * np.eye(3)
     return (flow(at + step) - flow(at - step)).T / (2 * DIFFERENCE_STEP)
 
 
-def test_uniform_and_shear_are_what_they_say():
+def test_uniform_and_shear_follow_their_formulas():
     at = points(50)
     assert np.array_equal(flows.Uniform(displacement_mm=(1, 2, 3))(at), np.tile([1.0, 2, 3], (50, 1)))
     shear = flows.Shear(along="z", across="y", rate=0.2, centre_mm=(5, 1, 7))
@@ -38,7 +38,7 @@ def test_uniform_and_shear_are_what_they_say():
 
 
 def test_ring_circles_its_core_line():
-    """In a half plane through the axis the ring is a plane vortex about the core line, with the stated profile."""
+    """In a half plane through the axis the ring is a plane vortex with the stated profile."""
     ring = flows.Ring(radius_mm=1.7, core_mm=0.8, peak_mm=0.2, centre_mm=(0.3, -0.2, 0.1))
     rng = np.random.default_rng(1)
     azimuth, angle, r = rng.uniform(0, 2 * np.pi, 200), rng.uniform(0, 2 * np.pi, 200), rng.uniform(0, 1.6, 200)
@@ -158,7 +158,7 @@ def test_tracers_predict_left_out_tracers_of_a_turbulent_flow(sample_data, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         (None, "no file"),
         ({"t0": np.zeros((50, 3))}, "'t1'"),
@@ -167,11 +167,11 @@ def test_tracers_predict_left_out_tracers_of_a_turbulent_flow(sample_data, tmp_p
         ({"t0": np.full((50, 3), np.nan), "t1": np.zeros((50, 3))}, "finite"),
     ],
 )
-def test_bad_tracer_files_are_named(tmp_path, arrays, said):
+def test_bad_tracer_files_are_named(tmp_path, arrays, message):
     path = tmp_path / "bad.npz"
     if arrays is not None:
         np.savez(path, **arrays)
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=message) as error:
         flows.Tracers(file=str(path), size_mm=(1, 1, 1)).tracers()
     assert "bad.npz" in str(error.value)
 
@@ -186,7 +186,7 @@ def test_shapes_are_checked():
 
 
 def top_hat(radius_ratio, mass_ratio, angle_deg, nodes=20_001):
-    """Profiles of Eq. 17's derivation: two flat streams, the outer one turned; the step at one of the nodes."""
+    """Return the profiles that lead to Eq. 17: two flat streams, the outer one with swirl; their step is at a node."""
     radius = np.concatenate([np.linspace(0, radius_ratio, nodes), np.linspace(radius_ratio, 1, nodes)])
     outer = np.arange(len(radius)) >= nodes
     axial = np.where(outer, 1.0, mass_ratio * (1 / radius_ratio**2 - 1))
@@ -194,7 +194,7 @@ def top_hat(radius_ratio, mass_ratio, angle_deg, nodes=20_001):
 
 
 def test_swirl_number_of_profiles_in_closed_form():
-    """Solid-body rotation in a uniform jet: half the wall's ratio; a swirled annulus round a channel: Eq. 17."""
+    """Solid-body rotation in a uniform jet has half the ratio at the wall. An annulus with swirl follows Eq. 17."""
     radius = np.linspace(0, 3, 2001)
     solid = swirl.swirl_number(radius, np.full(2001, 2.0), 0.7 * radius, nozzle_radius=3.0)
     assert solid == pytest.approx(0.7 * 3 / (2 * 2.0), rel=TRAPEZOID)
@@ -206,7 +206,7 @@ def test_swirl_number_of_profiles_in_closed_form():
 
 
 @pytest.mark.parametrize(
-    ("profiles", "said"),
+    ("profiles", "message"),
     [
         (([0, 1], [1, 1, 1], [0, 0]), "one length"),
         (([1, 0], [1, 1], [0, 0]), "rise"),
@@ -214,15 +214,15 @@ def test_swirl_number_of_profiles_in_closed_form():
         (([0, np.nan], [1, 1], [1, 1]), "finite"),
     ],
 )
-def test_bad_profiles_are_named(profiles, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_profiles_are_named(profiles, message):
+    with pytest.raises(ValueError, match=message):
         swirl.swirl_number(*profiles, nozzle_radius=1.0)
 
 
 @pytest.mark.parametrize(
     "changes", [{}, {"swirl_number": -0.8, "mass_ratio": 2.0, "shear_layer_mm": 3.0, "axis": "z", "spreading": 0.2}]
 )
-def test_swirling_jet_keeps_its_swirl_number_and_its_flow(changes):
+def test_swirling_jet_conserves_swirl_number_and_volume_flow(changes):
     jet = flows.SwirlingJet(bulk_mm=0.4, centre_mm=(1.0, -2.0, 0.5), **changes)
     number = "xyz".index(jet.axis)
     along, sideways = np.eye(3)[number], np.eye(3)[(number + 1) % 3]
@@ -246,8 +246,8 @@ def test_swirling_jet_keeps_its_swirl_number_and_its_flow(changes):
     assert abs(on_axis[2] @ along) < abs(on_axis[0] @ along)  # the jet spreads and slows down
 
 
-def test_turbulence_has_the_scales_it_says():
-    """Mean zero, equal rms along x, y, z, no divergence, the stated integral scale, another field for every seed."""
+def test_turbulence_has_the_stated_scales():
+    """Mean zero, equal RMS along x, y, z, no divergence, the stated integral scale, one field for each seed."""
     table = turbulence.Turbulence(rms_mm=0.2, integral_scale_mm=1.5, smallest_mm=0.3, modes=400)
     fields = [table.realisation(seed=(1, pair)) for pair in range(40)]
     at = points(500, 9, 30.0)
@@ -269,7 +269,7 @@ def test_turbulence_has_the_scales_it_says():
 
 
 def test_window_mean_of_turbulence_is_exact():
-    """In closed form what a fine quadrature finds, whatever the wavelength; the mean flow is averaged beside it."""
+    """The closed form equals a fine quadrature at all wavelengths, and the mean flow is averaged as well."""
     field = turbulence.Turbulence(rms_mm=0.2, integral_scale_mm=1.0, smallest_mm=0.4, modes=50).realisation(seed=4)
     centres, window = points(3, 1), (1.6, 0.8, 1.2)
     ring = flows.Ring(radius_mm=1.5, core_mm=0.7, peak_mm=0.2)

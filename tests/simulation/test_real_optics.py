@@ -1,15 +1,14 @@
-"""Windows and aberrations: exact rays against Snell's law traced forward, kernels against twins, cameras set up."""
+"""Windows and aberrations: rays against Snell's law, kernels against twins, cameras in focus."""
 
 import json
 import re
 
 import numpy as np
 import pytest
-from calibration.test_cameras import MAPPING_PITCH
-from calibration.test_cameras import SCENE as CALIBRATION_SCENE
 from scipy.optimize import fsolve
 from scipy.stats import qmc
-from simulation.test_simulator import SCENE, camera, land, lens_gain, points, relative_difference
+from support.calibration_scene import CALIBRATION_SCENE, MAPPING_PITCH
+from support.simulated_cameras import SMALL_SCENE, camera, land, lens_gain, points, relative_difference
 
 import lfpiv
 from lfpiv.errors import InputError
@@ -53,14 +52,14 @@ def pupil_points(count, radius=12.5, seed=3):
 
 
 def snell(direction, normal, before, after):
-    """Refracted unit direction, from the law in vectors; `normal` points along the light's way."""
+    """Return the refracted unit direction by the vector form of Snell's law. `normal` points along the light."""
     cosine = direction @ normal
     across = before / after * (direction - cosine * normal)
     return across + np.sqrt(1 - across @ across) * normal
 
 
 def forward(direction, point, scene_camera):
-    """Trace one ray from a point in the world out of its medium through all plates to the lens's plane: (u, v)."""
+    """Trace one ray from a world point through all plates to the plane of the lens: (u, v)."""
     place, index = np.array(point, float), scene_camera.window[0].medium_index
     towards_lens = scene_camera.rotation[2]
     for window in scene_camera.window:
@@ -81,7 +80,7 @@ def forward(direction, point, scene_camera):
 
 @pytest.mark.parametrize("name", ["glass", "tank"])
 def test_true_rays_obey_snell_s_law(name):
-    """The ray found by iteration from the lens is the one that Snell's law traces from the particle, by vectors."""
+    """The ray iterated from the lens equals the ray traced from the particle by Snell's law."""
     scene_camera = rig(name)
     optics, at, pupil = scene_camera.optics, 8 * points(12, 1), pupil_points(12)
     expected = []
@@ -103,8 +102,8 @@ def test_true_rays_obey_snell_s_law(name):
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_rays_go_back_the_way_they_came(name):
-    """From a point to the array and back to the point's plane: iterated one way, explicit the other."""
+def test_rays_are_reversible(name):
+    """A ray from a point to the array, and back to the plane of the point: iterated one way, explicit the other."""
     scene_camera = rig(name)
     at, pupil, scales = points(200, 1), pupil_points(200), scene_camera.optics
     array = true_mapping(scene_camera)(at, pupil)
@@ -116,7 +115,7 @@ def test_rays_go_back_the_way_they_came(name):
     assert np.abs(back - at).max() < SNELL_MM
 
 
-def test_order_and_sense_of_windows_in_air_do_not_matter_and_air_is_no_window():
+def test_order_and_normal_sign_of_windows_in_air_do_not_matter():
     at, pupil = 5 * points(50), pupil_points(50)
     both = true_mapping(rig("glass", window=(GLASS, OUTER)))(at, pupil)
     other = true_mapping(rig("glass", window=(OUTER, GLASS | {"normal": (0, 0, -7), "point_mm": (9, 3, 30)})))(
@@ -132,8 +131,8 @@ def test_order_and_sense_of_windows_in_air_do_not_matter_and_air_is_no_window():
 
 
 @pytest.mark.parametrize("name", ["glass", "tank"])
-def test_a_camera_is_set_up_through_its_windows(name):
-    """The stated point is imaged at the sensor's centre, and its rays' mean slope over the pupil is zero: in focus."""
+def test_cameras_are_in_focus_through_their_windows(name):
+    """The stated point is imaged at the sensor's centre. The mean slope of its rays over the pupil is zero."""
     focused = (0.3, -0.2, 0.5)
     scene_camera = rig(name, true_offset_mm=focused)
     pupil = 12.5 / np.sqrt(2) * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -142,8 +141,8 @@ def test_a_camera_is_set_up_through_its_windows(name):
     assert np.linalg.norm(scene_camera.axis_point_mm - focused) > 1  # it had to move
 
 
-def test_each_aberration_is_what_its_name_says():
-    """Stated at the edge of pupil and field, in pitches; exponents of field and pupil as in Seidel's theory."""
+def test_each_aberration_follows_seidel_theory():
+    """Values hold at the edge of pupil and field, in pitches. Exponents of field and pupil are Seidel's."""
     optics = camera("ideal").optics
     field = np.hypot(*optics.sensor_shape) * optics.pixel_mm / 2
     edge, up, across = np.array([field, 0.0]), np.array([0, 12.5]), np.array([12.5, 0])
@@ -169,7 +168,7 @@ def test_each_aberration_is_what_its_name_says():
 
 
 def test_aberrations_are_the_gradient_of_one_wave_aberration():
-    """Rays belong to wave fronts (Malus and Dupin): the error's curl over the pupil vanishes."""
+    """Rays are normal to wave fronts (Malus and Dupin): the curl of the error over the pupil is zero."""
     seidel = rig("lens").seidel
     array, pupil, step = 0.4 * points(50)[:, :2], pupil_points(50), 1e-4
     slopes = [
@@ -180,8 +179,8 @@ def test_aberrations_are_the_gradient_of_one_wave_aberration():
     assert np.abs(slopes[0][:, 1] - slopes[1][:, 0]).max() < 1e-10  # differences of 1e-15 mm over 1e-4 mm
 
 
-def sources_twin(scene_camera, eye, centres, counts, extent, rays, rng):
-    """Twin of `render_sources`: float64 true rays, landed on the sensor by the slow twin of the ideal renderer."""
+def sources_twin(scene_camera, renderer, centres, counts, extent, rays, rng):
+    """Twin of `render_sources`: true rays in float64, added up on the sensor by definition."""
     image, mapping = 0, true_mapping(scene_camera)
     angles = rng.uniform(0, 2 * np.pi, (len(centres), 2))
     for centre, count, (turn, roll) in zip(centres, counts, angles, strict=True):
@@ -189,18 +188,18 @@ def sources_twin(scene_camera, eye, centres, counts, extent, rays, rng):
         unit = rays[:, 2:].astype(float)
         unit[:, :2] = unit[:, :2] @ [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
         weight = np.full(len(rays), count / len(rays))
-        image = image + land(scene_camera, eye, mapping(centre + extent * unit, pupil), pupil, weight)
+        image = image + land(scene_camera, renderer, mapping(centre + extent * unit, pupil), pupil, weight)
     return image
 
 
 @pytest.mark.parametrize("name", RIGS)
 def test_sources_seen_through_real_optics_equal_their_twin(device, name):
     scene_camera = rig(name)
-    eye = render_camera(scene_camera)
+    renderer = render_camera(scene_camera)
     centres, counts = points(10), np.full(10, 1e5)
     rays = render.ray_table(4096, "ball", 0)
-    found = render.render_sources(eye, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
-    expected = sources_twin(scene_camera, eye, centres, counts, 0.03, rays, np.random.default_rng(2))
+    found = render.render_sources(renderer, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
+    expected = sources_twin(scene_camera, renderer, centres, counts, 0.03, rays, np.random.default_rng(2))
     assert expected.sum() > 0.1 * counts.sum()
     assert relative_difference(found, expected) < MOVED_RAYS
     plain = render_camera(camera("ideal", nominal_angle_deg=scene_camera.nominal_angle_deg))
@@ -210,11 +209,11 @@ def test_sources_seen_through_real_optics_equal_their_twin(device, name):
 
 @pytest.mark.parametrize("name", ["tank", "all"])
 def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
-    """Every pixel of a small sensor: its rays followed back in float64, without the kernel's short cut."""
+    """Trace the rays of each pixel of a small sensor back in float64, without the short cut of the kernel."""
     weak = {key: 0.05 for key in LENS if key.endswith("pitch")} | {"spherical_pitch": 0.6}  # the field is tiny
     changes = {"sensor_width_px": 40, "sensor_height_px": 30, "true_offset_mm": (0, 0, 0.15)}
     scene_camera = rig(name, **changes | ({"aberrations": weak} if name == "all" else {}))
-    optics, lattice, eye = scene_camera.optics, scene_camera.lattice, render_camera(scene_camera)
+    optics, lattice, renderer = scene_camera.optics, scene_camera.lattice, render_camera(scene_camera)
     board, samples = {"dots": (3, 2), "spacing_mm": 0.12, "dot_diameter_mm": 0.08}, 64
     table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(3)).random(samples) - 0.5
     cell = table[:, 2:] @ lattice.basis_mm
@@ -232,15 +231,15 @@ def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
             if not lit.any():
                 continue
             start, direction = real_optics.object_lines(
-                array, pupil, optics.object_distance_mm, optics.image_distance_mm, eye.plates, eye.aberrations
+                array, pupil, optics.object_distance_mm, optics.image_distance_mm, renderer.plates, renderer.aberrations
             )
-            start, direction = start @ eye.rotation + eye.offset_mm, direction @ eye.rotation
+            start, direction = start @ renderer.rotation + renderer.offset_mm, direction @ renderer.rotation
             x, y, _ = (start + ((0.15 - start[:, 2]) / direction[:, 2])[:, None] * direction).T
             off = np.hypot(
                 *(np.abs(a[:, None] - (np.arange(n) - (n - 1) / 2) * 0.12).min(1) for a, n in ((x, 3), (y, 2)))
             )
-            expected[row, column] += (lit & (off < 0.04)).mean() * lens_gain(eye, index[None])[0]
-    found = collect.render_board(eye, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
+            expected[row, column] += (lit & (off < 0.04)).mean() * lens_gain(renderer, index[None])[0]
+    found = collect.render_board(renderer, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
     assert expected.max() > 0.3
     assert np.abs(found - expected).max() <= EDGE_SAMPLES / samples
     assert (np.abs(found - expected) < 1e-6).mean() > 0.95
@@ -248,21 +247,31 @@ def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
 
 @pytest.mark.parametrize("name", ["glass", "all"])
 def test_dots_traced_forward_and_backward_agree(device, name):
-    """A dot's light from the area of its image, sent forward, is what pixels collect that look back at the dot."""
+    """The light of a dot, traced forward from the area of its image, equals the light that pixels collect backward."""
     scene_camera = rig(name, true_offset_mm=(0, 0, 0.1))
-    eye, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
-    lenses = np.pi * 0.05**2 * image_area(scene_camera, dots) / abs(np.linalg.det(eye.basis_mm))
+    renderer, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
+    lenses = np.pi * 0.05**2 * image_area(scene_camera, dots) / abs(np.linalg.det(renderer.basis_mm))
     rays = render.ray_table(1 << 17, "disc", 0)
-    forward = render.render_sources(eye, dots, lenses * eye.microimage_px, 0.05, rays, rng=np.random.default_rng(0))
+    forward = render.render_sources(
+        renderer, dots, lenses * renderer.microimage_px, 0.05, rays, rng=np.random.default_rng(0)
+    )
     backward = collect.render_board(
-        eye, 0.1, dots=(2, 1), spacing_mm=0.2, dot_diameter_mm=0.1, dot_light=1, board_light=0, samples=1024, seed=0
+        renderer,
+        0.1,
+        dots=(2, 1),
+        spacing_mm=0.2,
+        dot_diameter_mm=0.1,
+        dot_light=1,
+        board_light=0,
+        samples=1024,
+        seed=0,
     )
     uneven = 0.03  # a tilted radiant board favours one side of the pupil, and aberrations stretch the image unevenly
     assert forward.sum() == pytest.approx(backward.sum(), rel=uneven)
     assert np.linalg.norm(forward - backward) < (uneven + 0.03) * np.linalg.norm(backward)  # 3 %: noise of the rays
 
 
-def test_uniform_light_looks_the_same_through_everything(device):
+def test_windows_and_aberrations_do_not_change_uniform_light(device):
     plain = collect.render_white(render_camera(rig("all", window=(), aberrations={})), samples=64, seed=0)
     assert np.array_equal(collect.render_white(render_camera(rig("all")), samples=64, seed=0), plain)
 
@@ -278,17 +287,20 @@ coma_pitch = 0.3
 """
 
 
-def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_path):
+def test_cameras_and_truth_take_the_optics_of_the_scene(device, tmp_path):
     own = "[camera.aberrations]\nspherical_pitch = 0.2\n[[camera.window]]\nindex = 1.4\nthickness_mm = 2.0\n"
     own += "point_mm = [-20.0, 0.0, 20.0]\nnormal = [-1.0, 0.0, 1.0]\n"
-    text = SCENE.replace("dark_image = true\n", "dark_image = true\n" + own).replace("pairs = 2", "pairs = 1") + OPTICS
+    text = (
+        SMALL_SCENE.replace("dark_image = true\n", "dark_image = true\n" + own).replace("pairs = 2", "pairs = 1")
+        + OPTICS
+    )
     (tmp_path / "scene.toml").write_text(text)
     scene = open_scene(tmp_path / "scene.toml")
     one, two = scene.camera
     assert one.window == scene.window and one.window[0].index == 1.5 and one.aberrations.coma_pitch == 0.3
     assert two.window[0].index == 1.4 and two.aberrations.coma_pitch == 0 and two.aberrations.spherical_pitch == 0.2
     path = simulate(scene, tmp_path / "data")
-    assert "[window" not in path.read_text() and "aberration" not in path.read_text()  # the user is not told
+    assert "[window" not in path.read_text() and "aberration" not in path.read_text()  # the truth stays hidden
     spec = json.loads((path.parent / "truth" / "spec.json").read_text())
     at, pupil = points(20), pupil_points(20)
     for number in (0, 1):
@@ -298,7 +310,7 @@ def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("point_mm = [0.0, 0.0, 30.0]", "point_mm = [0.0, 0.0, 0.1]", "window[0]"),  # cuts the particles
         ("point_mm = [0.0, 0.0, 30.0]", "point_mm = [0.0, 0.0, 140.0]", "pupil"),  # cuts the lens at 45 degrees
@@ -310,12 +322,12 @@ def test_a_scene_hands_its_optics_to_its_cameras_and_to_the_truth(device, tmp_pa
         ("coma_pitch = 0.3", "distortion_percent = 9.0\ncentre_mm = [0.5, 0.0]", "camera 'one' has"),
     ],
 )
-def test_impossible_optics_are_refused(tmp_path, old, new, said):
+def test_impossible_optics_are_refused(tmp_path, old, new, message):
     assert old in OPTICS
-    (tmp_path / "scene.toml").write_text(SCENE + OPTICS.replace(old, new))
+    (tmp_path / "scene.toml").write_text(SMALL_SCENE + OPTICS.replace(old, new))
     with pytest.raises(InputError) as error:
         simulate(tmp_path / "scene.toml", tmp_path / "out")
-    assert said in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_only_the_window_next_to_the_particles_has_a_medium():
@@ -325,7 +337,7 @@ def test_only_the_window_next_to_the_particles_has_a_medium():
 
 @pytest.mark.slow
 def test_the_network_learns_what_the_thin_lens_cannot(device, tmp_path):
-    """A camera that stands where it is said to, behind a window, its lens aberrated: DRT fails for that alone."""
+    """A camera at its nominal position, behind a window and with aberrations: only the network maps it."""
     lens = "[aberrations]\ncoma_pitch = 0.27\ndistortion_percent = 1.0\ncentre_mm = [-2.3, 0.0]\n"
     text = re.sub(r"true_(yaw|pitch|roll|offset)\w* = .*\n", "", CALIBRATION_SCENE)
     (tmp_path / "scene.toml").write_text(text + OPTICS.split("[aberrations]")[0] + lens)

@@ -7,33 +7,33 @@ import numpy as np
 import pytest
 import tifffile
 from scipy.ndimage import gaussian_filter
-from simulation.test_simulator import MONTE_CARLO, ROUNDING, SCENE
+from support.simulated_cameras import MONTE_CARLO, ROUNDING, SMALL_SCENE
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import open_experiment
-from lfpiv.simulation.scene import Scene
-from lfpiv.simulation.simulator import DEMO_SCENE, open_scene, render_camera, simulate
+from lfpiv.simulation.scene import Scene, open_scene
+from lfpiv.simulation.simulator import render_camera, simulate
 from lfpiv_kernels.rendering import render
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory, device):
     folder = tmp_path_factory.mktemp("scene")
-    (folder / "scene.toml").write_text(SCENE)
-    seen = []
-    path = simulate(folder / "scene.toml", folder / "data", progress=lambda *step: seen.append(step))
-    return folder, path, seen
+    (folder / "scene.toml").write_text(SMALL_SCENE)
+    steps = []
+    path = simulate(folder / "scene.toml", folder / "data", progress=lambda *step: steps.append(step))
+    return folder, path, steps
 
 
-def test_data_set_is_what_the_contract_asks_for(small):
-    folder, path, seen = small
+def test_data_set_is_a_valid_experiment_with_truth(small):
+    folder, path, steps = small
     experiment = open_experiment(path)
     assert path == folder / "data" / "experiment.toml" and sorted(os.listdir(folder)) == ["data", "scene.toml"]
     assert [c.optics.sensor_shape for c in experiment.cameras] == [(130, 170), (150, 140)]
     assert experiment.cameras[1].optics.layout == "hexagonal" and experiment.grid.shape == (4, 5, 6)
     assert experiment.smart.iterations == 3 and experiment.dt_s == 2e-4
-    assert "true" not in path.read_text()  # the user is not told
-    assert seen[-1][1:] == (len(seen), len(seen)) and len(list(path.parent.rglob("*.tif"))) == len(seen) == 15
+    assert "true" not in path.read_text()  # the truth stays hidden
+    assert steps[-1][1:] == (len(steps), len(steps)) and len(list(path.parent.rglob("*.tif"))) == len(steps) == 15
     dark = experiment.dark("two")
     assert abs(dark.mean() - 40) < MONTE_CARLO * 3 / np.sqrt(dark.size) and experiment.dark("one") is None
 
@@ -59,13 +59,13 @@ def test_particle_images_show_the_truth_at_both_instants(small):
         )
     rays = render.ray_table(16384, "gaussian", 99)
     for number, name in enumerate(("one", "two")):
-        eye = render_camera(scene.camera[number], seed=[scene.seed, 3, number])
+        renderer = render_camera(scene.camera[number], seed=[scene.seed, 3, number])
         frames = {
             sign: gaussian_filter(
                 render.render_sources(
-                    eye,
+                    renderer,
                     position + sign * moved,
-                    600 * eye.microimage_px * intensity,
+                    600 * renderer.microimage_px * intensity,
                     0.02,
                     rays,
                     rng=np.random.default_rng(1),
@@ -81,9 +81,9 @@ def test_particle_images_show_the_truth_at_both_instants(small):
             assert error < 0.2 and other > 2 * error  # rays of two tables, shot and read noise leave 10 to 15 %
 
 
-def test_same_seed_same_files_and_a_flip_only_mirrors(small, tmp_path):
+def test_equal_seeds_give_equal_files_and_a_flip_mirrors(small, tmp_path):
     folder, path, _ = small
-    text = SCENE.replace('name = "two"', 'name = "two"\nimage_flip = "both"')
+    text = SMALL_SCENE.replace('name = "two"', 'name = "two"\nimage_flip = "both"')
     text = text.replace('name = "one"', 'name = "one"\nimage_flip = "vertical"')
     (tmp_path / "flipped.toml").write_text(text)
     flipped = open_experiment(simulate(tmp_path / "flipped.toml", tmp_path / "flipped"))
@@ -99,7 +99,7 @@ def test_same_seed_same_files_and_a_flip_only_mirrors(small, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("f_number = 4.0", "f_numer = 4.0", "f_numer"),
         ('kind = "swirl"', 'kind = "whirl"', "'uniform' or 'shear' or 'ring' or 'swirl' or 'swirling_jet'"),
@@ -117,26 +117,26 @@ def test_same_seed_same_files_and_a_flip_only_mirrors(small, tmp_path):
         ),
     ],
 )
-def test_a_bad_scene_is_refused_before_any_work(tmp_path, old, new, said):
+def test_a_bad_scene_is_refused_before_any_work(tmp_path, old, new, message):
     path = tmp_path / "scene.toml"
-    assert old in SCENE
-    path.write_text(SCENE.replace(old, new, 1))
+    assert old in SMALL_SCENE
+    path.write_text(SMALL_SCENE.replace(old, new, 1))
     with pytest.raises(InputError) as error:
         simulate(path, tmp_path / "out")
-    assert said in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
     assert os.listdir(tmp_path) == ["scene.toml"]
 
 
-def test_a_folder_with_files_is_left_alone(tmp_path):
+def test_a_folder_with_files_is_left_alone(small, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("kept")
     with pytest.raises(InputError, match="empty or absent folder"):
-        simulate(DEMO_SCENE, tmp_path / "out")
+        simulate(small[0] / "scene.toml", tmp_path / "out")
     assert os.listdir(tmp_path / "out") == ["mine"] and os.listdir(tmp_path) == ["out"]
 
 
 def test_interrupted_simulation_leaves_nothing(tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "scene.toml").write_text(SMALL_SCENE)
 
     def stop(what, done, total):
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Simulator: kernels against slow twins and a geometric ray trace, radiometry, noise, the sample data."""
+"""Simulator: kernels against slow twins and geometric rays, radiometry, noise, sample data."""
 
 import hashlib
 import json
@@ -12,144 +12,20 @@ import pytest
 import tifffile
 from scipy.ndimage import gaussian_filter
 from scipy.stats import qmc
+from support.simulated_cameras import MONTE_CARLO, RIGS, ROUNDING, camera, land, points, relative_difference
 
-from lfpiv.simulation.scene import Noise, SceneCamera
-from lfpiv.simulation.simulator import expose, render_camera, true_mapping
+from lfpiv.simulation.scene import Noise, SceneCamera, true_mapping
+from lfpiv.simulation.simulator import expose, render_camera
 from lfpiv_kernels.rendering import collect, render
 
-ROUNDING = 1e-12  # float64, a few operations on millimetres
 MOVED_RAYS = (
     2e-3  # share of the light in other pixels: float32 places rays to 2e-4 px, pixel edges pass each lens often
 )
 EDGE_SAMPLES = 2.5  # rays of one pixel that float32 may put on the other side of an edge
-MONTE_CARLO = 5.0  # standard errors; 1e-6 chance per comparison
-
-TABLE_2 = {
-    "name": "cam",
-    "focal_length_mm": 100,
-    "magnification": -1,
-    "f_number": 4,
-    "microlens_pitch_mm": 0.1,
-    "microlens_focal_length_mm": 0.8,
-    "pixel_um": 5.5,
-    "sensor_width_px": 150,
-    "sensor_height_px": 110,
-    "nominal_angle_deg": 45,
-}
-RIGS = {
-    "ideal": {"nominal_angle_deg": 0},
-    "misaligned": {
-        "true_yaw_deg": -43.0,
-        "true_pitch_deg": 1.5,
-        "true_roll_deg": -2.0,
-        "true_offset_mm": (0.05, -0.04, 0.3),
-        "true_array_roll_deg": 0.9,
-        "true_array_offset_mm": (0.031, -0.022),
-        "true_microlens_pitch_mm": 0.1013,
-        "vignetting": 0.3,
-        "lens_gain_sd": 0.1,
-    },
-    "hexagonal": {
-        "microlens_layout": "hexagonal",
-        "magnification": -0.8,
-        "nominal_angle_deg": 20,
-        "true_array_roll_deg": -7.0,
-        "true_array_offset_mm": (-0.02, 0.045),
-    },
-    "overlapping": {"f_number": 2.6, "true_array_roll_deg": 3.0, "nominal_angle_deg": 150},
-}
 
 
-SCENE = """
-name = "small"
-seed = 5
-dt_s = 2e-4
-[[camera]]
-name = "one"
-focal_length_mm = 100.0
-magnification = -1.0
-f_number = 4.0
-microlens_pitch_mm = 0.1
-microlens_focal_length_mm = 0.8
-pixel_um = 5.5
-sensor_width_px = 170
-sensor_height_px = 130
-nominal_angle_deg = 45
-true_yaw_deg = 44.0
-true_array_roll_deg = 0.5
-[[camera]]
-name = "two"
-focal_length_mm = 60.0
-magnification = -0.5
-f_number = 4.0
-microlens_pitch_mm = 0.1
-microlens_focal_length_mm = 0.7
-pixel_um = 5
-sensor_width_px = 140
-sensor_height_px = 150
-nominal_angle_deg = -40
-microlens_layout = "hexagonal"
-vignetting = 0.2
-lens_gain_sd = 0.02
-dark_image = true
-[board]
-dots = [3, 2]
-spacing_mm = 0.3
-dot_diameter_mm = 0.05
-planes_mm = [-0.2, 0.2]
-[volume]
-size_mm = [0.6, 0.5, 0.4]
-voxel_mm = 0.1
-[particles]
-per_microlens = 0.5
-pairs = 2
-intensity_sd = 0.5
-sigma_mm = 0.02
-[flow]
-kind = "swirl"
-peak_mm = 0.05
-core_mm = 0.2
-[quality]
-particle_rays = 16384
-dot_rays = 4096
-pixel_rays = 64
-[smart]
-iterations = 3
-[correlation]
-windows = [4]
-"""
-"""Two cameras, a board and a swirl, with every kind of key; `test_simulated_set` and others write it."""
-
-
-def camera(rig="misaligned", **changes):
-    return SceneCamera.model_validate(TABLE_2 | RIGS[rig] | changes)
-
-
-def points(count, seed=0):
-    return np.random.default_rng(seed).uniform(-0.35, 0.35, (count, 3))
-
-
-def lens_gain(eye, index):
-    """Transmission of lenses (i, j), zero outside the table."""
-    i, j = (index - eye.first_lens).astype(int).T
-    inside = (i >= 0) & (i < eye.lens_gain.shape[0]) & (j >= 0) & (j < eye.lens_gain.shape[1])
-    return np.where(inside, eye.lens_gain[np.where(inside, i, 0), np.where(inside, j, 0)], 0)
-
-
-def land(scene_camera, eye, s_t, pupil, weight):
-    """Twin of the sensor: Eq. 9 for rays (s, t) and (u, v), added up per pixel with the weight of each."""
-    lattice, optics = scene_camera.lattice, scene_camera.optics
-    index = lattice.nearest(s_t)
-    place = lattice.centres_mm(index) + optics.microlens_focal_length_mm / optics.image_distance_mm * (s_t - pupil)
-    rows, columns = optics.sensor_shape
-    column, row = np.floor(place / optics.pixel_mm + [columns / 2, rows / 2]).T
-    edges = (np.arange(rows + 1), np.arange(columns + 1))
-    weight = weight * lens_gain(eye, index) * (column < columns) * (row < rows)  # the last bin includes its end
-    return np.histogram2d(row, column, bins=edges, weights=weight)[0]
-
-
-def sources_twin(scene_camera, eye, centres, counts, extent, rays, rng):
-    """Twin of `render_sources`, ray by ray in float64, in the words of DRT: s = k u - m x_c."""
+def sources_twin(scene_camera, renderer, centres, counts, extent, rays, rng):
+    """Twin of `render_sources`, ray by ray in float64, by DRT: s = k u - m x_c."""
     optics, image = scene_camera.optics, 0
     f, si, so = optics.focal_length_mm, optics.image_distance_mm, optics.object_distance_mm
     angles = rng.uniform(0, 2 * np.pi, (len(centres), 2))
@@ -161,17 +37,13 @@ def sources_twin(scene_camera, eye, centres, counts, extent, rays, rng):
         d = so - z
         k, m = 1 - si / f + si / d, si / d
         s_t = k[:, None] * pupil - m[:, None] * np.stack([x, y], 1)
-        image = image + land(scene_camera, eye, s_t, pupil, np.full(len(rays), count / len(rays)))
+        image = image + land(scene_camera, renderer, s_t, pupil, np.full(len(rays), count / len(rays)))
     return image
-
-
-def relative_difference(found, expected):
-    return np.abs(found - expected).sum() / np.abs(expected).sum()
 
 
 @pytest.mark.parametrize("rig", RIGS)
 def test_true_mapping_is_a_thin_lens(rig):
-    """A ray through pupil point u meets the array where the line to the point's thin-lens image does."""
+    """A ray through pupil point u meets the array on the line to the thin-lens image of the point."""
     scene_camera = camera(rig)
     optics, at = scene_camera.optics, 5 * points(200, 1)
     pupil = np.random.default_rng(2).uniform(-10, 10, (200, 2))
@@ -200,11 +72,11 @@ def test_ray_tables_fill_pupil_and_source_evenly(shape):
 @pytest.mark.parametrize("shape", render.SOURCES)
 def test_sources_equal_their_twin(device, rig, shape):
     scene_camera = camera(rig)
-    eye = render_camera(scene_camera, seed=4)
+    renderer = render_camera(scene_camera, seed=4)
     centres, counts = points(12), np.random.default_rng(1).uniform(5e4, 2e5, 12)
     rays = render.ray_table(4096, shape, 0)
-    found = render.render_sources(eye, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
-    expected = sources_twin(scene_camera, eye, centres, counts, 0.03, rays, np.random.default_rng(2))
+    found = render.render_sources(renderer, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
+    expected = sources_twin(scene_camera, renderer, centres, counts, 0.03, rays, np.random.default_rng(2))
     assert expected.sum() > 0.1 * counts.sum()  # the sensor sees them
     assert relative_difference(found, expected) < MOVED_RAYS
 
@@ -213,18 +85,18 @@ def test_sources_equal_their_twin(device, rig, shape):
 def test_white_equals_rays_of_uniform_light(device, rig):
     """Backward coverage against forward rays: (s, t) anywhere on the array, (u, v) anywhere on the pupil."""
     scene_camera = camera(rig, sensor_width_px=60, sensor_height_px=44)
-    eye, optics, rng = render_camera(scene_camera, seed=4), scene_camera.optics, np.random.default_rng(5)
+    renderer, optics, rng = render_camera(scene_camera, seed=4), scene_camera.optics, np.random.default_rng(5)
     rows, columns = optics.sensor_shape
     half = np.array([columns, rows]) * optics.pixel_mm / 2 + 0.2
     rays = 500_000
     s_t = rng.uniform(-half, half, (rays, 2))
     radius, angle = optics.pupil_radius_mm * np.sqrt(rng.random(rays)), rng.uniform(0, 2 * np.pi, rays)
     pupil = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-    count = land(scene_camera, eye, s_t, pupil, np.ones(rays))
+    count = land(scene_camera, renderer, s_t, pupil, np.ones(rays))
     # rays per wholly lit pixel: each cell of the array spreads its share over one microimage
     cell = abs(np.linalg.det(scene_camera.lattice.basis_mm))
-    full = rays * cell / np.prod(2 * half) / eye.microimage_px
-    found = collect.render_white(eye, samples=256, seed=0)
+    full = rays * cell / np.prod(2 * half) / renderer.microimage_px
+    found = collect.render_white(renderer, samples=256, seed=0)
     assert found.max() > (3.9 if rig == "overlapping" else 0.9)  # there four microimages share the corners' pixels
     score = (count / full - found) / np.sqrt((found + 0.05) / full)  # gains below 1 make it narrower still
     assert abs(score.mean()) < MONTE_CARLO / np.sqrt(score.size)
@@ -233,7 +105,7 @@ def test_white_equals_rays_of_uniform_light(device, rig):
 
 
 def board_twin(scene_camera, plane, dots, spacing, diameter, table):
-    """Twin of `render_board` (bright dots), pixel by pixel: where on the board does the light of a pixel come from?"""
+    """Twin of `render_board` (bright dots): trace the light of each pixel back to the board."""
     optics, lattice = scene_camera.optics, scene_camera.lattice
     scale = optics.microlens_focal_length_mm / optics.image_distance_mm
     rows, columns = optics.sensor_shape
@@ -263,16 +135,16 @@ def board_twin(scene_camera, plane, dots, spacing, diameter, table):
 def test_board_equals_its_twin(device, rig):
     scene_camera = camera(rig, sensor_width_px=44, sensor_height_px=32, vignetting=0, lens_gain_sd=0)
     board = {"dots": (3, 2), "spacing_mm": 0.12, "dot_diameter_mm": 0.08}
-    eye, samples = render_camera(scene_camera), 64
+    renderer, samples = render_camera(scene_camera), 64
     table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(3)).random(samples) - 0.5
     expected = board_twin(scene_camera, 0.15, *board.values(), table)
-    found = collect.render_board(eye, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
+    found = collect.render_board(renderer, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
     assert expected.max() > 0.3
     assert np.abs(found - expected).max() <= EDGE_SAMPLES / samples
     assert (found == expected).mean() > 0.95  # the same rays: only float32 at an edge makes a difference
     # dark dots are the complement, up to a ray that lands exactly on an edge
-    inverse = collect.render_board(eye, 0.15, **board, dot_light=0, board_light=1, samples=samples, seed=3)
-    white = collect.render_white(eye, samples=samples, seed=3)
+    inverse = collect.render_board(renderer, 0.15, **board, dot_light=0, board_light=1, samples=samples, seed=3)
+    white = collect.render_white(renderer, samples=samples, seed=3)
     assert np.abs(found + inverse - white).max() <= EDGE_SAMPLES / samples
 
 
@@ -284,45 +156,60 @@ def test_dots_traced_forward_and_backward_agree(device, rig, tilt_error):
     per cent, which is the error allowed where the board is tilted.
     """
     scene_camera = camera(rig, vignetting=0, lens_gain_sd=0)
-    eye, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
+    renderer, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
     rays = render.ray_table(1 << 17, "disc", 0)
-    m = eye.image_distance_mm / (eye.object_distance_mm - ((dots - eye.offset_mm) @ eye.rotation.T)[:, 2])
-    lenses = np.pi * 0.05**2 * abs(eye.rotation[2, 2]) * m**2 / abs(np.linalg.det(eye.basis_mm))
-    forward = render.render_sources(eye, dots, lenses * eye.microimage_px, 0.05, rays, rng=np.random.default_rng(0))
+    m = renderer.image_distance_mm / (
+        renderer.object_distance_mm - ((dots - renderer.offset_mm) @ renderer.rotation.T)[:, 2]
+    )
+    lenses = np.pi * 0.05**2 * abs(renderer.rotation[2, 2]) * m**2 / abs(np.linalg.det(renderer.basis_mm))
+    forward = render.render_sources(
+        renderer, dots, lenses * renderer.microimage_px, 0.05, rays, rng=np.random.default_rng(0)
+    )
     backward = collect.render_board(
-        eye, 0.1, dots=(2, 1), spacing_mm=0.2, dot_diameter_mm=0.1, dot_light=1, board_light=0, samples=1024, seed=0
+        renderer,
+        0.1,
+        dots=(2, 1),
+        spacing_mm=0.2,
+        dot_diameter_mm=0.1,
+        dot_light=1,
+        board_light=0,
+        samples=1024,
+        seed=0,
     )
     assert forward.sum() == pytest.approx(backward.sum(), rel=tilt_error)
     assert np.linalg.norm(forward - backward) < (tilt_error + 0.02) * np.linalg.norm(backward)  # 2 %: noise of the rays
 
 
 def test_images_add_exactly_and_do_not_depend_on_threads(device, tmp_path):
-    eye, rays = render_camera(camera(), seed=4), render.ray_table(4096, "ball", 0)
+    renderer, rays = render_camera(camera(), seed=4), render.ray_table(4096, "ball", 0)
     centres, counts = points(40), np.random.default_rng(1).uniform(5e4, 2e5, 40)
-    whole = render.render_sources(eye, centres, counts, 0.02, rays, rng=np.random.default_rng(9))
+    whole = render.render_sources(renderer, centres, counts, 0.02, rays, rng=np.random.default_rng(9))
     rng = np.random.default_rng(9)
     parts = [
-        render.render_sources(eye, centres[part], counts[part], 0.02, rays, rng=rng)
+        render.render_sources(renderer, centres[part], counts[part], 0.02, rays, rng=rng)
         for part in (slice(0, 17), slice(17, None))
     ]
     assert np.array_equal(whole, parts[0] + parts[1])
     program = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import test_simulator as t, numpy as np, hashlib\n"
+        "import sys; sys.path.insert(0, sys.argv[1]); import numpy as np, hashlib\n"
+        "from support import simulated_cameras\n"
+        "from lfpiv.simulation.simulator import render_camera\n"
         "from lfpiv_kernels import runtime\n"
         "from lfpiv_kernels.rendering import render\n"
         "runtime.start(sys.argv[2], threads=1)\n"
-        "eye, rays = t.render_camera(t.camera(), seed=4), render.ray_table(4096, 'ball', 0)\n"
+        "camera, points = simulated_cameras.camera(), simulated_cameras.points(40)\n"
+        "renderer, rays = render_camera(camera, seed=4), render.ray_table(4096, 'ball', 0)\n"
         "counts = np.random.default_rng(1).uniform(5e4, 2e5, 40)\n"
-        "image = render.render_sources(eye, t.points(40), counts, 0.02, rays, rng=np.random.default_rng(9))\n"
+        "image = render.render_sources(renderer, points, counts, 0.02, rays, rng=np.random.default_rng(9))\n"
         "print(hashlib.sha256(image.tobytes()).hexdigest())"
     )
-    command = [sys.executable, "-c", program, str(Path(__file__).parent), device.kind]
+    command = [sys.executable, "-c", program, str(Path(__file__).parents[1]), device.kind]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ)
     assert done.stdout.split()[-1] == hashlib.sha256(whole.tobytes()).hexdigest()
 
 
-def test_exposure_has_the_noise_it_says():
-    """Mean kept; variance = read noise^2 + signal / (electrons per count) + rounding; nothing else."""
+def test_exposure_has_the_stated_noise():
+    """The mean is unchanged. Variance = read noise^2 + signal / (electrons per count) + rounding."""
     level = np.repeat(np.array([0.0, 300.0, 2500.0]), 200_000).reshape(600, 1000)
     noise = Noise(background=50.0, read_noise=4.0, full_well_e=8190.0)  # two electrons per count
     image = expose(level, camera(blur_px=0.0), noise, np.random.default_rng(0)).astype(float)
@@ -342,7 +229,7 @@ def test_exposure_has_the_noise_it_says():
 
 
 def shift_px(model, image):
-    """Sub-pixel shift (column, row) of an image against a model with fitted level, by least squares on the gradient."""
+    """Fit the sub-pixel shift (column, row) of an image against a model, by least squares on the gradient."""
     slope_y, slope_x = np.gradient(model)
     design = np.stack([model.ravel(), np.ones(model.size), -slope_x.ravel(), -slope_y.ravel()], 1)
     solved = np.linalg.lstsq(design.T @ design, design.T @ image.ravel(), rcond=None)[0]
@@ -357,12 +244,12 @@ SAMPLE_NOISE = 12.0  # count: variance per count of the sample's images, most of
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_reproduces_the_sample_data(device, sample_data, number):
-    """White, board and particle images of an independent ray tracer, from its specification of the rig alone."""
+    """White, board and particle images equal those of an independent ray tracer with the same specification."""
     folder = sample_data / "ring-vortex-2cam"
     scene_camera = SceneCamera.model_validate(
         json.loads((folder / "truth" / "spec.json").read_text())["camera"][number]
     )
-    eye, name = render_camera(scene_camera), scene_camera.name
+    renderer, name = render_camera(scene_camera), scene_camera.name
     dots = np.stack([*(g.ravel() for g in np.meshgrid(np.arange(-3.0, 4), np.arange(-3.0, 4))), np.full(49, 2.0)], 1)
     with np.load(folder / "truth" / "particles.npz") as truth:
         position = truth["pair_0000_positions_mm"] + truth["pair_0000_displacement_mm"] / 2
@@ -370,9 +257,11 @@ def test_reproduces_the_sample_data(device, sample_data, number):
     rng = np.random.default_rng(0)
     disc, blob = render.ray_table(1 << 16, "disc", 0), render.ray_table(1 << 15, "gaussian", 0)
     images = {
-        f"white/{name}.tif": collect.render_white(eye, samples=128, seed=0),
-        f"board/{name}/plane_08.tif": render.render_sources(eye, dots, np.full(49, 200.0), 0.05, disc, rng=rng),
-        f"particles/{name}/pair_0000_b.tif": render.render_sources(eye, position, intensity * 200, 0.02, blob, rng=rng),
+        f"white/{name}.tif": collect.render_white(renderer, samples=128, seed=0),
+        f"board/{name}/plane_08.tif": render.render_sources(renderer, dots, np.full(49, 200.0), 0.05, disc, rng=rng),
+        f"particles/{name}/pair_0000_b.tif": render.render_sources(
+            renderer, position, intensity * 200, 0.02, blob, rng=rng
+        ),
     }
     for path, image in images.items():
         recorded = tifffile.imread(folder / path).astype(float)

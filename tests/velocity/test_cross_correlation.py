@@ -1,4 +1,4 @@
-"""Correlation: known displacements, symmetries, validation, honest uncertainty."""
+"""Correlation: known displacements, symmetries, uncertainty, and the form of the result."""
 
 import json
 
@@ -9,8 +9,9 @@ import xarray as xr
 from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, shear, uniform
 
 import lfpiv
-from lfpiv.velocity import cross_correlation as vectors
-from lfpiv.velocity import validation
+from lfpiv.velocity.cross_correlation import Verdict
+from lfpiv.velocity.settings import CorrelationSettings
+from lfpiv.velocity.validation import LEAST_SEEN
 from lfpiv_kernels.correlation import correlate as kernel
 from lfpiv_kernels.correlation import deform
 
@@ -32,69 +33,6 @@ def error_of(result, flow, window):
 
 def correlate(pair, **options):
     return lfpiv.correlate(*pair, dt_s=1e-3, voxel_mm=1.0, **options)
-
-
-# --- validation --------------------------------------------------------------------------------------------------
-
-
-SEARCH = (9, 9, 9)
-
-
-def linear_field(shape, slope):
-    index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1)
-    return index @ np.asarray(slope, float)
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 2, 3), (1, 4, 5), (5, 6, 7)])
-def test_steep_gradients_are_not_outliers(shape):
-    field = linear_field(shape, [[2, 0, 1], [0, -3, 1], [1, 1, 2]])
-    result, valid = validation.validate(field, np.full_like(field, np.nan), np.ones(shape, bool), SEARCH)
-    assert valid.all()
-    np.testing.assert_array_equal(result, field)
-
-
-def test_outliers_are_found_and_replaced():
-    rng = np.random.default_rng(6)
-    shape = (8, 9, 10)
-    truth = linear_field(shape, 0.3 * rng.normal(size=(3, 3)))
-    field = truth + 0.05 * rng.normal(size=truth.shape)
-    wrong = rng.random(shape) < 0.1
-    field[wrong] += rng.choice((-1, 1), (wrong.sum(), 3)) * rng.uniform(2, 6, (wrong.sum(), 3))
-    second = np.full_like(field, np.nan)
-    rescued = wrong & (rng.random(shape) < 0.5)  # half of them have the truth as second peak
-    second[rescued] = truth[rescued]
-    missing = ~wrong & (rng.random(shape) < 0.05)
-    field[missing] = np.nan
-    result, valid = validation.validate(field, second, ~missing, SEARCH)
-    assert not valid[wrong & ~rescued].any() and not valid[missing].any()
-    assert valid[~wrong & ~missing].mean() > 0.98  # good vectors: noise is half of NOISE_VOXEL, rejections are rare
-    assert valid[rescued].mean() > 0.9
-    replaced = 0.5  # a median of linear neighbours at the edge of the grid misses by part of a step [voxel]
-    assert np.abs(result - truth).max() < replaced
-
-
-def test_a_known_field_helps_clear_peaks_only():
-    rng = np.random.default_rng(9)
-    index = np.stack(np.meshgrid(*(np.arange(n) for n in (2, 9, 10)), indexing="ij"), -1).astype(float)
-    bent = np.sin(1.5 * index[..., [2, 1, 2]] + index[..., [0, 0, 1]])  # bends from vector to vector, in two layers
-    field = bent + 0.03 * rng.normal(size=bent.shape)
-    wrong = rng.random(bent.shape[:3]) < 0.1
-    field[wrong] += rng.choice((-1, 1), (wrong.sum(), 3)) * rng.uniform(1, 2, (wrong.sum(), 3))
-    nowhere, measured = np.full_like(field, np.nan), np.ones(wrong.shape, bool)
-    shares = []
-    for ratio in (1.0, 4.0):
-        known = {"predicted": bent + 0.2, "peak_ratio": np.full(wrong.shape, ratio)}
-        valid = validation.validate(field, nowhere, measured, (3, 3, 3), **known)[1]
-        assert valid[wrong].mean() < 0.2  # a few agree with what scatters around them
-        shares.append(valid[~wrong].mean())
-    plain = validation.validate(field, nowhere, measured, (3, 3, 3))[1]
-    assert shares[0] == plain[~wrong].mean() < 0.8 and shares[1] > 0.98
-
-
-def test_nothing_valid_gives_nothing():
-    field = np.full((2, 3, 4, 3), np.nan)
-    result, valid = validation.validate(field, field, np.zeros((2, 3, 4), bool), SEARCH)
-    assert not valid.any() and np.isnan(result).all()
 
 
 # --- known displacements -----------------------------------------------------------------------------------------
@@ -135,8 +73,8 @@ def test_the_quarter_voxel_removes_the_bias_of_interpolation(monkeypatch):
 )
 def test_flows_are_recovered(flow, limit, noisy_limit):
     windows = (32, 16, 12, 12)  # limits: twice what was measured, mean over all vectors, edges included [voxel]
-    for spoilt, allowed in (({}, limit), ({"ghosts": 1.0, "noise": 0.05}, noisy_limit)):
-        result = correlate(particle_pair(SHAPE, flow, seed=30, **spoilt), windows=windows)
+    for degraded, allowed in (({}, limit), ({"ghosts": 1.0, "noise": 0.05}, noisy_limit)):
+        result = correlate(particle_pair(SHAPE, flow, seed=30, **degraded), windows=windows)
         error = np.linalg.norm(error_of(result, flow, 12), axis=-1)
         assert error.mean() < allowed
         assert float(result["valid"].mean()) > 0.95 and np.isfinite(measured(result)).all()
@@ -146,8 +84,8 @@ def test_flows_are_recovered(flow, limit, noisy_limit):
 @pytest.mark.parametrize(("depth", "window"), [(30, 20), (30, 14), (24, 16)], ids=str)
 def test_few_layers_of_vectors_are_enough(depth, window):
     shape = (depth, 56, 56)
-    for spoilt in ({}, {"ghosts": 1.0, "noise": 0.05}):
-        result = correlate(particle_pair(shape, ring(shape), seed=3, **spoilt), windows=(window, window))
+    for degraded in ({}, {"ghosts": 1.0, "noise": 0.05}):
+        result = correlate(particle_pair(shape, ring(shape), seed=3, **degraded), windows=(window, window))
         error = np.linalg.norm(error_of(result, ring(shape), window), axis=-1)
         assert float(result["valid"].mean()) > 0.9 and error.mean() < 0.3  # of a peak displacement of 2
 
@@ -169,11 +107,11 @@ def test_swapping_the_volumes_negates_the_field():
 
 
 @pytest.mark.parametrize("windows", [(32, 16, 16), (32, 16, 8)], ids=["16", "8"])
-def test_the_uncertainty_is_honest(windows):
+def test_the_uncertainty_agrees_with_the_errors(windows):
     flow = uniform(0.7, -1.3, 1.8)
     ratios = []
-    for number, spoilt in enumerate(({"lost": 0.2}, {"ghosts": 1.0}, {"noise": 0.1}, {"ghosts": 0.5, "lost": 0.1})):
-        result = correlate(particle_pair(SHAPE, flow, seed=50 + number, **spoilt), windows=windows)
+    for number, degraded in enumerate(({"lost": 0.2}, {"ghosts": 1.0}, {"noise": 0.1}, {"ghosts": 0.5, "lost": 0.1})):
+        result = correlate(particle_pair(SHAPE, flow, seed=50 + number, **degraded), windows=windows)
         deviation = np.stack([result[f"uncertainty_{axis}"].values for axis in "zyx"], -1)
         known, valid = np.isfinite(deviation).all(-1), result["valid"].values
         assert not known[~valid].any() and known[valid].mean() > 0.97  # a poor window's peak may be too odd to judge
@@ -196,7 +134,7 @@ def volumes(shape=(20, 24, 28), voxel=0.1, first=(-1.0, 2.0, 3.0), seed=40, **op
     return [xr.DataArray(volume, places, ("z", "y", "x")) for volume in pair]
 
 
-def test_the_dataset_has_units_and_says_where_vectors_are():
+def test_the_dataset_has_units_and_positions():
     result = lfpiv.correlate(*volumes(), windows=((16, 16, 20), (8, 12, 8)), overlap=0.5, dt_s=2e-4)
     assert result["u"].dims == ("z", "y", "x") and dict(result.sizes) == {"z": 4, "y": 3, "x": 6}
     for name, axis in (("u", "x"), ("v", "y"), ("w", "z")):
@@ -208,8 +146,9 @@ def test_the_dataset_has_units_and_says_where_vectors_are():
     assert float(result["z"][0]) == pytest.approx(-1.0 + 0.1 * (origin[0] + 3.5 + deform.OFFSET))
     assert float(result["x"][1] - result["x"][0]) == pytest.approx(0.4)
     settings, passes = (json.loads(result.attrs[key]) for key in ("settings", "passes"))
+    assert CorrelationSettings.of(result).windows == ((16, 16, 20), (8, 12, 8))
     assert settings["windows"] == [[16, 16, 20], [8, 12, 8]] and len(passes) == 2
-    assert result.attrs["verdict"] == vectors.Verdict.GOOD.value and result.attrs["dt_s"] == 2e-4
+    assert result.attrs["verdict"] == Verdict.GOOD.value and result.attrs["dt_s"] == 2e-4
 
 
 def test_intensity_scale_and_background_do_not_matter():
@@ -219,14 +158,14 @@ def test_intensity_scale_and_background_do_not_matter():
     np.testing.assert_allclose(scaled["u"], plain["u"], atol=1e-4 * TOLERANCE_PEAK)
 
 
-def test_unrelated_and_empty_volumes_say_so():
+def test_unrelated_and_empty_volumes_fail():
     first, second = volumes()[0], volumes(seed=41)[1]
     result = lfpiv.correlate(first, second, dt_s=1.0, windows=(12, 8, 8))
     # chance: three components within half the search range of their neighbours, (1/2)^3 of them, some more by consensus
-    assert float(result["valid"].mean()) < 0.3 and result.attrs["verdict"] == vectors.Verdict.FAILED.value
+    assert float(result["valid"].mean()) < 0.3 and result.attrs["verdict"] == Verdict.FAILED.value
     empty = lfpiv.correlate(0 * first, 0 * second, dt_s=1.0, windows=(12, 8))
     assert not empty["valid"].any() and np.isnan(empty["u"]).all()
-    assert empty.attrs["verdict"] == vectors.Verdict.FAILED.value
+    assert empty.attrs["verdict"] == Verdict.FAILED.value
 
 
 def test_windows_that_one_camera_sees_are_replaced():
@@ -237,47 +176,47 @@ def test_windows_that_one_camera_sees_are_replaced():
     options = {"windows": (16, window), "overlap": 0.75, "dt_s": 1.0}
     anything = lfpiv.correlate(first, second, **options)
     assert anything["valid"].mean() > 0.95 and anything.attrs["seen_fraction"] == 1
-    told = [volume.assign_coords(views=(("z", "y", "x"), views)) for volume in (first, second)]
-    result = lfpiv.correlate(*told, **options)
+    counted = [volume.assign_coords(views=(("z", "y", "x"), views)) for volume in (first, second)]
+    result = lfpiv.correlate(*counted, **options)
     origin, count = kernel.window_grid(shape, window, (2, 3, 2))
     share = np.zeros(count)
     for cell in np.ndindex(*count):
         corner = [o + k * s for o, k, s in zip(origin, cell, (2, 3, 2), strict=True)]
         share[cell] = (views[tuple(slice(c, c + w) for c, w in zip(corner, window, strict=True))] >= 2).mean()
-    enough = share >= validation.LEAST_SEEN
-    assert {0.0, validation.LEAST_SEEN, 1.0} <= set(share.ravel())  # nothing, just enough, all
+    enough = share >= LEAST_SEEN
+    assert {0.0, LEAST_SEEN, 1.0} <= set(share.ravel())  # nothing, just enough, all
     good = result["valid"].values
-    kept = good & anything["valid"].values
+    both = good & anything["valid"].values
     assert not good[~enough].any() and good[enough].mean() > 0.95
     assert result.attrs["seen_fraction"] == enough.mean() and result.attrs["valid_fraction"] == good.mean() < 0.8
-    assert result.attrs["verdict"] == vectors.Verdict.GOOD.value  # of what can be measured nearly all is valid
+    assert result.attrs["verdict"] == Verdict.GOOD.value  # of what can be measured nearly all is valid
     assert np.isfinite(measured(result)).all() and np.isnan(result["uncertainty"].values[~enough]).all()
-    np.testing.assert_array_equal(measured(result)[kept], measured(anything)[kept])
-    one = lfpiv.correlate(first, told[1], **options)
+    np.testing.assert_array_equal(measured(result)[both], measured(anything)[both])
+    one = lfpiv.correlate(first, counted[1], **options)
     np.testing.assert_array_equal(one["valid"], good)
     nowhere = [volume.assign_coords(views=(("z", "y", "x"), 0 * views)) for volume in (first, second)]
-    assert lfpiv.correlate(*nowhere, **options).attrs["verdict"] == vectors.Verdict.FAILED.value
+    assert lfpiv.correlate(*nowhere, **options).attrs["verdict"] == Verdict.FAILED.value
     with pytest.raises(ValueError, match=r"views: expected a coordinate over \(z, y, x\)"):
         lfpiv.correlate(first.assign_coords(views=("z", [2] * 20)), second, **options)
 
 
-def test_displacements_beyond_the_search_are_named():
-    """Chance makes some vectors valid; what the volumes are like as wholes tells that it was not looked far enough."""
-    shape, windows = (28, 40, 48), (24, 12)  # looked for up to 6 voxels along each axis
+def test_displacements_beyond_the_search_are_recognised():
+    """Some vectors are valid by chance. The correlation of the whole volumes shows that the search was too short."""
+    shape, windows = (28, 40, 48), (24, 12)  # searched up to 6 voxels along each axis
     for seed, flow, verdict in (
-        (60, uniform(0.4, 0.2, 9.3), vectors.Verdict.TOO_FAR),
-        (61, uniform(-8.6, 7.7, 0.5), vectors.Verdict.TOO_FAR),
-        (62, uniform(0.4, 0.2, 5.3), vectors.Verdict.GOOD),
+        (60, uniform(0.4, 0.2, 9.3), Verdict.TOO_FAR),
+        (61, uniform(-8.6, 7.7, 0.5), Verdict.TOO_FAR),
+        (62, uniform(0.4, 0.2, 5.3), Verdict.GOOD),
     ):
         result = correlate(particle_pair(shape, flow, seed=seed, ghosts=0.3), windows=windows)
         assert result.attrs["verdict"] == verdict.value
-    seldom = [particle_pair(shape, uniform(0, 0, 0), seed=seed)[0] for seed in (63, 64)]  # nothing in common
+    seldom = [particle_pair(shape, uniform(0, 0, 0), seed=seed)[0] for seed in (63, 64)]  # different particles
     for power in (0.5, 1.0):
         lost = correlate(seldom, windows=windows, intensity_power=power).attrs["verdict"]
-        assert lost in (vectors.Verdict.FAILED.value, vectors.Verdict.POOR.value)
+        assert lost in (Verdict.FAILED.value, Verdict.POOR.value)
         noisy = [np.random.default_rng(seed).random((40, 40, 40)) for seed in (65, 66)]
         lost = correlate(noisy, windows=(12, 12), intensity_power=power).attrs["verdict"]
-        assert lost in (vectors.Verdict.FAILED.value, vectors.Verdict.POOR.value)
+        assert lost in (Verdict.FAILED.value, Verdict.POOR.value)
 
 
 def test_a_single_edge_is_cut_to_the_volume():

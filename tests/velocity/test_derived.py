@@ -7,6 +7,8 @@ from support.vector_sets import axes, from_flow, random_vectors
 
 import lfpiv
 from lfpiv import derived, statistics
+from lfpiv.velocity.derived import check_velocity
+from lfpiv.velocity.statistics import STRESSES
 
 ROUNDING = 1e-9  # of double precision differences of positions in millimetres, relative to gradients of order 1
 SAMPLING = 5.0  # standard errors that a seeded random figure may be off
@@ -84,7 +86,7 @@ def test_errors_in_taylor_green_vortices_are_those_of_second_order_differences()
     assert errors[0] / errors[1] > 3.5  # 4 in the limit of small steps
 
 
-def test_the_flag_tells_exactly_what_rests_on_measured_vectors():
+def test_the_flag_marks_values_that_depend_on_measured_vectors_only():
     vectors = random_vectors(5, (6, 7, 8))
     assert 0.05 < float(1 - vectors.valid.mean()) < 0.5
     changed = vectors.copy(deep=True)
@@ -103,7 +105,7 @@ def test_the_flag_tells_exactly_what_rests_on_measured_vectors():
     assert sorted(doubtful) == sorted(near)
 
 
-def test_not_a_number_stays_where_the_differences_reach():
+def test_nan_spreads_as_far_as_the_differences_reach():
     vectors = random_vectors(5, (6, 7, 8))
     vectors["valid"] = xr.ones_like(vectors.valid)
     vectors.u[3, 3, 4] = np.nan
@@ -126,14 +128,14 @@ def test_without_a_flag_there_is_none_and_units_are_those_of_the_docstrings():
 
 def test_order_of_axes_and_further_dimensions_change_nothing():
     single = [random_vectors(seed) for seed in (1, 2)]
-    together = xr.concat(single, xr.IndexVariable("pair", [3, 7])).transpose("x", "pair", "z", "y")
+    both = xr.concat(single, xr.IndexVariable("pair", [3, 7])).transpose("x", "pair", "z", "y")
     for number, vectors in zip((3, 7), single, strict=True):
         for name in ("q_criterion", "divergence"):
-            one, other = getattr(derived, name)(together).sel(pair=number), getattr(derived, name)(vectors)
+            one, other = getattr(derived, name)(both).sel(pair=number), getattr(derived, name)(vectors)
             xr.testing.assert_allclose(one.drop_vars("pair"), other, rtol=ROUNDING)
 
 
-def test_dask_arrays_stay_dask_arrays_until_asked():
+def test_dask_arrays_stay_lazy():
     dask = pytest.importorskip("dask.array")
     vectors = xr.concat([random_vectors(seed) for seed in range(4)], xr.IndexVariable("pair", range(4)))
     lazy = vectors.chunk(pair=1)
@@ -169,7 +171,7 @@ def test_bad_input_is_refused_by_name(call, words):
 
 
 def ensemble(u, v=None, w=None, valid=None, numbers=None):
-    """Vectors over pairs at places in a row along x; components of shape (pair, place)."""
+    """Return vectors over pairs at positions along x, from components of shape (pair, position)."""
     parts = {"u": u, "v": u if v is None else v, "w": u if w is None else w}
     dims = ("pair", "z", "y", "x")
     variables = {name: (dims, part[:, None, None, :], {"units": "m/s"}) for name, part in parts.items()}
@@ -197,16 +199,16 @@ def test_statistics_are_their_definitions_over_the_valid_vectors():
         else:
             assert np.allclose([mean[name].isel(at) for name in "uvw"], chosen.mean(1), rtol=ROUNDING)
         if counted.sum() < 2:
-            assert all(np.isnan(stresses[name].isel(at)) for name in statistics.STRESSES)
+            assert all(np.isnan(stresses[name].isel(at)) for name in STRESSES)
             continue
         covariance = np.cov(chosen)
-        for name in statistics.STRESSES:
+        for name in STRESSES:
             row, column = ("uvw".index(letter) for letter in name)
             assert np.isclose(stresses[name].isel(at), covariance[row, column], rtol=1e-7, atol=ROUNDING)
         assert np.isclose(energy.isel(at), np.trace(covariance) / 2)
         assert np.allclose([rms[f"{name}_rms"].isel(at) for name in "uvw"], np.sqrt(np.diag(covariance)))
     assert stresses.uv.attrs["units"] == energy.attrs["units"] == "m^2/s^2" and rms.u_rms.attrs["units"] == "m/s"
-    assert derived.check_velocity(mean) is None and mean.x.attrs["units"] == "mm"
+    assert check_velocity(mean) is None and mean.x.attrs["units"] == "mm"
 
 
 def test_a_known_gaussian_ensemble_gives_its_covariance():
@@ -215,7 +217,7 @@ def test_a_known_gaussian_ensemble_gives_its_covariance():
     pairs, places = 400, 100
     draws = rng.multivariate_normal([1.0, 0.0, -1.0], covariance, (pairs, places)).transpose(2, 0, 1)
     stresses = statistics.reynolds_stresses(ensemble(*draws)).mean()
-    for name in statistics.STRESSES:
+    for name in STRESSES:
         row, column = ("uvw".index(letter) for letter in name)
         variance = covariance[row, column] ** 2 + covariance[row, row] * covariance[column, column]
         error = np.sqrt(variance / (pairs * places))  # of a sample covariance of Gaussian numbers
@@ -230,9 +232,9 @@ def test_the_standard_error_is_the_scatter_of_means_of_correlated_pairs(memory):
     series[0] = rng.normal(size=places)
     for step in range(1, pairs):  # correlation memory^k between pairs k apart
         series[step] = memory * series[step - 1] + np.sqrt(1 - memory**2) * rng.normal(size=places)
-    kept = np.sort(rng.choice(pairs, 450, replace=False))  # pairs may be missing
+    present = np.sort(rng.choice(pairs, 450, replace=False))  # pairs may be missing
     valid = rng.random((450, places)) > 0.1
-    vectors = ensemble(series[kept], valid=valid, numbers=kept)
+    vectors = ensemble(series[present], valid=valid, numbers=present)
     errors = statistics.standard_error(vectors).standard_error_u
     scatter = float(statistics.mean(vectors).u.std())
     sampling = SAMPLING / np.sqrt(2 * places)  # of a standard deviation over the places
@@ -248,7 +250,7 @@ SHORT = 0.12
 
 @pytest.mark.parametrize(("memory", "pairs"), [(0.0, 3), (0.0, 10), (0.5, 10), (0.5, 20), (0.8, 50)])
 @pytest.mark.parametrize("complete", [True, False])
-def test_the_standard_error_of_short_series_knows_that_their_mean_is_estimated(memory, pairs, complete):
+def test_the_standard_error_of_short_series_allows_for_their_estimated_mean(memory, pairs, complete):
     rng = np.random.default_rng(6)
     places = 4000  # independent of one another
     series = np.empty((pairs, places))

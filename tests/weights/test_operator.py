@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import warp as wp
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
@@ -13,16 +12,18 @@ from lfpiv.lightfield.decoder import disc_fraction
 from lfpiv.lightfield.microimage_layout import microimage_centres, microimages_of
 from lfpiv.warn import collected
 from lfpiv.weights import blocks as weightblocks
-from lfpiv.weights import choice as weightcheck
-from lfpiv.weights.blocks import StoredGrid, blocks_of, count_voxels, pack_camera
-from lfpiv.weights.choice import WHOLE, CountedVoxels, add_entries, choose_cuts, choose_form
+from lfpiv.weights import counting
+from lfpiv.weights.blocks import WHOLE, PackedCamera, blocks_of
+from lfpiv.weights.choice import choose_cuts, choose_form, form_errors
+from lfpiv.weights.counting import CountedVoxels, add_entries, count_voxels
 from lfpiv.weights.operator import compare_with_count, estimate_memory
 from lfpiv.weights.ray_fit import NEAR_PITCH, grid_models, ray_models
-from lfpiv_kernels import reference, runtime
+from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels import native, reference, runtime
 from lfpiv_kernels.rays import count as trace
 from lfpiv_kernels.rays.lattice import cell_frame, cell_rectangles, pack_lattice
-from lfpiv_kernels.reconstruction import projector as project
-from lfpiv_kernels.weights import footprint, footprint_source
+from lfpiv_kernels.reconstruction.pixel_rays import RayMap
+from lfpiv_kernels.weights import footprint, microimages
 from lfpiv_kernels.weights import ray_model as raymodel
 
 VOXEL_MM = 0.1
@@ -132,7 +133,7 @@ def test_footprints_of_parts_equal_the_twins_of_smaller_voxels(name, cuts):
     camera = replace(RIGS[name], optics=coarse)
     model = ray_models(camera, VOXELS_MM[1:2], VOXEL_MM)
     image = np.zeros(camera.optics.sensor_shape, np.float32)
-    add_entries(image, blocks_of(pack_camera(camera), [model], "pixels", (0, 0), cuts), 0)
+    add_entries(image, blocks_of(PackedCamera.of(camera), [model], "pixels", cuts=cuts), 0)
     twin = np.zeros(image.shape)
     edges = model[0, 12:18].reshape(3, 2), model[0, 18:30].reshape(3, 2, 2)
     for part in np.ndindex(*cuts):
@@ -166,7 +167,7 @@ def test_ray_models_of_a_grid_are_those_of_its_voxels(waves, step, monkeypatch):
 
     monkeypatch.setattr(camera, "map_fan", rippled)
     grid = lfpiv.Grid(shape=shape, voxel_mm=VOXEL_MM, first_centre_mm=(-1.0, 0.2, -0.3))
-    stored = weightblocks.StoredGrid(grid, (1, 0, 2))
+    stored = StoredGrid(grid, (1, 0, 2))
     found = np.concatenate(list(grid_models(camera, stored.shape, stored.positions_mm, (1, 2, 0))))
     assert asked[-1] == np.prod([np.ceil((n + 1) / step) + 1 for n in shape])
     exact = ray_models(camera, stored.centres_mm(np.arange(grid.size)), VOXEL_MM)
@@ -192,10 +193,10 @@ def test_rays_lie_where_their_lenses_put_them(layout, f_number):
     seen = (column >= 0) & (column < 130) & (row >= 0) & (row < 90)
     offset = np.stack(np.broadcast_arrays(column, row), -1) + 0.5 - centre[..., None, None, :]
     inside = np.where(seen, disc_fraction(offset.astype(np.float32), radius)[0], 0.0)
-    shape = (len(centre), footprint_source.LAYERS, *inside.shape[1:])
+    shape = (len(centre), microimages.LAYERS, *inside.shape[1:])
     pixel, share = (array[: np.prod(shape)].reshape(shape) for array in (rays.pixel, rays.share))
-    for layer in range(footprint_source.LAYERS):
-        fall = footprint_source.LAYER_FALL * (layer - footprint_source.SIDE_LAYERS)
+    for layer in range(microimages.LAYERS):
+        fall = native.constant("microimages.h", "LAYER_FALL") * (layer - microimages.LAYERS // 2)
         np.testing.assert_array_equal(pixel[:, layer], np.where(seen, 130 * row + column, -1))
         np.testing.assert_allclose(share[:, layer], inside * (1 + fall * (1 - inside) / 2), atol=TOLERANCE_SHARE)
     assert (rays.pixel[np.prod(shape) :] == -1).all() and not rays.share[np.prod(shape) :].any()
@@ -205,22 +206,27 @@ def test_rays_lie_where_their_lenses_put_them(layout, f_number):
 
 
 def test_a_pixel_knows_its_rays(small):
-    projector = small.projector("cam1")
-    rays, map = projector.blocks.microimages, projector.map.rays
-    projector.scatter(np.ones(small.grid.size, np.float32))
-    place = np.flatnonzero(projector.rays.numpy())
-    part = np.searchsorted(projector._places, place, side="right") - 1
-    ray = place - projector._places[part] + np.array([start for start, _ in projector._spans])[part]
+    """Light of the camera's rays in three parts of memory, of which neighbours overlap."""
+    rays = small.cameras["cam1"].microimages
+    third = rays.size // 3
+    starts, ends = np.array([0, third - 900, 2 * third - 900]), np.array([third, 2 * third, rays.size])
+    parts = np.concatenate([[0], np.cumsum(ends - starts)])
+    light = (np.random.default_rng(9).random(parts[-1]) < 0.2).astype(np.float32)
+    ray_map = RayMap(rays, light, parts, starts)
+    found, place = ray_map.rays, np.flatnonzero(light)
+    part = np.searchsorted(parts, place, side="right") - 1
+    ray = place - parts[part] + starts[part]
+    assert len(np.unique(ray)) < len(ray)
     lit = rays.share[ray] > 0
-    np.testing.assert_array_equal(map.dark.numpy(), place[~lit])
+    np.testing.assert_array_equal(found.dark.numpy(), place[~lit])
     pixel, first = np.unique(rays.pixel[ray[lit]], return_index=True)
-    np.testing.assert_array_equal(projector.map.pixel, pixel[np.argsort(first)])
-    counts = np.diff(map.first.numpy())
-    assert map.first.numpy()[0] == 0 and counts.min() > 0
-    order = np.lexsort((map.place.numpy(), np.repeat(projector.map.pixel, counts)))
+    np.testing.assert_array_equal(ray_map.pixel, pixel[np.argsort(first)])
+    counts = np.diff(found.first.numpy())
+    assert found.first.numpy()[0] == 0 and counts.min() > 0
+    order = np.lexsort((found.place.numpy(), np.repeat(ray_map.pixel, counts)))
     expected = np.lexsort((place[lit], rays.pixel[ray[lit]]))
-    np.testing.assert_array_equal(map.place.numpy()[order], place[lit][expected])
-    np.testing.assert_array_equal(map.share.numpy()[order], rays.share[ray[lit]][expected])
+    np.testing.assert_array_equal(found.place.numpy()[order], place[lit][expected])
+    np.testing.assert_array_equal(found.share.numpy()[order], rays.share[ray[lit]][expected])
 
 
 @pytest.mark.parametrize("form", footprint.FORMS)
@@ -231,7 +237,7 @@ def test_microimages_may_be_higher_than_a_block(form):
         IdealRig({"fine": IdealCamera("fine", rotation(0, 3, 2), optics=fine)}), grid, form=form
     )
     blocks = weights.projector("fine").blocks
-    assert blocks.height.max() == footprint_source.TALLEST and blocks.microimages.edge > footprint_source.TALLEST
+    assert blocks.height.max() == footprint.TALLEST and blocks.microimages.edge > footprint.TALLEST
     rays, _ = blocks.entries(0)
     assert len(np.unique(rays)) == len(rays)  # blocks do not overlap
     assert weights.image("fine", (0, 0, 0)).sum() == pytest.approx(1.0, rel=0.01)
@@ -251,15 +257,6 @@ def test_blocks_do_not_depend_on_how_the_voxels_are_cut(form, monkeypatch):
         assert getattr(cut, name).tobytes() == getattr(whole, name).tobytes(), name
 
 
-@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
-@pytest.mark.parametrize("module", [footprint, project], ids=lambda module: module.__name__.rpartition(".")[2])
-def test_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):
-    runtime.device()
-    (compiled,) = wp.compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
-    entries = compiled.read_text().count(".visible .entry")
-    assert entries == len(wp.get_module(module.__name__).kernels)
-
-
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
 def test_count_kernel_equals_its_twin(layout):
     runtime.device()
@@ -277,7 +274,7 @@ def test_count_kernel_equals_its_twin(layout):
         shift,
         window,
         corner,
-        footprint.pack_camera(
+        raymodel.pack_optics(
             sensor_per_pupil=setup.sensor_per_pupil,
             pixel_mm=setup.pixel_mm,
             sensor_shape=setup.sensor_shape,
@@ -329,8 +326,8 @@ def test_operator_is_the_stored_matrix(small):
     rng = np.random.default_rng(4)
     volume = rng.normal(size=small.grid.shape).astype(np.float32)
     images = small(volume)
-    for name, projector in small._projectors.items():
-        matrix = reference.dense(projector.blocks)
+    for name in small.cameras:
+        matrix = reference.dense(small.projector(name).blocks)
         camera = small.cameras[name]
         expected = (matrix @ small.stored.store(volume)).reshape(camera.gain.shape) * camera.gain
         assert np.abs(images[name] - expected).max() <= 1e-5 * np.abs(expected).max()  # float32 sums of <= 210 terms
@@ -409,10 +406,10 @@ def test_largest_weight_is_that_of_a_ray(small, form):
 def test_more_blocks_than_numbers_are_refused(small, monkeypatch):
     camera = small.cameras["cam1"]
     model = ray_models(camera, VOXELS_MM, VOXEL_MM)
-    blocks = len(blocks_of(pack_camera(camera), [model], "profiles", (0, 0)).ray)
+    blocks = len(blocks_of(PackedCamera.of(camera), [model], "profiles").ray)
     monkeypatch.setattr(weightblocks, "MOST_BLOCKS", blocks - 1)
     with pytest.raises(ValueError, match="voxels on one camera need"):
-        blocks_of(pack_camera(camera), [model], "profiles", (0, 0))
+        blocks_of(PackedCamera.of(camera), [model], "profiles")
     with pytest.raises(ValueError, match=r"5 x 6 x 7 voxels .* blocks.*Raise volume.voxel_mm"):
         lfpiv.build_weights(IdealRig(small.cameras), small.grid, form="profiles")
 
@@ -435,7 +432,7 @@ def test_form_follows_the_optics_and_the_limit_is_kept():
     weights = lfpiv.build_weights(IdealRig(cameras), grid)
     assert weights.forms == {"straight": "profiles", "bent": "pixels", "hexagonal": "pixels", "rolled": "pixels"}
     assert {name for name, cuts in weights.cuts.items() if cuts != WHOLE} == {"rolled"}  # parts only where they tell
-    plain = weights.counted("rolled").errors_of_form("pixels")
+    plain = form_errors(weights.counted("rolled"), "pixels")
     assert np.mean(plain) > 0.9 * np.mean(weights.profile_errors["rolled"])  # pixels alone would be bought for nothing
     assert min(weights.profile_errors["bent"]) > FOOTPRINT_MEAN
     for name, errors in compare_with_count(weights).items():
@@ -479,7 +476,7 @@ def test_only_voxels_that_are_seen_judge(seed):
     assert (np.abs(chief) < 1.1).all(1).mean() < 0.1  # six voxels at random would mostly show nothing
     judge = CountedVoxels(stored, camera, seed)
     choice = choose_form(judge)
-    assert len(choice.profile_errors) == weightcheck.VOXELS and choice.form == "pixels"
+    assert len(choice.profile_errors) == counting.VOXELS and choice.form == "pixels"
 
 
 def test_weights_that_nothing_judges_say_so():

@@ -1,8 +1,8 @@
 """Find and name the dots of a calibration board in all planes of one camera.
 
-A board carries no mark, so its dots are named by the nominal rig: the thin-lens image of the board, inverted, the angle
-right to about 10 degrees, the board's middle nearest to where the plan puts it. The planes of a camera share one pose,
-which is fitted from the plane nearest to z = 0 outwards. The board's edges that are in view then correct the names.
+A board has no mark, so the nominal rig names its dots: the camera's angle is known to about 10 degrees, and the board's
+middle is the lattice site nearest to its planned position. All planes of a camera share one pose, which is fitted from
+the plane nearest to z = 0 outwards. The edges of the board that are in view then correct the names.
 """
 
 from __future__ import annotations
@@ -13,155 +13,63 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv.calibration.board.dot_model import spread_over_pupil
-from lfpiv.calibration.board.edges import MARGIN, Extent, numbered, outline, require_stated
-from lfpiv.calibration.board.pose import (
-    BIN_PITCHES,
-    CameraPose,
-    Rectified,
-    Rectifier,
-    match_lattice,
-    search_radius_mm,
-    strong_enough,
-)
+from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard
+from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated, sites_found
+from lfpiv.calibration.board.planes import Signals
+from lfpiv.calibration.board.pose import BIN_PITCHES, Blobs, CameraPose, Rectified, Rectifier
 from lfpiv.errors import InputError
-from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.optics import Optics, spread_over_pupil
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
-_FIRST_PLANES = 3  # planes in which the lattice is looked for with nothing but the nominal pose
-FEWEST_DOTS = 4
-"""Dots that make a board."""
-
-_FEWEST_PART = 0.25  # of the dots in the field must be on the lattice
-_REGULAR = 0.5  # of the strongest blobs must lie on one lattice
-_JUDGED_DOTS = 6  # fewer blobs of a plane, or a search radius of fewer elements, do not tell a board from chance
-_JUDGED_BINS = 3
-_CHANCE = 0.2  # of the search radius: boards scatter by less than 0.1 of it about their places, chance by 0.2 to 0.6
-_CHANCE_PITCHES = 0.5  # but dots in focus are known to a lens only: they scatter by up to this
-_WHOLLY_SEEN = 0.9  # of a dot's light on lit pixels: its absence means something
-_LIT_GAIN = 0.3  # of a typical pixel's: less is a vignetted corner or a dead lens
-
-
-@dataclass(frozen=True, kw_only=True)
-class DotBoard:
-    """A flat board with a square lattice of dots, moved along z."""
-
-    dots: tuple[int, int]
-    """Dots along x and y."""
-    spacing_mm: float
-    """Distance of neighbouring dots [mm]."""
-    diameter_mm: float
-    """Diameter of a dot [mm]."""
-    planes_mm: tuple[float, ...]
-    """Depth z of each plane [mm]."""
-
-    @property
-    def size(self) -> int:
-        """Dots on the board."""
-        return self.dots[0] * self.dots[1]
-
-    def points_mm(self, plane: int, margin: int = 0) -> np.ndarray:
-        """World positions of the dots of one plane, dot j * nx + i at column i and row j, shape (dot, 3) [mm].
-
-        `margin` adds columns and rows of dots that are not there, around the board.
-        """
-        x, y = ((np.arange(-margin, n + margin) - (n - 1) / 2) * self.spacing_mm for n in self.dots)
-        x, y = np.meshgrid(x, y)
-        return np.stack([x.ravel(), y.ravel(), np.full(x.size, float(self.planes_mm[plane]))], axis=1)
-
-    def of_dots_mm(self, dot: np.ndarray) -> np.ndarray:
-        """World positions of dots numbered plane * (nx ny) + row * nx + column, shape (n, 3) [mm]."""
-        plane, place = np.divmod(dot, self.size)
-        points = self.points_mm(0)[place]
-        points[:, 2] = np.asarray(self.planes_mm)[plane]
-        return points
+_FIRST_PLANES = 3  # planes that are searched for the lattice with the nominal pose
+_FEWEST_SHARE = 0.25  # least share of the dots in the field on the first lattice
+_REGULAR = 0.5  # least share of the strongest blobs on one lattice
+_PEAK_SPACINGS = 0.4  # distance between blobs of the first lattice
+_INLIER_SPACINGS = 0.2  # largest distance of a blob from its site on the first lattice
+_SEARCH_SPACINGS = 0.35  # largest distance of a dot from where the pose expects it
+_JUDGED_DOTS = 6  # least number of blobs of a plane that distinguish a board from chance
+_JUDGED_BINS = 3  # least search radius that distinguishes them [elements]
+_CHANCE = 0.2  # largest scatter of a board's dots about their sites [search radius],
+_CHANCE_PITCHES = 0.5  # or [microlens pitch], because a focused dot is located to a lens only
+_FULLY_SEEN = 0.9  # least share of a site's light on lit pixels for an empty site to mean something
+_LIT_GAIN = 0.3  # least gain of a lit pixel; less is a vignetted corner or a dead lens
 
 
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """The dots as found in the rectified images, and the pose that names them."""
+def find_dots(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, nominal_angle_deg: float) -> Detection:
+    """Find and name the dots: the lattice in the first plane that shows one, then each plane with the fitted pose.
 
-    pose: CameraPose
-    """The pose fitted to them."""
-    sign: int
-    """+1 for dots brighter than the board, -1 for darker ones."""
-    dot: np.ndarray
-    """Numbers of the seen dots, plane * (nx ny) + row * nx + column, shape (d,)."""
-    chief_mm: np.ndarray
-    """Their rays through the pupil's centre on the array, to a fraction of a lens [mm], shape (d, 2)."""
-    in_field: np.ndarray
-    """Dots of which at least half of the light falls on the sensor, shape (plane, dot)."""
+    The nominal camera angle must be correct to about 10 degrees.
 
-
-def find_dots(
-    signals: Sequence[np.ndarray], decoder: LightFieldDecoder, board: DotBoard, nominal_angle_deg: float
-) -> Detection:
-    """Find and name the dots: lattice in the first plane that shows one, then plane by plane with the fitted pose."""
+    Raises
+    ------
+    InputError
+        If no plane shows the board's lattice, or the board certainly has another number of dots than stated.
+    """
     optics = decoder.optics
     half_x, half_y = ((n / 2 + MARGIN + 0.5) * board.spacing_mm for n in board.dots)
     rectify = Rectifier(decoder, (half_x, half_y), board.diameter_mm)
-    order = np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
     plan = CameraPose.from_plan(optics, nominal_angle_deg)
-
-    first: list[_FirstLattice] = []
-    for plane in order:
-        if len(first) >= _FIRST_PLANES and any(lattice.regular for lattice in first):
-            break
-        first.append(_first_lattice(rectify(signals[plane], plan, board.planes_mm[plane]), board, plan, plane))
-    candidates = [lattice for lattice in first if lattice.regular] or first
-    best = max(lattice.score for lattice in candidates)
-    start = next(lattice for lattice in candidates if lattice.score >= best / 2)  # the nearer to z = 0 the surer
-    visible = max(_in_field(plan, board.points_mm(plane), optics).sum() for plane in order[: len(first)])
-    if len(start.points) < min(max(FEWEST_DOTS, _FEWEST_PART * visible), board.size) or not start.regular:
-        chance = len(start.points) > 0 and not start.regular
-        blobs = f" among blobs of which only {start.share:.0%} lie on one lattice" if chance else ""
-        raise InputError(
-            f"board: expected a lattice of {board.dots[0]} x {board.dots[1]} dots, {board.spacing_mm:g} mm apart, near "
-            f"z = {board.planes_mm[order[0]]:g} mm; found {len(start.points)} dots of it{blobs}. Check that these are "
-            f"board images, the board's numbers and the nominal angle ({nominal_angle_deg:g} degrees)."
-        )
-    points, chief, sign = start.points, start.chief_mm, start.sign
-    pose = plan.fitted(points, chief, optics)
-
-    seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    for plane in order:
-        targets = board.points_mm(plane, MARGIN)
-        rectified = rectify(signals[plane], pose, board.planes_mm[plane])
-        found, contrast = _near_lattice(rectified, targets[:, :2], board, sign)
-        place = np.flatnonzero(strong_enough(contrast))
-        if not _on_lattice(found[place] - targets[place, :2], targets[place, :2], board, rectified.bin_mm):
-            place = place[:0]
-        at_plane = np.column_stack([found[place], np.full(len(place), board.planes_mm[plane])])
-        seen[plane] = place, pose.rays(at_plane)[0]
-        known = [(board.points_mm(p, MARGIN)[places], rays) for p, (places, rays) in seen.items()]
-        all_points, all_rays = (np.concatenate(part) for part in zip(*known, strict=True))
-        pose = pose.fitted(all_points, all_rays, optics)
-
-    shift = _shift_to_edges([seen[plane][0] for plane in range(len(signals))], pose, decoder, board)
-    dots, chiefs = [], []
-    for plane in range(len(signals)):
-        places, rays = seen[plane]
-        row, column = np.divmod(places, board.dots[0] + 2 * MARGIN)
-        column, row = column - MARGIN - shift[0], row - MARGIN - shift[1]
-        named = (column >= 0) & (column < board.dots[0]) & (row >= 0) & (row < board.dots[1])
-        dots.append(plane * board.size + (row * board.dots[0] + column)[named])
-        chiefs.append(rays[named])
-    dot, chief = np.concatenate(dots), np.concatenate(chiefs)
+    start = _find_first_lattice(signals, rectify, board, plan, optics)
+    pose = plan.fitted(start.points_mm, start.chief_mm, optics)
+    planes, pose = _find_in_planes(signals, rectify, board, pose, start.sign, optics)
+    shift = _shift_to_edges([plane.site for plane in planes], pose, decoder, board)
+    named = [_name(planes[number], number, shift, board) for number in range(len(planes))]
+    dot, chief = (np.concatenate(part) for part in zip(*named, strict=True))
     if any(shift):
         warn(log, Warning(code=Code.BOARD_RENAMED, figures={"columns": int(shift[0]), "rows": int(shift[1])}))
         pose = plan.fitted(board.of_dots_mm(dot), chief, optics)
-    in_field = np.stack([_in_field(pose, board.points_mm(p), optics) for p in range(len(signals))])
-    return Detection(pose, sign, dot, chief, in_field)
+    in_field = np.stack([_in_field(pose, board.points_mm(plane), optics) for plane in range(len(planes))])
+    return Detection(pose=pose, sign=start.sign, dot=dot, chief_mm=chief, in_field=in_field)
 
 
 @dataclass(frozen=True, eq=False)
 class _FirstLattice:
-    """What one plane shows with the nominal pose."""
+    """The lattice that one plane shows with the nominal pose."""
 
-    points: np.ndarray
+    points_mm: np.ndarray
     """Board points of the dots, shape (d, 3) [mm]."""
     chief_mm: np.ndarray
     """Their chief rays on the array, shape (d, 2) [mm]."""
@@ -170,38 +78,187 @@ class _FirstLattice:
     score: float
     """Sum of their contrasts."""
     share: float
-    """Part of the strongest blobs, as many as the board has dots, that lie on one lattice."""
+    """Share of the strongest blobs, as many as the board has dots, on one lattice."""
 
     @property
     def regular(self) -> bool:
-        """Whether the blobs are a board: a lattice drawn through blobs at random holds 0.2 to 0.3 of them."""
+        """Whether the blobs are a board, not chance."""
         return self.share >= _REGULAR
 
 
-def _first_lattice(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> _FirstLattice:
-    """Look for the lattice in a plane seen with the nominal pose."""
+def _find_first_lattice(
+    signals: Signals, rectify: Rectifier, board: DotBoard, plan: CameraPose, optics: Optics
+) -> _FirstLattice:
+    """Find the lattice with the nominal pose in one of the planes nearest to z = 0."""
+    order = _order(board)
+    found: list[_FirstLattice] = []
+    for plane in order:
+        if len(found) >= _FIRST_PLANES and any(lattice.regular for lattice in found):
+            break
+        rectified = rectify(signals.of_plane(plane), plan, board.planes_mm[plane])
+        found.append(_lattice_of_plane(rectified, board, plan, plane))
+    candidates = [lattice for lattice in found if lattice.regular] or found
+    best = max(lattice.score for lattice in candidates)
+    start = next(lattice for lattice in candidates if lattice.score >= best / 2)  # planes near z = 0 are more certain
+    visible = max(_in_field(plan, board.points_mm(plane), optics).sum() for plane in order[: len(found)])
+    fewest = min(max(FEWEST_DOTS, _FEWEST_SHARE * visible), board.size)
+    if len(start.points_mm) < fewest or not start.regular:
+        chance = len(start.points_mm) > 0 and not start.regular
+        blobs = f" among blobs of which only {start.share:.0%} lie on one lattice" if chance else ""
+        raise InputError(
+            f"board: expected a lattice of {board.dots[0]} x {board.dots[1]} dots, {board.spacing_mm:g} mm apart, near "
+            f"z = {board.planes_mm[order[0]]:g} mm; found {len(start.points_mm)} dots of it{blobs}. Check that these "
+            f"are board images, the board's numbers and the nominal angle ({np.degrees(plan.nominal[0]):g} degrees)."
+        )
+    return start
+
+
+def _order(board: DotBoard) -> np.ndarray:
+    """Return the planes by their distance from z = 0."""
+    return np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
+
+
+def _lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> _FirstLattice:
+    """Match the lattice to the blobs of a plane, bright or dark ones."""
     best = _FirstLattice(np.empty((0, 3)), np.empty((0, 2)), 1, 0.0, 0.0)
     for sign in (1, -1):
-        peaks, contrast = rectified.peaks(0.4 * board.spacing_mm, sign)
-        index, member, score, regular = match_lattice(peaks, contrast, board.dots, board.spacing_mm)
+        blobs = rectified.peaks(_PEAK_SPACINGS * board.spacing_mm, sign)
+        match = _match_lattice(blobs, board)
+        score = float(blobs.contrast[match.member].sum())
         if score > best.score:
-            points = board.points_mm(plane)[index[:, 1] * board.dots[0] + index[:, 0]]
-            at = np.column_stack([peaks[member], np.full(len(member), board.planes_mm[plane])])
-            strongest = np.argsort(-contrast, kind="stable")[: board.size]
-            best = _FirstLattice(points, pose.rays(at)[0], sign, score, float(regular[strongest].mean()))
+            points = board.points_mm(plane)[match.index[:, 1] * board.dots[0] + match.index[:, 0]]
+            at = np.column_stack([blobs.position_mm[match.member], np.full(len(points), board.planes_mm[plane])])
+            strongest = np.argsort(-blobs.contrast, kind="stable")[: board.size]
+            best = _FirstLattice(points, pose.rays(at)[0], sign, score, float(match.regular[strongest].mean()))
     return best
 
 
-def _on_lattice(miss: np.ndarray, targets: np.ndarray, board: DotBoard, bin_mm: float) -> bool:
-    """Whether blobs found near the predicted places are a board's, not chance: they miss the places alike.
+@dataclass(frozen=True, eq=False)
+class _LatticeMatch:
+    """Blobs on the lattice of a board."""
 
-    What blobs miss their places by (n, 2) [mm] is a smooth function of the place for a board, here a robust linear one,
-    and spread over the whole search radius for blobs that are there by chance.
+    index: np.ndarray
+    """Column and row of each blob that is a dot of the board, shape (n, 2)."""
+    member: np.ndarray
+    """Numbers of these blobs, shape (n,)."""
+    regular: np.ndarray
+    """Blobs on the lattice, on the board or beyond it, shape (blobs,), bool."""
+
+
+def _match_lattice(blobs: Blobs, board: DotBoard) -> _LatticeMatch:
+    """Find the lattice in a cloud of blobs that may lack dots and contain others.
+
+    The board's middle is the admissible lattice site nearest to the origin.
     """
-    radius = search_radius_mm(board.spacing_mm)
+    peaks, contrast = blobs.position_mm, blobs.contrast
+    if len(peaks) < 1:
+        return _LatticeMatch(np.empty((0, 2), int), np.empty(0, int), np.zeros(0, bool))
+    inverse, phase = _lattice_waves(blobs, board)
+    for _ in range(6):
+        site = peaks @ inverse.T - phase
+        index = np.rint(site)
+        close = np.hypot(*(site - index).T) < _INLIER_SPACINGS
+        if close.sum() < 3 or np.linalg.matrix_rank(index[close] - index[close].mean(0)) < 2:
+            break
+        design = np.column_stack([peaks[close], np.ones(close.sum())])
+        fit = np.linalg.lstsq(design, index[close], rcond=None)[0]
+        inverse, phase = fit[:2].T, -fit[2]
+    site = peaks @ inverse.T - phase
+    index = np.rint(site).astype(int)
+    middle = (np.array(board.dots) - 1) / 2
+    index += np.rint(middle + phase).astype(int)  # the origin's site is -phase
+    regular = np.hypot(*(site - np.rint(site)).T) < _INLIER_SPACINGS
+    member = np.flatnonzero(((index >= 0) & (index < board.dots)).all(1) & regular)
+    member = member[np.argsort(-contrast[member], kind="stable")]  # the stronger of two blobs at one site
+    _, first = np.unique(index[member], axis=0, return_index=True)
+    member = np.sort(member[first])
+    return _LatticeMatch(index[member], member, regular)
+
+
+def _lattice_waves(blobs: Blobs, board: DotBoard) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrix and phase of site = matrix @ position - phase: the plane waves that fit the blobs best.
+
+    The wave vectors are searched near (1, 0) and (0, 1) per spacing.
+    """
+    weight = np.minimum(blobs.contrast, 3 * np.median(blobs.contrast))
+    size, turn = np.meshgrid(np.linspace(0.75, 1.35, 61), np.radians(np.linspace(-9, 9, 37)), indexing="ij")
+    prior = np.exp(-0.5 * (np.log(size) / 0.3) ** 2 - 0.5 * (turn / np.radians(9)) ** 2).ravel()
+    along = np.stack([size * np.cos(turn), size * np.sin(turn)], -1).reshape(-1, 2) / board.spacing_mm
+    waves, phases = [], []
+    for axis, count in enumerate(board.dots):
+        wave = along if axis == 0 else along[:, ::-1] * (-1, 1)
+        sums = np.exp(2j * np.pi * wave @ blobs.position_mm.T) @ weight
+        best = np.argmax(np.abs(sums) * prior) if count > 1 else np.argmax(prior)
+        waves.append(wave[best])
+        phases.append(np.angle(sums[best]) / (2 * np.pi))
+    return np.array(waves), np.array(phases)
+
+
+@dataclass(frozen=True, eq=False)
+class _PlaneDots:
+    """Dots of one plane, on the stated lattice with its margin."""
+
+    site: np.ndarray
+    """Numbers of their lattice sites, row by row, shape (d,)."""
+    chief_mm: np.ndarray
+    """Their chief rays on the array [mm], shape (d, 2)."""
+
+
+def _find_in_planes(
+    signals: Signals, rectify: Rectifier, board: DotBoard, pose: CameraPose, sign: int, optics: Optics
+) -> tuple[list[_PlaneDots], CameraPose]:
+    """Find the dots of every plane near where the pose expects them; fit the pose again after each plane."""
+    seen: dict[int, _PlaneDots] = {}
+    for plane in _order(board):
+        z_mm, sites = board.planes_mm[plane], board.points_mm(plane, MARGIN)
+        rectified = rectify(signals.of_plane(plane), pose, z_mm)
+        blobs = _near_sites(rectified, sites[:, :2], board, sign)
+        site = np.flatnonzero(blobs.strong)
+        found = blobs.position_mm[site]
+        if not on_lattice(found - sites[site, :2], sites[site, :2], board, rectified.bin_mm):
+            site, found = site[:0], found[:0]
+        at = np.column_stack([found, np.full(len(site), z_mm)])
+        seen[plane] = _PlaneDots(site, pose.rays(at)[0])
+        points = np.concatenate([board.points_mm(p, MARGIN)[dots.site] for p, dots in seen.items()])
+        pose = pose.fitted(points, np.concatenate([dots.chief_mm for dots in seen.values()]), optics)
+    return [seen[plane] for plane in range(len(seen))], pose
+
+
+def _near_sites(rectified: Rectified, sites_mm: np.ndarray, board: DotBoard, sign: int) -> Blobs:
+    """Return the blobs near the expected sites, after a shift common to all."""
+    radius = search_radius_mm(board)
+    blobs = rectified.near(sites_mm, radius, sign)
+    if blobs.strong.any():
+        shift = np.median((blobs.position_mm - sites_mm)[blobs.strong], axis=0)
+        blobs = rectified.near(sites_mm + shift, radius, sign)
+    return blobs
+
+
+def search_radius_mm(board: DotBoard) -> float:
+    """Return the largest distance of a dot from where the pose expects it [mm]."""
+    return _SEARCH_SPACINGS * board.spacing_mm
+
+
+def on_lattice(miss: np.ndarray, sites_mm: np.ndarray, board: DotBoard, bin_mm: float) -> bool:
+    """Return whether blobs found near the expected sites are a board's dots, not chance.
+
+    The misses of a board's dots vary smoothly over the sites, here by a robust linear function. Chance spreads the
+    misses over the whole search radius.
+
+    Parameters
+    ----------
+    miss : ndarray, shape (n, 2)
+        Position of each blob minus its site [mm].
+    sites_mm : ndarray, shape (n, 2)
+        The sites (x, y) [mm].
+    board : DotBoard
+    bin_mm : float
+        Spacing of the elements of the rectified image [mm].
+    """
+    radius = search_radius_mm(board)
     if len(miss) < _JUDGED_DOTS or radius < _JUDGED_BINS * bin_mm:
         return True
-    design = np.column_stack([np.ones(len(miss)), targets / board.spacing_mm])
+    design = np.column_stack([np.ones(len(miss)), sites_mm / board.spacing_mm])
     weight = np.ones(len(miss))
     for _ in range(10):
         solution = np.linalg.lstsq(design * weight[:, None], miss * weight[:, None], rcond=None)[0]
@@ -210,43 +267,35 @@ def _on_lattice(miss: np.ndarray, targets: np.ndarray, board: DotBoard, bin_mm: 
     return bool(np.median(distance) < max(_CHANCE * radius, _CHANCE_PITCHES * bin_mm / BIN_PITCHES))
 
 
-def _near_lattice(
-    rectified: Rectified, targets: np.ndarray, board: DotBoard, sign: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Blobs nearest to their predicted places; a common shift of all is allowed for first."""
-    radius = search_radius_mm(board.spacing_mm)
-    found, contrast = rectified.near(targets, radius, sign)
-    sure = strong_enough(contrast)
-    if sure.any():
-        shift = np.median((found - targets)[sure], axis=0)
-        found, contrast = rectified.near(targets + shift, radius, sign)
-    return found, contrast
-
-
 def _shift_to_edges(
-    places: list[np.ndarray], pose: CameraPose, decoder: LightFieldDecoder, board: DotBoard
+    sites: Sequence[np.ndarray], pose: CameraPose, decoder: LightFieldDecoder, board: DotBoard
 ) -> tuple[int, int]:
-    """Columns and rows by which the names must move so that the edges in view are the board's."""
-    found = numbered(places, board.dots)
-    points = [board.points_mm(plane, MARGIN) for plane in range(len(places))]
-    in_view = np.stack([_lit_share(pose, at, decoder) >= _WHOLLY_SEEN for at in points]).reshape(found.shape)
-    extents = outline(found, in_view, board.dots)
+    """Return the columns and rows by which the names must move to match the board's edges in view."""
+    found = sites_found(sites, board.dots)
+    points = [board.points_mm(plane, MARGIN) for plane in range(len(sites))]
+    in_view = np.stack([_lit_share(pose, at, decoder) >= _FULLY_SEEN for at in points]).reshape(found.shape)
+    extents = find_extents(found, in_view, board.dots)
     if extents is None:
         return 0, 0
     require_stated(extents, found)
-    for extent, name in zip(extents, ("x", "y"), strict=True):
+    for extent, axis in zip(extents, ("x", "y"), strict=True):
         if extent.open and extent.count != extent.stated:
-            _warn_of_open(extent, name, board)
+            figures = {"axis": axis, "count": extent.count, "stated": extent.stated}
+            figures |= {"half_spacing_mm": board.spacing_mm / 2}
+            warn(log, Warning(code=Code.BOARD_EDGE_UNSEEN, figures=figures))
     return extents[0].shift, extents[1].shift
 
 
-def _warn_of_open(extent: Extent, axis: str, board: DotBoard) -> None:
-    figures = {"axis": axis, "count": extent.count, "stated": extent.stated, "half_spacing_mm": board.spacing_mm / 2}
-    warn(log, Warning(code=Code.BOARD_EDGE_UNSEEN, figures=figures))
+def _name(dots: _PlaneDots, plane: int, shift: tuple[int, int], board: DotBoard) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers and chief rays of the dots of a plane that are on the board."""
+    row, column = np.divmod(dots.site, board.dots[0] + 2 * MARGIN)
+    column, row = column - MARGIN - shift[0], row - MARGIN - shift[1]
+    on_board = (column >= 0) & (column < board.dots[0]) & (row >= 0) & (row < board.dots[1])
+    return plane * board.size + (row * board.dots[0] + column)[on_board], dots.chief_mm[on_board]
 
 
 def _lit_share(pose: CameraPose, points: np.ndarray, decoder: LightFieldDecoder) -> np.ndarray:
-    """Part of each dot's light that falls on pixels which answer to light, shape (n,)."""
+    """Return the share of each dot's light on pixels that respond to light, shape (n,)."""
     column, row = np.moveaxis(np.rint(_light_px(pose, points, decoder.optics)), -1, 0)
     rows, columns = decoder.optics.sensor_shape
     on_sensor = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
@@ -256,7 +305,7 @@ def _lit_share(pose: CameraPose, points: np.ndarray, decoder: LightFieldDecoder)
 
 
 def _in_field(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray:
-    """Dots of which at least half of the light falls on the sensor."""
+    """Return the dots with at least half of their light on the sensor, bool, shape (n,)."""
     position = _light_px(pose, points, optics)
     rows, columns = optics.sensor_shape
     inside = (position > -0.5) & (position < np.array([columns, rows]) - 0.5)
@@ -265,7 +314,7 @@ def _in_field(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarra
 
 
 def _light_px(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray:
-    """Where rays spread over the pupil take each dot's light on the sensor (column, row) [pixel], (n, views, 2)."""
+    """Return where rays spread over the pupil meet the sensor (column, row) [pixel], shape (n, rays, 2)."""
     chief, slope = pose.rays(points)
     pupil = spread_over_pupil(optics.pupil_radius_mm)
     array = chief[:, None] + slope[:, None, None] * pupil

@@ -1,149 +1,127 @@
-"""What all dots of a camera share: their diameter, the blur of its pixels, and the bend of its rays.
+"""Parameters of one camera that its dots share: diameter, blur and bend; and the noise and response of its pixels.
 
-The bend is what the rays do beyond the second order of the pupil point: spherical aberration above all, which is cubic.
-It hardly changes over a board, and one dot tells it coarsely or not at all, like the other two; all dots together tell
-them well. Each fit of a dot hands on what it says about them with its own ray model fitted along
-(`lfpiv.calibration.board.dot_model.DotFit`), so that sums over the dots are the Gauss-Newton equations of one joint fit of everything: a
-bordered system, solved by elimination.
+The bend is the third-order part of the rays over the pupil, mostly spherical aberration. One dot measures the shared
+parameters poorly, all dots measure them well. Each `DotFit` holds the Gauss-Newton equations of the shared
+parameters with the dot's own unknowns eliminated, so the sum of these equations over the dots is the joint fit of all.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
-from lfpiv.calibration.board.dot_model import BENDS, TERMS, DotFit, LensIntegral, ray_terms
-from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.calibration.board.dot_fit import BoardPixels, DotFit, converged, fit_dots
+from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
+from lfpiv.calibration.board.dots import ExpectedDot
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
-_SAMPLE = 48  # dots that tell the diameter, the blur and a first bend
+_SAMPLE = 48  # dots that estimate diameter, blur and a first bend
 _ROUNDS = 8
-_CHANGE = 0.005  # they are settled when they change by less than this: a part, pixel^2, pitches
-_STEP = 0.25  # and change at most by this in one round
-_SIZE_PRIOR = (0.3, 0.5)  # how far a diameter is off (logarithm), and how large the square of a blur is [pixel^2]
-_BEND_PRIOR_PITCHES = 0.5  # how large a term of the bend is
-_NOTABLE = 0.1  # a diameter this far off is worth a warning
-_CHANCE = 1e-3  # a bend is taken for one where dots without it would show as much this rarely
-_OUTLIER_CHI2 = 2.0  # fits this many times worse than the typical one have no say
+_CHANGE = 0.005  # smallest change that needs another round [logarithm, pixel^2, pitch]
+_LARGEST_CHANGE = 0.25  # of one round, in the same units
+_SIZE_PRIOR = (0.3, 0.5)  # standard deviation of the prior on log(diameter) and on blur^2 [pixel^2]
+_BEND_PRIOR_PITCHES = 0.5  # standard deviation of the prior on each term of the bend
+_NOTABLE = 0.1  # error of the stated diameter that is worth a warning [logarithm]
+_CHANCE = 1e-3  # probability that dots without a bend show one by chance
+_OUTLIER_CHI2 = 2.0  # fits with this many times the typical residual are left out
+_SHARE = 0.3  # pixels with at least this share of a dot measure noise and pixel response
+_CALM_SIGMA, _CALM_DEVIATION = 4.0, 0.5  # pixels further off in light or response are left out
+_NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Shared:
-    """What all dots of one camera share."""
+def estimate_shared(
+    pixels: BoardPixels,
+    expected: Sequence[ExpectedDot],
+    stated_diameter_mm: float,
+    margin_mm: float,
+) -> SharedParameters:
+    """Fit the shared parameters to a sample of the dots.
 
-    diameter_mm: float
-    """Diameter of the dots as they look [mm]."""
-    blur_px: float
-    """Blur of the sensor and the microlenses, standard deviation [pixel]."""
-    bend_mm: np.ndarray
-    """Ray model beyond the second order of the pupil point [mm], shape (BENDS, 2)."""
-
-    def model(self, decoder: LightFieldDecoder, noise: float, counts_per_photon: float) -> LensIntegral:
-        """Dot model of a camera with these."""
-        return LensIntegral(decoder, self.diameter_mm, self.blur_px, self.bend_mm, noise, counts_per_photon)
-
-
-def settle(
-    fit: Callable[[LensIntegral, np.ndarray], Sequence[DotFit | None]],
-    dots: int,
-    decoder: LightFieldDecoder,
-    nominal_diameter_mm: float,
-    noise: float,
-) -> Shared:
-    """Find what a sample of the dots fits best.
-
-    A dot drawn too large or too small is fitted in the wrong place wherever its light is cut by a lens's edge. The
-    diameter matters everywhere, the blur grows with the slope of the rays; so focus tells the two apart.
+    A model dot of the wrong size is fitted in the wrong position where a lens's edge cuts its light. The diameter acts
+    at all depths, the blur grows with the slope of the rays, so planes at different depths separate the two.
 
     Parameters
     ----------
-    fit : callable
-        Fits the chosen ones of the dots.
-    dots : int
-        Number of dots to choose from.
-    decoder : LightFieldDecoder
-        The camera's decoder.
-    nominal_diameter_mm : float
-        Diameter the user states [mm].
-    noise : float
-        Read-out noise [counts].
+    pixels : BoardPixels
+        Pixels of all planes.
+    expected : sequence of ExpectedDot
+        The dots.
+    stated_diameter_mm : float
+        Diameter in the experiment file [mm].
+    margin_mm : float
+        Distance beyond the expected light of a dot that is fitted too [mm].
     """
-    chosen = np.unique(np.linspace(0, dots - 1, _SAMPLE).astype(int))
-    pitch = decoder.optics.microlens_pitch_mm
+    optics, lattice = pixels.decoder.optics, pixels.decoder.lattice
+    chosen = np.unique(np.linspace(0, len(expected) - 1, _SAMPLE).astype(int))
+    sample = [expected[k] for k in chosen]
+    pitch = optics.microlens_pitch_mm
     prior = np.array([*_SIZE_PRIOR, *[_BEND_PRIOR_PITCHES] * (2 * BENDS)])
     unit = np.array([1, 1, *[pitch] * (2 * BENDS)])
-    at = np.zeros(len(prior))  # log(diameter / nominal), blur^2 [pixel^2], bend [pitch]
+    at = np.zeros(len(prior))  # log(diameter / stated), blur^2 [pixel^2], bend [pitch]
     for _ in range(_ROUNDS):
-        model = _shared(at, nominal_diameter_mm, pitch).model(decoder, noise, decoder.counts_per_photon)
-        fits, typical = _alike(fit(model, chosen))
+        model = LensIntegral(optics, lattice, _shared(at, stated_diameter_mm, pitch))
+        fits, typical = _typical(fit_dots(model, pixels, sample, margin_mm))
         if not fits:
             break
         total = sum(one.pull_information for one in fits) * np.outer(unit, unit) / typical + np.diag(1 / prior**2)
         pull = sum(one.pull for one in fits) * unit / typical - at / prior**2
-        change = np.clip(np.linalg.solve(total, pull), -_STEP, _STEP)
-        if at[1] + change[1] < 0:  # no blur: the others alone
+        change = np.clip(np.linalg.solve(total, pull), -_LARGEST_CHANGE, _LARGEST_CHANGE)
+        if at[1] + change[1] < 0:  # no blur: solve for the others only
             free = np.arange(len(at)) != 1
-            change[free] = np.clip(np.linalg.solve(total[free][:, free], pull[free]), -_STEP, _STEP)
+            change[free] = np.linalg.solve(total[free][:, free], pull[free]).clip(-_LARGEST_CHANGE, _LARGEST_CHANGE)
             change[1] = -at[1]
         at = at + change
         if np.abs(change).max() < _CHANGE:
             break
+    shared = _shared(at, stated_diameter_mm, pitch)
     if abs(at[0]) > _NOTABLE:
-        seen = nominal_diameter_mm * np.exp(at[0])
-        figures = {"seen_mm": float(seen), "stated_mm": nominal_diameter_mm}
+        figures = {"seen_mm": shared.diameter_mm, "stated_mm": stated_diameter_mm}
         warn(log, Warning(code=Code.DOT_WIDTH, figures=figures))
-    return _shared(at, nominal_diameter_mm, pitch)
+    return shared
 
 
-def _shared(at: np.ndarray, nominal_diameter_mm: float, pitch: float) -> Shared:
-    return Shared(
-        diameter_mm=float(nominal_diameter_mm * np.exp(at[0])),
+def _shared(at: np.ndarray, stated_diameter_mm: float, pitch: float) -> SharedParameters:
+    return SharedParameters(
+        diameter_mm=float(stated_diameter_mm * np.exp(at[0])),
         blur_px=float(np.sqrt(at[1])),
         bend_mm=pitch * at[2:].reshape(2, BENDS).T,
     )
 
 
-def _alike(fits: Sequence[DotFit | None]) -> tuple[list[DotFit], float]:
-    """Return the fits that are as good as the typical one, and its mean squared residual."""
-    sure = [fit for fit in fits if fit is not None and fit.converged]
+def _typical(fits: Sequence[DotFit | None]) -> tuple[list[DotFit], float]:
+    """Return the fits that are not much worse than the typical one, and its mean squared residual."""
+    sure = converged(fits)
     typical = float(np.median([fit.reduced_chi2 for fit in sure])) if sure else np.nan
     return [fit for fit in sure if fit.reduced_chi2 <= _OUTLIER_CHI2 * typical], typical
 
 
-def update_bend(shared: Shared, fits: Sequence[DotFit | None], pitch_mm: float) -> tuple[Shared, list[DotFit | None]]:
-    """Find the bend that all dots together show, none where chance explains it, and take their ray models along.
+def estimate_bend(shared: SharedParameters, fits: Sequence[DotFit | None], pitch_mm: float) -> SharedParameters:
+    """Return the shared parameters with the bend that all dots show; no bend where chance explains it.
 
-    The dots' bends scatter about the common one; an F-test of the common bend against that scatter, which model errors
-    widen too, tells whether there is any. Without it a perfect lens would get a bend made of noise.
+    The bends of single dots scatter about the common bend, by model errors too. An F-test compares the common bend with
+    that scatter. Without the test the noise would give a perfect lens a bend.
 
     Parameters
     ----------
-    shared : Shared
-        What the dots were fitted with.
+    shared : SharedParameters
+        Parameters that the dots were fitted with.
     fits : sequence of DotFit or None
-        Fits of all dots, by priors that leave the decision to the dots' light.
+        Fits of all dots, by weak priors.
     pitch_mm : float
         Microlens pitch [mm].
-
-    Returns
-    -------
-    shared : Shared
-        With the new bend.
-    fits : list of DotFit or None
-        With the coefficients that belong to it, to first order.
     """
-    sure, typical = _alike(fits)
+    sure, typical = _typical(fits)
     start = shared.bend_mm.T.ravel()
     bend = np.zeros_like(start)
     if len(sure) > 1:
         information = np.stack([fit.pull_information[2:, 2:] for fit in sure]) / typical
-        pull = np.stack([fit.pull[2:] for fit in sure]) / typical + information @ start  # as seen from no bend
+        pull = np.stack([fit.pull[2:] for fit in sure]) / typical + information @ start  # relative to no bend
         prior = np.eye(len(start)) / (_BEND_PRIOR_PITCHES * pitch_mm) ** 2
         total = information.sum(0) + prior
         found = np.linalg.solve(total, pull.sum(0))
@@ -151,23 +129,60 @@ def update_bend(shared: Shared, fits: Sequence[DotFit | None], pitch_mm: float) 
         scatter = np.einsum("ka,ka->", miss, np.linalg.solve(information + prior, miss[..., None])[..., 0])
         freedom = len(start) * (len(sure) - 1)
         ratio = found @ total @ found / len(start) / (scatter / freedom)
-        chance = float(stats.f.sf(ratio, len(start), freedom))
-        if chance < _CHANCE:
+        if float(stats.f.sf(ratio, len(start), freedom)) < _CHANCE:
             bend = found
-            log.info("rays bent beyond the second order of the pupil: %.3f pitch at its edge", _edge(bend) / pitch_mm)
-    moved = [
-        fit
-        and replace(
-            fit,
-            coefficients=fit.coefficients + (fit.following[:, 2:] @ (bend - start)).reshape(2, TERMS).T,
-        )
+            log.info("third-order bend of the rays: %.3f pitch (rms at the pupil's edge)", _edge(bend) / pitch_mm)
+    return replace(shared, bend_mm=bend.reshape(2, BENDS).T)
+
+
+def follow_bend(fits: Sequence[DotFit | None], change_mm: np.ndarray) -> list[DotFit | None]:
+    """Return the fits with the coefficients that belong to a changed bend, to first order.
+
+    Parameters
+    ----------
+    fits : sequence of DotFit or None
+        Fits by the former bend.
+    change_mm : ndarray, shape (BENDS, 2)
+        New bend minus former bend [mm].
+    """
+    change = change_mm.T.ravel()
+    return [
+        fit and replace(fit, coefficients=fit.coefficients + (fit.following[:, 2:] @ change).reshape(2, TERMS).T)
         for fit in fits
     ]
-    return replace(shared, bend_mm=bend.reshape(2, BENDS).T), moved
 
 
 def _edge(bend: np.ndarray) -> float:
-    """Root mean square of a bend over the pupil's edge, where it is largest [mm]."""
+    """Return the root mean square of a bend over the pupil's edge [mm]."""
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     edge = ray_terms(np.stack([np.cos(angle), np.sin(angle)], 1), 1.0)[:, TERMS:]
     return float(np.sqrt(((edge @ bend.reshape(2, BENDS).T) ** 2).sum(1).mean()))
+
+
+def estimate_pixels(pixels: BoardPixels, fits: Sequence[DotFit | None]) -> BoardPixels:
+    """Return the pixels with the shot noise, and the response share of the white image's scatter, of fitted dots.
+
+    For true response, light over fit minus 1 equals white over smooth white minus 1. For noise of the white image the
+    two are independent. The slope of the first over the second is the share.
+    """
+    decoder = pixels.decoder
+    deviations, lights, misses = [], [], []
+    for fit in converged(fits):
+        chosen = fit.share > _SHARE
+        at = tuple(fit.pixel[chosen].T)
+        smooth = decoder.smooth_gain[at]
+        light = (fit.base + fit.amplitude * fit.share[chosen]) * smooth
+        light = light * decoder.coverage[at] * decoder.white_counts
+        use = (smooth > 0) & (light > 0)
+        lights.append(light[use])
+        misses.append(fit.misfit[chosen][use])
+        deviations.append((decoder.gain[at] / np.maximum(smooth, 1e-3) - 1)[use])
+    if not lights:
+        return pixels.measured(1.0, decoder.counts_per_photon)
+    deviation, expected, miss = (np.concatenate(part).astype(float) for part in (deviations, lights, misses))
+    relative = miss / expected
+    limit = _CALM_SIGMA * _NORMAL_MAD * np.median(np.abs(relative))
+    calm = (np.abs(relative) < limit) & (np.abs(deviation) < _CALM_DEVIATION)
+    share = float(np.clip((deviation * relative)[calm].sum() / max((deviation**2)[calm].sum(), 1e-12), 0, 1))
+    left = (miss - share * deviation * expected) ** 2 / expected
+    return pixels.measured(share, max(float(np.median(left)) * _NORMAL_MAD**2, 1e-3))

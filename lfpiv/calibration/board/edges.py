@@ -1,10 +1,8 @@
-"""The outline of a board as a camera sees it, held against the stated one: it names the dots, or refuses to.
+"""Find the edges of a board in a camera's view, and compare the enclosed columns and rows with the stated ones.
 
-Dots look alike, so only the board's edges tell one column from the next. An edge is seen where the lattice goes on in
-the camera's view but no dots do. Two edges that enclose another number of columns than stated mean that the board, or a
-part of it, is not what was stated: the middle of the board, and with it the names, would then be off by half a spacing
-or more, and not alike in all cameras. One edge, the other one outside the view, names the dots by itself. Where no edge
-is in view the names rest on the nominal axis of the camera alone.
+All dots look alike, so only the board's edges identify a column. An edge is seen where the view continues beyond the
+lattice but no dots do. One edge names the dots. Two edges that enclose another number of columns than stated refuse the
+board, because the names would then be wrong by half a spacing or more, by different amounts in different cameras.
 """
 
 from __future__ import annotations
@@ -18,12 +16,12 @@ import numpy as np
 from lfpiv.errors import InputError
 
 MARGIN = 2
-"""Places around the stated board that are looked at: a board stated too small by two columns is still told."""
-FEWEST_PLACES = 3
-"""Places of a column that must be in view, over all planes, to say that its dots are there or not."""
+"""Columns and rows of lattice sites that are searched around the stated board."""
+FEWEST_SITES = 3
+"""Sites of a column that must be in view, over all planes, to judge whether the column has dots."""
 OCCUPIED, EMPTY = 0.5, 0.2
-"""Share of its places with a dot, relative to the typical column, above which a column is on the board and below which
-it is not; dirt, reflections and noise leave the share of real columns above 0.9, of others below 0.1."""
+"""Share of sites with a dot, relative to the typical column: a column above the first is on the board, one below the
+second is not."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +35,9 @@ class Extent:
     last: int
     """Last column with dots."""
     starts: bool
-    """Whether the view goes on before the first column, so that it is the board's edge."""
+    """Whether the view continues before the first column, which is then the board's edge."""
     ends: bool
-    """Whether the view goes on behind the last column."""
+    """Whether the view continues after the last column."""
 
     @property
     def count(self) -> int:
@@ -48,7 +46,7 @@ class Extent:
 
     @property
     def fits(self) -> bool:
-        """Whether the stated number can be right."""
+        """Whether the stated number may be correct."""
         return self.count == self.stated if self.starts and self.ends else self.count <= self.stated or self.open
 
     @property
@@ -58,28 +56,49 @@ class Extent:
 
     @property
     def shift(self) -> int:
-        """By how much the names are off."""
+        """Columns by which the names must move; 0 where no edge is in view."""
         if self.starts:
             return self.first
         return self.last - (self.stated - 1) if self.ends else 0
 
 
-def outline(found: np.ndarray, in_view: np.ndarray, dots: tuple[int, int]) -> tuple[Extent, Extent] | None:
-    """Columns and rows that hold dots.
+def sites_found(sites: Sequence[np.ndarray], dots: tuple[int, int]) -> np.ndarray:
+    """Return which lattice sites have a dot.
+
+    Parameters
+    ----------
+    sites : sequence of ndarray
+        Numbers of the sites with a dot in each plane, row by row over the lattice with its margin.
+    dots : (int, int)
+        Stated columns and rows.
+
+    Returns
+    -------
+    ndarray of bool, shape (plane, rows + 2 MARGIN, columns + 2 MARGIN)
+    """
+    columns, rows = (n + 2 * MARGIN for n in dots)
+    found = np.zeros((len(sites), rows * columns), bool)
+    for plane, site in enumerate(sites):
+        found[plane, site] = True
+    return found.reshape(len(sites), rows, columns)
+
+
+def find_extents(found: np.ndarray, in_view: np.ndarray, dots: tuple[int, int]) -> tuple[Extent, Extent] | None:
+    """Find the columns and rows that hold dots.
 
     Parameters
     ----------
     found : ndarray of bool, shape (plane, rows + 2 MARGIN, columns + 2 MARGIN)
-        Places of the lattice where a dot was found.
+        Lattice sites where a dot was found.
     in_view : ndarray of bool, same shape
-        Places whose dot would be seen wholly.
+        Sites whose dot would be fully in view.
     dots : (int, int)
         Stated columns and rows.
 
     Returns
     -------
     (Extent, Extent) or None
-        Of the columns and of the rows; None where too few dots are in view to tell.
+        Extents of the columns and of the rows; None where too few dots are in view.
     """
     found = found & in_view
     columns = _extent(found, in_view, dots[0])
@@ -93,7 +112,7 @@ def require_stated(extents: tuple[Extent, Extent], found: np.ndarray) -> None:
     Raises
     ------
     InputError
-        Says which planes show how many columns and rows, and what to set.
+        Names the columns and rows that each plane shows, and what to set.
     """
     if all(extent.fits for extent in extents):
         return
@@ -112,13 +131,11 @@ def require_stated(extents: tuple[Extent, Extent], found: np.ndarray) -> None:
 
 
 def _extent(found: np.ndarray, in_view: np.ndarray, stated: int) -> Extent | None:
-    """Extent along the last axis, from the lines across it that hold dots in a plane."""
-    across = found.sum(2)  # dots per plane and line across
-    usual = np.array([np.median(counts[counts > 0]) if (counts > 0).any() else np.inf for counts in across])
-    lines = (across >= OCCUPIED * usual[:, None])[:, :, None]
-    seen, places = (found & lines).sum((0, 1)), (in_view & lines).sum((0, 1))
-    known = places >= FEWEST_PLACES
-    share = np.divide(seen, places, out=np.zeros(len(seen)), where=known)
+    """Find the extent along the last axis from the lines across it that hold dots."""
+    lines = np.stack([_occupied(counts) for counts in found.sum(2)])[:, :, None]
+    seen, sites = (found & lines).sum((0, 1)), (in_view & lines).sum((0, 1))
+    known = sites >= FEWEST_SITES
+    share = np.divide(seen, sites, out=np.zeros(len(seen)), where=known)
     if not share.any():
         return None
     share /= np.median(share[share > EMPTY * share.max()])
@@ -134,25 +151,19 @@ def _extent(found: np.ndarray, in_view: np.ndarray, stated: int) -> Extent | Non
     )
 
 
+def _occupied(counts: np.ndarray) -> np.ndarray:
+    """Return the lines of one plane that hold about as many dots as the typical one, bool."""
+    typical = np.median(counts[counts > 0]) if (counts > 0).any() else np.inf
+    occupied: np.ndarray = counts >= OCCUPIED * typical
+    return occupied
+
+
 def _per_plane(found: np.ndarray) -> str:
-    """Columns and rows of each plane in words: ``planes 0-3: 7 x 7, plane 4: 6 x 7``."""
-    sizes = []
-    for plane in found:
-        counts = [plane.sum(axis) for axis in (0, 1)]
-        usual = [np.median(count[count > 0]) if (count > 0).any() else np.inf for count in counts]
-        sizes.append(" x ".join(str((c >= OCCUPIED * u).sum()) for c, u in zip(counts, usual, strict=True)))
+    """Return columns and rows of each plane in words: ``planes 0-3: 7 x 7, plane 4: 6 x 7``."""
+    sizes = [" x ".join(str(_occupied(plane.sum(axis)).sum()) for axis in (0, 1)) for plane in found]
     words, plane = [], 0
     for size, group in groupby(sizes):
         last = plane + len(list(group)) - 1
         words.append(f"plane {plane}: {size}" if last == plane else f"planes {plane}-{last}: {size}")
         plane = last + 1
     return ", ".join(words)
-
-
-def numbered(places: Sequence[np.ndarray], dots: tuple[int, int]) -> np.ndarray:
-    """Places found in each plane as a bool array of shape (plane, rows + 2 MARGIN, columns + 2 MARGIN)."""
-    columns, rows = (n + 2 * MARGIN for n in dots)
-    grid = np.zeros((len(places), rows * columns), bool)
-    for plane, place in enumerate(places):
-        grid[plane, place] = True
-    return grid.reshape(len(places), rows, columns)

@@ -1,0 +1,91 @@
+"""`Reconstruction`: a volume by SMART, how well its projections match the images, and why the iteration stopped."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.geometry.volume import VIEWS
+from lfpiv.reconstruction.settings import SmartSettings
+
+
+class SmartStop(enum.Enum):
+    """Why the iteration ended; the text is the advice."""
+
+    DONE = "all iterations asked for were done"
+    CONVERGED = "misfit no longer falls by more than the tolerance"
+    ITERATION_LIMIT = "iteration limit reached: raise smart.iterations if the misfit still falls"
+    DIVERGED = "misfit rises: lower smart.relaxation"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction:
+    """Volume of one instant; figures of cameras are by camera name."""
+
+    grid: Grid
+    volume: np.ndarray
+    """Particle intensity [counts per unit weight], shape (z, y, x), float32."""
+    views: np.ndarray | None
+    """Number of cameras that see each voxel, shape (z, y, x). None for one camera, or if two see every voxel."""
+    residual: tuple[float, ...]
+    """||I - P|| / ||I|| before each iteration and after the last."""
+    misfit: tuple[float, ...]
+    """Kullback-Leibler divergence that SMART lowers [counts], before each iteration and after the last."""
+    stop: SmartStop
+    floor: dict[str, float]
+    """Noise floor [counts]."""
+    camera_gain: dict[str, float]
+    """Brightness relative to the brightest camera."""
+    light_outside: dict[str, float]
+    """Part of an image's light in pixels that no voxel lights."""
+    sieve_voxel: float
+    """Standard deviation of the sieve that was used [voxel]."""
+    settings: SmartSettings
+
+    @property
+    def iterations(self) -> int:
+        """Number of iterations that were done."""
+        return len(self.residual) - 1
+
+    def continued_by(self, after: Reconstruction) -> Reconstruction:
+        """Return a later reconstruction that started from this one, with the history of both.
+
+        It keeps this one's reason to stop, unless the later one diverged: a later one is short by design.
+        """
+        stop = after.stop if after.stop is SmartStop.DIVERGED else self.stop
+        residual, misfit = self.residual[:-1] + after.residual, self.misfit[:-1] + after.misfit
+        return replace(after, residual=residual, misfit=misfit, stop=stop)
+
+    def to_dataarray(self) -> xr.DataArray:
+        """Return the volume with its coordinates [mm] and all figures as attributes, see `lfpiv.reconstruct`."""
+        coordinates: dict[str, Any] = {
+            name: (name, self.grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate(AXES)
+        }
+        if self.views is not None:
+            about = {"units": "1", "long_name": "number of cameras that see the voxel"}
+            coordinates[VIEWS] = (AXES, self.views, about)
+        settings = self.settings
+        attributes = {
+            "long_name": "particle intensity",
+            "units": "counts",
+            "voxel_mm": self.grid.voxel_mm,
+            "residual": list(self.residual),
+            "misfit": list(self.misfit),
+            "stop": self.stop.value,
+            "iterations": self.iterations,
+            "relaxation": settings.relaxation,
+            "floor": list(self.floor.values()),
+            "camera_gain": list(self.camera_gain.values()),
+            "light_outside": list(self.light_outside.values()),
+            "normalisation": settings.normalisation,
+            "accelerate": int(settings.accelerate),
+            "smoothing_voxel": settings.smoothing_voxel,
+            "sieve_voxel": self.sieve_voxel,
+            "active_share": settings.active_share,
+        }
+        return xr.DataArray(self.volume, dims=AXES, coords=coordinates, name="intensity", attrs=attributes)

@@ -1,0 +1,124 @@
+"""First guesses of both frames of a pair from the light that their volumes share along the motion between them.
+
+Each volume is carried along the measured displacement to the other frame's instant. A volume keeps its own particles in
+their places; only their brightness changes, by the ratio of the two volumes after both were smoothed. Ghosts that do
+not move as the particles do fade.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from scipy import ndimage
+
+from lfpiv.velocity.predictor import Predictor
+from lfpiv_kernels.correlation import deform
+
+SMOOTHING_VOXEL = 0.7
+"""Standard deviation of the Gaussian that smooths both volumes before they are compared [voxel]: about the size of a
+particle."""
+DARK_SHARE = 0.02
+"""Light added to both volumes before their ratio is taken, as a share of the smoothed volume's brightness,
+sum E^2 / sum E. Voxels as dark as that are changed little."""
+LARGEST_GAIN = 3.0
+"""Largest factor by which the other frame brightens a voxel."""
+FAINTEST = 1e-6
+"""Least light of a voxel in the first guess, as a share of the brightest one. SMART can raise it; it cannot raise 0."""
+FOLLOWED = 4
+"""Fixed-point steps that turn displacements midway in time into those of the particles of one frame."""
+
+
+def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list[np.ndarray]:
+    """Return first guesses of both frames from what their volumes share along measured displacements.
+
+    With E and E' the two volumes, d the displacement from one to the other, G a Gaussian of `SMOOTHING_VOXEL` and e the
+    light of `DARK_SHARE`, the guess of one frame is ``E min((G E'(x + d) + e) / (G E + e), LARGEST_GAIN)``, both
+    volumes scaled to the same light. Where vectors were replaced by the validation, or particles left the volume, the
+    factor is 1. In between its logarithm is interpolated.
+
+    Parameters
+    ----------
+    volumes : sequence of two DataArrays, shape (z, y, x)
+        Both frames, >= 0, with coordinates in mm.
+    vectors : Dataset
+        From `correlate` of the two: displacements midway in time.
+
+    Returns
+    -------
+    list of two ndarrays, shape (z, y, x), float32
+        Each with the light of its volume, zero where that is zero.
+    """
+    values = [np.asarray(volume.values, np.float32) for volume in volumes]
+    light = [float(value.sum(dtype=np.float64)) for value in values]
+    coefficients = [deform.spline_coefficients(value) for value in values]
+    everywhere = deform.spline_coefficients(np.ones_like(values[0]))
+    motion = MotionField(volumes[0], vectors)
+    guesses = []
+    for number, own in enumerate(values):
+        field = motion.displacement(1 if number == 0 else -1)
+        partner = motion.carried(coefficients[1 - number], field)
+        partner *= np.float32(light[number] / light[1 - number])
+        trusted = motion.trust * np.clip(motion.carried(everywhere, field), 0, 1)
+        guess = own * _gain(own, np.maximum(partner, 0)) ** trusted
+        np.maximum(guess, FAINTEST * guess.max(), out=guess, where=own > 0)
+        guesses.append(guess * np.float32(light[number] / guess.sum(dtype=np.float64)))
+    return guesses
+
+
+def _gain(own: np.ndarray, partner: np.ndarray) -> np.ndarray:
+    """Return the factor that changes a volume's brightness; `partner` is the other one, carried to its instant."""
+    own, partner = (ndimage.gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant") for volume in (own, partner))
+    dark = np.float32(DARK_SHARE * np.square(own, dtype=np.float64).sum() / own.sum(dtype=np.float64))
+    return np.minimum((partner + dark) / (own + dark), np.float32(LARGEST_GAIN))
+
+
+class MotionField:
+    """Motion between two frames, midway in time, on control points between which it is linear [voxel].
+
+    Parameters
+    ----------
+    volume : DataArray, shape (z, y, x)
+        One of the frames, with coordinates in mm.
+    vectors : Dataset
+        From `correlate`.
+    """
+
+    def __init__(self, volume: xr.DataArray, vectors: xr.Dataset):
+        axes = [(volume[axis].values.astype(float), vectors[axis].values) for axis in "zyx"]
+        self.nodes = [(centres - own[0]) * (len(own) - 1) / (own[-1] - own[0]) for own, centres in axes]
+        """Positions of the vectors along each axis [voxel]."""
+        nz, ny, nx = volume.shape
+        displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], axis=-1).astype(float)
+        self.midway = Predictor.between(self.nodes, displacement, (nz, ny, nx))
+        """Displacement of what is at a control point midway in time."""
+        trust = vectors["valid"].values.astype(float)
+        for axis, (nodes, count) in enumerate(zip(self.nodes, volume.shape, strict=True)):
+            trust = _linear(trust, nodes, np.arange(count), axis)
+        self.trust = trust.astype(np.float32)
+        """1 among valid vectors, 0 among replaced ones, shape (z, y, x)."""
+
+    def displacement(self, sign: int) -> np.ndarray:
+        """Return the displacement of what is at the control points of one frame to the other frame; (3, z, y, x).
+
+        `sign` is 1 from the first frame to the second, -1 back.
+        """
+        points, spacing = self.midway.points, np.array(self.midway.spacing)[:, None, None, None]
+        start = np.stack(np.meshgrid(*points, indexing="ij")) - deform.OFFSET  # the kernel's field at x + OFFSET
+        middle = moved = np.moveaxis(self.midway.field.astype(float), -1, 0)
+        for _ in range(FOLLOWED):
+            halfway = (start + sign * moved / 2) / spacing
+            moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in middle])
+        return sign * moved
+
+    def carried(self, coefficients: np.ndarray, field: np.ndarray) -> np.ndarray:
+        """Sample a volume, given by its spline coefficients, at x + field(x) for all voxels x; 0 outside."""
+        half = np.moveaxis(2 * (field - deform.OFFSET), 0, -1)  # the kernel samples at x + OFFSET + half / 2
+        return deform.deform_pair(coefficients, coefficients, half.astype(np.float32), self.midway.spacing)[1]
+
+
+def _linear(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:
+    """Interpolate linearly between values at nodes along an axis, constant beyond the outer nodes."""
+    matrix = np.stack([np.interp(points, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
+    return np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)

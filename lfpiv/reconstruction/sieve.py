@@ -1,0 +1,59 @@
+"""Gaussian blurs of SMART's flat volumes: the sieve, and the smoothing between iterations.
+
+With a sieve G the volume is E = G c, and SMART iterates the coefficients c with W G in place of W [1]_. Smoothing blurs
+the volume itself after an iteration.
+
+.. [1] D. L. Snyder, M. I. Miller, "The use of sieves to stabilize images produced with the EM algorithm for emission
+   tomography", IEEE Trans. Nucl. Sci. 32 (1985) 3864-3872, doi:10.1109/TNS.1985.4334521.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+TRUNCATE = 3.5
+"""Reach of the sieve's Gaussian [standard deviation]."""
+SMOOTHING_TRUNCATE = 3.0
+"""Reach of the Gaussian that smooths between iterations [standard deviation]."""
+
+
+@dataclass(frozen=True)
+class Sieve:
+    """Gaussian blur of volumes, shape (voxel,), zero outside the volume. Its matrix is symmetric: its own adjoint."""
+
+    sigma_voxel: float
+    """Standard deviation [voxel]; 0 for the identity."""
+    shape: tuple[int, int, int]
+    """Voxel counts in stored order."""
+
+    def __call__(self, volume: np.ndarray) -> np.ndarray:
+        """Blur a volume."""
+        if self.sigma_voxel == 0:
+            return volume
+        shaped = volume.reshape(self.shape)
+        blurred: np.ndarray = ndimage.gaussian_filter(shaped, self.sigma_voxel, mode="constant", truncate=TRUNCATE)
+        return blurred.ravel()
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Gaussian blur of volumes, shape (voxel,), continued constantly outside the volume."""
+
+    sigma_voxel: float
+    """Standard deviation [voxel]; 0 for the identity."""
+    shape: tuple[int, int, int]
+    """Voxel counts in stored order."""
+    lit: np.ndarray
+    """Voxels that some camera sees, shape (voxel,), bool. The others stay dark."""
+
+    def __call__(self, volume: np.ndarray) -> np.ndarray:
+        """Blur a volume."""
+        if self.sigma_voxel == 0:
+            return volume
+        shaped = volume.reshape(self.shape)
+        blurred = ndimage.gaussian_filter(shaped, self.sigma_voxel, mode="nearest", truncate=SMOOTHING_TRUNCATE)
+        smoothed: np.ndarray = blurred.ravel() * self.lit
+        return smoothed

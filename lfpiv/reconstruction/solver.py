@@ -1,0 +1,172 @@
+"""`SmartSolver`: SMART for one rig. Made once, it reconstructs the volume of every instant from its images."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
+from lfpiv.reconstruction.momentum import Momentum
+from lfpiv.reconstruction.particle_size import ParticleSizer
+from lfpiv.reconstruction.recording import Recording, record
+from lfpiv.reconstruction.result import Reconstruction, SmartStop
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.sieve import Sieve, Smoothing
+from lfpiv.reconstruction.smart import CameraEquation, ImageEquations, Misfit, State, iterate
+from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
+from lfpiv.weights.operator import Weights
+
+log = logging.getLogger(__name__)
+
+LEAST_COLUMN_SUM = 1e-6
+"""Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
+DIVERGENCE = 1.5
+"""Rise of the misfit over its first value that counts as divergence. Smoothing may raise it a little."""
+
+
+@dataclass
+class _History:
+    """Misfits of an iteration so far, and whether it should stop."""
+
+    settings: SmartSettings
+    iterations: int
+    squares: list[float] = field(default_factory=list)
+    divergence: list[float] = field(default_factory=list)
+
+    def append(self, misfit: Misfit) -> None:
+        self.squares.append(misfit.squares)
+        self.divergence.append(misfit.divergence)
+
+    @property
+    def early_stop(self) -> SmartStop | None:
+        """Reason to stop before the last iteration; None to go on."""
+        count, misfit, tolerance = len(self.divergence) - 1, self.divergence, self.settings.tolerance
+        if count > 0 and not misfit[-1] <= DIVERGENCE * misfit[0]:  # true for NaN
+            return SmartStop.DIVERGED
+        if tolerance > 0 and 0 < count < self.iterations and misfit[-2] - misfit[-1] < tolerance * misfit[-2]:
+            return SmartStop.CONVERGED
+        return None
+
+
+class SmartSolver:
+    """SMART with fixed weights and settings.
+
+    Parameters
+    ----------
+    weights : Weights
+        The operator.
+    settings : SmartSettings
+        Settings of every reconstruction.
+    """
+
+    def __init__(self, weights: Weights, settings: SmartSettings):
+        self.weights = weights
+        self.settings = settings
+
+    def solve(
+        self,
+        images: Mapping[str, np.ndarray],
+        *,
+        floor: float | Mapping[str, float] | None = None,
+        iterations: int | None = None,
+        first: np.ndarray | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> Reconstruction:
+        """Reconstruct one instant; arguments and exceptions as of `lfpiv.reconstruct`.
+
+        `iterations` replaces that of the settings.
+        """
+        settings, stored = self.settings, self.weights.stored
+        count = settings.iterations if iterations is None else iterations
+        recordings = record(self.weights, images, floor=floor, floor_share=settings.floor_share)
+        sieve = Sieve(self._sieve_voxel(images), stored.shape)
+        cameras = [self._equation(name, one) for name, one in recordings.items()]
+        norm = _norm(cameras)
+        equations = ImageEquations(cameras)
+        gains = (np.float32(one.camera_gain) for one in recordings.values())
+        column_sum = sum(gain * own for gain, own in zip(gains, self.weights.camera_sums, strict=True))
+        lit = column_sum > LEAST_COLUMN_SUM * column_sum.max()
+        if first is None:
+            guess = multiplicative_guess(cameras, [one.peak for one in recordings.values()], column_sum, lit)
+        else:
+            guess = checked_guess(first, stored) * lit
+        if settings.active_share > 0:
+            guess[guess < settings.active_share * guess.max()] = 0.0
+        momentum = Momentum(guess) if settings.accelerate else None
+        state = State(guess, momentum, self._steps(column_sum, lit, sieve))
+        smooth = Smoothing(settings.smoothing_voxel, stored.shape, lit)
+        states = iterate(equations, state, sieve, iterations=count, smooth=smooth)
+        history, stop = _History(settings, count), None
+        with equations.locked():
+            for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
+                history.append(misfit)
+                if progress is not None:
+                    progress((number + 1) / (count + 1))
+                stop = history.early_stop
+                if stop is not None:
+                    break
+        if stop is SmartStop.DIVERGED:
+            log.warning("SMART: %s", stop.value)
+        last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
+        return Reconstruction(
+            grid=self.weights.grid,
+            volume=stored.restore(volume),
+            views=self._views,
+            residual=tuple(float(np.sqrt(squares)) / norm for squares in history.squares),
+            misfit=tuple(history.divergence),
+            stop=stop or last,
+            floor={name: one.floor for name, one in recordings.items()},
+            camera_gain={name: one.camera_gain for name, one in recordings.items()},
+            light_outside={name: one.light_outside for name, one in recordings.items()},
+            sieve_voxel=sieve.sigma_voxel,
+            settings=settings,
+        )
+
+    def _sieve_voxel(self, images: Mapping[str, np.ndarray]) -> float:
+        sieve = self.settings.sieve_voxel
+        return self._particle_sizer.matching_sieve(images) if isinstance(sieve, str) else sieve
+
+    @cached_property
+    def _particle_sizer(self) -> ParticleSizer:
+        return ParticleSizer(self.weights)
+
+    @cached_property
+    def _views(self) -> np.ndarray | None:
+        """Number of cameras that see each voxel; None for one camera, or if two see every voxel."""
+        if len(self.weights.cameras) == 1:
+            return None
+        views = self.weights.views
+        return views if views.min() < 2 else None
+
+    def _equation(self, name: str, recording: Recording) -> CameraEquation:
+        gain = self.weights.gain(name)
+        if recording.camera_gain != 1:
+            gain = gain * np.float32(recording.camera_gain)
+        projector = self.weights.projector(name)
+        return CameraEquation(image=recording.image, gain=gain, floor=recording.floor, projector=projector)
+
+    def _steps(self, column_sum: np.ndarray, lit: np.ndarray, sieve: Sieve) -> tuple[Step, ...]:
+        """Return the steps of an iteration, the fastest first. Sharpened steps come with a sieve and momentum."""
+
+        def quotient(numerator: float, denominator: np.ndarray, where: np.ndarray) -> np.ndarray:
+            result: np.ndarray = np.divide(numerator, denominator, out=np.zeros_like(column_sum), where=where)
+            return result
+
+        relaxation = self.settings.relaxation
+        if self.settings.normalisation == "column":
+            size, unblurred = (quotient(relaxation, total, lit) for total in (sieve(column_sum), column_sum))
+        else:
+            pixels = self.weights.stored.store(self.weights.affected_pixels)
+            size = unblurred = quotient(relaxation / self.weights.largest, pixels, lit & (pixels > 0))
+        plain = SmartStep(size, sieve)
+        sharpened = self.settings.accelerate and sieve.sigma_voxel > 0
+        return (SharpenedStep(unblurred, sieve.shape), plain) if sharpened else (plain,)
+
+
+def _norm(cameras: Sequence[CameraEquation]) -> float:
+    """Euclidean norm of all images [counts]."""
+    return float(np.sqrt(sum(np.square(camera.image, dtype=np.float64).sum() for camera in cameras)))

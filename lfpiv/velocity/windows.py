@@ -1,0 +1,41 @@
+"""Grid of interrogation windows in a volume, as one frozen value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfpiv.velocity.settings import Triple
+from lfpiv_kernels.correlation.correlate import window_grid
+
+
+@dataclass(frozen=True, kw_only=True)
+class Windows:
+    """Evenly spaced windows; all tuples are ordered (z, y, x) [voxel]."""
+
+    window: Triple
+    """Edges of a window."""
+    origin: Triple
+    """First voxel of the first window."""
+    step: Triple
+    """Distance of neighbouring windows."""
+    count: Triple
+    """Number of windows."""
+
+    @classmethod
+    def covering(cls, shape: Triple, window: Triple, step: Triple) -> Windows:
+        """Return the windows that cover a volume, with equal margins at both ends."""
+        origin, count = window_grid(shape, window, step)
+        return cls(window=window, origin=origin, step=step, count=count)
+
+    @property
+    def centres(self) -> list[np.ndarray]:
+        """Window centres along each axis [voxel]."""
+        return [first + (edge - 1) / 2 for edge, first in zip(self.window, self.first_voxels, strict=True)]
+
+    @property
+    def first_voxels(self) -> list[np.ndarray]:
+        """First voxel of each window along each axis."""
+        layout = zip(self.origin, self.step, self.count, strict=True)
+        return [origin + step * np.arange(count) for origin, step, count in layout]

@@ -1,0 +1,289 @@
+"""Weights by counting rays (Eq. 10): weight = rays that reach a pixel / rays traced from the voxel.
+
+Object points in a voxel and points in the pupil are stratified samples. `count_voxels` traces and counts them. A whole
+grid of counts becomes the operator's `Blocks` (`count_blocks`). A few counted voxels, `CountedVoxels`, measure the
+error of integrated weights.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lfpiv.lightfield.microimage_layout import plain
+from lfpiv.warn import Code, Warning, warn
+from lfpiv.weights.blocks import PackedCamera, require_numbers
+from lfpiv.weights.ray_fit import fit_rays
+from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels import runtime
+from lfpiv_kernels.rays.count import count_rays
+from lfpiv_kernels.reconstruction.projector import Blocks
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
+
+log = logging.getLogger(__name__)
+
+COUNT_POINTS = 8
+"""Object points along each edge of a voxel: 512 per voxel. The paper has 500."""
+COUNT_SAMPLES = 36
+"""Pupil points along each axis when every voxel of a grid is counted: about 1,000 rays per object point."""
+COUNT_CHUNK = 64
+"""Number of voxels counted at once. Each needs a window of the sensor in memory."""
+COUNT_TALLEST = 128
+"""Largest height of a block of counts [row]."""
+VOXELS = 6
+"""Number of voxels per camera that are compared with integrated weights."""
+POOLS = 1 << 12, 1 << 18
+"""Sizes of the random pools from which these voxels are drawn. The larger pool is used if the camera sees too few of
+the smaller one."""
+POINTS, SAMPLES = 16, 36
+"""Object points along each voxel edge and pupil points along each axis in a comparison: 4e6 rays per voxel, counted
+twice."""
+
+
+def count_voxels(
+    camera: CalibratedCamera,
+    centres_mm: np.ndarray,
+    voxel_mm: float,
+    *,
+    samples: int,
+    points: int = COUNT_POINTS,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Trace rays from stratified points in voxels and count them per pixel (Eq. 10).
+
+    Parameters
+    ----------
+    camera : CalibratedCamera
+        Mapping, optics and lattice.
+    centres_mm : ndarray, shape (voxel, 3)
+        Voxel centres (x, y, z) [mm].
+    voxel_mm : float
+        Voxel edge [mm].
+    samples : int
+        Pupil points along each axis.
+    points : int
+        Object points along each voxel edge.
+    seed : int
+        Seed of the positions inside the strata.
+
+    Returns
+    -------
+    count : ndarray, shape (voxel, rows, columns), int32
+        Rays in a window of the sensor.
+    total : ndarray, shape (voxel,), int32
+        Rays traced.
+    first_pixel : ndarray, shape (voxel, 2), int32
+        (column, row) of each window's first pixel; may lie outside the sensor.
+    """
+    runtime.device()
+    rng = np.random.default_rng(seed)
+    packed, optics = PackedCamera.of(camera), camera.optics
+    strata = np.stack(np.meshgrid(*[np.arange(points)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    inside = (strata + rng.random((len(centres_mm), len(strata), 3))) / points - 0.5
+    objects = (np.asarray(centres_mm)[:, None] + inside * voxel_mm).reshape(-1, 3)
+    rays = fit_rays(camera, objects, degree=3)
+    # window: where a voxel's rays meet the array, widened by one lens and one microimage
+    radius = optics.pupil_radius_mm
+    corner = rays.reshape(len(centres_mm), len(strata), 2, -1)
+    spread = np.abs(corner[..., 1]) * radius + np.abs(corner[..., 2]) * radius
+    spread += np.abs(corner[..., 3:6]).sum(-1) * radius**2 + np.abs(corner[..., 6:]).sum(-1) * radius**3
+    margin = (radius + optics.microlens_pitch_mm) * optics.sensor_per_pupil + optics.microlens_pitch_mm
+    scale = 1 + optics.sensor_per_pupil
+    low = optics.sensor_px(((corner[..., 0] - spread).min(1) * scale) - margin)
+    high = optics.sensor_px(((corner[..., 0] + spread).max(1) * scale) + margin)
+    first_pixel = np.floor(low).astype(np.int32)
+    columns, rows = (np.ceil(high).astype(int) - first_pixel).max(0) + 1
+    count, total = count_rays(
+        rays,
+        rng.random((len(objects), 2)).astype(np.float32),
+        np.repeat(np.arange(len(centres_mm), dtype=np.int32), len(strata)),
+        first_pixel,
+        packed.camera,
+        packed.lattice,
+        hexagonal=camera.lattice.layout == "hexagonal",
+        samples=samples,
+        shape=(int(rows), int(columns)),
+    )
+    return count, total, first_pixel
+
+
+def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
+    """Add one voxel's stored weights to a sensor image, in place."""
+    ray, weight = blocks.entries(voxel)
+    share = blocks.microimages.share[ray]
+    lit = share > 0
+    np.add.at(image.ravel(), blocks.microimages.pixel[ray[lit]], weight[lit] * share[lit])
+
+
+# -- a few voxels, to compare integrated weights with
+
+
+class CountedVoxels:
+    """A few random voxels that a camera sees, counted twice with independent rays.
+
+    The difference of the two counts gives their noise. There are no voxels if the camera sees none.
+    """
+
+    def __init__(self, stored: StoredGrid, camera: CalibratedCamera, seed: int = 0):
+        self.stored, self.camera = stored, camera
+        self.voxels = draw_seen(stored, camera, seed)
+        self.centres_mm = stored.centres_mm(self.voxels)
+        if not len(self.voxels):
+            return
+        counts, total, corner = count_voxels(
+            camera,
+            np.repeat(self.centres_mm, 2, axis=0),
+            stored.grid.voxel_mm,
+            samples=SAMPLES,
+            points=POINTS,
+            seed=seed,
+        )
+        shares = counts / np.maximum(total, 1)[:, None, None]
+        self._corner = corner.reshape(-1, 2, 2).min(1)
+        extent = np.array(counts.shape[:0:-1]) + (corner.reshape(-1, 2, 2).max(1) - self._corner).max(0)
+        self._halves = np.zeros((len(self.voxels), 2, extent[1], extent[0]), np.float32)
+        for number, (share, (column, row)) in enumerate(zip(shares, corner, strict=True)):
+            column, row = (column, row) - self._corner[number // 2]
+            window = self._halves[number // 2, number % 2, row : row + share.shape[0], column : column + share.shape[1]]
+            window[:] = share
+        for half, start in zip(self._halves, self._corner, strict=True):
+            half *= _window(camera.gain, start, half.shape[1:])
+
+    def errors(self, blocks: Blocks, voxels: Sequence[int] | None = None) -> list[float]:
+        """Return the relative L2 difference of blocks from the counts, one per voxel, the counts' noise subtracted.
+
+        `voxels` are the indices of the counted voxels in `blocks`; default: their stored indices in the grid.
+        """
+        errors = []
+        columns = blocks.microimages.sensor_shape[1]
+        for number, voxel in enumerate(self.voxels if voxels is None else voxels):
+            first, second = self._halves[number].astype(np.float64)
+            mean = (first + second) / 2
+            light = np.linalg.norm(mean)
+            if light == 0:
+                continue
+            image, corner = np.zeros(mean.shape), self._corner[number]
+            ray, weight = blocks.entries(int(voxel))
+            pixel = blocks.microimages.pixel[ray]
+            seen = pixel >= 0
+            row, column = np.divmod(pixel[seen], columns)
+            weight = weight[seen] * blocks.microimages.share[ray[seen]] * self.camera.gain[row, column]
+            row, column = row - corner[1], column - corner[0]
+            inside = (row >= 0) & (row < image.shape[0]) & (column >= 0) & (column < image.shape[1])
+            np.add.at(image, (row[inside], column[inside]), weight[inside])
+            outside = (weight[~inside] ** 2).sum()
+            noise = np.linalg.norm(first - second) / 2  # of the mean of the two
+            error = np.linalg.norm(image - mean) ** 2 + outside - noise**2
+            errors.append(float(np.sqrt(max(error, 0.0)) / light))
+        return errors
+
+
+def draw_seen(stored: StoredGrid, camera: CalibratedCamera, seed: int = 0) -> np.ndarray:
+    """Draw `VOXELS` random voxels whose chief rays meet the sensor, or as many as are found. Return sorted indices."""
+    rng, size = np.random.default_rng(seed), stored.grid.size
+    half_mm = np.array(camera.optics.sensor_shape[::-1]) / 2 * camera.optics.pixel_mm
+    for pool in POOLS:
+        drawn = rng.choice(size, min(pool, size), replace=False)
+        chief = camera.map(stored.centres_mm(drawn), np.zeros((len(drawn), 2))) * (1 + camera.optics.sensor_per_pupil)
+        seen = drawn[(np.abs(chief) < half_mm).all(-1)]
+        if len(seen) >= VOXELS or pool >= size:
+            break
+    return np.sort(seen[:VOXELS])
+
+
+def _overlap(shape: tuple[int, ...], window: tuple[int, ...], corner: np.ndarray) -> tuple[tuple[slice, ...], ...]:
+    """Return the overlap of an image and a window whose first pixel is `corner` (column, row): slices of both."""
+    column, row = (int(c) for c in corner)
+    rows = slice(max(row, 0), max(min(row + window[0], shape[0]), max(row, 0)))
+    columns = slice(max(column, 0), max(min(column + window[1], shape[1]), max(column, 0)))
+    within = slice(rows.start - row, rows.stop - row), slice(columns.start - column, columns.stop - column)
+    return (rows, columns), within
+
+
+def add_window(image: np.ndarray, window: np.ndarray, corner: np.ndarray) -> None:
+    """Add a window whose first pixel is `corner` (column, row) to a sensor image, in place."""
+    on_sensor, in_window = _overlap(image.shape, window.shape, corner)
+    image[on_sensor] += window[in_window]
+
+
+def _window(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Cut a window out of a sensor image; zero outside it."""
+    out = np.zeros(shape, image.dtype)
+    on_sensor, in_window = _overlap(image.shape, shape, corner)
+    out[in_window] = image[on_sensor]
+    return out
+
+
+# -- all voxels of a grid
+
+
+def count_blocks(stored: StoredGrid, camera: CalibratedCamera) -> Blocks:
+    """Count the rays of every voxel of a grid and pack the counts into blocks. Warn that this takes long."""
+    rays, size = plain(camera.optics.sensor_shape), stored.grid.size
+    warn(log, Warning(code=Code.COUNT_SLOW, subject=camera.name, figures={"voxels": size}))
+    parts = []
+    for first in range(0, size, COUNT_CHUNK):
+        last = min(first + COUNT_CHUNK, size)
+        counts, total, corner = count_voxels(
+            camera, stored.centres_mm(np.arange(first, last)), stored.grid.voxel_mm, samples=COUNT_SAMPLES, seed=first
+        )
+        parts.append(_pack_windows(counts / total[:, None, None], corner, camera.optics.sensor_shape, rays.edge))
+    blocks, rows, ray, height, value, scale = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    require_numbers(blocks.sum(dtype=np.int64), stored.grid.shape)
+    return Blocks(
+        form="pixels",
+        first_block=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
+        first_value=np.concatenate([[0], BLOCK_WIDTH * np.cumsum(rows)]).astype(np.int64),
+        ray=ray,
+        height=height,
+        width=np.full(len(ray), BLOCK_WIDTH, np.uint8),
+        value=np.append(value, np.zeros(BLOCK_WIDTH, np.uint8)),
+        scale=scale,
+        microimages=rays,
+    )
+
+
+def _pack_windows(
+    windows: np.ndarray, corner: np.ndarray, sensor_shape: tuple[int, int], stride: int
+) -> tuple[np.ndarray, ...]:
+    """Pack windows of weights, shape (voxel, rows, columns), into blocks of one column of tiles each.
+
+    Returns the number of blocks and of rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
+    """
+    row = corner[:, 1, None] + np.arange(windows.shape[1])
+    column = corner[:, 0, None] + np.arange(windows.shape[2])
+    seen = ((row >= 0) & (row < sensor_shape[0]))[:, :, None] & ((column >= 0) & (column < sensor_shape[1]))[:, None]
+    windows = np.where(seen, windows, 0.0)
+    windows = np.pad(windows, ((0, 0), (0, 0), (0, -windows.shape[2] % BLOCK_WIDTH)))
+    tiles = windows.reshape(*windows.shape[:2], -1, BLOCK_WIDTH).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
+    scale = tiles.max((1, 2, 3)) / LEVELS
+    lit = tiles.any(-1)
+    place = np.arange(lit.shape[2]) % COUNT_TALLEST
+    starts = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (1, 0)))[:, :, :-1] & (place > 0)))
+    ends = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (0, 1)))[:, :, 1:] & (place < COUNT_TALLEST - 1)))
+    voxel, tile, first = starts.T
+    # a tile that begins left of the sensor starts at the end of the row above, with weights of 0 there
+    pixel = (corner[voxel, 1] + first) * stride + corner[voxel, 0] + tile * BLOCK_WIDTH
+    unit = np.where(scale > 0, scale, 1.0)
+    value = np.rint(tiles[lit] / unit[np.nonzero(lit)[0], None]).astype(np.uint8)
+    shift = np.maximum(-pixel, 0)  # before the sensor's first pixel: move the block's lanes instead
+    if shift.any():
+        rows_of = np.repeat(shift, ends[:, 2] - first + 1)
+        for amount in np.unique(rows_of[rows_of > 0]):
+            some = rows_of == amount
+            value[some] = np.roll(value[some], -amount, axis=1)
+        pixel = pixel + shift
+    return (
+        np.bincount(voxel, minlength=len(windows)),
+        np.bincount(voxel, weights=ends[:, 2] - first + 1, minlength=len(windows)).astype(np.int64),
+        pixel.astype(np.int32),
+        (ends[:, 2] - first + 1).astype(np.uint8),
+        value,
+        scale.astype(np.float32),
+    )

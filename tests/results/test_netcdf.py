@@ -1,0 +1,114 @@
+"""NetCDF files of vectors and volumes: read back as written, older versions read, other forms refused."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lfpiv.errors import InputError
+from lfpiv.results import netcdf, provenance
+from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
+from lfpiv.warn import Code, Warning
+
+
+def vectors(seed=0, shape=(2, 3, 4)):
+    """A small vector dataset in the form every correlation writes."""
+    rng = np.random.default_rng(seed)
+    names = [name for name in netcdf.VECTOR_UNITS if name != "valid"]
+    variables = {
+        name: (("z", "y", "x"), rng.normal(size=shape), {"units": netcdf.VECTOR_UNITS[name]}) for name in names
+    }
+    variables["valid"] = (("z", "y", "x"), rng.random(shape) > 0.2)
+    variables["uncertainty"][1][0, 0, 0] = np.nan
+    for name, axis in zip("uvw", "xyz", strict=True):  # 0.1 mm per voxel in 1 ms
+        variables[name] = (("z", "y", "x"), 0.1 * variables[f"displacement_{axis}"][1], {"units": "m/s"})
+    coordinates = {name: (name, np.arange(n) * 0.4, {"units": "mm"}) for name, n in zip("zyx", shape, strict=True)}
+    return xr.Dataset(
+        variables,
+        coordinates,
+        {"dt_s": 1e-3, "voxel_mm": [0.1] * 3, "verdict": "most vectors are valid", "passes": [{"window": [8, 8, 8]}]},
+    )
+
+
+def volume(seed, residual):
+    rng = np.random.default_rng(seed)
+    coordinates = {name: (name, np.arange(n) * 0.1) for name, n in zip("zyx", (3, 4, 5), strict=True)}
+    attributes = {"residual": residual, "stop": "iteration limit reached"}
+    return xr.DataArray(rng.random((3, 4, 5), np.float32), coordinates, ("z", "y", "x"), attrs=attributes)
+
+
+def test_vectors_and_volumes_come_back_as_written(tmp_path):
+    written, pair = vectors(), {"a": volume(1, [0.9, 0.5, 0.4]), "b": volume(2, [0.8, 0.6])}
+    path = tmp_path / "pair_0000.nc"
+    reconstruction = netcdf.build_reconstruction(pair)
+    attributes = {"settings_hash": "0123", "smart": {"iterations": 2}}
+    netcdf.write_vectors(written, path, attributes=attributes, reconstruction=reconstruction)
+    back = netcdf.read_vectors(path)
+    xr.testing.assert_equal(back, written)
+    assert back["valid"].dtype == bool and back["w"].attrs["units"] == "m/s"
+    assert provenance.read_marks(path) == provenance.Marks(settings_hash="0123")
+    assert json.loads(back.attrs["smart"]) == {"iterations": 2}
+    condensed = netcdf.read_reconstruction(path)
+    np.testing.assert_array_equal(condensed["projection_y"].values[1], pair["b"].values.max(1))
+    profile = pair["b"].values.mean((1, 2))
+    np.testing.assert_allclose(condensed["profile_z"].sel(frame="b"), profile, rtol=1e-6)  # single precision
+    np.testing.assert_array_equal(condensed["residual"].values, [[0.9, 0.5, 0.4], [0.8, 0.6, np.nan]])
+    netcdf.write_volume(pair["a"], tmp_path / "volume.nc", attributes={"settings_hash": "4567"})
+    again = netcdf.read_volume(tmp_path / "volume.nc")
+    xr.testing.assert_equal(again, pair["a"])
+    xr.testing.assert_equal(netcdf.build_reconstruction({"a": again, "b": pair["b"]}), reconstruction)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["pair_0000.nc", "volume.nc"]
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_files_of_earlier_versions_are_read(tmp_path, version):
+    """1: the group shares its axes' names with the vectors; 2: no profile over the depth."""
+    path = tmp_path / "pair_0000.nc"
+    reconstruction = netcdf.build_reconstruction({"a": volume(1, [0.9])})
+    netcdf.write_vectors(vectors().assign_attrs(schema_version=version), path, attributes={})
+    older = reconstruction if version == 3 else reconstruction.drop_vars("profile_z")
+    names = {} if version == 1 else {axis: f"voxel_{axis}" for axis in "zyx"}
+    older.assign_attrs(schema_version=version).rename(names).to_netcdf(
+        path, mode="a", group="reconstruction", engine="h5netcdf"
+    )
+    xr.testing.assert_equal(netcdf.read_vectors(path), vectors())
+    xr.testing.assert_equal(netcdf.read_reconstruction(path), older)
+
+
+def test_what_is_known_of_the_images_travels_with_the_volumes(tmp_path):
+    volumes, records = [volume(1, [0.9, 0.5]), volume(2, [0.8, 0.6])], []
+    for one, frame, values in zip(volumes, "ab", ([0.5, 0.01], [0.4, 0.6]), strict=True):
+        one.attrs |= {"camera_gain": [1.0, 0.4], "light_outside": [0.25, values[1]]}
+        structure = dict(zip(("left", "right"), values, strict=True))
+        doubt = Warning(code=Code.SATURATED, subject=f"left, frame {frame}", figures={"share": 0.1})
+        records.append(FrameRecord(frame=frame, structure=structure, warnings=(doubt,), seconds=2.0))
+    pair = PairVolumes(volumes=tuple(volumes), records=tuple(records))
+    stamps = provenance.PairStamps(volumes=provenance.Stamp({"volume": 1}), vectors=provenance.Stamp({}))
+    paths = (tmp_path / "a.nc", tmp_path / "b.nc")
+    files = PairFiles(pair=0, vectors=tmp_path / "pair.nc", volumes=paths, stamps=stamps)
+    files.write_volumes(pair)
+    stored = files.read_volumes()
+    assert stored.records == pair.records
+    condensed = stored.condensed()
+    assert condensed["structure"].sel(frame="a", camera="right") == 0.01
+    assert condensed["camera_gain"].sel(frame="b", camera="right") == 0.4
+    assert condensed["light_outside"].sel(frame="b", camera="right") == 0.6
+    xr.testing.assert_equal(condensed, pair.condensed())
+
+
+def test_a_vector_file_of_another_form_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="peak_ratio"):
+        netcdf.write_vectors(vectors().drop_vars("peak_ratio"), tmp_path / "pair.nc", attributes={})
+    wrong = vectors()
+    wrong["u"].attrs["units"] = "mm/s"
+    with pytest.raises(ValueError, match="m/s"):
+        netcdf.write_vectors(wrong, tmp_path / "pair.nc", attributes={})
+    assert not any(tmp_path.iterdir())
+    netcdf.write_vectors(vectors().assign_attrs(schema_version=99), tmp_path / "pair.nc", attributes={})
+    with pytest.raises(InputError, match="schema version"):
+        netcdf.read_vectors(tmp_path / "pair.nc")
+    (tmp_path / "pair.nc").write_bytes(b"no NetCDF")
+    with pytest.raises(InputError, match=r"pair\.nc"):
+        netcdf.read_vectors(tmp_path / "pair.nc")
+    assert provenance.read_marks(tmp_path / "pair.nc") is None

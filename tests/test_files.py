@@ -1,0 +1,35 @@
+"""Files of a run: whole-or-nothing writing, and the hash of settings."""
+
+import json
+
+import numpy as np
+import pytest
+
+import lfpiv
+from lfpiv import files
+from lfpiv.experiment.settings import Smart
+
+
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
+    path = tmp_path / "summary.json"
+    files.write_json({"value": float("nan"), "array": np.arange(2), "path": (1, 2)}, path)
+    old = path.read_text()
+    assert json.loads(old) == {"value": None, "array": [0, 1], "path": [1, 2]}
+    with pytest.raises(RuntimeError), files.replacing(path) as scratch:
+        scratch.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == old and list(tmp_path.iterdir()) == [path]
+
+
+def test_settings_hash_sees_every_value_and_no_order():
+    settings = Smart().model_dump()
+    hashes = {files.settings_hash(smart=settings), files.settings_hash(smart=dict(reversed(settings.items())))}
+    assert len(hashes) == 1
+    for key, value in settings.items():
+        hashes.add(files.settings_hash(smart=settings | {key: f"{value}, but another"}))
+    assert len(hashes) == 1 + len(settings)
+
+
+def test_an_unknown_public_name_is_refused():
+    with pytest.raises(AttributeError, match="frobnicate"):
+        _ = lfpiv.frobnicate
