@@ -1,4 +1,4 @@
-"""The errors that users meet: what they can mend in files, keys, arguments, on the disk or in a cluster."""
+"""Errors that users can resolve: in files, keys or arguments, on the disk, or in a cluster."""
 
 
 class InputError(ValueError):
@@ -9,14 +9,14 @@ class InputError(ValueError):
 
 
 class StorageError(OSError):
-    """Results cannot be written, for want of space or rights; the message names the file and says how to go on.
+    """Results cannot be written, because space or rights are missing; the message names the file and how to continue.
 
-    What was written before is whole. The command line exits with status 1.
+    Files that were written before are complete. The command line exits with status 1.
     """
 
 
 class ClusterError(RuntimeError):
-    """The scheduler that hands pairs to workers was lost in the middle of a run; the message says how to go on.
+    """The scheduler that distributes pairs to workers was lost during a run; the message says how to continue.
 
-    What was finished before is whole. The command line exits with status 1.
+    Results that were finished before are complete. The command line exits with status 1.
     """

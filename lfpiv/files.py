@@ -1,4 +1,4 @@
-"""Write files whole or not at all: each is written under a temporary name and renamed. Turn values into JSON."""
+"""Write files atomically: each is written under a temporary name and renamed. Convert values to JSON."""
 
 from __future__ import annotations
 
@@ -22,39 +22,39 @@ MIB = 1 << 20
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a scratch path in the folder of `path`; renamed to `path` at the end, removed on any failure.
+    """Yield a scratch path in the folder of `path`; rename it to `path` at the end, remove it on any failure.
 
-    The path is new each time, so that two processes may write one file; what a killed one leaves ends in ``.tmp``.
+    The scratch path is unique, so two processes may write the same file. That of a killed process ends in ``.tmp``.
     """
     scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield scratch
         with scratch.open("rb") as file:
-            os.fsync(file.fileno())  # the name must not outlive a power failure without its bytes
+            os.fsync(file.fileno())  # a power failure must not leave the name without its bytes
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
 
 
 def write_bytes(content: bytes | memoryview, path: Path) -> None:
-    """Write a file, whole or not at all; HDF5 files too: HDF5's own writing crashes the process on a full disk."""
+    """Write a file atomically. HDF5 files too: HDF5 itself crashes the process if the disk becomes full."""
     with replacing(path) as scratch:
         scratch.write_bytes(content)
 
 
 def write_text(text: str, path: Path) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically."""
     with replacing(path) as scratch:
         scratch.write_text(text, "utf-8")
 
 
 def write_json(value: Any, path: Path) -> None:
-    """Write a JSON file, whole or not at all; NaN and infinity become null."""
+    """Write a JSON file atomically; NaN and infinity become null."""
     write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n", path)
 
 
 def plain(value: Any) -> Any:
-    """Turn arrays, NumPy numbers, tuples, paths and non-finite numbers into what JSON knows."""
+    """Convert arrays, NumPy numbers, tuples, paths and non-finite numbers to types that JSON has."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
@@ -69,14 +69,14 @@ def plain(value: Any) -> Any:
 
 
 def settings_hash(**parts: Any) -> str:
-    """Short hash of everything a result depends on; the order of keys does not matter."""
+    """Return a short hash of everything a result depends on; the order of keys does not matter."""
     text = json.dumps(plain(parts), sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn what goes wrong while a result is written into a StorageError that says how to go on."""
+    """Convert an OSError while a result is written into a StorageError that says how to continue."""
     try:
         yield
     except StorageError:

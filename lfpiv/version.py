@@ -1,4 +1,4 @@
-"""Version of the package, and versions of what its numbers depend on."""
+"""Version of this package, and of the libraries that its numbers depend on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package, of Python and of the libraries its numbers depend on."""
+    """Return the versions of this package, of Python and of the libraries that its numbers depend on."""
     names = ("numpy", "scipy", "taichi", "warp-lang", "xarray", "opencv-python-headless", "scikit-learn")
     found = {"lfpiv": __version__, "python": platform.python_version()}
     for name in names:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import json
 import logging
 import string
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 NAMED_PAIRS = 5
@@ -76,26 +77,26 @@ SENTENCES: Mapping[Code, str] = {
         "and are f_number and microlens_focal_length_mm right?"
     ),
     Code.SATURATED: (
-        "{share:percent} % of the bright pixels are saturated; clipped particles make ghosts, lower the laser's power"
-        " or the camera's gain"
+        "{share:percent} % of the bright pixels are saturated; clipped particles make ghosts, lower the laser's "
+        "power or the camera's gain"
     ),
     Code.UNEVEN: (
-        "{parts:.0f} of 9 parts of the sensor are {ratio:g} times and more as bright in one frame as in the other; "
+        "{parts:.0f} of 9 parts of the sensor are {ratio:g} times or more as bright in one frame as in the other; "
         "check the laser's pulses and the shutter"
     ),
     Code.DIM: (
-        "particles hardly rise above the noise (light of near pixels correlates by {structure:.2f}; clear images give"
-        " 0.2 or more): displacements are drawn towards zero. More light, more particles or larger windows help"
+        "particles hardly rise above the noise (light of near pixels correlates by {structure:.2f}; clear images "
+        "give 0.2 or more): displacements are biased towards zero. More light, more particles or larger windows help"
     ),
     Code.EMPTY: (
-        "no particles, only noise in the image (light of near pixels correlates by {structure:.3f}; clear images give"
-        " 0.2 or more): check laser, trigger and file. Vectors of such a pair do not count where fewer than two "
-        "cameras saw particles; otherwise they are not to be trusted"
+        "no particles, only noise in the image (light of near pixels correlates by {structure:.3f}; clear images "
+        "give 0.2 or more): check laser, trigger and file. If fewer than two cameras saw particles, no vector of the "
+        "pair is valid; otherwise do not rely on its vectors"
     ),
     Code.APERTURE: (
         "the microimages are {seen_px:.1f} px wide, not {stated_px:.1f} px as f_number = {f_number:g} and "
-        "microlens_focal_length_mm = {microlens_focal_length_mm:g} have it; f_number = {fitting:.3g} would fit. Check"
-        " both, and the aperture of all images."
+        "microlens_focal_length_mm = {microlens_focal_length_mm:g} imply; f_number = {fitting:.3g} would fit. Check "
+        "both, and the aperture of all images."
     ),
     Code.WHITE_SATURATED: (
         "{share:percent} % of the white image's bright pixels are saturated, so their response is not known; expose "
@@ -108,8 +109,8 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.LENSES_IRREGULAR: "microimages lie {rms_px:.2f} px (rms) off a regular lattice; check the white image.",
     Code.BOARD_SATURATED: (
-        "{share:percent} % of the bright pixels of {path} are saturated and left out, so the dots are known less "
-        "well; expose the board to two thirds of the range."
+        "{share:percent} % of the bright pixels of {path} are saturated and left out, so the dots are measured less "
+        "accurately; expose the board to two thirds of the range."
     ),
     Code.BOARD_MISPLACED: (
         "{path}: light falls between the microimages of the white image. Is it of the same camera, focus, zoom and "
@@ -117,8 +118,8 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.BOARD_RENAMED: "the board's dots were renamed by {columns} columns and {rows} rows to match its outline",
     Code.BOARD_EDGE_UNSEEN: (
-        "no edge of the board is in view along {axis} ({count} dots, {stated} stated): they are named right only "
-        "where the camera's axis meets the board within half a spacing ({half_spacing_mm:g} mm) of its middle"
+        "no edge of the board is in view along {axis} ({count} dots, {stated} stated): their numbers are right only "
+        "if the camera's axis meets the board within half a spacing ({half_spacing_mm:g} mm) of its middle"
     ),
     Code.DOT_WIDTH: "the board's dots look {seen_mm:.3g} mm wide, not {stated_mm:.3g} mm",
     Code.DOTS_MISSING: (
@@ -126,40 +127,38 @@ SENTENCES: Mapping[Code, str] = {
         "in the report.{hint}"
     ),
     Code.PLANE_EMPTY: (
-        "no dot was found in plane {plane} of the board (z = {z_mm:g} mm), {path}: look at the image; the calibration"
-        " goes without it."
+        "no dot was found in plane {plane} of the board (z = {z_mm:g} mm), {path}: look at the image; the "
+        "calibration does not use it."
     ),
     Code.PLANE_LEFT_OUT: (
-        "{left_out} of {seen} dots of plane {plane} of the board (z = {z_mm:g} mm) do not fit the others and are left"
-        " out: check that place in board.planes_mm, and {path}."
+        "{left_out} of {seen} dots of plane {plane} of the board (z = {z_mm:g} mm) do not fit the others and are "
+        "left out: check that place in board.planes_mm, and {path}."
     ),
     Code.TURNED: (
-        "by the board's dots the camera stands {turn_deg:.0f} degrees from where nominal_angle_deg = {nominal_deg:g} "
-        "has it. Are its pictures turned by 90 degrees? Then x and y are."
+        "the board's dots show the camera {turn_deg:.0f} degrees away from nominal_angle_deg = {nominal_deg:g}. Are "
+        "its pictures turned by 90 degrees? Then x and y are exchanged."
     ),
     Code.MAGNIFIED: (
         "the board's dots are magnified {magnification:.3f} times, not {stated:g} times as stated. Check "
         "magnification, and board.spacing_mm and board.planes_mm: all lengths and velocities depend on those two."
     ),
     Code.FEW_LABELS: (
-        "{dots} dots tell the network {values} values for its {parameters} parameters, so it can be wrong between the"
-        " dots; use more dots or planes, or fewer nodes (network.hidden)."
+        "{dots} dots give the network {values} values for its {parameters} parameters, so it can be wrong between "
+        "the dots; use more dots or planes, or fewer nodes (network.hidden)."
     ),
     Code.MAPPING_ERROR: (
-        "the mapping is {sigma_nor:.3f} pitch off on held-out dots (sigma_nor), {usual:g} and less is usual; use more"
-        " dots or planes, and check the board's images."
+        "the mapping is {sigma_nor:.3f} pitch off on held-out dots (sigma_nor), {usual:g} and less is usual; use "
+        "more dots or planes, and check the board's images."
     ),
     Code.OUTSIDE_CALIBRATION: (
-        "{share:percent} % of the volume lies outside the calibrated region ({region} mm), by up to {distance_mm:.2f}"
-        " mm: {advice}."
+        "{share:percent} % of the volume lies outside the calibrated region ({region} mm), by up to "
+        "{distance_mm:.2f} mm: {advice}."
     ),
     Code.OUTSIDE_SIGHT: "sees only about {share:percent} % of the volume",
     Code.SEEN_BY_ONE: (
         "about {share:percent} % of the volume is seen by fewer than two cameras; vectors there are not valid: {where}"
     ),
-    Code.ONE_CAMERA: (
-        "one camera hardly sees depth: w and displacement_z are not to be trusted, nor is their validation"
-    ),
+    Code.ONE_CAMERA: "one camera hardly resolves depth: do not rely on w, displacement_z and their validation",
     Code.APART: (
         "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: a camera moved since the board was "
         "recorded; {advice}."
@@ -169,12 +168,12 @@ SENTENCES: Mapping[Code, str] = {
         "different instants, or show very few particles."
     ),
     Code.WEIGHTS_UNCHECKED: (
-        "sees none of the voxels drawn at random to check its weights against counted rays: they are unchecked. Check"
-        " the volume's place and size against what the camera sees"
+        "sees none of the voxels drawn at random to check its weights against counted rays: they are unchecked. "
+        "Check the volume's place and size against what the camera sees"
     ),
     Code.WEIGHTS_DIFFER: (
-        "weights as {form} differ from counted rays by {mean:percent1} % (worst voxel {worst:percent1} %), aimed at "
-        "are {aim_mean:percent} % ({aim_worst:percent1} %). Cause: {cause} (rays depart from second order by "
+        "weights as {form} differ from counted rays by {mean:percent1} % (worst voxel {worst:percent1} %), the aim "
+        "is {aim_mean:percent} % ({aim_worst:percent1} %). Cause: {cause} (rays depart from second order by "
         "{bent_pitch:.2f}, a voxel's edge is {wide_pitch:.1f} microlens pitch)"
     ),
     Code.COUNT_SLOW: "counting rays for {voxels} voxels; 'footprint' is about a thousand times faster",
@@ -182,14 +181,14 @@ SENTENCES: Mapping[Code, str] = {
     Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
     Code.FEWER_WORKERS: (
-        "{fits} {noun} instead of {planned}: beside {weights_gib:.1f} GiB of weights each takes {each_gib:.1f} GiB of"
-        " memory"
+        "{fits} {noun} instead of {planned}: beside {weights_gib:.1f} GiB of weights each takes {each_gib:.1f} GiB "
+        "of memory"
     ),
     Code.ONE_GPU: (
         "one of {gpus} GPUs is used: several processes need the package `distributed`. Install it: pip install "
         "'lfpiv[distributed]'"
     ),
-    Code.NO_LOCKS: "this file system knows no locks: start no second run on this folder",
+    Code.NO_LOCKS: "this file system has no file locks: do not start a second run on this folder",
     Code.OTHER: "{text}",
 }
 """Sentence of each code, with its figures in braces. Shares have the format `percent` or `percent1`."""
@@ -229,7 +228,9 @@ class Warning:
 
     def to_json(self) -> dict[str, Any]:
         """Return what a file stores."""
-        return {"code": self.code.value, "subject": self.subject, "figures": dict(self.figures)}
+        figures = {name: asdict(value) if isinstance(value, Span) else value for name, value in self.figures.items()}
+        stored = {"code": self.code.value, "subject": self.subject, "figures": figures}
+        return stored | {"pairs": list(self.pairs)} if self.pairs else stored
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
@@ -240,12 +241,15 @@ class Warning:
             subject = stored["camera"] + (f", frame {stored['frame']}" if stored["frame"] else "")
             figure = {_FINDING_FIGURES[stored["what"]]: stored["value"], "ratio": 4.0}
             return cls(code=Code(stored["what"]), subject=subject, figures=figure)
-        code = stored["code"]
+        code, pairs = stored["code"], tuple(stored.get("pairs", ()))
         if code not in {known.value for known in Code}:
-            figures = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
-            text = f"{code} ({figures})" if figures else str(code)
-            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text})
-        return cls(code=Code(code), subject=stored["subject"], figures=stored["figures"])
+            values = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
+            text = f"{code} ({values})" if values else str(code)
+            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text}, pairs=pairs)
+        figures = {
+            name: Span(**value) if isinstance(value, dict) else value for name, value in stored["figures"].items()
+        }
+        return cls(code=Code(code), subject=stored["subject"], figures=figures, pairs=pairs)
 
 
 @dataclass(frozen=True)
@@ -266,6 +270,16 @@ class _Words(string.Formatter):
         if format_spec.startswith("percent"):
             return f"{100 * value:.{format_spec[7:] or 0}f}"
         return str(super().format_field(value, format_spec))
+
+
+def to_text(warnings: Iterable[Warning]) -> str:
+    """Return the JSON text that an attribute of a file stores."""
+    return json.dumps([warning.to_json() for warning in warnings])
+
+
+def from_text(text: str) -> tuple[Warning, ...]:
+    """Read the JSON text that an attribute of a file stores."""
+    return tuple(Warning.from_json(stored) for stored in json.loads(text))
 
 
 def gather(warnings: Iterable[Warning]) -> list[Warning]:
@@ -290,7 +304,7 @@ def _merged(group: Sequence[Warning]) -> Warning:
 
 
 def name_pairs(pairs: Sequence[int]) -> str:
-    """Name some pairs, and say how many there are where they are many; empty for none."""
+    """Name the first pairs and count the others; empty for none."""
     if not pairs:
         return ""
     names = ", ".join(map(str, pairs[:NAMED_PAIRS]))
@@ -309,9 +323,25 @@ def warn(log: logging.Logger, warning: Warning) -> None:
         found.append(warning)
 
 
+@dataclass(frozen=True)
+class FirstOfEachCode:
+    """Log for the warnings of many pairs: the first warning of each code only. The summary names all pairs."""
+
+    log: logging.Logger
+    logged: set[Code] = field(default_factory=set)
+    """Codes that were logged; grows with each call."""
+
+    def __call__(self, warnings: Iterable[Warning]) -> None:
+        """Log the warnings whose codes are new."""
+        new = [warning for warning in warnings if warning.code not in self.logged]
+        for warning in gather(new):
+            self.log.warning("%s", warning.sentence)
+        self.logged.update(warning.code for warning in new)
+
+
 @contextlib.contextmanager
 def collected() -> Iterator[list[Warning]]:
-    """Collect the warnings of a block in a list, whatever the log level. A block inside another keeps its own."""
+    """Collect the warnings of a block in a list, at any log level. A block inside another one has its own list."""
     found: list[Warning] = []
     token = _collected.set(found)
     try:

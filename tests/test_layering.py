@@ -17,7 +17,7 @@ KERNEL_FILES = sorted((ROOT / "lfpiv_kernels").rglob("*.py"))
 PACKAGE_FILES = sorted((ROOT / "lfpiv").rglob("*.py"))
 ALL_FILES = KERNEL_FILES + PACKAGE_FILES
 
-GROUND = {"geometry", "files", "errors", "warn", "version"}
+GROUND = {"geometry", "files", "errors", "warn", "version", "progress"}
 """Rooms that every room may import, beside `lfpiv_kernels`."""
 FACES = {"__init__", "__main__", "derived", "statistics"}
 """Files that hand public names on: they may import every room, and no room imports them."""
@@ -25,6 +25,7 @@ FACES = {"__init__", "__main__", "derived", "statistics"}
 MAY_IMPORT = {
     "errors": set(),
     "version": set(),
+    "progress": set(),
     "warn": {"errors"},
     "files": {"errors", "version"},
     "geometry": {"errors"},

@@ -6,7 +6,8 @@ import logging
 import pytest
 
 from lfpiv.runs import summary_warnings
-from lfpiv.warn import SENTENCES, Code, Warning, collected, gather, warn
+from lfpiv.runs.pair_figures import PairFigures, Spread
+from lfpiv.warn import SENTENCES, Code, FirstOfEachCode, Warning, collected, gather, warn
 
 
 def dark(share):
@@ -58,6 +59,46 @@ def test_warnings_of_other_versions_are_read(stored, sentence):
 def test_many_pairs_with_the_same_trouble_are_one_line():
     (found,) = gather(dark(0.1 + number / 1e4).of_pair(number) for number in range(1000))
     assert found.sentence.startswith("left, frame a, pairs 0, 1, 2, 3, 4 and 995 more: 10 to 20 % of the bright pixels")
-    poor = [{"pair": number, "verdict": "look", "valid_fraction": 0.01 * number} for number in (3, 5)]
-    (few,) = summary_warnings.pair_warnings(poor)
+    (few,) = summary_warnings.pair_warnings({pair: figures("look", 0.01 * pair) for pair in (3, 5)})
     assert few.sentence == "pairs 3, 5: 3 to 5 % of the vectors are valid; look"
+
+
+def figures(verdict, valid_fraction):
+    return PairFigures(
+        vectors=[1, 2, 3],
+        valid_fraction=valid_fraction,
+        finite_fraction=1.0,
+        seen_fraction=1.0,
+        verdict=verdict,
+        warnings=(dark(0.1),),
+        reconstruction_s=1.0,
+        correlation_s=1.0,
+        velocity_m_per_s={"u": Spread(mean=None, sd=None, min=None, max=None)},
+        uncertainty_voxel=None,
+        peak_ratio=2.0,
+    )
+
+
+def test_gathered_warnings_come_back_with_their_pairs_and_ranges():
+    (found,) = gather(dark(0.1 * pair).of_pair(pair) for pair in (1, 2))
+    stored = json.loads(json.dumps(found.to_json()))
+    assert stored["pairs"] == [1, 2] and stored["figures"] == {"share": {"low": 0.1, "high": 0.2}}
+    assert Warning.from_json(stored) == found
+
+
+def test_each_code_is_logged_once(caplog):
+    log_first = FirstOfEachCode(logging.getLogger("lfpiv.pairs"))
+    dim = Warning(code=Code.DIM, figures={"structure": 0.03})
+    for pair in range(3):
+        log_first(warning.of_pair(pair) for warning in (dark(0.1), dim)[: pair + 1])
+    assert [text.split(":")[0] for text in caplog.messages] == ["left, frame a, pair 0", "pair 1"]
+
+
+def test_figures_of_a_pair_come_back_the_same():
+    """Those of version 0.1.0 too, which call warnings findings."""
+    known = figures("look", 0.5)
+    stored = json.loads(json.dumps(known.to_json()))
+    assert PairFigures.from_json(stored) == known and stored["uncertainty_voxel"] is None and "stop" not in stored
+    stored["findings"] = [{"what": "saturated", "camera": "left", "frame": "a", "value": 0.1}]
+    (old,) = PairFigures.from_json({name: value for name, value in stored.items() if name != "warnings"}).warnings
+    assert old.sentence == dark(0.1).sentence

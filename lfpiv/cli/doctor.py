@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import time
 from collections.abc import Iterator
@@ -44,8 +43,7 @@ def examine(device: str = "auto") -> Iterator[Finding]:
     yield Finding("system", f"{platform.system()} {platform.release()}, {platform.machine()}", True)
     for name, version in versions().items():
         yield Finding(name, version, True)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield Finding("CPU cores", str(cores), True)
+    yield Finding("CPU cores", str(runtime.cores()), True)
     yield Finding("memory available", f"{memory.available_bytes() / memory.GIB:.1f} GiB", True)
     try:
         running = runtime.start(device)

@@ -1,4 +1,7 @@
-"""Files of a run: one writer, reader and validator of vectors and volumes. A finished name is the resume marker."""
+"""NetCDF files of vectors and volumes: their writers, readers and validator.
+
+A file gets its name when it is complete. So a file that exists is a finished result, and a rerun continues from it.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.version import versions
 
 SCHEMA_VERSION = 3
-"""Version of the form of the files; readers refuse newer ones. 2: the group has dimensions of its own; 3: it holds
-``profile_z``, which older ones lack."""
+"""Version of the files' form; readers refuse newer ones. 2: the group has its own dimensions. 3: adds ``profile_z``."""
 
 VECTOR_UNITS = {
     "u": "m/s",
@@ -37,13 +39,12 @@ VECTOR_UNITS = {
 """Variables of a vector dataset and their units."""
 
 ROUNDING = 1e-5
-"""Largest difference of a velocity from what its displacement tells, relative or in voxels: both are rounded to single
-precision, and so may be what a user computes from them."""
+"""Largest difference between a velocity and its displacement, relative or [voxel]: both have single precision."""
 
 RECONSTRUCTION = "reconstruction"
 """NetCDF group beside the vectors of a pair: projections, profiles and residuals of its two volumes."""
 
-_GROUP_AXES = {axis: f"voxel_{axis}" for axis in AXES}  # the group's axes in the file, where z, y, x are the vectors'
+_GROUP_AXES = {axis: f"voxel_{axis}" for axis in AXES}  # in the file z, y, x are the axes of the vectors
 _DESCRIPTIONS: dict[str, dict[str, Any]] = {
     "z": {"axis": "Z"},
     "y": {"axis": "Y"},
@@ -53,37 +54,39 @@ _DESCRIPTIONS: dict[str, dict[str, Any]] = {
         "flag_values": np.array([0, 1], np.int8),
         "flag_meanings": "replaced measured",
     },
-}  # attributes of the CF conventions, which plotting and geometry tools look for
-
+}  # attributes of the CF conventions, for plotting and geometry tools
 
 OF_IMAGES = ("structure", "camera_gain", "light_outside")
-"""What is known of each camera's image: how far light of near pixels correlates, the camera's brightness relative to
-the brightest one, and the part of its light in pixels that no voxel lights."""
+"""Figures of each camera's image: correlation of near pixels, brightness relative to the brightest camera, and the
+share of its light in pixels that no voxel lights."""
 
 
-def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
-    """Condense the volumes of a pair to what a report shows: maximum projections, brightness and residual history.
+def build_reconstruction(
+    volumes: Mapping[str, xr.DataArray], structure: Mapping[str, Mapping[str, float]] | None = None
+) -> xr.Dataset:
+    """Condense the volumes of a pair to projections, profiles and figures for the report.
 
     Parameters
     ----------
     volumes : dict
-        Frame name -> volume (z, y, x) with ``residual`` (one number per iteration) and ``stop`` in its attributes, and
-        ``cameras`` with what is known of their images by the names of `OF_IMAGES`.
+        Frame name -> volume (z, y, x) as `reconstruct` returns it, with its attributes.
+    structure : dict, optional
+        Frame name -> camera name -> correlation of near pixels of that image. Names the cameras in their order.
 
     Returns
     -------
     Dataset
         ``projection_z`` (frame, y, x), ``projection_y`` (frame, z, x), ``projection_x`` (frame, z, y) [counts],
         ``profile_z`` (frame, z), the mean brightness of each plane of voxels [counts],
-        ``residual`` (frame, iteration), ``stop`` (frame) and those of `OF_IMAGES` that are known (frame, camera).
+        ``residual`` (frame, iteration), ``stop`` (frame) and, with `structure`, those of `OF_IMAGES` that are known
+        (frame, camera).
     """
-    frames = list(volumes)
-    first = volumes[frames[0]]
+    frames, first = list(volumes), next(iter(volumes.values()))
     variables: dict[str, tuple[tuple[str, ...], np.ndarray | list[str]]] = {}
     for axis in AXES:
-        kept = tuple(name for name in AXES if name != axis)
-        stack = np.stack([volume.max(axis).transpose(*kept).values for volume in volumes.values()])
-        variables[f"projection_{axis}"] = (("frame", *kept), stack.astype(np.float32))
+        others = tuple(name for name in AXES if name != axis)
+        stack = np.stack([volume.max(axis).transpose(*others).values for volume in volumes.values()])
+        variables[f"projection_{axis}"] = (("frame", *others), stack.astype(np.float32))
     profiles = np.stack([volume.mean(["y", "x"], dtype=float).values for volume in volumes.values()])
     variables["profile_z"] = (("frame", "z"), profiles.astype(np.float32))
     histories = [np.atleast_1d(np.asarray(volume.attrs["residual"], float)) for volume in volumes.values()]
@@ -93,13 +96,14 @@ def build_reconstruction(volumes: Mapping[str, xr.DataArray]) -> xr.Dataset:
     variables["residual"] = (("frame", "iteration"), residual)
     variables["stop"] = (("frame",), [str(volume.attrs["stop"]) for volume in volumes.values()])
     coordinates: dict[str, Any] = {"frame": frames}
-    if "cameras" in first.attrs:
-        cameras = first.attrs["cameras"]
-        coordinates["camera"] = json.loads(cameras) if isinstance(cameras, str) else list(cameras)
+    if structure and structure[frames[0]]:
+        coordinates["camera"] = list(structure[frames[0]])
+        rows = np.array([list(structure[frame].values()) for frame in frames], float)
+        variables["structure"] = (("frame", "camera"), rows)
         for name in OF_IMAGES:
-            if name in first.attrs:
-                rows = [np.atleast_1d(np.asarray(volume.attrs[name], float)) for volume in volumes.values()]
-                variables[name] = (("frame", "camera"), np.stack(rows))
+            if name in first.attrs and name not in variables:
+                rows = np.stack([np.atleast_1d(np.asarray(volume.attrs[name], float)) for volume in volumes.values()])
+                variables[name] = (("frame", "camera"), rows)
     coordinates |= {axis: (axis, first[axis].values, {"units": "mm"}) for axis in AXES}
     return xr.Dataset(variables, coordinates)
 
@@ -147,7 +151,7 @@ def check_vectors(vectors: xr.Dataset) -> None:
 def write_vectors(
     vectors: xr.Dataset, path: Path, *, attributes: Mapping[str, Any], reconstruction: xr.Dataset | None = None
 ) -> None:
-    """Write the vectors of one pair as NetCDF4, whole or not at all.
+    """Write the vectors of one pair as NetCDF4, atomically.
 
     Parameters
     ----------
@@ -163,7 +167,7 @@ def write_vectors(
     Raises
     ------
     ValueError
-        If the dataset does not have the form `check_vectors` asks for.
+        If the dataset does not have the form that `check_vectors` requires.
     """
     check_vectors(vectors)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -190,7 +194,7 @@ def read_vectors(path: Path) -> xr.Dataset:
 
 
 def read_reconstruction(path: Path) -> xr.Dataset | None:
-    """Read what `build_reconstruction` left beside the vectors of a pair; None where there is nothing."""
+    """Read the condensed volumes beside the vectors of a pair; None if the file has none."""
     try:
         stored = _read(path, RECONSTRUCTION)
     except InputError:
@@ -199,13 +203,19 @@ def read_reconstruction(path: Path) -> xr.Dataset | None:
 
 
 def write_volume(volume: xr.DataArray, path: Path, *, attributes: Mapping[str, Any]) -> None:
-    """Write one volume (z, y, x) [counts] as NetCDF4, whole or not at all."""
+    """Write one volume (z, y, x) [counts] as NetCDF4, atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _write({"": _packed(volume.rename("intensity").to_dataset(), {**attributes, "versions": versions()})}, path)
 
 
 def read_volume(path: Path) -> xr.DataArray:
-    """Read one volume into memory; raises InputError as `read_vectors` does."""
+    """Read one volume into memory.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, unreadable, of a newer schema, or no volume.
+    """
     dataset = _read(path, None)
     if "intensity" not in dataset or dataset["intensity"].dims != AXES:
         raise InputError(f"{path}: expected a volume 'intensity' over (z, y, x), found {list(dataset.data_vars)}.")
@@ -222,7 +232,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
 
 
 def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, Any] | None = None) -> None:
-    """Write a dataset of any form as NetCDF4, whole or not at all; attributes that NetCDF does not know become JSON.
+    """Write a dataset of any form as NetCDF4, atomically; attributes of other types become JSON.
 
     Raises
     ------
@@ -237,7 +247,7 @@ def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, A
 
 
 def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """Give a dataset the attributes and the compression it has in a file."""
+    """Return a dataset with the attributes and the compression that it has in a file."""
     dataset = dataset.copy()
     own = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
     dataset.attrs = {key: _attribute(value) for key, value in own.items()}
@@ -250,7 +260,7 @@ def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
 
 
 def _write(groups: Mapping[str, xr.Dataset], path: Path) -> None:
-    """Write datasets as the groups of a NetCDF4 file; "" is its root. Put together in memory: see `write_bytes`."""
+    """Write datasets as the groups of a NetCDF4 file; "" is its root. It is built in memory: see `write_bytes`."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
@@ -262,7 +272,7 @@ def _write(groups: Mapping[str, xr.Dataset], path: Path) -> None:
 
 
 def _attribute(value: Any) -> Any:
-    """Put a value into the form of a NetCDF attribute: numbers, their lists and text as they are, else JSON."""
+    """Return a value as a NetCDF attribute: numbers, lists of numbers and text as they are, all else as JSON."""
     if isinstance(value, (str, int, float, np.number)) and not isinstance(value, bool):
         return value
     if isinstance(value, (list, tuple, np.ndarray)) and len(value) > 0:

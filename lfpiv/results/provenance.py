@@ -1,30 +1,48 @@
-"""What a finished file depends on, kept inside it: a rerun compares, does anew what changed, and says what that was."""
+"""Stamps: what a finished file depends on, stored inside it.
+
+A later run compares the stamp of a file with the stamp that the present experiment asks for. It does again what differs
+and names the differences.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from lfpiv import files
+from lfpiv import files, warn
 from lfpiv.experiment.davis import split_frame
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.version import __version__
+from lfpiv.warn import Warning
+
+
+@dataclass(frozen=True, kw_only=True)
+class Marks:
+    """What a finished file says about itself."""
+
+    settings_hash: str = ""
+    """Hash of its stamp."""
+    depends_on: str = ""
+    """Parts of its stamp, as JSON."""
+    figures: Mapping[str, Any] | None = None
+    """Figures for the summary; None in files without."""
+    warnings: tuple[Warning, ...] = ()
+    """Warnings about the images it was made from."""
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """The parts that a result depends on, and the hash of all of them."""
+    """The parts that a result depends on."""
 
     parts: Mapping[str, Any]
-    """Name -> settings, a hash, or what tells the images apart; None where the images are gone."""
+    """Name -> settings, a hash, or the identity of images; None for images that are gone."""
 
     @cached_property
     def hash(self) -> str:
@@ -32,20 +50,20 @@ class Stamp:
         return files.settings_hash(**self.parts)
 
     @property
-    def attributes(self) -> dict[str, Any]:
-        """What is written into the result."""
+    def attributes(self) -> dict[str, str]:
+        """Attributes that a file stores."""
         return {"settings_hash": self.hash, "depends_on": json.dumps(files.plain(self.parts))}
 
-    def changes(self, marks: Mapping[str, Any]) -> list[str]:
-        """Names of what changed since a file was made, from its `marks`; empty where the file still fits.
+    def changes(self, marks: Marks) -> list[str]:
+        """Name what changed since a file was made; empty if the file still fits.
 
         Images that are gone did not change: a result outlives its raw data.
         """
-        if marks.get("settings_hash") == self.hash:
+        if marks.settings_hash == self.hash:
             return []
         try:
-            before = dict(json.loads(marks["depends_on"]))
-        except (KeyError, ValueError, TypeError):
+            before = dict(json.loads(marks.depends_on))
+        except (ValueError, TypeError):
             return ["settings or images"]
         now = files.plain(self.parts)
         found = []
@@ -60,24 +78,46 @@ class Stamp:
                 found.append(name)
         return found
 
+    def fits(self, marks: Marks | None) -> bool:
+        """Return whether there is a file and nothing it depends on changed."""
+        return marks is not None and not self.changes(marks)
 
-def marks(path: Path) -> dict[str, Any] | None:
-    """Stamp, figures and warnings in a finished NetCDF or HDF5 file; None where there is none or it cannot be read."""
+
+@dataclass(frozen=True, kw_only=True)
+class PairStamps:
+    """Stamps of the results of one pair."""
+
+    volumes: Stamp
+    vectors: Stamp
+
+
+def read_marks(path: Path) -> Marks | None:
+    """Read the marks of a finished NetCDF or HDF5 file; None if it is missing or cannot be read."""
     import h5py
 
-    found = {}
     try:
         with h5py.File(path, "r") as file:
-            for name in ("settings_hash", "depends_on", "figures", "warnings", "findings"):
-                with contextlib.suppress(KeyError):
-                    found[name] = file.attrs[name]
+            found = {name: str(file.attrs[name]) for name in _MARKS if name in file.attrs}
     except OSError:
         return None
-    return found
+    return Marks(
+        settings_hash=found.get("settings_hash", ""),
+        depends_on=found.get("depends_on", ""),
+        figures=json.loads(found["figures"]) if "figures" in found else None,
+        warnings=stored_warnings(found),
+    )
+
+
+_MARKS = ("settings_hash", "depends_on", "figures", "warnings", "findings")
+
+
+def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
+    """Read the warnings in the attributes of a file; version 0.1.0 calls them findings."""
+    return warn.from_text(attributes.get("warnings", attributes.get("findings", "[]")))
 
 
 def of_calibration(experiment: Experiment) -> Stamp:
-    """Stamp of the calibration."""
+    """Return the stamp of the calibration."""
     cameras = {
         camera.name: [dataclasses.asdict(camera.optics), camera.nominal_angle_deg, camera.image_flip]
         for camera in experiment.cameras
@@ -94,15 +134,51 @@ def of_calibration(experiment: Experiment) -> Stamp:
 
 
 def of_self_calibration(experiment: Experiment, calibration: str) -> Stamp | None:
-    """Stamp of the self-calibration; None where none is asked for. `calibration` is the calibration's hash."""
+    """Return the stamp of the self-calibration; None if the experiment has none.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    calibration : str
+        Hash of the calibration's stamp.
+    """
     if not experiment.self_calibration.pairs:
         return None
     volume = dataclasses.asdict(experiment.grid)
     return Stamp({"calibration": calibration, "volume": volume, "self_calibration": _self_calibration(experiment)})
 
 
+def of_pair(experiment: Experiment, calibration: str, pair: int) -> PairStamps:
+    """Return the stamps of the volumes and of the vectors of a pair.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    calibration : str
+        Hash of the calibration's stamp.
+    pair : int
+        Number of the pair.
+    """
+    compute = experiment.compute
+    reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
+    parts = {
+        "calibration": calibration,
+        "self_calibration": _self_calibration(experiment),
+        "volume": dataclasses.asdict(experiment.grid),
+        "smart": experiment.smart.model_dump(),
+        "motion": reach if experiment.smart.motion_passes else None,
+        "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
+        "particles": {"images": experiment.particle_images, "frames": list(experiment.frames)},
+        "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
+    }
+    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    return PairStamps(volumes=Stamp(parts), vectors=Stamp(parts | of_vectors))
+
+
 def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
-    """Return settings and images of the self-calibration; None where none is asked for."""
+    """Return settings and images of the self-calibration; None if the experiment has none."""
     if not experiment.self_calibration.pairs:
         return None
     images = [
@@ -113,32 +189,8 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
     return {**experiment.self_calibration.model_dump(), "images": _identity(images, experiment.path.parent)}
 
 
-def of_volumes(experiment: Experiment, calibration: str, pair: int) -> Stamp:
-    """Stamp of both volumes of a pair; `calibration` is the calibration's hash."""
-    compute = experiment.compute
-    reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
-    return Stamp(
-        {
-            "calibration": calibration,
-            "self_calibration": _self_calibration(experiment),
-            "volume": dataclasses.asdict(experiment.grid),
-            "smart": experiment.smart.model_dump(),
-            "motion": reach if experiment.smart.motion_passes else None,
-            "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
-            "particles": {"images": experiment.particle_images, "frames": list(experiment.frames)},
-            "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
-        }
-    )
-
-
-def of_vectors(experiment: Experiment, calibration: str, pair: int) -> Stamp:
-    """Stamp of the vectors of a pair."""
-    volumes = of_volumes(experiment, calibration, pair).parts
-    return Stamp({**volumes, "correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s})
-
-
-def _identity(paths: list[Path], start: Path) -> list[list[Any]] | None:
-    """Tell images from others at the price of a glance: by path from `start`, size and time of the last change."""
+def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
+    """Return path from `start`, size and time of the last change of images; None if one is gone. Reads no pixels."""
     try:
         found = [(path, split_frame(path)[0].stat()) for path in paths]
     except OSError:
@@ -147,7 +199,7 @@ def _identity(paths: list[Path], start: Path) -> list[list[Any]] | None:
 
 
 def content_hash(paths: Iterable[Path]) -> str:
-    """Hash of the bytes of several images, in order; a frame of a file that holds several counts, too."""
+    """Hash the bytes of several images, in order, and the frame's number where a file holds several."""
     digest = hashlib.blake2b(digest_size=16)
     for path in paths:
         image, frame = split_frame(path)

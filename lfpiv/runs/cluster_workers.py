@@ -1,4 +1,4 @@
-"""A Dask cluster that others started: watched while it does the pairs of a run, and left as it was."""
+"""Workers of a Dask cluster that the user started. The run watches the scheduler and leaves the cluster as it was."""
 
 from __future__ import annotations
 
@@ -15,32 +15,33 @@ from typing import Any
 
 from lfpiv.errors import ClusterError, InputError
 from lfpiv.runs import worker
-from lfpiv.runs.local_workers import CLOSE_S, Width, engine
+from lfpiv.runs.local_workers import CLOSE_S, Capacity, import_distributed
 
 log = logging.getLogger(__name__)
 
 CONNECT_S = 15.0
-"""A scheduler that cannot be reached within this time is not there, at the start and after a broken connection [s]."""
+"""Longest time to connect to a scheduler, at the start and after a broken connection [s]."""
 ASK_S = 5.0
-"""How often a scheduler is asked how many workers it has [s]."""
+"""Interval at which a scheduler is asked for its number of workers [s]."""
 SILENT_S = 600.0
-"""A scheduler that has not answered for so long is given up [s]."""
+"""Time without an answer after which a scheduler counts as lost [s]."""
 REMIND_S = 60.0
-"""A user whose run waits, for a worker or an answer, is told so this often [s]."""
+"""Interval of log lines while a run waits for a worker or for an answer [s]."""
 
-GO_ON = "What is finished is kept and whole; the same command goes on from there once the cluster runs again."
+RESUME = "What is finished is kept and whole; the same command goes on from there once the cluster runs again."
+"""Advice in messages about a lost cluster."""
 
 
 @contextlib.contextmanager
-def workers(address: str, shared: Path) -> Iterator[tuple[Any, Width]]:
-    """Connect to a cluster that others started; it goes on afterwards and keeps nothing of the run.
+def workers(address: str, shared: Path) -> Iterator[tuple[Any, Capacity]]:
+    """Connect to a running cluster; yield Dask's client and the capacity. The cluster forgets the run afterwards.
 
     Raises
     ------
     InputError
         If no scheduler answers at `address`.
     """
-    dask = engine("--scheduler")
+    dask = import_distributed("--scheduler")
     try:
         client = dask.Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
@@ -50,10 +51,10 @@ def workers(address: str, shared: Path) -> Iterator[tuple[Any, Width]]:
             f"({type(error).__name__}: {reason})."
         ) from None
     try:
-        yield client, _Watch(client, address).width
+        yield client, _Watch(client, address).capacity
     finally:
         if client.status == "running":
-            # in a thread: a scheduler that hangs must not keep this process from its end
+            # in a thread, so that a scheduler that hangs cannot stop this process from ending
             release = threading.Thread(target=_release, args=(client, shared), daemon=True)
             release.start()
             release.join(CLOSE_S)
@@ -62,49 +63,51 @@ def workers(address: str, shared: Path) -> Iterator[tuple[Any, Width]]:
 
 
 class _Watch:
-    """How a scheduler is: asked now and then, without waiting for its answer."""
+    """State of a scheduler, which is asked at intervals without waiting for its answer."""
 
     def __init__(self, client: Any, address: str):
         self.client, self.address = client, address
         self.count = 1
-        """Workers, as last heard."""
-        self.heard = self.told = self.asked = time.monotonic()
+        """Number of workers in the last answer."""
+        self.answered_s = self.reminded_s = self.asked_s = time.monotonic()
         self.broken = False
+        """Whether the connection is broken."""
         self.answer: Future[int] | None = None
+        """Answer that is expected."""
 
-    def width(self) -> float:
-        """Say how many pairs may be submitted; ClusterError where the scheduler is gone or hangs."""
+    def capacity(self) -> float:
+        """Return how many pairs may be submitted; raise ClusterError if the scheduler is lost."""
         now = time.monotonic()
         if self.client.status != "running":
-            if self.client.status == "closed" or now - self.heard > SILENT_S:
-                raise ClusterError(f"the scheduler at {self.address} is gone. {GO_ON}")
+            if self.client.status == "closed" or now - self.answered_s > SILENT_S:
+                raise ClusterError(f"the scheduler at {self.address} is gone. {RESUME}")
             if not self.broken:
                 log.info("the connection to the scheduler at %s broke: trying to get it back", self.address)
             self.broken = True
             return 0
         if self.broken:
-            self.heard, self.broken = now, False
-        self._listen(now)
-        silent = now - self.heard
+            self.answered_s, self.broken = now, False
+        self._ask(now)
+        silent = now - self.answered_s
         if silent > SILENT_S:
-            raise ClusterError(f"the scheduler at {self.address} has not answered for {silent:.0f} s. {GO_ON}")
-        if now - self.told > REMIND_S:
-            self.told = now
+            raise ClusterError(f"the scheduler at {self.address} has not answered for {silent:.0f} s. {RESUME}")
+        if now - self.reminded_s > REMIND_S:
+            self.reminded_s = now
             if silent > REMIND_S:
                 log.info("the scheduler at %s has not answered for %.0f s: waiting", self.address, silent)
             elif not self.count:
                 log.info("%s has no workers: waiting for some", self.address)
         return math.inf
 
-    def _listen(self, now: float) -> None:
-        """Take the answer to the last question, ask the next one."""
+    def _ask(self, now: float) -> None:
+        """Take the expected answer if it is there; ask again at intervals."""
         if self.answer is None:
-            if now - self.asked > ASK_S:
-                self.asked = now
+            if now - self.asked_s > ASK_S:
+                self.asked_s = now
                 self.answer = asyncio.run_coroutine_threadsafe(_count(self.client), self.client.loop.asyncio_loop)
         elif self.answer.done():
-            with contextlib.suppress(Exception):  # no answer
-                self.count, self.heard = self.answer.result(), now
+            with contextlib.suppress(Exception):  # the question failed
+                self.count, self.answered_s = self.answer.result(), now
             self.answer = None
 
 

@@ -1,6 +1,6 @@
-"""Pairs side by side in several processes, on this machine or on a cluster: Dask starts the processes and watches them.
+"""Hand out pairs: one after the other in this process, or in parallel to worker processes that Dask watches.
 
-A pair whose worker dies is tried once more, in another worker and after all others; then it is a pair that failed.
+If a worker dies, its pair is tried once more, in another worker and after all other pairs. Then the pair has failed.
 """
 
 from __future__ import annotations
@@ -11,54 +11,49 @@ import logging
 import os
 import queue
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import ClusterError, InputError, StorageError
+from lfpiv.progress import StepProgress, part_of
 from lfpiv.runs import cluster_workers, local_workers, worker
-from lfpiv.runs.local_workers import Width
-from lfpiv.runs.pair import Outcome
+from lfpiv.runs.local_workers import Capacity
+from lfpiv.runs.pair import Outcome, PairWork
 from lfpiv.runs.worker_plan import Plan
 from lfpiv_kernels.runtime import cores
 
 log = logging.getLogger(__name__)
 
 FETCH_S = 600.0
-"""A scheduler that does not hand out a result for so long is given up [s]."""
+"""Longest time to wait for a finished result from the scheduler [s]."""
 TICK_S = 0.5
-"""How often a waiting parent looks whether the cluster is well, and tells how far the pairs are [s]."""
+"""Interval at which the state of the cluster is checked and progress is reported [s]."""
 
 
-def together(
-    shared: Path,
-    todo: Sequence[int],
-    planned: Plan | None,
-    scheduler: str | None,
-    progress: Callable[[float], None],
-    peak: Callable[[float], None],
+def sequential(work: PairWork, todo: Sequence[int], progress: StepProgress) -> Generator[Outcome, None, None]:
+    """Do pairs one after the other in this process; yield the outcome of each."""
+    for number, pair in enumerate(todo):
+        step = part_of(progress, number / len(todo), (number + 1) / len(todo))
+        step(0.0)
+        yield work.do(pair, step)
+
+
+def parallel(
+    shared: Path, todo: Sequence[int], workers: Plan | str, progress: StepProgress
 ) -> Generator[Outcome, None, None]:
-    """Do pairs side by side, in any order.
+    """Do pairs in parallel, in any order; yield the outcome of each.
 
     Parameters
     ----------
     shared : Path
-        What the workers need, from `worker.share`.
+        Folder with everything that the workers need, from `worker.share`.
     todo : sequence of int
         Pairs to do.
-    planned : Plan, optional
-        Processes to start on this machine; None with `scheduler`.
-    scheduler : str, optional
-        Address of a Dask scheduler whose workers see `shared`.
+    workers : Plan or str
+        Processes to start on this machine, or the address of a Dask scheduler whose workers see `shared`.
     progress : callable
         Called with the finished fraction of all pairs.
-    peak : callable
-        Called with the largest memory that a worker held so far [MiB].
-
-    Yields
-    ------
-    Outcome
-        One for each pair.
 
     Raises
     ------
@@ -71,94 +66,115 @@ def together(
     RuntimeError
         If the workers cannot run what is sent to them.
     """
-    with contextlib.ExitStack() as stack:
-        if scheduler is None:
-            assert planned is not None
-            client, width = stack.enter_context(local_workers.workers(planned, shared))
-        else:
-            client, width = stack.enter_context(cluster_workers.workers(scheduler, shared))
-        yield from _outcomes(client, width, shared, todo, progress, peak)
+    found = (
+        cluster_workers.workers(workers, shared) if isinstance(workers, str) else local_workers.workers(workers, shared)
+    )
+    with found as (client, capacity):
+        yield from _Dispatch(client, capacity, shared, todo).outcomes(progress)
 
 
-def _outcomes(
-    client: Any,
-    width: Width,
-    shared: Path,
-    todo: Sequence[int],
-    progress: Callable[[float], None],
-    peak: Callable[[float], None],
-) -> Generator[Outcome, None, None]:
-    from distributed import CancelledError, KilledWorker, TimeoutError
+class _Dispatch:
+    """Pairs of a run on their way to and from the workers of a Dask client."""
 
-    arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    waiting, again, number = deque(todo), deque[int](), itertools.count()
-    running: dict[str, tuple[Any, int]] = {}
-    fractions: dict[int, float] = {}
-    tried: set[int] = set()
-    largest, done = 0.0, 0
-    topic = f"lfpiv-{shared.name}"
-    client.subscribe_topic(topic, lambda event: fractions.update([event[1]]))
-    try:
-        while done < len(todo):
-            if not waiting and not running:
-                waiting, again = again, waiting
-            room = width() - len(running)
-            while waiting and room > 0:
-                pair, room = waiting.popleft(), room - 1
-                name = f"lfpiv-{shared.name}-{pair}-{next(number)}"
-                future = client.submit(_in_worker, str(shared), pair, topic, key=name, pure=False)
-                running[name] = future, pair
-                future.add_done_callback(arrived.put)
-            under_way = sum(fractions.get(pair, 0.0) for _, pair in list(running.values()))
-            progress((done + min(under_way, len(running))) / len(todo))
-            try:
-                future = arrived.get(timeout=TICK_S)
-            except queue.Empty:
-                continue
-            _, pair = running.pop(future.key)
-            fractions.pop(pair, None)
-            result = None
-            if future.status == "finished":
+    def __init__(self, client: Any, capacity: Capacity, shared: Path, todo: Sequence[int]):
+        self.client, self.capacity, self.shared = client, capacity, shared
+        self.total, self.done = len(todo), 0
+        self.waiting, self.again = deque(todo), deque[int]()
+        """Pairs to submit now, and after all others."""
+        self.running: dict[str, tuple[Any, int]] = {}
+        """Key of Dask -> future and pair; futures that are not referenced are cancelled."""
+        self.fractions: dict[int, float] = {}
+        """Pair -> finished fraction, as its worker reports it."""
+        self.tried: set[int] = set()
+        """Pairs whose worker died once."""
+        self.numbers = itertools.count()
+        self.arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.topic = f"lfpiv-{shared.name}"
+
+    def outcomes(self, progress: StepProgress) -> Generator[Outcome, None, None]:
+        """Submit all pairs and yield their outcomes."""
+        self.client.subscribe_topic(self.topic, lambda event: self.fractions.update([event[1]]))
+        try:
+            while self.done < self.total:
+                self._submit()
+                progress(self._fraction())
                 try:
-                    result = future.result(timeout=FETCH_S)
-                except TimeoutError:
-                    raise ClusterError(
-                        f"the scheduler keeps the result of pair {pair} back. {cluster_workers.GO_ON}"
-                    ) from None
-                except (CancelledError, OSError):  # the connection to the scheduler broke just now
-                    pass
-            if result is not None:
-                _log(result)
-                if result.outcome is None:
-                    raise (StorageError if result.storage else InputError)(result.fatal)
-                if result.peak_mib > largest:
-                    largest = result.peak_mib
-                    peak(largest)
-                outcome = result.outcome
-            elif future.status == "error" and isinstance(future.exception(), KilledWorker):
-                if pair not in tried:
-                    tried.add(pair)
-                    again.append(pair)
-                    log.info("pair %d: its worker died; it is tried once more in another one", pair)
+                    future = self.arrived.get(timeout=TICK_S)
+                except queue.Empty:
                     continue
-                outcome = Outcome(
-                    pair=pair,
-                    reason="its worker died, in each of two trials: killed, a crash, or too little memory",
-                )
-            elif future.status == "error":
-                raise RuntimeError(f"the workers cannot do pair {pair}: {_first_line(future.exception())}")
-            else:  # the scheduler forgot it, when the connection to it broke
-                waiting.append(pair)
-                continue
-            done += 1
-            yield outcome
-    finally:
-        with contextlib.suppress(Exception):  # the cluster may be lost
-            client.unsubscribe_topic(topic)
+                outcome = self._outcome(future)
+                if outcome is not None:
+                    self.done += 1
+                    yield outcome
+        finally:
+            with contextlib.suppress(Exception):  # the cluster may be lost
+                self.client.unsubscribe_topic(self.topic)
+
+    def _submit(self) -> None:
+        """Submit as many waiting pairs as the workers take."""
+        if not self.waiting and not self.running:
+            self.waiting, self.again = self.again, self.waiting
+        room = self.capacity() - len(self.running)
+        while self.waiting and room > 0:
+            pair, room = self.waiting.popleft(), room - 1
+            name = f"{self.topic}-{pair}-{next(self.numbers)}"
+            future = self.client.submit(_in_worker, str(self.shared), pair, self.topic, key=name, pure=False)
+            self.running[name] = future, pair
+            future.add_done_callback(self.arrived.put)
+
+    def _fraction(self) -> float:
+        """Return the finished fraction of all pairs."""
+        running = sum(self.fractions.get(pair, 0.0) for _, pair in list(self.running.values()))
+        return (self.done + min(running, len(self.running))) / self.total
+
+    def _outcome(self, future: Any) -> Outcome | None:
+        """Return the outcome of a pair that came back; None if the pair is submitted once more."""
+        from distributed import KilledWorker
+
+        _, pair = self.running.pop(future.key)
+        self.fractions.pop(pair, None)
+        result = _fetched(future, pair) if future.status == "finished" else None
+        if result is not None:
+            return _checked(result)
+        if future.status != "error":  # the scheduler forgot the pair when the connection to it broke
+            self.waiting.append(pair)
+            return None
+        if not isinstance(future.exception(), KilledWorker):
+            raise RuntimeError(f"the workers cannot do pair {pair}: {_first_line(future.exception())}")
+        if pair not in self.tried:
+            self.tried.add(pair)
+            self.again.append(pair)
+            log.info("pair %d: its worker died; it is tried once more in another one", pair)
+            return None
+        return Outcome(
+            pair=pair, reason="its worker died, in each of two trials: killed, a crash, or too little memory"
+        )
+
+
+def _fetched(future: Any, pair: int) -> worker.Result | None:
+    """Return the result of a finished future; None if the connection to the scheduler broke just now."""
+    from distributed import CancelledError, TimeoutError
+
+    try:
+        found: worker.Result = future.result(timeout=FETCH_S)
+    except TimeoutError:
+        raise ClusterError(f"the scheduler keeps the result of pair {pair} back. {cluster_workers.RESUME}") from None
+    except (CancelledError, OSError):
+        return None
+    return found
+
+
+def _checked(result: worker.Result) -> Outcome:
+    """Log what the worker logged and return the outcome; raise the error that ends the run."""
+    for name, level, text in result.records:
+        logging.getLogger(name).log(level, "%s", text)
+    if result.outcome is None:
+        raise (StorageError if result.storage else InputError)(result.fatal)
+    return result.outcome
 
 
 def _in_worker(shared: str, pair: int, topic: str) -> worker.Result:
-    """Run in a worker of Dask."""
+    """Do one pair in a worker of Dask."""
     from distributed import get_client, get_worker
     from distributed.comm.addressing import get_address_host
 
@@ -174,26 +190,21 @@ def _in_worker(shared: str, pair: int, topic: str) -> worker.Result:
         host = get_address_host(here.address)
         near = [address for address in client.nthreads() if get_address_host(address) == host]
         places = list(client.run(_place, workers=near, on_error="return").values())
-        return max(_cores() // max(places.count(_place()), 1), 1)
+        return max(_granted_cores() // max(places.count(_place()), 1), 1)
 
     return worker.work_on(Path(shared), pair, report, threads)
 
 
 def _place() -> tuple[Any, ...]:
-    """Say what workers of one machine share: the job that a queue gave them, and the cores that they may use."""
+    """Return what workers with the same cores have in common: the job of a queue, and the cores they may use."""
     affinity = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     return os.environ.get("SLURM_JOB_ID"), *affinity
 
 
-def _cores() -> int:
-    """Cores to share there: fewer than there are where a queue says so and binds nobody to them."""
+def _granted_cores() -> int:
+    """Return the number of cores of this job; SLURM may grant fewer than the system shows."""
     granted = os.environ.get("SLURM_CPUS_PER_TASK", "")
     return min(cores(), int(granted)) if granted.isdigit() else cores()
-
-
-def _log(result: worker.Result) -> None:
-    for name, level, text in result.records:
-        logging.getLogger(name).log(level, "%s", text)
 
 
 def _first_line(error: BaseException | None) -> str:

@@ -1,4 +1,4 @@
-"""Worker processes of this machine: Dask starts and watches them, and nothing is left of them afterwards."""
+"""Worker processes of this machine. Dask starts and watches them; none is left when the run ends."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from lfpiv.errors import ClusterError, InputError
 from lfpiv.runs.worker_plan import Plan
 
 START_S = 300.0
-"""Worker processes that are not up after this time never will be [s]."""
+"""Longest time that worker processes may take to start [s]."""
 CLOSE_S = 10.0
-"""Time that a cluster is given to close [s]."""
+"""Time that Dask is given to close [s]."""
 
-Width = Callable[[], float]
-"""How many pairs may be under way now; raises where the cluster is lost."""
+Capacity = Callable[[], float]
+"""Returns how many pairs may be submitted at once; raises ClusterError if the scheduler is lost."""
 
 SETTINGS = {
-    "distributed.worker.profile.enabled": False,  # looks at the workers' stacks 100 times a second
-    "distributed.admin.tick.interval": "1s",  # 20 ms, in every process
+    "distributed.worker.profile.enabled": False,  # would look at the workers' stacks 100 times a second
+    "distributed.admin.tick.interval": "1s",  # default: 20 ms, in every process
     "distributed.admin.system-monitor.interval": "10s",
 }
-"""What Dask does beside the work, which took 4 % of a core for each process."""
+"""Settings of Dask that reduce its own load on the processes."""
 
 
-def engine(key: str) -> Any:
-    """Import Dask's engine, which does not say its types.
+def import_distributed(key: str) -> Any:
+    """Import Dask's package `distributed`.
 
     Raises
     ------
     InputError
-        If it is not installed; names `key` as what asked for it.
+        If it is not installed; `key` is the option that needs it.
     """
     try:
         import distributed
@@ -50,29 +50,29 @@ def engine(key: str) -> Any:
     return distributed
 
 
-def warm_up(kind: str) -> None:
-    """Start to read what workers need, in a process of its own that they are forked from, and return at once.
+def start_preloading(kind: str) -> None:
+    """Start the process that workers are forked from, and let it import what they need; return at once.
 
-    What this process does first, the calibration for example, goes on meanwhile. That process serves all later runs
-    too, and ends with this one. On CUDA, whose drivers no fork survives, nothing is done: workers start afresh.
+    It imports while this process works, on the calibration for example. It serves all later runs of this process too
+    and ends with it. CUDA drivers do not survive a fork, so on CUDA this does nothing.
 
     Raises
     ------
     InputError
-        If Dask's engine is not installed.
+        If `distributed` is not installed.
     """
-    dask = engine("--workers")
+    dask = import_distributed("--workers")
     if not _forks(kind):
         return
     from multiprocessing import forkserver, resource_tracker
 
     with _settings(kind):
         dask.utils.get_mp_context().set_forkserver_preload(["lfpiv.runs.worker_preload"])  # after Dask's own
-    resource_tracker.ensure_running()  # it lets Ctrl-C through again
+    resource_tracker.ensure_running()  # must start first: it unblocks Ctrl-C
     path = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # the same modules as here
     try:
-        with unheard_by_children():
+        with interrupts_blocked():
             forkserver.ensure_running()
     finally:
         if path is None:
@@ -82,12 +82,12 @@ def warm_up(kind: str) -> None:
 
 
 def _forks(kind: str) -> bool:
-    """Elsewhere than on Linux libraries of the system may not survive a fork, either."""
+    """Return whether workers are forked. Libraries of other systems than Linux may not survive a fork."""
     return kind == "cpu" and sys.platform == "linux"
 
 
 def _settings(kind: str) -> Any:
-    """Hold Dask to what is right for a few processes of this machine; a context."""
+    """Return a context with the settings of Dask for processes of this machine."""
     import dask
 
     method = "forkserver" if _forks(kind) else "spawn"
@@ -95,15 +95,40 @@ def _settings(kind: str) -> Any:
 
 
 @contextlib.contextmanager
-def workers(planned: Plan, shared: Path) -> Iterator[tuple[Any, Width]]:
-    """Start worker processes on this machine; nothing is left of them afterwards, however that comes."""
-    warm_up(planned.kind)
+def workers(planned: Plan, shared: Path) -> Iterator[tuple[Any, Capacity]]:
+    """Start worker processes on this machine; yield Dask's client and their capacity. End them in any case."""
+    start_preloading(planned.kind)
     with _settings(planned.kind):
-        yield from _workers(planned, shared)
+        cluster = _start_scheduler()
+        finished = False
+        try:
+            with import_distributed("--workers").Client(cluster, set_as_default=False) as client:
+                cluster.worker_spec.update(_specifications(planned, shared))
+                cluster.scale(planned.workers)  # starts them
+                yield client, _capacity(client, cluster)
+                finished = True
+        finally:
+            if not finished:
+                _kill(cluster)
+            with contextlib.suppress(Exception):  # processes that do not close end with this one
+                cluster.close(timeout=CLOSE_S)
 
 
-def _workers(planned: Plan, shared: Path) -> Iterator[tuple[Any, Width]]:
-    dask = engine("--workers")
+def _start_scheduler() -> Any:
+    dask = import_distributed("--workers")
+    with interrupts_blocked():
+        return dask.SpecCluster(
+            scheduler={
+                "cls": dask.Scheduler,
+                # Dask must not repeat a pair whose worker died: `dispatch` decides that
+                "options": {"host": "127.0.0.1", "dashboard": False, "allowed_failures": 0, "worker_ttl": None},
+            },
+            silence_logs=logging.CRITICAL,
+        )
+
+
+def _specifications(planned: Plan, shared: Path) -> dict[int, dict[str, Any]]:
+    """Return Dask's specification of every worker by its number."""
     options = {
         "nthreads": 1,
         "memory_limit": 0,
@@ -112,50 +137,35 @@ def _workers(planned: Plan, shared: Path) -> Iterator[tuple[Any, Width]]:
         "silence_logs": logging.CRITICAL,
         "dashboard": False,
     }
+    nanny = import_distributed("--workers").Nanny
     envs = [{} if device is None else {"CUDA_VISIBLE_DEVICES": device} for device in planned.devices]
-    processes = {number: {"cls": dask.Nanny, "options": {**options, "env": env}} for number, env in enumerate(envs)}
-    with unheard_by_children():
-        cluster = dask.SpecCluster(
-            scheduler={
-                "cls": dask.Scheduler,
-                # a worker's death is final for what it did; here is decided what is tried again
-                "options": {"host": "127.0.0.1", "dashboard": False, "allowed_failures": 0, "worker_ttl": None},
-            },
-            silence_logs=logging.CRITICAL,
-        )
-    finished = False
-    try:
-        with dask.Client(cluster, set_as_default=False) as client:
-            cluster.worker_spec.update(processes)
-            cluster.scale(len(processes))  # starts them
-            alive = time.monotonic()
+    return {number: {"cls": nanny, "options": {**options, "env": env}} for number, env in enumerate(envs)}
 
-            def width() -> float:
-                nonlocal alive
-                if client.status != "running":
-                    raise ClusterError("the scheduler of the workers ended. The same command goes on where it stopped.")
-                count = len(cluster.scheduler.workers)
-                if count:
-                    alive = time.monotonic()
-                elif time.monotonic() - alive > START_S:
-                    raise RuntimeError(
-                        "no worker process starts. A script that calls lfpiv.run with workers must do so below "
-                        '`if __name__ == "__main__":`'
-                    )
-                return count
 
-            yield client, width
-            finished = True
-    finally:
-        if not finished:
-            _kill(cluster)
-        with contextlib.suppress(Exception):  # what is left of it ends with this process
-            cluster.close(timeout=CLOSE_S)
+def _capacity(client: Any, cluster: Any) -> Capacity:
+    """Return a function that counts the workers; it raises if the scheduler ended or no worker starts."""
+    last_seen_s = time.monotonic()
+
+    def capacity() -> float:
+        nonlocal last_seen_s
+        if client.status != "running":
+            raise ClusterError("the scheduler of the workers ended. The same command goes on where it stopped.")
+        count = len(cluster.scheduler.workers)
+        if count:
+            last_seen_s = time.monotonic()
+        elif time.monotonic() - last_seen_s > START_S:
+            raise RuntimeError(
+                "no worker process starts. A script that calls lfpiv.run with workers must do so below "
+                '`if __name__ == "__main__":`'
+            )
+        return count
+
+    return capacity
 
 
 @contextlib.contextmanager
-def unheard_by_children() -> Iterator[None]:
-    """Block Ctrl-C for the threads and processes started here: it is the parent that answers it, and ends them."""
+def interrupts_blocked() -> Iterator[None]:
+    """Block Ctrl-C in threads and processes started in this block: only the main process answers it and ends them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -167,7 +177,7 @@ def unheard_by_children() -> Iterator[None]:
 
 
 def _kill(cluster: Any) -> None:
-    """End the workers of a run that is given up, at once: what they write appears whole or not at all."""
+    """Kill the workers at once. They write files atomically, so no file is damaged."""
     for nanny in list(cluster.workers.values()):
         with contextlib.suppress(Exception):
             nanny.auto_restart = False

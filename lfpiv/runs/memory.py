@@ -1,4 +1,4 @@
-"""How much memory a run needs and how much there is."""
+"""Estimate the memory that a run needs, and find out how much this process may take."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.files import MIB
 
 if TYPE_CHECKING:
     from lfpiv.calibration.cameras import Calibration
 
 log = logging.getLogger(__name__)
 
-MIB = 1 << 20
 GIB = 1 << 30
 
 BYTES_PER_VOXEL = 64
-"""Volume-sized float32 arrays held at once at the least: two frames, and SMART's or the correlation's work on them."""
+"""Least memory per voxel [byte]: two volumes, and the float32 arrays that SMART or the correlation works on."""
 
 BYTES_PER_VOXEL_AND_CAMERA = 64
-"""Ray model of a voxel in one camera: chief ray, slopes, second-order terms, widths."""
+"""Ray model of a voxel in one camera [byte]: chief ray, slopes, second-order terms, widths."""
 
 BYTES_PER_PIXEL = 64
-"""Per sensor pixel: images, their light-field blocks, the decoder's arrays."""
+"""Memory per sensor pixel [byte]: images, their light-field blocks, the decoder's arrays."""
 
 BASE_BYTES = GIB // 2
-"""Python, its libraries and compiled kernels."""
+"""Memory of Python, its libraries and compiled kernels [byte]."""
 
 GROUPS = Path("/sys/fs/cgroup")
-"""Control groups of the machine, or of the container."""
+"""Folder of the control groups of the system or the container."""
 
 OWN_GROUPS = Path("/proc/self/cgroup")
-"""Names those that this process belongs to."""
+"""File that names the control groups of this process."""
 
 
 def least_bytes(experiment: Experiment) -> int:
-    """Estimate the least memory a run of the experiment takes [byte], from the volume and the sensors alone."""
+    """Estimate the least memory a run of the experiment takes [byte], from the volume and the sensors only."""
     cameras = len(experiment.cameras)
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
     voxel_bytes = BYTES_PER_VOXEL + BYTES_PER_VOXEL_AND_CAMERA * cameras
@@ -50,7 +50,10 @@ def least_bytes(experiment: Experiment) -> int:
 
 
 def weights_bytes(experiment: Experiment) -> int:
-    """Estimate the memory of the weights [byte] from the nominal rig, before any image is read; logs the upper end."""
+    """Estimate the memory of the weights [byte] from the nominal rig, before any image is read.
+
+    Logs the upper limit if the form of the weights is chosen later.
+    """
     from lfpiv.weights.operator import estimate_memory
 
     cameras, grid, form = _nominal_cameras(experiment), experiment.grid, experiment.compute.weights_form
@@ -61,13 +64,13 @@ def weights_bytes(experiment: Experiment) -> int:
 
 
 def worker_bytes(experiment: Experiment) -> int:
-    """Estimate what one worker process takes beside the weights, which all share [byte]."""
+    """Estimate the memory of one worker process without the weights, which all workers share [byte]."""
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
     return BASE_BYTES + BYTES_PER_VOXEL * experiment.grid.size + BYTES_PER_PIXEL * pixels
 
 
 def run_bytes(experiment: Experiment, weights: int, workers: int) -> int:
-    """Estimate what a run takes [byte]: alone, or the larger of building the weights and working with them together."""
+    """Estimate the memory of a run [byte]. With several workers: the larger of building and of using the weights."""
     build = least_bytes(experiment) + weights
     if workers == 1:
         return build
@@ -75,7 +78,7 @@ def run_bytes(experiment: Experiment, weights: int, workers: int) -> int:
 
 
 def fitting_workers(experiment: Experiment, weights: int, workers: int) -> int:
-    """Return how many of so many workers fit into the memory, at least 1."""
+    """Return the largest number of workers, up to `workers`, that fits into the memory; at least 1."""
     limit = allowed_bytes(experiment)
     while workers > 1 and run_bytes(experiment, weights, workers) > limit:
         workers -= 1
@@ -83,13 +86,13 @@ def fitting_workers(experiment: Experiment, weights: int, workers: int) -> int:
 
 
 def allowed_bytes(experiment: Experiment) -> int:
-    """Return the memory a run may take [byte]: what is available, and what ``compute.memory_gib`` allows."""
+    """Return the memory a run may take [byte]: the available memory, limited by ``compute.memory_gib``."""
     allowed = experiment.compute.memory_gib
     return available_bytes() if allowed is None else min(int(allowed * GIB), available_bytes())
 
 
 def available_bytes() -> int:
-    """Return the memory this process may take [byte]: what the machine has free or its control groups allow."""
+    """Return the memory this process may take [byte]: what is free, limited by its control groups."""
     free = _meminfo("MemAvailable")
     if free is None:
         free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
@@ -97,7 +100,7 @@ def available_bytes() -> int:
 
 
 def left_for_weights(experiment: Experiment) -> int:
-    """Return the memory that the weights may take [byte], beside volumes that are still to come."""
+    """Return the memory that the weights may take [byte] beside the volumes, which are allocated later."""
     left = available_bytes() - BYTES_PER_VOXEL * experiment.grid.size
     if experiment.compute.memory_gib is not None:
         left = min(left, int(experiment.compute.memory_gib * GIB) - least_bytes(experiment))
@@ -105,7 +108,7 @@ def left_for_weights(experiment: Experiment) -> int:
 
 
 def require(needed: int, experiment: Experiment, what: str) -> None:
-    """Refuse work that needs more memory than there is, or than ``compute.memory_gib`` allows.
+    """Refuse work that needs more memory than is available or than ``compute.memory_gib`` allows.
 
     Raises
     ------
@@ -141,10 +144,7 @@ def _meminfo(key: str) -> int | None:
 
 
 def _left_in_groups() -> Iterator[int]:
-    """Memory that each control group of this process with a limit, its own one or one above, leaves it [byte].
-
-    Files in the page cache count as used there, but the kernel drops them when memory is asked for.
-    """
+    """Yield the memory that the control group of this process and each group above it leave it [byte]."""
     names = ("memory.max", "memory.current", "inactive_file", "active_file")
     older = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file", "total_active_file")
     for controller, place, files in (("", GROUPS, names), ("memory", GROUPS / "memory", older)):
@@ -153,33 +153,39 @@ def _left_in_groups() -> Iterator[int]:
 
 
 def _groups(controller: str, place: Path) -> list[Path]:
-    """Folders of this process's group and of those above it up to `place`; controllers of version 2 have no name."""
+    """List the folders of this process's group and of the groups above it up to `place`.
+
+    `controller` is empty for control groups of version 2.
+    """
     try:
         lines = [line.split(":", 2) for line in OWN_GROUPS.read_text().splitlines()]
     except OSError:
         lines = []
     own = next((group for _, names, group in lines if controller in names.split(",")), "/")
-    if ".." in own:  # outside of what a container sees
+    if ".." in own:  # not visible in the container
         own = "/"
     path = place / own.strip("/")
     return [path, *(parent for parent in path.parents if parent.is_relative_to(place))]
 
 
 def _left_in(group: Path, names: tuple[str, str, str, str]) -> int:
-    """Memory that one group leaves its processes [byte]; no end of it where there is no such group, or no limit."""
-    limit, used, *dropped = names
+    """Return the memory that one group leaves its processes [byte]; `sys.maxsize` without such a group or limit.
+
+    Files in the page cache count as used, but the kernel drops them when memory is needed. So they are added.
+    """
+    limit, used, *droppable = names
     try:
         left = int((group / limit).read_text()) - int((group / used).read_text())
-    except (OSError, ValueError):  # not there, or "max"
+    except (OSError, ValueError):  # no such group, or the limit is "max"
         return sys.maxsize
     with contextlib.suppress(OSError):
         lines = (line.split() for line in (group / "memory.stat").read_text().splitlines())
-        left += sum(int(value) for name, value in lines if name in dropped)
+        left += sum(int(value) for name, value in lines if name in droppable)
     return left
 
 
 def _nominal_cameras(experiment: Experiment) -> Calibration:
-    """Return the rig as the data sheets have it: no image is read, nothing found."""
+    """Return the nominal rig of the experiment file. Reads no image."""
     from lfpiv.calibration.cameras import CalibratedCamera, Calibration
     from lfpiv.calibration.thin_lens_model import thin_lens_model
     from lfpiv.geometry.optics import LensLattice
@@ -192,7 +198,7 @@ def _nominal_cameras(experiment: Experiment) -> Calibration:
             name=setup.name,
             optics=setup.optics,
             lattice=LensLattice(origin_mm=(0.0, 0.0), basis_mm=((pitch, 0.0), second), layout=setup.optics.layout),
-            decoder=None,  # type: ignore[arg-type]  # there is no image yet
+            decoder=None,  # type: ignore[arg-type]  # made from images
             baseline=thin_lens_model(setup.optics, setup.nominal_angle_deg),
         )
     return Calibration(cameras)

@@ -1,20 +1,32 @@
-"""The steps of one experiment in order: calibrate, weights, reconstruct, correlate, report; resumable in its folder."""
+"""The steps of one experiment in order: calibrate, weights, reconstruct, correlate, report.
+
+Each function opens a run on an output folder, does what is not finished there, and returns the content of summary.json.
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.runs import worker_plan
-from lfpiv.runs.pair import Outcome
-from lfpiv.runs.run import Job, Progress, open_job
+from lfpiv.progress import Progress
+from lfpiv.runs import dispatch, local_workers, memory, rig, worker, worker_plan
+from lfpiv.runs.frame_light import read_darks
+from lfpiv.runs.invocation import Invocation, WeightsFigures, Workers
+from lfpiv.runs.pair import Outcome, PairWork
+from lfpiv.runs.run import Run, open_run
+from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
     from lfpiv.calibration.cameras import Calibration
+    from lfpiv.weights.operator import Weights
+
+PAIRS = "image pairs"
+"""Name of the step that works on pairs, for progress."""
 
 
 def run(
@@ -28,17 +40,17 @@ def run(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Do the whole job: raw images to vectors, summary and report.
+    """Do all steps: raw images to vectors, summary and report.
 
-    What is finished in `out` and still fits the experiment is kept: the calibration, and the pairs. A pair that cannot
-    be done is left out and listed under ``failed``; the others are done.
+    Finished results in `out` that still fit the experiment are kept. A pair that fails is left out and listed under
+    ``failed``; the other pairs are done.
 
     Parameters
     ----------
     experiment : Experiment or path
         The experiment, or its file.
     out : path
-        Output folder; made where it is missing.
+        Output folder; made if it is missing.
     pairs : (int, int), optional
         First pair and the one after the last, None for the end; default: all.
     device : {"auto", "cpu", "cuda"}, optional
@@ -46,9 +58,9 @@ def run(
     keep_volumes : bool
         Write the volumes too.
     workers : int, optional
-        Processes of this machine that work on pairs side by side, each with its share of the cores; default: one per
-        GPU on CUDA, this process alone otherwise. More than one need the extra ``distributed``, and a script that asks
-        for them calls this below ``if __name__ == "__main__":``.
+        Number of processes of this machine that work on pairs in parallel and share its cores; default: one per GPU on
+        CUDA, this process only otherwise. More than one need the extra ``distributed``, and a script must call this
+        function below ``if __name__ == "__main__":``.
     scheduler : str, optional
         Address of a Dask scheduler whose workers do the pairs; they must see `out` and the images under the same paths.
     progress : callable, optional
@@ -62,19 +74,18 @@ def run(
     Raises
     ------
     InputError
-        If something the user can mend is wrong: files, keys, memory, the output folder, the device, the workers.
+        If files, keys, memory, output folder, device or workers are not as expected; the message says what to change.
     StorageError
-        If results cannot be written, for want of space or rights.
+        If results cannot be written because space or rights are missing.
     """
     if scheduler is not None and workers is not None:
         raise InputError("--workers, --scheduler: expected one of them: a cluster has workers of its own.")
-    with open_job(experiment, out, device, progress, pairs) as job:
-        todo = job.unfinished(volumes=keep_volumes)
-        todo, planned = _plan(job, todo, workers, scheduler)
-        calibration = job.calibrate()
-        if todo:
-            _do(job, _outcomes(job, calibration, todo, planned, scheduler, keep_volumes))
-        return job.finish(report=True)
+    with open_run(experiment, out, device, progress, pairs) as current:
+        todo = current.unfinished(volumes=keep_volumes)
+        checked = _check(current, todo.pairs, workers, scheduler)
+        calibrated = rig.calibrate(current)
+        done = _process(current, calibrated.calibration, checked, keep_volumes)
+        return current.finish(calibrated, replace(done, reused=todo.reused), report=True)
 
 
 def calibrate(
@@ -84,10 +95,9 @@ def calibrate(
     device: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Calibrate the cameras into ``calibration.h5``; the first step of `run`. Returns the summary."""
-    with open_job(experiment, out, device, progress) as job:
-        job.calibrate()
-        return job.finish(report=False)
+    """Calibrate the cameras into ``calibration.h5``; the first step of `run`. Return the summary."""
+    with open_run(experiment, out, device, progress) as current:
+        return current.finish(rig.calibrate(current), Invocation(), report=False)
 
 
 def reconstruct(
@@ -98,16 +108,17 @@ def reconstruct(
     device: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct the volumes of some pairs into ``volumes/``; calibrates first where need be. Returns the summary."""
-    with open_job(experiment, out, device, progress, pairs) as job:
-        todo = job.unfinished(vectors=False, volumes=True)
-        todo, _ = _plan(job, todo, 1, None)
-        calibration = job.calibrate()
-        if todo:
-            weights = job.build_weights(job.self_calibrate(calibration), todo)
-            work = job.work(weights, keep_volumes=True, vectors=False)
-            _do(job, worker_plan.alone(work, todo, job.step("image pairs")))
-        return job.finish(report=False)
+    """Reconstruct the volumes of some pairs into ``volumes/``; calibrate first if necessary. Return the summary."""
+    with open_run(experiment, out, device, progress, pairs) as current:
+        todo = current.unfinished(vectors=False, volumes=True)
+        checked = _check(current, todo.pairs, 1, None)
+        calibrated = rig.calibrate(current)
+        done = Invocation(outcomes=checked.failed)
+        if checked.pairs:
+            weights, figures = rig.build_weights(current, calibrated.calibration, checked.pairs)
+            work = _work(current, weights, keep_volumes=True, vectors=False)
+            done = Invocation(outcomes=_sequential(current, work, checked.pairs), weights=figures)
+        return current.finish(calibrated, replace(done, reused=todo.reused), report=False)
 
 
 def correlate(
@@ -118,100 +129,110 @@ def correlate(
     device: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Correlate the volumes in ``volumes/`` into ``vectors/``. Returns the summary.
+    """Correlate the volumes in ``volumes/`` into ``vectors/``. Return the summary.
 
     Raises
     ------
     InputError
         If the calibration, or the volumes of all pairs, are missing or belong to other settings.
     """
-    with open_job(experiment, out, device, progress, pairs) as job:
-        job.load_calibration()
-        todo = job.unfinished()
-        if todo:
-            if not any(job.has_volumes(pair) for pair in todo):
-                raise InputError(
-                    f"{job.folder.volume(todo[0], 0)}: expected the two volumes of pair {todo[0]} made with the "
-                    "present settings, found none. Run `lfpiv reconstruct` first."
-                )
-            work = job.work(None, keep_volumes=False)
-            _do(job, worker_plan.alone(work, todo, job.step("image pairs")))
-        return job.finish(report=False)
+    with open_run(experiment, out, device, progress, pairs) as current:
+        calibrated = rig.load_calibration(current)
+        todo = current.unfinished()
+        if todo.pairs and not any(map(current.has_volumes, todo.pairs)):
+            raise InputError(
+                f"{current.folder.volume(todo.pairs[0], 0)}: expected the two volumes of pair {todo.pairs[0]} made "
+                "with the present settings, found none. Run `lfpiv reconstruct` first."
+            )
+        outcomes = _sequential(current, _work(current, None, keep_volumes=False), todo.pairs)
+        return current.finish(calibrated, Invocation(outcomes=outcomes, reused=todo.reused), report=False)
 
 
 def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, Any]:
-    """Write summary and report anew from what a folder holds, also while a run goes on. Returns the summary.
+    """Write summary and report anew from what a folder holds, also during a run on it. Return the summary.
 
     Raises
     ------
     InputError
         If the folder holds no calibration that fits the experiment.
     """
-    with open_job(experiment, out, None, None, writes_results=False) as job:
-        job.load_calibration()
-        return job.finish(report=True)
+    with open_run(experiment, out, None, None, writes_results=False) as current:
+        return current.finish(rig.load_calibration(current), Invocation(), report=True)
 
 
-def _plan(
-    job: Job, todo: list[int], workers: int | None, scheduler: str | None
-) -> tuple[list[int], worker_plan.Plan | None]:
-    """Check images, memory and workers before any work; return the pairs worth it, and None where a cluster does it."""
-    from lfpiv.runs import memory
+@dataclass(frozen=True, kw_only=True)
+class _Checked:
+    """Pairs to do, after all checks."""
 
-    gpus = worker_plan.visible_gpus() if job.device.kind == "cuda" else ()
-    planned = worker_plan.plan(len(todo), workers, job.device, gpus)
-    if todo:
-        todo = job.check_images(todo)
-    if todo:
-        weights = memory.weights_bytes(job.experiment) if not all(map(job.has_volumes, todo)) else 0
+    pairs: list[int]
+    failed: list[Outcome]
+    """Outcomes of all pairs if none can be done; empty otherwise."""
+    workers: Plan | str
+    """Processes of this machine, or the address of a Dask scheduler."""
+
+
+def _check(current: Run, todo: list[int], workers: int | None, scheduler: str | None) -> _Checked:
+    """Check images, memory and workers before any work, and start to preload worker processes."""
+    gpus = worker_plan.visible_gpus() if current.device.kind == "cuda" else ()
+    planned = worker_plan.plan(len(todo), workers, current.device, gpus)
+    pairs, failed = current.check_images(todo) if todo else ([], [])
+    if pairs:
+        needed = 0 if all(map(current.has_volumes, pairs)) else memory.weights_bytes(current.experiment)
         if workers is None:
-            planned = worker_plan.lowered(worker_plan.unasked(planned, job.device), job.experiment, weights, job.device)
-        worker_plan.require_memory(job.experiment, weights, 1 if scheduler else planned.workers)
-    if scheduler:
-        return todo, None
-    if planned.workers > 1:
-        from lfpiv.runs import local_workers
-
-        local_workers.warm_up(planned.kind)
-    return todo, planned
+            planned = worker_plan.fit_installation(planned, current.device)
+            planned = worker_plan.fit_memory(planned, current.experiment, needed, current.device)
+        worker_plan.require_memory(current.experiment, needed, 1 if scheduler else planned.workers)
+    if pairs and planned.workers > 1 and not scheduler:
+        local_workers.start_preloading(planned.kind)
+    return _Checked(pairs=pairs, failed=failed, workers=scheduler or planned)
 
 
-def _outcomes(
-    job: Job,
-    calibration: Calibration,
-    todo: Sequence[int],
-    planned: worker_plan.Plan | None,
-    scheduler: str | None,
-    keep_volumes: bool,
-) -> Generator[Outcome, None, None]:
-    """Do the pairs here or in several processes; the weights are built once, for all of them."""
-    weights = None
-    if not all(map(job.has_volumes, todo)):
-        weights = job.build_weights(job.self_calibrate(calibration), todo)
-    work = job.work(weights, keep_volumes=keep_volumes)
-    if planned is not None and weights is not None:
-        planned = worker_plan.lowered(planned, job.experiment, weights.memory_bytes, job.device)
-    if planned is not None and planned.workers == 1:
-        yield from worker_plan.alone(work, todo, job.step("image pairs"))
-        return
-    from lfpiv.runs import dispatch, worker
-
-    if planned is None:
-        shared = worker.share(work, job.device_request, job.experiment.compute.threads)
-        job.workers_report |= {"count": None, "threads": job.experiment.compute.threads}
+def _process(current: Run, calibration: Calibration, checked: _Checked, keep_volumes: bool) -> Invocation:
+    """Do the pairs in this process or in several; the weights are built once for all of them."""
+    todo, workers = checked.pairs, checked.workers
+    if not todo:
+        return Invocation(outcomes=checked.failed)
+    weights: Weights | None = None
+    figures: WeightsFigures | None = None
+    if not all(map(current.has_volumes, todo)):
+        weights, figures = rig.build_weights(current, calibration, todo)
+        if isinstance(workers, Plan):
+            workers = worker_plan.fit_memory(workers, current.experiment, weights.memory_bytes, current.device)
+    work = _work(current, weights, keep_volumes=keep_volumes)
+    if isinstance(workers, Plan) and workers.workers == 1:
+        return Invocation(outcomes=_sequential(current, work, todo), weights=figures)
+    if isinstance(workers, Plan):
+        used = Workers(count=workers.workers, threads=workers.threads)
     else:
-        shared = worker.share(work, job.device.kind, planned.threads)
-        job.workers_report |= {"count": planned.workers, "threads": planned.threads}
-    del work, weights  # the workers have them in their files; there must be room for both
+        used = Workers(count=None, threads=current.experiment.compute.threads)
+    device = current.device.kind if isinstance(workers, Plan) else current.device_request
+    shared = worker.share(work, device, used.threads)
+    del work, weights  # the workers map them from files; the memory may not have room for both
+    outcomes = _collect(current, dispatch.parallel(shared, todo, workers, current.step(PAIRS)))
+    peak_mib = max(outcome.peak_memory_mib for outcome in outcomes)
+    return Invocation(outcomes=outcomes, weights=figures, workers=replace(used, peak_memory_mib=peak_mib or None))
 
-    def peak(mib: float) -> None:
-        job.workers_report["peak_memory_mib"] = mib
 
-    yield from dispatch.together(shared, todo, planned, scheduler, job.step("image pairs"), peak)
+def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
+    """Return what to do with each pair."""
+    return PairWork(
+        experiment=current.experiment,
+        folder=current.folder,
+        calibration_hash=current.calibration_stamp.hash,
+        weights=weights,
+        darks={} if weights is None else read_darks(current.experiment),
+        keep_volumes=keep_volumes,
+        vectors=vectors,
+    )
 
 
-def _do(job: Job, outcomes: Generator[Outcome, None, None]) -> None:
-    with contextlib.closing(outcomes):  # no worker outlives an interruption
-        for outcome in outcomes:
-            job.note(outcome)
-    job.progress("image pairs", 1.0)
+def _sequential(current: Run, work: PairWork, todo: Sequence[int]) -> list[Outcome]:
+    return _collect(current, dispatch.sequential(work, todo, current.step(PAIRS))) if todo else []
+
+
+def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> list[Outcome]:
+    """Record the outcomes of all pairs as they arrive."""
+    with contextlib.closing(outcomes):  # ends the workers if the run is interrupted
+        found = [current.record(outcome) for outcome in outcomes]
+    current.progress(PAIRS, 1.0)
+    return found

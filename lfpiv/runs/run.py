@@ -1,42 +1,42 @@
-"""One invocation on one experiment and one output folder: what is done once for all pairs, its clock, its warnings."""
+"""One invocation on one experiment and one output folder: its checks, the pairs to do, its summary and report.
+
+`open_run` checks everything, starts the device and yields a `Run`. A `Run` does not change; its methods return what
+they find, and `Run.finish` puts the results of all steps together.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import io
-import json
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, check_pairs, read_experiment
 from lfpiv.files import writing
+from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.results import provenance
-from lfpiv.results.folder import Folder, make_writable, retire
-from lfpiv.runs import memory, summary
-from lfpiv.runs.pair import Outcome, PairWork
-from lfpiv.warn import NAMED_PAIRS, Code, Warning, collected, name_pairs
+from lfpiv.results.folder import Folder, make_writable
+from lfpiv.results.pair_files import PairFiles
+from lfpiv.results.provenance import Stamp
+from lfpiv.runs import memory, pair_figures, summary
+from lfpiv.runs.invocation import Calibrated, Invocation, Workers
+from lfpiv.runs.pair import Outcome
+from lfpiv.runs.summary import Contents, EarlierSummary
+from lfpiv.warn import NAMED_PAIRS, Warning, collected, name_pairs
 from lfpiv_kernels import runtime
-
-if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
-    from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
 
-Progress = Callable[[str, float], None]
-"""Called as ``progress(step, fraction)``, fraction from 0 to 1."""
-
 
 @contextlib.contextmanager
-def open_job(
+def open_run(
     experiment: Experiment | str | Path,
     out: str | Path,
     device: str | None,
@@ -44,12 +44,12 @@ def open_job(
     pairs: tuple[int, int | None] | None = None,
     *,
     writes_results: bool = True,
-) -> Iterator[Job]:
-    """Check everything, start the device, keep the warnings; leave no empty folder behind on failure.
+) -> Iterator[Run]:
+    """Check everything, start the device and collect warnings. Remove the output folder if it stays empty.
 
-    Jobs that write results hold the folder for themselves; `writes_results` is False for one that only reports.
+    A run that writes results locks the folder; `writes_results` is False for a run that only reports.
     """
-    start = time.perf_counter()
+    start_s = time.perf_counter()
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
     folder = Folder(Path(out))
@@ -63,16 +63,27 @@ def open_job(
                 stack.enter_context(folder.held())
                 folder.sweep()
                 stack.callback(folder.sweep)
+            request = device or experiment.compute.device
             try:
-                running = runtime.start(device or experiment.compute.device, threads=experiment.compute.threads)
+                running = runtime.start(request, threads=experiment.compute.threads)
             except (RuntimeError, ValueError) as error:
                 raise InputError(str(error)) from None
             stack.enter_context(threadpool_limits(running.threads))
-            request = device or experiment.compute.device
-            yield Job(experiment, folder, numbers, progress, request, running, warnings, start)
+            yield Run(
+                experiment=experiment,
+                folder=folder,
+                numbers=numbers,
+                progress=progress or ignore_progress,
+                device_request=request,
+                device=running,
+                warnings=warnings,
+                start_s=start_s,
+                calibration_stamp=provenance.of_calibration(experiment),
+                earlier=summary.read(folder.summary),
+            )
     finally:
         for path in made:
-            with contextlib.suppress(OSError):  # not empty: the run got somewhere
+            with contextlib.suppress(OSError):  # not empty
                 path.rmdir()
 
 
@@ -87,314 +98,137 @@ def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> ran
     return range(first, after)
 
 
-class Job:
-    """One invocation: the steps done once, the pairs to do, and what came of them."""
+@dataclass(frozen=True)
+class Todo:
+    """The pairs that an invocation has to do, and what it reuses."""
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        folder: Folder,
-        numbers: range,
-        progress: Progress | None,
-        device_request: str,
-        device: runtime.Device,
-        warnings: list[Warning],
-        start: float,
-    ):
-        self.experiment = experiment
-        self.folder = folder
-        self.numbers = numbers
-        """Pairs selected for this invocation."""
-        self.progress: Progress = progress or (lambda step, fraction: None)
-        self.device_request = device_request
-        """What was asked for: a cluster's machines have devices of their own."""
-        self.device = device
-        self.warnings = warnings
-        self.reused: list[str] = []
-        self.start = start
-        self.seconds: dict[str, float] = {}
-        self.failed: dict[int, str] = {}
-        """Pair -> why this invocation has no result of it."""
-        self.tried: set[int] = set()
-        self.weights_report: dict[str, Any] = {}
-        self.workers_report: dict[str, Any] = {"count": 1, "threads": device.threads, "peak_memory_mib": None}
-        self.calibration: Calibration | None = None
-        self.calibration_stamp = provenance.of_calibration(experiment)
-        self.previous = summary.read(folder.summary)
+    pairs: list[int]
+    reused: tuple[str, ...]
+    """Results of earlier invocations, named for the summary."""
 
-    @contextlib.contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the time of a block that ends well to a stage."""
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def step(self, name: str) -> Callable[[float], None]:
-        """Progress of a step as a function of its fraction."""
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One invocation on one experiment and one output folder."""
+
+    experiment: Experiment
+    folder: Folder
+    numbers: range
+    """Pairs selected for this invocation."""
+    progress: Progress
+    device_request: str
+    """Device that the user asked for; workers of a cluster choose their own by it."""
+    device: runtime.Device
+    warnings: Sequence[Warning]
+    """Warnings of this invocation so far; grows while `open_run` collects them."""
+    start_s: float
+    calibration_stamp: Stamp
+    earlier: EarlierSummary
+
+    def step(self, name: str) -> StepProgress:
+        """Return the progress of one step of the run."""
         return lambda fraction: self.progress(name, fraction)
 
-    # --- what is there, what is to do
+    def files(self, pair: int) -> PairFiles:
+        """Return the files of a pair with the stamps that they must have."""
+        return PairFiles.of(self.experiment, self.calibration_stamp.hash, self.folder, pair)
 
-    def unfinished(self, *, vectors: bool = True, volumes: bool = False) -> list[int]:
-        """Pairs of this invocation whose vectors or volumes are not there or do not fit; logs what is kept and why."""
-        todo, changed = [], dict[str, list[int]]()
+    def has_volumes(self, pair: int) -> bool:
+        """Return whether both volumes of a pair are in the folder and fit."""
+        return self.files(pair).fitting_volumes() is not None
+
+    def unfinished(self, *, vectors: bool = True, volumes: bool = False) -> Todo:
+        """Find the selected pairs whose vectors or volumes are missing or do not fit; log what is kept and why."""
+        changed: dict[str, list[int]] = {}
         for pair in self.numbers:
-            wanted = [(self.folder.vectors(pair), provenance.of_vectors)] if vectors else []
-            wanted += [(self.folder.volume(pair, frame), provenance.of_volumes) for frame in (0, 1)] if volumes else []
-            for path, mark in wanted:
-                found = provenance.marks(path)
-                why = None if found is None else mark(self.experiment, self.calibration_stamp.hash, pair).changes(found)
-                if why != []:
-                    todo.append(pair)
-                    changed.setdefault(", ".join(why or ()), []).append(pair)
-                    break
-            else:
-                self.reused.append(f"{'vectors' if vectors else 'volumes'} of pair {pair}")
-        if len(todo) < len(self.numbers):
-            log.info(
-                "%d of %d pairs: finished before with the same settings, kept",
-                len(self.numbers) - len(todo),
-                len(self.numbers),
-            )
+            changes = self.files(pair).outdated(vectors=vectors, volumes=volumes)
+            if changes is not None:
+                changed.setdefault(", ".join(changes), []).append(pair)
+        todo = sorted(pair for pairs in changed.values() for pair in pairs)
+        finished = sorted({*self.numbers}.difference(todo))
+        if finished:
+            log.info("%d of %d pairs: finished before with the same settings, kept", len(finished), len(self.numbers))
         for reason, pairs in changed.items():
             if reason:
                 log.info("%s changed: %s made anew", reason, name_pairs(pairs))
-        return todo
+        kind = "vectors" if vectors else "volumes"
+        return Todo(todo, tuple(f"{kind} of pair {pair}" for pair in finished))
 
-    def check_images(self, todo: Sequence[int]) -> list[int]:
-        """Warn of pairs whose images cannot be used, and return those that are worth any work.
+    def check_images(self, todo: Sequence[int]) -> tuple[list[int], list[Outcome]]:
+        """Log pairs whose images cannot be used; return the pairs to do, and outcomes if none can be done.
 
-        They are tried and left out when their turn comes; where all are such, none is worth it, and all have failed.
+        If some pairs can be done, all are tried, and the others fail when their turn comes.
 
         Raises
         ------
         InputError
-            If the first one's images cannot be used and no finished pair shows that the experiment file is right.
+            If the first pair cannot be used and no finished pair shows that the experiment file is right.
         """
         bad = dict(check_pairs(self.experiment, [pair for pair in todo if not self.has_volumes(pair)]))
-        if bad and todo[0] in bad and not any(map(self.is_finished, range(self.experiment.pairs))):
+        if bad and todo[0] in bad and not any(map(self._is_finished, range(self.experiment.pairs))):
             others = f" To do the pairs after it, use --pairs {todo[0] + 1}:." if len(bad) < len(todo) else ""
             raise InputError(bad[todo[0]] + others)
         if len(bad) == len(todo):
-            for pair, reason in bad.items():
-                self.note(Outcome(pair=pair, reason=reason))
-            return []
+            return [], [self.record(Outcome(pair=pair, reason=reason)) for pair, reason in bad.items()]
         for reason in list(bad.values())[:NAMED_PAIRS]:
             log.error("%s The other pairs will be done.", reason)
         if len(bad) > NAMED_PAIRS:
             log.error("%d pairs have images that cannot be used: %s", len(bad), name_pairs(list(bad)))
-        return list(todo)
+        return list(todo), []
 
-    def is_finished(self, pair: int) -> bool:
-        """Whether vectors or both volumes of a pair are in the folder and fit."""
-        found = provenance.marks(self.folder.vectors(pair))
-        wanted = provenance.of_vectors(self.experiment, self.calibration_stamp.hash, pair)
-        return (found is not None and not wanted.changes(found)) or self.has_volumes(pair)
+    def _is_finished(self, pair: int) -> bool:
+        found = self.files(pair)
+        return found.fitting_vectors() is not None or found.fitting_volumes() is not None
 
-    def has_volumes(self, pair: int) -> bool:
-        """Whether both volumes of a pair are in the folder and fit."""
-        wanted = provenance.of_volumes(self.experiment, self.calibration_stamp.hash, pair)
-        found = [provenance.marks(self.folder.volume(pair, frame)) for frame in (0, 1)]
-        return all(marks is not None and not wanted.changes(marks) for marks in found)
+    def record(self, outcome: Outcome) -> Outcome:
+        """Log the failure of a pair, retire its results that were made of other images, and return the outcome."""
+        if outcome.reason:
+            log.error("pair %d failed and is left out: %s", outcome.pair, outcome.reason)
+            for path, aside in self.files(outcome.pair).retire_those_of_other_images():
+                log.warning("%s: made of other images than there are now; renamed %s", path, aside.name)
+        return outcome
 
-    # --- steps done once
-
-    def load_calibration(self) -> Calibration:
-        """Load the calibration in the folder; InputError where there is none that fits the experiment."""
-        from lfpiv.calibration.cameras import load_calibration
-
-        path = self.folder.calibration
-        found = provenance.marks(path)
-        if found is None or self.calibration_stamp.changes(found):
-            raise InputError(
-                f"{path}: expected the calibration of this experiment, found none that fits. "
-                "Run `lfpiv calibrate` or `lfpiv run` first."
-            )
-        log.info("calibration: finished before with the same settings, kept")
-        self.reused.insert(0, "calibration")
-        self.calibration = load_calibration(path)
-        return self.calibration
-
-    def calibrate(self) -> Calibration:
-        """Keep the calibration in the folder where it fits the experiment, make it otherwise."""
-        path = self.folder.calibration
-        found = provenance.marks(path)
-        changes = None if found is None else self.calibration_stamp.changes(found)
-        if changes == []:
-            return self.load_calibration()
-        if changes:
-            log.info("%s changed: calibration made anew", ", ".join(changes))
-        from lfpiv.calibration.cameras import calibrate as calibrate_cameras
-
-        with self.timed("calibration"):
-            self.calibration = calibrate_cameras(self.experiment, progress=self.step("calibration"))
-        attributes = {**self.calibration_stamp.attributes, "seconds": self.seconds["calibration"]}
-        _write_calibration(self.calibration, path, **attributes)
-        return self.calibration
-
-    def self_calibrate(self, calibration: Calibration) -> Calibration:
-        """Correct the calibration by the particles where the experiment asks for it; what is in the folder is kept."""
-        mark = provenance.of_self_calibration(self.experiment, self.calibration_stamp.hash)
-        if mark is None:
-            return calibration
-        from lfpiv.calibration.camera import load_calibration
-        from lfpiv.runs import moved_cameras
-
-        path = self.folder.self_calibration
-        found = provenance.marks(path)
-        if found is not None and not mark.changes(found):
-            log.info("self-calibration: finished before with the same settings, kept")
-            self.weights_report["self_calibration"] = json.loads(found["figures"])
-            return load_calibration(path)
-        try:
-            with self.timed("self_calibration"):
-                corrected, self.weights_report["self_calibration"] = moved_cameras.correct(
-                    self.experiment, calibration, self.step("self-calibration")
-                )
-        except ValueError as error:
-            raise InputError(f"{self.experiment.path}: self_calibration.pairs: {error}") from None
-        figures = self.weights_report["self_calibration"]
-        _write_calibration(corrected.calibration, path, **mark.attributes, figures=json.dumps(figures))
-        return corrected.calibration
-
-    def build_weights(self, calibration: Calibration, todo: Sequence[int]) -> Weights:
-        """Build the weights of the grid, for some pairs of which the first tells whether cameras moved."""
-        from lfpiv.calibration.coverage import require_seen, warn_outside
-        from lfpiv.runs import moved_cameras
-        from lfpiv.weights.operator import build_weights, compare_with_count
-
-        method = self.experiment.compute.weights
-        require_seen(self.experiment.path, calibration, self.experiment.grid)
-        warn_outside(calibration, self.experiment.grid)
-        if len(calibration.cameras) == 1:
-            log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
-        with collected() as warnings:
-            with self.timed("weights"):
-                weights = build_weights(
-                    calibration,
-                    self.experiment.grid,
-                    method,
-                    form=self.experiment.compute.weights_form,
-                    limit_bytes=memory.left_for_weights(self.experiment),
-                    progress=self.step("weights"),
-                )
-                _ = weights.camera_sums  # made once for all pairs and workers
-            counted = compare_with_count(weights) if method == "footprint" else {}
-            disparity = moved_cameras.check(self.experiment, weights, todo)
-        memory_mib = weights.memory_bytes / memory.MIB
-        self.weights_report |= {
-            "method": method,
-            "memory_mib": memory_mib,
-            "warnings": [one.to_json() for one in warnings],
-            **disparity,
-        }
-        if method == "footprint":
-            self.weights_report |= {"form": dict(weights.forms), "cuts": dict(weights.cuts)}
-            self.weights_report["profiles_check_l2"] = {
-                name: [round(error, 4) for error in errors] for name, errors in weights.profile_errors.items()
-            }
-            errors = [error for camera in counted.values() for error in camera]
-            self.weights_report["count_check_l2"] = [round(error, 4) for error in errors]
-            if errors:  # of the few voxels drawn some camera may see none
-                share = 100 * np.mean(errors)
-                log.info("weights differ from counted rays by %.1f %% (mean of %d voxels)", share, len(errors))
-        return weights
-
-    # --- the pairs
-
-    def work(self, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
-        """Put together what is to be done with each pair."""
-        return PairWork(
-            experiment=self.experiment,
-            folder=self.folder,
-            calibration_hash=self.calibration_stamp.hash,
-            weights=weights,
-            keep_volumes=keep_volumes,
-            vectors=vectors,
+    def finish(self, calibrated: Calibrated, done: Invocation, *, report: bool) -> dict[str, Any]:
+        """Write summary.json about all results in the folder, and report.html if asked for; return the summary."""
+        contents = self._contents()
+        reused = (*(("calibration",) if calibrated.reused else ()), *done.reused)
+        done = replace(
+            done,
+            reused=reused,
+            warnings=tuple(self.warnings),
+            workers=done.workers or Workers(count=1, threads=self.device.threads),
         )
-
-    def note(self, outcome: Outcome) -> None:
-        """Keep what came of a pair; where it failed, put results aside that were made of other images of it."""
-        pair = outcome.pair
-        self.tried.add(pair)
-        if not outcome.reason:
-            return
-        self.failed[pair] = outcome.reason
-        log.error("pair %d failed and is left out: %s", pair, outcome.reason)
-        made = [(self.folder.vectors(pair), provenance.of_vectors)]
-        made += [(self.folder.volume(pair, frame), provenance.of_volumes) for frame in (0, 1)]
-        for path, mark in made:
-            found = provenance.marks(path)
-            wanted = mark(self.experiment, self.calibration_stamp.hash, pair)
-            if found is None or "images" not in wanted.changes(found):
-                continue
-            with writing(path):
-                aside = retire(path)
-            log.warning("%s: made of other images than there are now; renamed %s", path, aside.name)
-
-    def finish(self, *, report: bool) -> dict[str, Any]:
-        """Write summary.json of all that the folder holds, and report.html where asked; return the summary."""
-        if self.calibration is None:
-            raise InputError(f"{self.folder.calibration}: expected a calibration, found none. Run `lfpiv calibrate`.")
-        vectors, pairs, reconstructed = {}, [], []
-        for pair in range(self.experiment.pairs):
-            path = self.folder.vectors(pair)
-            found = provenance.marks(path)
-            if found is not None and not provenance.of_vectors(
-                self.experiment, self.calibration_stamp.hash, pair
-            ).changes(found):
-                vectors[pair] = path
-                pairs.append(summary.pair_entry(pair, path, found))
-            elif self.has_volumes(pair):
-                marks = [provenance.marks(self.folder.volume(pair, frame)) for frame in (0, 1)]
-                reconstructed.append(summary.volumes_entry(pair, filter(None, marks)))
-        earlier = {entry["pair"]: entry["reason"] for entry in self.previous.get("failed", ())}
-        done = {*self.tried, *vectors}
-        result = summary.build(
-            experiment=self.experiment,
-            calibration=self.calibration,
-            calibration_path=self.folder.calibration,
-            pairs=pairs,
-            reconstructed=reconstructed,
-            failed=self.failed,
-            failed_earlier={
-                pair: reason for pair, reason in earlier.items() if pair < self.experiment.pairs and pair not in done
-            },
-            previous=self.previous,
-            weights_s=self.seconds.get("weights"),
-            weights=self.weights_report,
-            workers=self.workers_report,
-            device=self.device,
-            warnings=self.warnings,
-            reused=self.reused,
-        )
-        self._stop_clock(result)
+        result = summary.build(self.experiment, self.device, calibrated, contents, done, self.earlier)
+        result |= self._usage(done, result["timings_s"])
         if report:
             from lfpiv.report import write_report
 
-            with self.timed("report"), writing(self.folder.report):
-                write_report(self.experiment, self.calibration, result, vectors, self.folder.report)
-            result["timings_s"]["report"] = self.seconds["report"]
-            self._stop_clock(result)
+            start = time.perf_counter()
+            vectors = {pair: self.folder.vectors(pair) for pair in contents.vectors}
+            with writing(self.folder.report):
+                write_report(self.experiment, calibrated.calibration, result, vectors, self.folder.report)
+            result |= self._usage(done, result["timings_s"] | {"report": time.perf_counter() - start})
         with writing(self.folder.summary):
             files.write_json(result, self.folder.summary)
         return result
 
-    def _stop_clock(self, result: dict[str, Any]) -> None:
-        """Put the time and the peak memory so far into a summary."""
-        result["timings_s"]["total"] = time.perf_counter() - self.start
-        earlier = self.previous.get("peak_memory_mib") if self.reused else None
-        peaks = (memory.peak_mib(), earlier, self.workers_report["peak_memory_mib"])
-        result["peak_memory_mib"] = max(peak or 0.0 for peak in peaks)
+    def _contents(self) -> Contents:
+        """Read the figures of all finished pairs of the experiment, from the attributes of their files."""
+        vectors, volumes = {}, {}
+        for pair in range(self.experiment.pairs):
+            found = self.files(pair)
+            if (marks := found.fitting_vectors()) is not None:
+                vectors[pair] = pair_figures.read_figures(found.vectors, marks)
+            elif (both := found.fitting_volumes()) is not None:
+                volumes[pair] = both[0].warnings + both[1].warnings
+        return Contents(vectors=vectors, volumes=volumes)
 
-
-def _write_calibration(calibration: Calibration, path: Path, **attributes: Any) -> None:
-    """Write a calibration and what its file is marked with, whole or not at all."""
-    import h5py
-
-    content = io.BytesIO()  # not straight to disk: see `dataset.write_bytes`
-    calibration.save(content)  # type: ignore[arg-type]  # HDF5 takes files too
-    with h5py.File(content, "a") as opened:
-        opened.attrs.update(attributes)
-    with writing(path):
-        files.write_bytes(content.getbuffer(), path)
+    def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:
+        """Return the time and the peak memory so far, in the form of the summary."""
+        earlier = self.earlier.peak_memory_mib if done.reused else None
+        workers = done.workers.peak_memory_mib if done.workers else None
+        total_s = time.perf_counter() - self.start_s
+        return {
+            "timings_s": timings_s | {"total": total_s},
+            "peak_memory_mib": max(memory.peak_mib(), earlier or 0.0, workers or 0.0),
+        }

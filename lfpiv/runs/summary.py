@@ -1,160 +1,201 @@
-"""The machine-readable figures of a run, ``summary.json``."""
+"""Build ``summary.json``, the machine-readable figures of a run, and read what an earlier invocation wrote there.
+
+`build` takes the calibration, the figures of all results in the folder and what the invocation did. It returns the
+content of the file; nothing else in the package knows its keys.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from lfpiv import files, version
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.results import netcdf
 from lfpiv.runs import summary_warnings
+from lfpiv.runs.invocation import Calibrated, Invocation
+from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.warn import Warning
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import CalibratedCamera, Calibration
+    from lfpiv.calibration.cameras import CalibratedCamera
     from lfpiv.geometry.grid import Grid
     from lfpiv_kernels.runtime import Device
 
 SCHEMA_VERSION = 1
 
 CORRECTION_RAYS = 4000
-"""Rays that tell the network's part in the mapping: their mean square is known to some percent."""
+"""Number of rays for the network's part in the mapping."""
 
-_STAGES = ("calibration", "network_training", "weights", "reconstruction", "correlation")
+
+@dataclass(frozen=True, kw_only=True)
+class Contents:
+    """Results in the folder of a run."""
+
+    vectors: Mapping[int, PairFigures]
+    """Pair -> figures of its vectors."""
+    volumes: Mapping[int, tuple[Warning, ...]]
+    """Pair with volumes and no vectors -> warnings about its images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EarlierSummary:
+    """What the present summary takes over from that of an earlier invocation."""
+
+    weights: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of the weights as stored; empty if there were none."""
+    weights_s: float = 0.0
+    failed: Mapping[int, str] = field(default_factory=dict)
+    """Pair -> why it failed."""
+    peak_memory_mib: float | None = None
+
+
+def read(path: Path) -> EarlierSummary:
+    """Read an earlier summary; an empty one if the file is missing, damaged or of another schema."""
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return EarlierSummary()
+    if not isinstance(found, dict) or found.get("schema_version") != SCHEMA_VERSION:
+        return EarlierSummary()
+    return EarlierSummary(
+        weights=found.get("weights", {}),
+        weights_s=float(found.get("timings_s", {}).get("weights") or 0.0),
+        failed={entry["pair"]: entry["reason"] for entry in found.get("failed", ())},
+        peak_memory_mib=found.get("peak_memory_mib"),
+    )
 
 
 def build(
-    *,
     experiment: Experiment,
-    calibration: Calibration,
-    calibration_path: Path,
-    pairs: Sequence[Mapping[str, Any]],
-    reconstructed: Sequence[Mapping[str, Any]],
-    failed: Mapping[int, str],
-    failed_earlier: Mapping[int, str],
-    previous: Mapping[str, Any],
-    weights_s: float | None,
-    weights: Mapping[str, Any],
-    workers: Mapping[str, Any],
     device: Device,
-    warnings: Sequence[Warning],
-    reused: Sequence[str],
+    calibrated: Calibrated,
+    contents: Contents,
+    done: Invocation,
+    earlier: EarlierSummary,
 ) -> dict[str, Any]:
-    """Put together the figures of everything a folder holds.
+    """Build the summary of everything in a folder.
 
-    ``timings_s`` says what the results in the folder took, read from the files themselves, so also where this
-    invocation found them finished; the peak memory likewise. ``total`` is the time of this invocation.
+    ``timings_s`` is the time that the results took, also those of earlier invocations. ``warnings`` are
+    sentences for people. ``warning_records`` are the same warnings, in the same order, with code and figures.
 
     Parameters
     ----------
     experiment : Experiment
-        What was run.
-    calibration, calibration_path
-        The calibration and its file.
-    pairs : sequence of dict
-        Figures of the finished pairs, from `pair_entry`.
-    reconstructed : sequence of dict
-        Number and warnings of pairs that have volumes and no vectors yet, from `volumes_entry`.
-    failed, failed_earlier : dict
-        Pair -> why it has no result: of this invocation, and of earlier ones.
-    previous : dict
-        Earlier summary of the folder, or nothing.
-    weights_s, weights
-        Seconds and figures of the weights; None and nothing where this invocation built none.
-    workers : dict
-        Processes that worked on pairs: how many, their threads and their peak memory.
+        The experiment.
     device : Device
-        Where the kernels ran.
-    warnings : sequence of Warning
-        Warnings of this invocation. Warnings about results are read from the results, in every invocation.
-    reused : sequence of str
-        What was kept from an earlier invocation.
+        Where the kernels of this process ran.
+    calibrated : Calibrated
+        The calibration.
+    contents : Contents
+        Results in the folder.
+    done : Invocation
+        What this invocation did.
+    earlier : EarlierSummary
+        The summary that was in the folder.
 
     Returns
     -------
     dict
-        JSON-able content of ``summary.json``; ``total`` and the peak memory are filled in at the very end of a run.
+        Content of ``summary.json`` without ``timings_s.total`` and ``peak_memory_mib``, which the run adds at its end.
     """
-    reports = {name: _report(camera, experiment.grid) for name, camera in calibration.cameras.items()}
-    earlier = previous.get("timings_s", {})
-    timings = {
-        "calibration": float(netcdf.read_attributes(calibration_path)["seconds"]),
-        "network_training": sum(float(report.get("training_s", 0.0)) for report in reports.values()),
-        "weights": weights_s if weights_s is not None else float(earlier.get("weights") or 0.0),
-        "reconstruction": sum(pair["reconstruction_s"] for pair in pairs),
-        "correlation": sum(pair["correlation_s"] for pair in pairs),
-    }
-    grid = experiment.grid
-    weights = dict(weights) or previous.get("weights", {})
-    found = [
-        *summary_warnings.rig_warnings(calibration, grid),
-        *map(Warning.from_json, weights.get("warnings", ())),
-        *summary_warnings.image_warnings([*pairs, *reconstructed]),
-        *summary_warnings.pair_warnings(pairs),
-        *warnings,
-    ]
+    reports = {name: _report(camera, experiment.grid) for name, camera in calibrated.calibration.cameras.items()}
+    weights = done.weights.to_json() if done.weights else dict(earlier.weights)
+    warnings = _warnings(experiment, calibrated, contents, done, weights)
+    pairs = contents.vectors.values()
     return {
         "schema_version": SCHEMA_VERSION,
+        **_settings(experiment),
+        "device": {"kind": device.kind, "threads": device.threads, "reason": device.reason},
+        "workers": asdict(done.workers) if done.workers else {},
+        "versions": version.versions(),
+        "timings_s": {
+            "calibration": calibrated.seconds,
+            "network_training": sum(float(report.get("training_s", 0.0)) for report in reports.values()),
+            "weights": done.weights.seconds if done.weights else earlier.weights_s,
+            "reconstruction": sum(figures.reconstruction_s for figures in pairs),
+            "correlation": sum(figures.correlation_s for figures in pairs),
+        },
+        "calibration": reports,
+        "weights": weights,
+        "pairs": [_pair_entry(pair, figures) for pair, figures in contents.vectors.items()],
+        "failed": _failures(experiment, contents, done, earlier),
+        "valid_fraction": _mean(figures.valid_fraction for figures in pairs),
+        "finite_fraction": _mean(figures.finite_fraction for figures in pairs),
+        "warnings": list(warnings),
+        "warning_records": [warning.to_json() for warning in warnings.values()],
+        "reused": list(done.reused),
+    }
+
+
+def _settings(experiment: Experiment) -> dict[str, Any]:
+    return {
         "experiment": {
             "name": experiment.name,
             "file": str(experiment.path),
             "dt_s": experiment.dt_s,
             "pairs": experiment.pairs,
-            "volume_shape": list(grid.shape),
-            "voxel_mm": grid.voxel_mm,
+            "volume_shape": list(experiment.grid.shape),
+            "voxel_mm": experiment.grid.voxel_mm,
         },
-        "device": {"kind": device.kind, "threads": device.threads, "reason": device.reason},
-        "workers": dict(workers),
-        "versions": version.versions(),
         "settings": {
             "smart": experiment.smart.model_dump(),
             "correlation": experiment.correlation.model_dump(),
             "network": experiment.network.model_dump(),
             "compute": experiment.compute.model_dump(),
         },
-        "timings_s": {stage: timings[stage] for stage in _STAGES},
-        "peak_memory_mib": None,
-        "calibration": {name: _scalars(report) for name, report in reports.items()},
-        "weights": weights,
-        "pairs": list(pairs),
-        "failed": sorted(
-            [{"pair": pair, "reason": reason} for pair, reason in failed.items()]
-            + [{"pair": pair, "reason": reason, "earlier": True} for pair, reason in failed_earlier.items()],
-            key=lambda entry: entry["pair"],
-        ),
-        "valid_fraction": _mean(pair["valid_fraction"] for pair in pairs),
-        "finite_fraction": _mean(pair["finite_fraction"] for pair in pairs),
-        "warnings": list(dict.fromkeys(warning.sentence for warning in found)),
-        "reused": list(reused),
     }
 
 
-def read(path: Path) -> dict[str, Any]:
-    """Read an earlier summary; nothing where there is none or it cannot be read."""
-    try:
-        found = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) and found.get("schema_version") == SCHEMA_VERSION else {}
+def _warnings(
+    experiment: Experiment, calibrated: Calibrated, contents: Contents, done: Invocation, weights: Mapping[str, Any]
+) -> dict[str, Warning]:
+    """Collect all warnings by their sentences, each once."""
+    images = {pair: figures.warnings for pair, figures in contents.vectors.items()} | dict(contents.volumes)
+    found = [
+        *summary_warnings.rig_warnings(calibrated.calibration, experiment.grid),
+        *map(Warning.from_json, weights.get("warnings", ())),
+        *summary_warnings.image_warnings(images),
+        *summary_warnings.pair_warnings(contents.vectors),
+        *done.warnings,
+    ]
+    by_sentence: dict[str, Warning] = {}
+    for warning in found:
+        by_sentence.setdefault(warning.sentence, warning)
+    return by_sentence
+
+
+def _failures(
+    experiment: Experiment, contents: Contents, done: Invocation, earlier: EarlierSummary
+) -> list[dict[str, Any]]:
+    """List the pairs that failed; those of earlier invocations are marked unless they were tried or finished since."""
+    tried_or_finished = {*(outcome.pair for outcome in done.outcomes), *contents.vectors}
+    entries = [{"pair": pair, "reason": reason} for pair, reason in done.failed.items()]
+    entries += [
+        {"pair": pair, "reason": reason, "earlier": True}
+        for pair, reason in earlier.failed.items()
+        if pair < experiment.pairs and pair not in tried_or_finished
+    ]
+    return sorted(entries, key=lambda entry: entry["pair"])
 
 
 def _report(camera: CalibratedCamera, grid: Grid) -> dict[str, Any]:
-    """Figures of a camera's calibration, and of the network's part in it over the volume."""
-    texts = [warning.sentence for warning in camera.warnings]
-    figures = {} if camera.report is None else camera.report.to_json()
-    return figures | {"warnings": texts, "network_correction_pitch": network_correction(camera, grid)}
+    """Return the numbers and short texts of a camera's calibration; its arrays stay in the calibration file."""
+    report = ({} if camera.report is None else camera.report.to_json()) | {
+        "warnings": [warning.sentence for warning in camera.warnings],
+        "network_correction_pitch": network_correction(camera, grid),
+    }
+    return {key: files.plain(value) for key, value in report.items() if not isinstance(value, np.ndarray)}
 
 
 def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
-    """Root mean square of what the network adds to the thin lens over a volume [microlens pitch].
+    """Return the root mean square of what the network adds to the thin lens over a volume [microlens pitch].
 
-    Rays through the whole pupil from a sample of the voxels; None without a thin lens, where the network is all.
+    Uses rays through the whole pupil from random voxels. None without a thin lens, where the network is the mapping.
     """
     if camera.network is None or camera.baseline is None:
         return None
@@ -167,78 +208,10 @@ def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
     return float(np.sqrt((correction**2).sum(1).mean()) / camera.lattice.pitch_mm)
 
 
-def pair_entry(number: int, path: Path, marks: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures of a finished pair, from the marks of its file: thousands of files are not read as a whole."""
-    if "figures" in marks:
-        figures = json.loads(marks["figures"])
-    else:
-        figures = files.plain(pair_figures(netcdf.read_vectors(path), netcdf.read_reconstruction(path)))
-    return {"pair": number, "file": path.name, **figures}
-
-
-def volumes_entry(number: int, marks: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the warnings of a pair whose vectors are not there yet, from the marks of its volumes."""
-    found = [warning.to_json() for mark in marks for warning in summary_warnings.stored_warnings(mark)]
-    return {"pair": number, "warnings": found}
-
-
-def pair_figures(vectors: xr.Dataset, reconstruction: xr.Dataset | None) -> dict[str, Any]:
-    """Figures of a pair's vectors and of what is left of its volumes; stored with the vectors."""
-    valid = vectors["valid"].values
-    finite = np.isfinite(vectors["u"].values) & np.isfinite(vectors["v"].values) & np.isfinite(vectors["w"].values)
-    result: dict[str, Any] = {
-        "vectors": list(vectors["u"].shape),
-        "valid_fraction": float(valid.mean()),
-        "finite_fraction": float(finite.mean()),
-        "seen_fraction": float(vectors.attrs.get("seen_fraction", 1.0)),
-        "verdict": str(vectors.attrs["verdict"]),
-        "warnings": [warning.to_json() for warning in summary_warnings.stored_warnings(vectors.attrs)],
-        "reconstruction_s": float(vectors.attrs["reconstruction_s"]),
-        "correlation_s": float(vectors.attrs["correlation_s"]),
-        "velocity_m_per_s": {name: _spread(vectors[name], valid & finite) for name in ("u", "v", "w")},
-        "uncertainty_voxel": _median(vectors["uncertainty"].values[valid]),
-        "peak_ratio": _median(vectors["peak_ratio"].values[valid]),
-    }
-    if "motion" in vectors.attrs:
-        from lfpiv.reconstruction.motion import Motion
-
-        result["motion"] = {
-            "verdict": str(vectors.attrs["motion"]),
-            "followed": vectors.attrs["motion"] == Motion.FOLLOWED.value,
-            "valid_fraction": np.atleast_1d(vectors.attrs["motion_valid"]).tolist(),
-        }
-    if reconstruction is not None:
-        frames = [str(frame) for frame in reconstruction["frame"].values]
-        history = reconstruction["residual"].values
-        result["residual"] = {frame: row[np.isfinite(row)].tolist() for frame, row in zip(frames, history, strict=True)}
-        for name in netcdf.OF_IMAGES:
-            if name in reconstruction:
-                cameras = [str(camera) for camera in reconstruction["camera"].values]
-                result[name] = {
-                    frame: dict(zip(cameras, map(float, row), strict=True))
-                    for frame, row in zip(frames, reconstruction[name].values, strict=True)
-                }
-        result["stop"] = {frame: str(stop) for frame, stop in zip(frames, reconstruction["stop"].values, strict=True)}
-    return result
-
-
-def _spread(values: xr.DataArray, valid: np.ndarray) -> dict[str, float | None]:
-    good = values.values[valid]
-    if good.size == 0:
-        return {"mean": None, "sd": None, "min": None, "max": None}
-    return {"mean": float(good.mean()), "sd": float(good.std()), "min": float(good.min()), "max": float(good.max())}
-
-
-def _median(values: np.ndarray) -> float | None:
-    values = values[np.isfinite(values)]
-    return float(np.median(values)) if values.size else None
+def _pair_entry(pair: int, figures: PairFigures) -> dict[str, Any]:
+    return {"pair": pair, "file": f"pair_{pair:04d}.nc", **figures.to_json()}
 
 
 def _mean(values: Iterable[float]) -> float | None:
     values = list(values)
     return float(np.mean(values)) if values else None
-
-
-def _scalars(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers and short texts of a camera's report; arrays belong to the calibration file."""
-    return {key: files.plain(value) for key, value in report.items() if not isinstance(value, np.ndarray)}

@@ -1,23 +1,16 @@
-"""Collect the warnings about the results in a folder: each once, with the pairs that it concerns."""
+"""Collect the warnings about the results in a folder. Equal warnings about several pairs become one."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 from lfpiv.calibration.camera import Calibration
 from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.geometry.grid import Grid
 from lfpiv.reconstruction.result import SmartStop
+from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import Code, Warning, gather
-
-
-def stored_warnings(attributes: Mapping[str, Any]) -> list[Warning]:
-    """Read the warnings about the images of a pair from the attributes of its file, of version 0.1.0 too."""
-    stored = json.loads(attributes.get("warnings", attributes.get("findings", "[]")))
-    return [Warning.from_json(one) for one in stored]
 
 
 def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
@@ -27,25 +20,23 @@ def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
     return [*found, Warning(code=Code.ONE_CAMERA)] if len(calibration.cameras) == 1 else found
 
 
-def image_warnings(pairs: Iterable[Mapping[str, Any]]) -> list[Warning]:
-    """Return the warnings about the images of all pairs, from the ``warnings`` in their entries of the summary."""
-    return gather(
-        Warning.from_json(stored).of_pair(pair["pair"]) for pair in pairs for stored in pair.get("warnings", ())
-    )
+def image_warnings(pairs: Mapping[int, Iterable[Warning]]) -> list[Warning]:
+    """Return the warnings about the images of all pairs, given those of each pair."""
+    return gather(warning.of_pair(pair) for pair, warnings in pairs.items() for warning in warnings)
 
 
-def pair_warnings(pairs: Sequence[Mapping[str, Any]]) -> list[Warning]:
-    """Return the warnings about volumes and vectors of finished pairs, from their entries of the summary."""
+def pair_warnings(pairs: Mapping[int, PairFigures]) -> list[Warning]:
+    """Return the warnings about volumes and vectors of finished pairs, given the figures of each pair."""
     found = []
-    for pair in pairs:
-        of_pair, motion = (pair["pair"],), pair.get("motion")
-        if SmartStop.DIVERGED.value in pair.get("stop", {}).values():
-            found.append(Warning(code=Code.DIVERGED, pairs=of_pair, figures={"verdict": SmartStop.DIVERGED.value}))
-        if motion is not None and not motion["followed"]:
-            shares = motion["valid_fraction"]
-            figures = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion["verdict"]}
-            found.append(Warning(code=Code.MOTION_LOST, pairs=of_pair, figures=figures))
-        if pair["verdict"] != Verdict.GOOD.value:
-            figures = {"share": pair["valid_fraction"], "verdict": pair["verdict"]}
-            found.append(Warning(code=Code.FEW_VALID, pairs=of_pair, figures=figures))
+    for pair, figures in pairs.items():
+        if figures.stop is not None and SmartStop.DIVERGED.value in figures.stop.values():
+            found.append(Warning(code=Code.DIVERGED, pairs=(pair,), figures={"verdict": SmartStop.DIVERGED.value}))
+        motion = figures.motion
+        if motion is not None and not motion.followed:
+            shares = motion.valid_fraction
+            words = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion.verdict}
+            found.append(Warning(code=Code.MOTION_LOST, pairs=(pair,), figures=words))
+        if figures.verdict != Verdict.GOOD.value:
+            words = {"share": figures.valid_fraction, "verdict": figures.verdict}
+            found.append(Warning(code=Code.FEW_VALID, pairs=(pair,), figures=words))
     return gather(found)

@@ -1,7 +1,7 @@
-"""What runs in a worker process: pairs, one at a time, with weights that all processes of a machine share.
+"""Work of a worker process: one pair at a time, with weights that all processes of a machine share.
 
-The parent leaves a task in a folder; a worker opens it once and keeps it for the pairs that follow. Nothing but the
-names of that folder and of a pair is sent to a worker, and nothing but a `Result` comes back.
+The run writes a task into a folder with `share`. A worker opens it once and uses it for all its pairs. It gets the
+names of that folder and of a pair, and returns a `Result`.
 """
 
 from __future__ import annotations
@@ -22,23 +22,25 @@ from pathlib import Path
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
+from lfpiv.progress import StepProgress
 from lfpiv.results.folder import Folder
 from lfpiv.runs import memory
-from lfpiv.runs.pair import WRITES, Outcome, PairWork
+from lfpiv.runs.frame_light import read_darks
+from lfpiv.runs.pair import CORRELATED, Outcome, PairWork
 from lfpiv.version import __version__
 from lfpiv_kernels import runtime
 
 log = logging.getLogger(__name__)
 
 REPORT_EVERY_S = 0.5
-"""A worker tells how far it is at most this often [s]."""
+"""Shortest interval between two progress reports of a worker [s]."""
 
 _TASK, _WEIGHTS = "task.pickle", "weights"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What a worker needs to know of a run; everything larger it finds in the run's folder."""
+    """Settings of a run for its workers. Arrays lie in files of the run's folder."""
 
     version: str
     experiment: Experiment
@@ -47,33 +49,32 @@ class Task:
     keep_volumes: bool
     vectors: bool
     weights: str | None
-    """Hash of the weights' content; None where none are needed."""
+    """Hash of the weights' content; None if no volume has to be reconstructed."""
     device: str
     threads: int | None
-    """CPU threads of each worker; None for those its cluster gave it."""
+    """CPU threads of each worker; None for as many as its cluster grants."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What came of a pair in a worker."""
+    """Result of the work on a pair in a worker."""
 
     outcome: Outcome | None
-    """None where the worker could not even try; `fatal` says why."""
+    """None if no pair can be done; `fatal` says why."""
     fatal: str = ""
     storage: bool = False
-    """Whether that is because results cannot be written."""
+    """Whether the reason is that results cannot be written."""
     records: tuple[tuple[str, int, str], ...] = ()
-    """What was logged: logger, level, text."""
-    peak_mib: float = 0.0
+    """Log records: logger, level, text."""
 
 
 def share(work: PairWork, device: str, threads: int | None) -> Path:
-    """Write what the workers need into the run's folder, weights included; return the folder to hand to `work_on`.
+    """Write the task and the weights into the run's folder; return the folder for `work_on`.
 
     Raises
     ------
     StorageError
-        If there is no room for it.
+        If there is no space for them.
     """
     from lfpiv.weights.storage import save_weights
 
@@ -104,7 +105,7 @@ def share(work: PairWork, device: str, threads: int | None) -> Path:
 
 
 def _absolute(experiment: Experiment) -> Experiment:
-    """Return the same experiment for processes that run in another folder."""
+    """Return the experiment with absolute paths, for processes that run in another folder."""
     cameras = tuple(
         dataclasses.replace(
             camera,
@@ -118,13 +119,13 @@ def _absolute(experiment: Experiment) -> Experiment:
 
 # --- in the worker
 
-_busy = threading.Lock()  # kernels and their scratch memory serve one pair at a time
+_busy = threading.Lock()  # kernels and their scratch memory can be used by one pair at a time
 _opened: dict[Path, PairWork] = {}
 _stopped: set[Path] = set()
 
 
 class _Stopped(BaseException):
-    """The run was given up; no Exception, so that nobody takes it for a pair's failure."""
+    """The run ended. No Exception, so that it is not taken for a failure of the pair."""
 
 
 def work_on(shared: Path, pair: int, report: Callable[[int, float], None], threads: Callable[[], int]) -> Result:
@@ -137,23 +138,24 @@ def work_on(shared: Path, pair: int, report: Callable[[int, float], None], threa
     pair : int
         Number of the pair.
     report : callable
-        Called as ``report(pair, fraction)`` now and then.
+        Called as ``report(pair, fraction)``, at most once in `REPORT_EVERY_S`.
     threads : callable
-        Returns the CPU threads this worker may use where the task does not say.
+        Returns the CPU threads that this worker may use if the task does not say.
     """
-    with _busy, _caught() as records:
+    with _busy, _captured_logs() as records:
         try:
             work = _open(shared, threads)
-            outcome = work.do(pair, _now_and_then(shared, pair, report))
+            done = work.do(pair, _throttled(shared, pair, report))
         except _Stopped:
             return Result(outcome=None, fatal="stopped")
         except (StorageError, InputError) as error:
             return Result(outcome=None, fatal=str(error), storage=isinstance(error, StorageError))
-        return Result(outcome=outcome, records=tuple(records), peak_mib=memory.peak_mib())
+        outcome = dataclasses.replace(done, peak_memory_mib=memory.peak_mib())
+        return Result(outcome=outcome, records=tuple(records))
 
 
 def release(shared: Path) -> None:
-    """Forget a task, and give up the pair of it that is being worked on."""
+    """Forget a task and stop the work on its present pair."""
     _stopped.add(shared)
     _opened.pop(shared, None)
 
@@ -182,28 +184,30 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
     if task.weights is not None:
         cameras = load_calibration(folder.calibration).cameras
         weights = open_weights(shared / _WEIGHTS, cameras, task.weights)
-    _opened.clear()  # of an earlier run
+    _opened.clear()  # the task of an earlier run
     _opened[shared] = PairWork(
         experiment=task.experiment,
         folder=folder,
         calibration_hash=task.calibration_hash,
         weights=weights,
+        darks={} if weights is None else read_darks(task.experiment),
         keep_volumes=task.keep_volumes,
         vectors=task.vectors,
     )
     return _opened[shared]
 
 
-def _now_and_then(shared: Path, pair: int, report: Callable[[int, float], None]) -> Callable[[float], None]:
+def _throttled(shared: Path, pair: int, report: Callable[[int, float], None]) -> StepProgress:
+    """Return the progress of a pair: it reports at intervals, and stops the work if the run ended."""
     last = -REPORT_EVERY_S
 
     def progress(fraction: float) -> None:
         nonlocal last
         if shared in _stopped:
             raise _Stopped
-        if time.monotonic() - last >= REPORT_EVERY_S or fraction == WRITES:
+        if time.monotonic() - last >= REPORT_EVERY_S or fraction == CORRELATED:
             last = time.monotonic()
-            if not (shared / _TASK).exists():  # its run is dead, and the next one has swept it away
+            if not (shared / _TASK).exists():  # the run died, and the next run removed its folder
                 raise _Stopped
             report(pair, fraction)
 
@@ -211,8 +215,8 @@ def _now_and_then(shared: Path, pair: int, report: Callable[[int, float], None])
 
 
 @contextlib.contextmanager
-def _caught() -> Iterator[list[tuple[str, int, str]]]:
-    """Collect what this package logs while a pair is worked on: the parent logs it in its own process."""
+def _captured_logs() -> Iterator[list[tuple[str, int, str]]]:
+    """Collect what this package logs in a block; the process of the run logs it instead."""
     records: list[tuple[str, int, str]] = []
 
     class Collect(logging.Handler):

@@ -1,92 +1,88 @@
-"""Many pairs: how many processes work on them, with which threads and devices, and what comes of each pair."""
+"""Plan the worker processes of a run: how many, with how many threads, on which GPUs, within the memory."""
 
 from __future__ import annotations
 
 import importlib.util
 import logging
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.runs import memory
-from lfpiv.runs.pair import Outcome, PairWork
 from lfpiv.warn import Code, Warning, warn
 from lfpiv_kernels.runtime import Device
 
 log = logging.getLogger(__name__)
 
-MOST_WORKERS = 1024
-"""More are a slip."""
+MAX_WORKERS = 1024
+"""Largest number of workers that is accepted; more are taken for a typing error."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How the pairs of a run are shared out on this machine."""
+    """Distribution of the pairs of a run over processes of this machine."""
 
     workers: int
-    """Processes that work on pairs; one: this process itself."""
+    """Number of processes that work on pairs; 1 is the process of the run itself."""
     threads: int
     """CPU threads of each."""
     devices: tuple[str | None, ...]
-    """What each process sees as CUDA_VISIBLE_DEVICES; None: what this one sees."""
+    """CUDA_VISIBLE_DEVICES of each process; None leaves it as it is in this process."""
     kind: str = "cpu"
     """Where their kernels run: "cpu" or "cuda"."""
 
 
 def plan(pairs: int, workers: int | None, device: Device, gpus: Sequence[str] = ()) -> Plan:
-    """Share pairs out to processes: never more of them than pairs, on CUDA in turn over the GPUs.
+    """Distribute pairs over at most as many processes; on CUDA the processes take the GPUs in turn.
 
     Parameters
     ----------
     pairs : int
-        Pairs to do.
+        Number of pairs.
     workers : int, optional
-        Processes asked for; default: one per GPU on CUDA, one otherwise.
+        Number of processes; default: one per GPU on CUDA, one otherwise.
     device : Device
-        Where this process runs its kernels; its threads are shared out.
+        Device of this process; the workers share its threads.
     gpus : sequence of str
-        Names of the GPUs, as CUDA_VISIBLE_DEVICES has them.
+        Names of the GPUs as in CUDA_VISIBLE_DEVICES.
 
     Raises
     ------
     InputError
-        If `workers` is not a whole number from 1 on.
+        If `workers` is no whole number from 1 to `MAX_WORKERS`.
     """
-    if workers is not None and not (type(workers) is int and 1 <= workers <= MOST_WORKERS):
-        raise InputError(f"--workers: expected a whole number from 1 to {MOST_WORKERS}, found {workers!r}.")
-    spread = device.kind == "cuda" and len(gpus) > 1
+    if workers is not None and not (type(workers) is int and 1 <= workers <= MAX_WORKERS):
+        raise InputError(f"--workers: expected a whole number from 1 to {MAX_WORKERS}, found {workers!r}.")
+    several = device.kind == "cuda" and len(gpus) > 1
     if workers is None:
-        workers = len(gpus) if spread else 1
+        workers = len(gpus) if several else 1
     workers = max(min(workers, pairs), 1)
-    devices = tuple(gpus[number % len(gpus)] if spread and workers > 1 else None for number in range(workers))
-    if spread and workers != len(gpus):
+    devices = tuple(gpus[number % len(gpus)] if several and workers > 1 else None for number in range(workers))
+    if several and workers != len(gpus):
         using = f"each has one of {len(gpus)} GPUs" if workers < len(gpus) else f"they share {len(gpus)} GPUs"
         log.info("%d %s for %d pairs: %s", workers, "worker" if workers == 1 else "workers", pairs, using)
     return Plan(workers, max(device.threads // workers, 1), devices, device.kind)
 
 
 def visible_gpus() -> tuple[str, ...]:
-    """Return the names of the GPUs that processes of this one can have, as CUDA_VISIBLE_DEVICES has them.
-
-    Warp must run.
-    """
+    """Return the names of the GPUs that worker processes can use. Warp must run."""
     import warp as wp
 
     return gpu_names(os.environ.get("CUDA_VISIBLE_DEVICES"), len(wp.get_cuda_devices()))
 
 
 def gpu_names(listed: str | None, count: int) -> tuple[str, ...]:
-    """Name the GPUs that a process may hand on to others.
+    """Name the GPUs of this process as in CUDA_VISIBLE_DEVICES.
 
     Parameters
     ----------
     listed : str, optional
-        CUDA_VISIBLE_DEVICES: numbers or UUIDs, as the user or the cluster set it; None where it is not set.
+        CUDA_VISIBLE_DEVICES: numbers or UUIDs, as the user or the cluster set it; None if it is not set.
     count : int
-        GPUs that this process sees. Of a list CUDA takes what stands before the first name it does not know. Of parts
-        of GPUs (names with "MIG-") it shows every process a single one, whatever the list says.
+        GPUs that this process sees. CUDA ignores the list from the first unknown name on. Of parts of GPUs (names with
+        "MIG-") CUDA shows a process only one, so all listed parts count.
     """
     names = [name.strip() for name in (listed or "").split(",")]
     if count and all(name.startswith("MIG-") for name in names):
@@ -95,7 +91,16 @@ def gpu_names(listed: str | None, count: int) -> tuple[str, ...]:
 
 
 def require_memory(experiment: Experiment, weights: int, workers: int) -> None:
-    """Log what the run will take; refuse workers that do not fit into the memory, before any work.
+    """Log the memory that the run needs; refuse more workers than fit, before any work.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    weights : int
+        Memory of the weights [byte].
+    workers : int
+        Number of worker processes.
 
     Raises
     ------
@@ -117,8 +122,8 @@ def require_memory(experiment: Experiment, weights: int, workers: int) -> None:
     memory.require(needed, experiment, "volumes and weights of")
 
 
-def lowered(planned: Plan, experiment: Experiment, weights: int, device: Device) -> Plan:
-    """Take fewer workers where so many do not fit into the memory beside the weights; says so."""
+def fit_memory(planned: Plan, experiment: Experiment, weights: int, device: Device) -> Plan:
+    """Return a plan with as many workers as fit into the memory beside weights [byte]; warn if these are fewer."""
     fits = memory.fitting_workers(experiment, weights, planned.workers)
     if fits == planned.workers:
         return planned
@@ -133,20 +138,9 @@ def lowered(planned: Plan, experiment: Experiment, weights: int, device: Device)
     return replace(planned, workers=fits, threads=max(device.threads // fits, 1), devices=planned.devices[:fits])
 
 
-def unasked(planned: Plan, device: Device) -> Plan:
-    """Several workers that nobody asked for need a package that nobody need have installed; without it, take one."""
+def fit_installation(planned: Plan, device: Device) -> Plan:
+    """Return a plan with one worker, and warn, if several need the package `distributed` and it is not installed."""
     if planned.workers == 1 or importlib.util.find_spec("distributed") is not None:
         return planned
     warn(log, Warning(code=Code.ONE_GPU, figures={"gpus": len(set(planned.devices))}))
     return Plan(1, device.threads, (None,), device.kind)
-
-
-def alone(work: PairWork, todo: Sequence[int], progress: Callable[[float], None]) -> Generator[Outcome, None, None]:
-    """Do pairs one after the other in this process."""
-    for number, pair in enumerate(todo):
-
-        def step(fraction: float, number: int = number) -> None:
-            progress((number + fraction) / len(todo))
-
-        step(0.0)
-        yield work.do(pair, step)

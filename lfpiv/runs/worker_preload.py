@@ -1,6 +1,6 @@
-"""Everything that a worker process imports, read once by the process that the workers of a machine are forked from.
+"""Imports of a worker process. The process that workers are forked from imports this module once.
 
-Reading it takes most of a worker's start. No device is started here: each worker does so itself, once.
+Imports take most of the time that a worker needs to start. No device is started here: each worker starts its own.
 """
 # ruff: noqa: F401
 

@@ -8,6 +8,8 @@ import xarray as xr
 
 from lfpiv.errors import InputError
 from lfpiv.results import netcdf, provenance
+from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
+from lfpiv.warn import Code, Warning
 
 
 def vectors(seed=0, shape=(2, 3, 4)):
@@ -45,7 +47,8 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
     back = netcdf.read_vectors(path)
     xr.testing.assert_equal(back, written)
     assert back["valid"].dtype == bool and back["w"].attrs["units"] == "m/s"
-    assert provenance.marks(path) == {"settings_hash": "0123"} and json.loads(back.attrs["smart"]) == {"iterations": 2}
+    assert provenance.read_marks(path) == provenance.Marks(settings_hash="0123")
+    assert json.loads(back.attrs["smart"]) == {"iterations": 2}
     condensed = netcdf.read_reconstruction(path)
     np.testing.assert_array_equal(condensed["projection_y"].values[1], pair["b"].values.max(1))
     profile = pair["b"].values.mean((1, 2))
@@ -74,16 +77,24 @@ def test_files_of_earlier_versions_are_read(tmp_path, version):
 
 
 def test_what_is_known_of_the_images_travels_with_the_volumes(tmp_path):
-    pair = {"a": volume(1, [0.9, 0.5]), "b": volume(2, [0.8, 0.6])}
-    for frame, values in (("a", [0.5, 0.01]), ("b", [0.4, 0.6])):
-        pair[frame].attrs |= {"cameras": ["left", "right"], "structure": values}
-        pair[frame].attrs |= {"camera_gain": [1.0, 0.4], "light_outside": [0.25, values[1]]}
-        netcdf.write_volume(pair[frame], tmp_path / f"{frame}.nc", attributes={})
-    condensed = netcdf.build_reconstruction({frame: netcdf.read_volume(tmp_path / f"{frame}.nc") for frame in "ab"})
+    volumes, records = [volume(1, [0.9, 0.5]), volume(2, [0.8, 0.6])], []
+    for one, frame, values in zip(volumes, "ab", ([0.5, 0.01], [0.4, 0.6]), strict=True):
+        one.attrs |= {"camera_gain": [1.0, 0.4], "light_outside": [0.25, values[1]]}
+        structure = dict(zip(("left", "right"), values, strict=True))
+        doubt = Warning(code=Code.SATURATED, subject=f"left, frame {frame}", figures={"share": 0.1})
+        records.append(FrameRecord(frame=frame, structure=structure, warnings=(doubt,), seconds=2.0))
+    pair = PairVolumes(volumes=tuple(volumes), records=tuple(records))
+    stamps = provenance.PairStamps(volumes=provenance.Stamp({"volume": 1}), vectors=provenance.Stamp({}))
+    paths = (tmp_path / "a.nc", tmp_path / "b.nc")
+    files = PairFiles(pair=0, vectors=tmp_path / "pair.nc", volumes=paths, stamps=stamps)
+    files.write_volumes(pair)
+    stored = files.read_volumes()
+    assert stored.records == pair.records
+    condensed = stored.condensed()
     assert condensed["structure"].sel(frame="a", camera="right") == 0.01
     assert condensed["camera_gain"].sel(frame="b", camera="right") == 0.4
     assert condensed["light_outside"].sel(frame="b", camera="right") == 0.6
-    xr.testing.assert_equal(condensed, netcdf.build_reconstruction(pair))
+    xr.testing.assert_equal(condensed, pair.condensed())
 
 
 def test_a_vector_file_of_another_form_is_refused(tmp_path):
@@ -100,4 +111,4 @@ def test_a_vector_file_of_another_form_is_refused(tmp_path):
     (tmp_path / "pair.nc").write_bytes(b"no NetCDF")
     with pytest.raises(InputError, match=r"pair\.nc"):
         netcdf.read_vectors(tmp_path / "pair.nc")
-    assert provenance.marks(tmp_path / "pair.nc") is None
+    assert provenance.read_marks(tmp_path / "pair.nc") is None

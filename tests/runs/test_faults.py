@@ -21,7 +21,7 @@ from lfpiv.cli import commands
 from lfpiv.errors import InputError
 from lfpiv.results.folder import Folder
 from lfpiv.runs import pipeline
-from lfpiv.runs.pair import PairWork
+from lfpiv.runs.frame_light import frame_light
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -310,13 +310,13 @@ def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatc
     images[1].unlink()
     tifffile.imwrite(images[2], np.ones((40, 30), np.uint16))
     tifffile.imwrite(images[3], np.full((400, 400), np.nan, np.float32))
-    read = PairWork.read_light
+    read = frame_light
 
-    def late(work, pair, frame):
+    def late(*arguments):
         images[0].unlink(missing_ok=True)
-        return read(work, pair, frame)
+        return read(*arguments)
 
-    monkeypatch.setattr(PairWork, "read_light", late)
+    monkeypatch.setattr("lfpiv.runs.frame_light.frame_light", late)
     assert commands.call(["run", str(experiment), "--out", str(out)]) == 3
     written, said = capfd.readouterr()
     failed = {item["pair"]: item["reason"] for item in json.loads((out / "summary.json").read_text())["failed"]}

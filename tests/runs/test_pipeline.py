@@ -15,8 +15,10 @@ import lfpiv
 from lfpiv import files
 from lfpiv.experiment.experiment import read_experiment
 from lfpiv.results import netcdf, provenance
-from lfpiv.runs import pipeline, summary
-from lfpiv.runs.run import open_job
+from lfpiv.results.provenance import Marks
+from lfpiv.runs import pair_figures, pipeline, rig
+from lfpiv.runs.invocation import Invocation
+from lfpiv.runs.run import open_run
 
 TOLERANCE_VOXEL = 0.2
 """Mean of the valid vectors against the flow. Particles are few and two cameras blur depth; a wrong sign, axis, frame
@@ -153,12 +155,13 @@ def test_each_setting_concerns_what_depends_on_it(small_run, tmp_path, case):
     old, new, concerned = EDITS[case]
     experiment = read_experiment(changed(small_run.experiment, tmp_path, old, new))
     wanted = provenance.of_calibration(experiment)
+    of_pair = provenance.of_pair(experiment, wanted.hash, 1)
     marks = {
         "calibration": (small_run.out / "calibration.h5", wanted),
-        "volumes": (small_run.out / "volumes" / "pair_0001_b.nc", provenance.of_volumes(experiment, wanted.hash, 1)),
-        "vectors": (small_run.out / "vectors" / "pair_0001.nc", provenance.of_vectors(experiment, wanted.hash, 1)),
+        "volumes": (small_run.out / "volumes" / "pair_0001_b.nc", of_pair.volumes),
+        "vectors": (small_run.out / "vectors" / "pair_0001.nc", of_pair.vectors),
     }
-    differ = {name: mark.changes(provenance.marks(path)) for name, (path, mark) in marks.items()}
+    differ = {name: stamp.changes(provenance.read_marks(path)) for name, (path, stamp) in marks.items()}
     assert {name for name, changes in differ.items() if changes} == set(filter(None, concerned.split(", "))), differ
 
 
@@ -166,8 +169,8 @@ def test_a_new_image_concerns_its_pair_alone_and_a_lost_one_none(small_run, tmp_
     experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
 
     def unfinished():
-        with open_job(experiment, out, None, None) as job:
-            return job.unfinished(volumes=True)
+        with open_run(experiment, out, None, None) as run:
+            return run.unfinished(volumes=True).pairs
 
     assert unfinished() == []
     images = sorted((tmp_path / "data").rglob("*0002*"))
@@ -189,16 +192,20 @@ def test_images_are_told_apart_by_their_whole_path(small_run, tmp_path):
     text = re.sub('images = "particles.*"', 'images = "particles/{frame}/{camera}/{pair:04d}.tif"', file.read_text())
     file.write_text(text)
     experiment = read_experiment(file)
-    made = provenance.of_vectors(experiment, "calibration", 0)
+
+    def stamp(experiment):
+        return provenance.of_pair(experiment, "calibration", 0).vectors
+
+    made = Marks(**stamp(experiment).attributes)
     exchanged = dataclasses.replace(experiment, frames=("b", "a"))
-    assert provenance.of_vectors(exchanged, "calibration", 0).changes(made.attributes) == ["particles.frames", "images"]
+    assert stamp(exchanged).changes(made) == ["particles.frames", "images"]
     file.parent.rename(tmp_path / "elsewhere")  # the images with their experiment: nothing has changed
     there = read_experiment(tmp_path / "elsewhere" / file.name)
-    assert provenance.of_vectors(there, "calibration", 0).changes(made.attributes) == []
+    assert stamp(there).changes(made) == []
     shutil.rmtree(tmp_path / "elsewhere" / "particles")  # gone, but stated to be others
     exchanged = dataclasses.replace(there, frames=("b", "a"))
-    assert provenance.of_vectors(there, "calibration", 0).changes(made.attributes) == []
-    assert provenance.of_vectors(exchanged, "calibration", 0).changes(made.attributes) == ["particles.frames"]
+    assert stamp(there).changes(made) == []
+    assert stamp(exchanged).changes(made) == ["particles.frames"]
 
 
 def test_figures_come_from_the_files_without_reading_them(finished, monkeypatch):
@@ -208,12 +215,13 @@ def test_figures_come_from_the_files_without_reading_them(finished, monkeypatch)
     (out / "summary.json").unlink()
     for name in ("read_vectors", "read_reconstruction", "read_volume"):
         monkeypatch.setattr(netcdf, name, lambda path: pytest.fail(f"{path} is read as a whole"))
-    with open_job(experiment, out, None, None) as job:
-        job.load_calibration()
-        assert job.finish(report=False)["pairs"] == whole["pairs"]
+    with open_run(experiment, out, None, None) as run:
+        assert run.finish(rig.load_calibration(run), Invocation(), report=False)["pairs"] == whole["pairs"]
     monkeypatch.undo()
     last = out / "vectors" / f"pair_{PAIRS - 1:04d}.nc"
-    assert summary.pair_entry(PAIRS - 1, last, {}) == whole["pairs"][-1]  # of a file without figures of its own
+    marks = dataclasses.replace(provenance.read_marks(last), figures=None)
+    measured = pair_figures.read_figures(last, marks).to_json()  # of a file without figures of its own
+    assert {"pair": PAIRS - 1, "file": last.name, **measured} == whole["pairs"][-1]
 
 
 def test_a_failure_leaves_no_part_and_no_other_pair_undone(small_run, tmp_path, monkeypatch):
@@ -226,7 +234,7 @@ def test_a_failure_leaves_no_part_and_no_other_pair_undone(small_run, tmp_path, 
             raise RuntimeError("the power went off")
         return correlate(first, second, **settings)
 
-    monkeypatch.setattr(lfpiv, "correlate", fail, raising=False)
+    monkeypatch.setattr("lfpiv.runs.pair.correlate", fail)
     monkeypatch.setattr(netcdf, "read_volume", numbered(netcdf.read_volume))
     result = pipeline.correlate(small_run.experiment, out)
     assert result["failed"] == [{"pair": 1, "reason": "unexpected RuntimeError: the power went off"}]

@@ -87,12 +87,12 @@ def test_gpus_are_named_as_the_cluster_gave_them(listed, count, names):
 
 def test_several_gpus_do_not_ask_for_a_package_nobody_asked_for(monkeypatch, caplog):
     plan = worker_plan.plan(100, None, GPU, FOUR)
-    assert worker_plan.unasked(plan, GPU) == plan
+    assert worker_plan.fit_installation(plan, GPU) == plan
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert worker_plan.unasked(plan, GPU) == worker_plan.Plan(1, 8, (None,), "cuda")
+    assert worker_plan.fit_installation(plan, GPU) == worker_plan.Plan(1, 8, (None,), "cuda")
     assert "one of 4 GPUs" in caplog.text and "pip install 'lfpiv[distributed]'" in caplog.text
     one = worker_plan.plan(100, None, GPU, ("0",))
-    assert worker_plan.unasked(one, GPU) == one
+    assert worker_plan.fit_installation(one, GPU) == one
 
 
 @pytest.mark.parametrize("workers", [0, -1, 10**6, 2.0, True])
@@ -111,8 +111,8 @@ def test_workers_must_fit_into_the_memory_together(small_run, monkeypatch):
         worker_plan.require_memory(experiment, weights, 4)
     worker_plan.require_memory(experiment, weights, 3)
     plan = worker_plan.plan(100, 4, CPU)
-    assert worker_plan.lowered(plan, experiment, weights, CPU) == worker_plan.Plan(3, 2, (None,) * 3)
-    assert worker_plan.lowered(plan, experiment, weights // 2, CPU) == plan
+    assert worker_plan.fit_memory(plan, experiment, weights, CPU) == worker_plan.Plan(3, 2, (None,) * 3)
+    assert worker_plan.fit_memory(plan, experiment, weights // 2, CPU) == plan
     monkeypatch.setattr(memory, "available_bytes", lambda: weights)
     with pytest.raises(InputError, match=r"volume: .*need at least"):
         worker_plan.require_memory(experiment, weights, 4)
@@ -197,7 +197,7 @@ class DeadlyFuture:
 
 def outcomes(client, todo, width=2):
     fractions = []
-    found = list(dispatch._outcomes(client, lambda: width, Path("shared"), todo, fractions.append, lambda mib: None))
+    found = list(dispatch._Dispatch(client, lambda: width, Path("shared"), todo).outcomes(fractions.append))
     assert fractions == sorted(fractions) and fractions[-1] <= 1
     return {outcome.pair: outcome.reason for outcome in found}
 
@@ -232,19 +232,19 @@ def test_a_scheduler_that_hangs_is_told_and_given_up(monkeypatch, caplog):
     watch.answer = Future()
     with caplog.at_level("INFO", "lfpiv.runs.cluster_workers"):
         for now[0] in np.arange(0.0, cluster_workers.SILENT_S, 1.0):
-            assert watch.width() > 1e6
+            assert watch.capacity() > 1e6
     assert len(caplog.messages) == cluster_workers.SILENT_S // cluster_workers.REMIND_S - 1
     assert all("tcp://there:1 has not answered for" in text for text in caplog.messages)
     now[0] = cluster_workers.SILENT_S + 1
     with pytest.raises(ClusterError, match=r"tcp://there:1 has not answered for 601 s\. What is finished is kept"):
-        watch.width()
+        watch.capacity()
     watch.answer.set_result(0)
-    assert watch.width() > 1e6 and watch.count == 0, "it answered after all"
+    assert watch.capacity() > 1e6 and watch.count == 0, "it answered after all"
     watch.client.status = "connecting"
-    assert watch.width() == 0
+    assert watch.capacity() == 0
     watch.client.status = "closed"
     with pytest.raises(ClusterError, match="tcp://there:1 is gone"):
-        watch.width()
+        watch.capacity()
 
 
 @pytest.mark.parametrize(("granted", "expected"), [(None, 16), ("4", 4), ("64", 16)])
@@ -253,7 +253,7 @@ def test_a_worker_uses_the_cores_that_its_job_was_given(monkeypatch, granted, ex
     monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
     if granted is not None:
         monkeypatch.setenv("SLURM_CPUS_PER_TASK", granted)
-    assert dispatch._cores() == expected
+    assert dispatch._granted_cores() == expected
 
 
 def test_what_workers_are_forked_from_is_whole_and_has_started_nothing():
@@ -300,9 +300,9 @@ def test_finishing_thousands_of_pairs_opens_each_file_at_most_twice(small_run, t
         path = out / "vectors" / f"pair_{pair:04d}.nc"
         path.write_bytes(content)
         with h5py.File(path, "a") as vectors:
-            vectors.attrs.update(provenance.of_vectors(experiment, calibration, pair).attributes)
-    opened, marks = [], provenance.marks
-    monkeypatch.setattr(provenance, "marks", lambda path: opened.append(path) or marks(path))
+            vectors.attrs.update(provenance.of_pair(experiment, calibration, pair).vectors.attributes)
+    opened, read_marks = [], provenance.read_marks
+    monkeypatch.setattr(provenance, "read_marks", lambda path: opened.append(path) or read_marks(path))
     monkeypatch.setattr(netcdf, "read_vectors", lambda path: pytest.fail(f"{path} is read as a whole"))
     monkeypatch.setattr(lfpiv.report, "write_report", lambda *arguments: None)
     summary = pipeline.run(experiment, out)

@@ -1,0 +1,121 @@
+"""Read particle images: light without background, its noise, and warnings about the images.
+
+`frame_light` takes the calibrated cameras and their dark images, and returns everything that is known about the images
+of one frame before they are reconstructed. `pair_light` does so for both frames of a pair and compares them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lfpiv.lightfield import image_checks
+from lfpiv.lightfield.particle_signal import seen_structure
+from lfpiv.warn import Warning
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
+    from lfpiv.experiment.experiment import Experiment
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameLight:
+    """The images of one frame and what they show; every mapping is by camera name."""
+
+    frame: str
+    images: Mapping[str, np.ndarray]
+    """Images without dark image and background, shape (rows, columns), float32 [counts]."""
+    noise: Mapping[str, float]
+    """Noise of the background [counts]."""
+    structure: Mapping[str, float]
+    """Correlation of near pixels under one microlens: about 0 for noise, 0.2 or more for clear particles."""
+    fingerprints: Mapping[str, bytes]
+    """Hash of the recorded pixels."""
+    warnings: tuple[Warning, ...]
+    """Warnings about the images; those about both frames of a pair are with the first frame."""
+    seconds: float
+    """Time that reading and checking took [s]."""
+
+
+def read_darks(experiment: Experiment) -> dict[str, np.ndarray | None]:
+    """Read the dark image of every camera, shape (rows, columns) [counts]; None for a camera without one."""
+    return {camera.name: experiment.dark(camera.name) for camera in experiment.cameras}
+
+
+def frame_light(
+    experiment: Experiment,
+    cameras: Mapping[str, CalibratedCamera],
+    darks: Mapping[str, np.ndarray | None],
+    pair: int,
+    frame: str,
+) -> FrameLight:
+    """Read and check the images of one frame of a pair.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Names the images.
+    cameras : dict
+        Camera name -> calibrated camera, whose decoder finds background and microimages.
+    darks : dict
+        Camera name -> dark image, from `read_darks`.
+    pair : int
+        Number of the pair.
+    frame : str
+        Name of the frame in the experiment.
+
+    Raises
+    ------
+    InputError
+        If an image is missing, damaged, of another shape, or uniform.
+    """
+    start = time.perf_counter()
+    images, noise, structure, fingerprints, warnings = {}, {}, {}, {}, list[Warning]()
+    for name, camera in cameras.items():
+        raw, dark = experiment.particle_image(name, pair, frame), darks[name]
+        image = raw if dark is None else raw - dark
+        level, noise[name] = camera.decoder.background(image)
+        light = images[name] = image - np.float32(level)
+        structure[name] = seen_structure(light, camera.decoder)
+        fingerprints[name] = image_checks.fingerprint(raw)
+        warnings += image_checks.image_warnings(raw, light, camera.decoder, name, frame)
+    return FrameLight(
+        frame=frame,
+        images=images,
+        noise=noise,
+        structure=structure,
+        fingerprints=fingerprints,
+        warnings=(*warnings, *image_checks.signal_warnings(structure, frame)),
+        seconds=time.perf_counter() - start,
+    )
+
+
+def pair_light(
+    experiment: Experiment,
+    cameras: Mapping[str, CalibratedCamera],
+    darks: Mapping[str, np.ndarray | None],
+    pair: int,
+) -> tuple[FrameLight, FrameLight]:
+    """Read and check the images of both frames of a pair; the parameters are those of `frame_light`.
+
+    Raises
+    ------
+    InputError
+        As `frame_light`, and if two images are the same, pixel by pixel.
+    """
+    first, second = (frame_light(experiment, cameras, darks, pair, frame) for frame in experiment.frames)
+    image_checks.require_different(
+        (f"{name}, pair {pair}, frame {one.frame}", fingerprint)
+        for one in (first, second)
+        for name, fingerprint in one.fingerprints.items()
+    )
+    uneven = [
+        warning
+        for name in cameras
+        for warning in image_checks.uneven_warnings(first.images[name], second.images[name], name)
+    ]
+    return replace(first, warnings=(*first.warnings, *uneven)), second

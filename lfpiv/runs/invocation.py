@@ -1,0 +1,100 @@
+"""Results of the steps of one invocation, from which its summary is made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from lfpiv.runs.moved_cameras import CameraDisparity, SelfCalibrationFigures
+from lfpiv.runs.pair import Outcome
+from lfpiv.warn import Warning
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.cameras import Calibration
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrated:
+    """The calibration of a run."""
+
+    calibration: Calibration
+    seconds: float
+    """Time that it took when it was made [s]."""
+    reused: bool
+    """Whether an earlier invocation made it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightsFigures:
+    """Figures of the weights and of the cameras' positions, for the summary."""
+
+    method: str
+    memory_mib: float
+    seconds: float
+    """Time that building them took [s]."""
+    warnings: tuple[Warning, ...]
+    disparity: CameraDisparity | None
+    forms: Mapping[str, str]
+    """Camera -> form of its weights; empty for counted weights."""
+    cuts: Mapping[str, Sequence[int]]
+    """Camera -> parts of a voxel along z, y, x; empty for counted weights."""
+    profile_errors: Mapping[str, Sequence[float]]
+    """Camera -> relative errors of profiles against counted rays; empty for counted weights."""
+    count_errors: Mapping[str, Sequence[float]]
+    """Camera -> relative errors of the weights against counted rays; empty for counted weights."""
+    self_calibration: SelfCalibrationFigures | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what the summary stores."""
+        stored: dict[str, Any] = {
+            "method": self.method,
+            "memory_mib": self.memory_mib,
+            "warnings": [warning.to_json() for warning in self.warnings],
+        }
+        if self.self_calibration is not None:
+            stored["self_calibration"] = self.self_calibration.to_json()
+        if self.disparity is not None:
+            stored |= {"disparity_voxel": self.disparity.voxel, "disparity_pair": self.disparity.pair}
+        if self.method == "footprint":
+            stored |= {"form": dict(self.forms), "cuts": dict(self.cuts)}
+            stored["profiles_check_l2"] = {name: _rounded(errors) for name, errors in self.profile_errors.items()}
+            stored["count_check_l2"] = [error for errors in self.count_errors.values() for error in _rounded(errors)]
+        return stored
+
+
+def _rounded(errors: Sequence[float]) -> list[float]:
+    return [round(error, 4) for error in errors]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workers:
+    """Processes that worked on pairs."""
+
+    count: int | None
+    """None for the workers of a cluster."""
+    threads: int | None
+    """CPU threads of each; None for as many as the cluster grants."""
+    peak_memory_mib: float | None = None
+    """Largest memory that one of several workers held."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Invocation:
+    """What one invocation did."""
+
+    outcomes: Sequence[Outcome] = ()
+    """Outcomes of the pairs that were tried."""
+    weights: WeightsFigures | None = None
+    """None if no weights were built."""
+    workers: Workers | None = None
+    """None if no pair was tried."""
+    reused: tuple[str, ...] = ()
+    """Results of earlier invocations, named for the summary."""
+    warnings: Sequence[Warning] = ()
+    """Warnings of the run itself; warnings about results are stored with the results."""
+
+    @property
+    def failed(self) -> dict[int, str]:
+        """Pair -> why it failed."""
+        return {outcome.pair: outcome.reason for outcome in self.outcomes if outcome.reason}

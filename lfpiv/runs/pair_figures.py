@@ -1,0 +1,162 @@
+"""Figures of a finished pair: measured when its vectors are written, stored with them, and read for the summary.
+
+The summary of thousands of pairs is built from these figures, without reading the arrays of any file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lfpiv import files
+from lfpiv.reconstruction.motion import Motion
+from lfpiv.results import netcdf
+from lfpiv.results.provenance import Marks
+from lfpiv.warn import Warning
+
+ByFrame = Mapping[str, Mapping[str, float]]
+"""Frame -> camera -> figure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Distribution of a velocity component over the valid vectors [m/s]; None without valid vectors."""
+
+    mean: float | None
+    sd: float | None
+    min: float | None
+    max: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionFigures:
+    """Outcome of the motion passes."""
+
+    verdict: str
+    followed: bool
+    valid_fraction: Sequence[float]
+    """Share of valid vectors before each pass."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairFigures:
+    """Figures of the vectors of a pair and of its volumes, in the form of an entry of the summary."""
+
+    vectors: Sequence[int]
+    """Number of vectors along z, y, x."""
+    valid_fraction: float
+    finite_fraction: float
+    seen_fraction: float
+    verdict: str
+    warnings: tuple[Warning, ...]
+    """Warnings about the images."""
+    reconstruction_s: float
+    correlation_s: float
+    velocity_m_per_s: Mapping[str, Spread]
+    uncertainty_voxel: float | None
+    """Median over the valid vectors."""
+    peak_ratio: float | None
+    """Median over the valid vectors."""
+    motion: MotionFigures | None = None
+    """None without motion passes."""
+    residual: Mapping[str, Sequence[float]] | None = None
+    """Frame -> residual before each iteration and after the last one."""
+    structure: ByFrame | None = None
+    camera_gain: ByFrame | None = None
+    light_outside: ByFrame | None = None
+    stop: Mapping[str, str] | None = None
+    """Frame -> why the iteration ended."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a file stores; figures that are not known are left out."""
+        stored = asdict(self) | {"warnings": [warning.to_json() for warning in self.warnings]}
+        return {name: value for name, value in stored.items() if name not in _OPTIONAL or value is not None}
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> PairFigures:
+        """Read what a file stores; the findings of version 0.1.0 are warnings."""
+        known = {name: stored[name] for name in cls.__dataclass_fields__ if name in stored}
+        known["warnings"] = tuple(map(Warning.from_json, stored.get("warnings", stored.get("findings", ()))))
+        known["velocity_m_per_s"] = {name: Spread(**one) for name, one in stored["velocity_m_per_s"].items()}
+        if "motion" in known:
+            known["motion"] = MotionFigures(**known["motion"])
+        return cls(**known)
+
+
+_OPTIONAL = ("motion", "residual", *netcdf.OF_IMAGES, "stop")
+
+
+def read_figures(path: Path, marks: Marks) -> PairFigures:
+    """Return the figures of a finished pair from the marks of its vectors; files without figures are measured."""
+    if marks.figures is not None:
+        return PairFigures.from_json(marks.figures)
+    measured = measure(netcdf.read_vectors(path), netcdf.read_reconstruction(path), marks.warnings)
+    return PairFigures.from_json(files.plain(measured.to_json()))
+
+
+def measure(vectors: xr.Dataset, condensed: xr.Dataset | None, warnings: Iterable[Warning]) -> PairFigures:
+    """Measure the figures of a pair.
+
+    Parameters
+    ----------
+    vectors : Dataset
+        The vectors with the attributes of their file.
+    condensed : Dataset, optional
+        The volumes as `netcdf.build_reconstruction` returns them.
+    warnings : iterable of Warning
+        Warnings about the images.
+    """
+    valid = vectors["valid"].values
+    finite = np.isfinite(vectors["u"].values) & np.isfinite(vectors["v"].values) & np.isfinite(vectors["w"].values)
+    known = {} if condensed is None else _of_volumes(condensed)
+    return PairFigures(
+        vectors=list(vectors["u"].shape),
+        valid_fraction=float(valid.mean()),
+        finite_fraction=float(finite.mean()),
+        seen_fraction=float(vectors.attrs.get("seen_fraction", 1.0)),
+        verdict=str(vectors.attrs["verdict"]),
+        warnings=tuple(warnings),
+        reconstruction_s=float(vectors.attrs["reconstruction_s"]),
+        correlation_s=float(vectors.attrs["correlation_s"]),
+        velocity_m_per_s={name: _spread(vectors[name].values[valid & finite]) for name in ("u", "v", "w")},
+        uncertainty_voxel=_median(vectors["uncertainty"].values[valid]),
+        peak_ratio=_median(vectors["peak_ratio"].values[valid]),
+        motion=_motion(vectors.attrs) if "motion" in vectors.attrs else None,
+        **known,
+    )
+
+
+def _motion(attributes: Mapping[str, Any]) -> MotionFigures:
+    return MotionFigures(
+        verdict=str(attributes["motion"]),
+        followed=attributes["motion"] == Motion.FOLLOWED.value,
+        valid_fraction=np.atleast_1d(attributes["motion_valid"]).tolist(),
+    )
+
+
+def _of_volumes(condensed: xr.Dataset) -> dict[str, Any]:
+    frames = [str(frame) for frame in condensed["frame"].values]
+    histories = zip(frames, condensed["residual"].values, strict=True)
+    found: dict[str, Any] = {"residual": {frame: row[np.isfinite(row)].tolist() for frame, row in histories}}
+    for name in [name for name in netcdf.OF_IMAGES if name in condensed]:
+        cameras = [str(camera) for camera in condensed["camera"].values]
+        rows = zip(frames, condensed[name].values, strict=True)
+        found[name] = {frame: dict(zip(cameras, map(float, row), strict=True)) for frame, row in rows}
+    found["stop"] = {frame: str(stop) for frame, stop in zip(frames, condensed["stop"].values, strict=True)}
+    return found
+
+
+def _spread(values: np.ndarray) -> Spread:
+    if values.size == 0:
+        return Spread(mean=None, sd=None, min=None, max=None)
+    return Spread(mean=float(values.mean()), sd=float(values.std()), min=float(values.min()), max=float(values.max()))
+
+
+def _median(values: np.ndarray) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if values.size else None

@@ -1,0 +1,162 @@
+"""Steps that a run does once for all pairs: calibration, self-calibration and weights.
+
+Each step keeps what is in the output folder if it still fits the experiment.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lfpiv import files
+from lfpiv.errors import InputError
+from lfpiv.files import MIB, writing
+from lfpiv.results import netcdf, provenance
+from lfpiv.runs import memory, moved_cameras
+from lfpiv.runs.invocation import Calibrated, WeightsFigures
+from lfpiv.runs.moved_cameras import SelfCalibrationFigures
+from lfpiv.warn import Code, Warning, collected
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.runs.run import Run
+    from lfpiv.weights.operator import Weights
+
+log = logging.getLogger(__name__)
+
+
+def load_calibration(run: Run) -> Calibrated:
+    """Load the calibration in the folder.
+
+    Raises
+    ------
+    InputError
+        If there is none that fits the experiment.
+    """
+    from lfpiv.calibration.cameras import load_calibration
+
+    path = run.folder.calibration
+    if not run.calibration_stamp.fits(provenance.read_marks(path)):
+        raise InputError(
+            f"{path}: expected the calibration of this experiment, found none that fits. "
+            "Run `lfpiv calibrate` or `lfpiv run` first."
+        )
+    log.info("calibration: finished before with the same settings, kept")
+    seconds = float(netcdf.read_attributes(path)["seconds"])
+    return Calibrated(calibration=load_calibration(path), seconds=seconds, reused=True)
+
+
+def calibrate(run: Run) -> Calibrated:
+    """Calibrate the cameras and write the calibration, unless the folder holds one that fits the experiment."""
+    from lfpiv.calibration.cameras import calibrate
+
+    marks = provenance.read_marks(run.folder.calibration)
+    if run.calibration_stamp.fits(marks):
+        return load_calibration(run)
+    if marks is not None:
+        log.info("%s changed: calibration made anew", ", ".join(run.calibration_stamp.changes(marks)))
+    start = time.perf_counter()
+    calibration = calibrate(run.experiment, progress=run.step("calibration"))
+    seconds = time.perf_counter() - start
+    _write(calibration, run.folder.calibration, {**run.calibration_stamp.attributes, "seconds": seconds})
+    return Calibrated(calibration=calibration, seconds=seconds, reused=False)
+
+
+def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, SelfCalibrationFigures | None]:
+    """Correct the calibration by particle images if the experiment asks for it.
+
+    Returns
+    -------
+    calibration : Calibration
+        The corrected calibration, or `calibration` without self-calibration.
+    figures : SelfCalibrationFigures or None
+        None without self-calibration.
+    """
+    from lfpiv.calibration.camera import load_calibration
+
+    stamp = provenance.of_self_calibration(run.experiment, run.calibration_stamp.hash)
+    if stamp is None:
+        return calibration, None
+    path = run.folder.self_calibration
+    marks = provenance.read_marks(path)
+    if marks is not None and marks.figures is not None and stamp.fits(marks):
+        log.info("self-calibration: finished before with the same settings, kept")
+        return load_calibration(path), SelfCalibrationFigures.from_json(marks.figures)
+    try:
+        corrected, figures = moved_cameras.correct(run.experiment, calibration, run.step("self-calibration"))
+    except ValueError as error:
+        raise InputError(f"{run.experiment.path}: self_calibration.pairs: {error}") from None
+    _write(corrected.calibration, path, {**stamp.attributes, "figures": json.dumps(figures.to_json())})
+    return corrected.calibration, figures
+
+
+def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
+    """Self-calibrate if asked for, build the weights of the grid, and check that no camera moved.
+
+    Parameters
+    ----------
+    run : Run
+        The invocation.
+    calibration : Calibration
+        Calibration from the board.
+    todo : sequence of int
+        Pairs to do; the first ones are used to check the cameras.
+    """
+    from lfpiv.calibration.coverage import require_seen, warn_outside
+    from lfpiv.weights.operator import build_weights, compare_with_count
+
+    experiment, compute = run.experiment, run.experiment.compute
+    calibration, self_calibration = self_calibrate(run, calibration)
+    require_seen(experiment.path, calibration, experiment.grid)
+    warn_outside(calibration, experiment.grid)
+    if len(calibration.cameras) == 1:
+        log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
+    start = time.perf_counter()
+    with collected() as warnings:
+        weights = build_weights(
+            calibration,
+            experiment.grid,
+            compute.weights,
+            form=compute.weights_form,
+            limit_bytes=memory.left_for_weights(experiment),
+            progress=run.step("weights"),
+        )
+        _ = weights.camera_sums  # computed here, once for all pairs and workers
+        seconds = time.perf_counter() - start
+        counted = compare_with_count(weights) if compute.weights == "footprint" else {}
+        disparity = moved_cameras.check(experiment, weights, todo)
+    errors = [error for camera in counted.values() for error in camera]
+    if errors:  # a camera may see none of the voxels that were drawn
+        share = 100 * np.mean(errors)
+        log.info("weights differ from counted rays by %.1f %% (mean of %d voxels)", share, len(errors))
+    return weights, WeightsFigures(
+        method=compute.weights,
+        memory_mib=weights.memory_bytes / MIB,
+        seconds=seconds,
+        warnings=tuple(warnings),
+        disparity=disparity,
+        forms=weights.forms,
+        cuts=weights.cuts,
+        profile_errors=weights.profile_errors,
+        count_errors=counted,
+        self_calibration=self_calibration,
+    )
+
+
+def _write(calibration: Calibration, path: Path, attributes: Mapping[str, Any]) -> None:
+    """Write a calibration with attributes, atomically."""
+    import h5py
+
+    content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
+    calibration.save(content)  # type: ignore[arg-type]  # HDF5 takes files too
+    with h5py.File(content, "a") as opened:
+        opened.attrs.update(attributes)
+    with writing(path):
+        files.write_bytes(content.getbuffer(), path)
