@@ -61,6 +61,7 @@ def build_dependencies(module):
     return wp.get_module(module).options["extra_build_options"].extra_build_dependencies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", warp_modules())
 def test_compiler_has_no_warnings(module, changed_options, capfd, tmp_path):
     """Those that Warp's own compiler gives by default, anywhere, and all others in the headers."""

@@ -196,6 +196,7 @@ def small_grid(file):
     return lfpiv.open_experiment(file).grid
 
 
+@pytest.mark.slow
 def test_library_call_recovers_a_known_movement(small_run):
     experiment = lfpiv.open_experiment(small_run.experiment)
     calibration = lfpiv.load_calibration(small_run.out / "calibration.h5")
