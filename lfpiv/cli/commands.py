@@ -229,7 +229,7 @@ def _simulate(
     with _output.progress() as progress:
         from lfpiv.simulation.simulator import simulate
 
-        path = simulate(scene, out, progress=lambda step, done, total: progress(step, done / total))
+        path = simulate(scene, out, progress=progress)
     _output.show({"experiment": str(path)}, lambda: print(f"experiment: {path}"))
 
 

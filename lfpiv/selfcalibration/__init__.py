@@ -1,1 +1,1 @@
-"""Self-calibration: disparities between cameras, measured with particles, and the camera movements that explain them."""
+"""Measure disparities between cameras with particles, and find the camera movements that explain them."""

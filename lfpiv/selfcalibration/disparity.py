@@ -7,7 +7,7 @@ particle images of some instants. Output: a `Disparity` per pair of cameras and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ import numpy as np
 import scipy.fft
 from scipy.ndimage import gaussian_filter
 
+from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 
@@ -78,7 +79,7 @@ class Disparity:
 def disparities(
     weights: Weights,
     images: Sequence[Mapping[str, np.ndarray]],
-    progress: Callable[[float], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> tuple[Disparity, ...]:
     """Measure the disparities of all pairs of cameras in the parts of a volume, without those that have no clear peak.
 

@@ -11,7 +11,7 @@ movements and their standard errors. Focused images allow triangulation instead;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from lfpiv.calibration.camera import Calibration
 from lfpiv.geometry.grid import Grid
+from lfpiv.progress import StepProgress, part_of
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, Disparity, disparities, unlinked
 from lfpiv.weights.operator import build_weights
 
@@ -98,7 +99,7 @@ def self_calibrate(
     grid: Grid,
     images: Sequence[Mapping[str, np.ndarray]],
     *,
-    progress: Callable[[float], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> SelfCalibration:
     """Correct a calibration for movements of its cameras, using images of particles.
 
@@ -131,12 +132,8 @@ def self_calibrate(
     movements = {name: Movement.none(grid) for name in calibration.cameras}
     found, apart = [], list[float]()
     for number in range(ROUNDS + 1):
-
-        def step(fraction: float, number: int = number) -> None:
-            if progress is not None:
-                progress((number + fraction) / (ROUNDS + 1))
-
-        found.append(disparities(build_weights(corrected, grid), images, step))
+        part = None if progress is None else part_of(progress, number / (ROUNDS + 1), (number + 1) / (ROUNDS + 1))
+        found.append(disparities(build_weights(corrected, grid), images, part))
         lost = unlinked(found[-1], movements)
         if lost:
             raise ValueError(

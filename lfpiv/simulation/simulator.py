@@ -11,7 +11,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,8 @@ import tifffile
 from scipy.ndimage import gaussian_filter
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.images import FLIPS
+from lfpiv.progress import Progress, ignore_progress
 from lfpiv.simulation.flows import Tracers
 from lfpiv.simulation.scene import Noise, Scene, open_scene
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
@@ -38,9 +40,6 @@ AREA_STEP_MM = 1e-3
 
 LEAST_INTENSITY = 0.3
 """Lower limit of a particle's intensity, relative to the mean."""
-
-Progress = Callable[[str, int, int], None]
-"""Called as ``progress(step, done, total)``."""
 
 
 class PlacedParticles(NamedTuple):
@@ -164,7 +163,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     out : str or Path
         Folder to write, absent or empty. It appears only when it is complete.
     progress : callable, optional
-        Called as ``progress(step, done, total)``.
+        Called as ``progress(step, fraction)``.
 
     Returns
     -------
@@ -190,7 +189,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     except OSError as error:
         raise InputError(f"{out}: the folder cannot be written ({error.strerror}). Name another folder.") from None
     try:
-        _write(scene, pairs, scratch, progress or (lambda step, done, total: None))
+        _write(scene, pairs, scratch, progress or ignore_progress)
         scratch.chmod(0o755)
         os.replace(scratch, out)
     except BaseException:
@@ -256,7 +255,7 @@ def _write(scene: Scene, pairs: list[PlacedParticles], folder: Path, progress: P
             rng = np.random.default_rng([scene.seed, 2, number, done])
             _write_image(folder / path, expose(image, camera, scene.noise, rng))
             done += 1
-            progress("simulated images", done, total)
+            progress("simulated images", done / total)
     (folder / "truth").mkdir()
     truth: dict[str, Any] = {}
     for pair, placed in enumerate(pairs):
@@ -341,11 +340,7 @@ def expose(image: np.ndarray, camera: SceneCamera, noise: Noise, rng: np.random.
     if saturated > 1e-3:
         log.warning("camera %s: %.1f %% of an image's pixels saturate; lower [exposure]", camera.name, 100 * saturated)
     image = np.clip(np.rint(image), 0, FULL_SCALE).astype(np.uint16)
-    if camera.image_flip in ("horizontal", "both"):
-        image = image[:, ::-1]
-    if camera.image_flip in ("vertical", "both"):
-        image = image[::-1]
-    return np.ascontiguousarray(image)
+    return np.ascontiguousarray(image[FLIPS[camera.image_flip]])
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:
