@@ -11,10 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 # Strict types refuse text and `true` in place of a number; an integer is a number. TOML's lists become tuples.
 Number = Annotated[float, Field(strict=True)]
-Whole = Annotated[int, Field(strict=True)]
 Positive = Annotated[float, Field(strict=True, gt=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
+NonNegative = Annotated[float, Field(strict=True, ge=0)]
 Flag = Annotated[bool, Field(strict=True)]
+Point = tuple[Number, Number, Number]
 
 SMALLEST_WINDOW = 4
 """Smallest edge of an interrogation window that holds a correlation peak [voxel]."""
@@ -158,8 +159,8 @@ class CameraTable(NominalCamera):
     """Path of an image with the lens capped; absent: the gaps between microimages give the dark level."""
 
 
-class Board(Table):
-    """Table ``[board]``: the dot board and the depths of its planes."""
+class NominalBoard(Table):
+    """Keys of ``[board]``, in experiments and in scenes of the simulator."""
 
     dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
     """Number of dots along x and y."""
@@ -169,6 +170,17 @@ class Board(Table):
     """Diameter of a dot, less than their distance [mm]."""
     planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
     """Depth z of each plane, all different [mm]."""
+
+    @model_validator(mode="after")
+    def _dots_apart(self) -> NominalBoard:
+        if self.dot_diameter_mm >= self.spacing_mm:
+            raise ValueError("dot_diameter_mm smaller than spacing_mm")
+        return self
+
+
+class Board(NominalBoard):
+    """Table ``[board]``: the dot board and the depths of its planes."""
+
     images: Annotated[str, Field(min_length=1)]
     """Path of the board images with ``{camera}`` and ``{plane}``; planes count from 0."""
 
@@ -179,17 +191,11 @@ class Board(Table):
             raise ValueError("a different depth for each plane")
         return planes
 
-    @model_validator(mode="after")
-    def _dots_apart(self) -> Board:
-        if self.dot_diameter_mm >= self.spacing_mm:
-            raise ValueError("dot_diameter_mm smaller than spacing_mm")
-        return self
-
 
 class Volume(Table):
     """Table ``[volume]``: the voxel grid, in the order (x, y, z)."""
 
-    centre_mm: tuple[Number, Number, Number]
+    centre_mm: Point
     """Centre (x, y, z) of the volume [mm]."""
     size_mm: tuple[Positive, Positive, Positive]
     """Size (x, y, z) of the volume, at least 4 voxels along each axis [mm]."""

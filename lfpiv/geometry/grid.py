@@ -81,7 +81,12 @@ class Grid:
         z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in range(3)), indexing="ij")
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
+    @property
+    def centre_mm(self) -> np.ndarray:
+        """Centre (x, y, z) of the volume, shape (3,) [mm]."""
+        return np.array([self.axis_mm(axis)[[0, -1]].mean() for axis in (2, 1, 0)])
+
     def centre_text(self) -> str:
         """Return the centre (x, y, z) as text for messages."""
-        centre = (round(float(self.axis_mm(axis).mean()), 6) + 0.0 for axis in (2, 1, 0))
+        centre = (round(value, 6) + 0.0 for value in self.centre_mm.tolist())
         return f"({', '.join(f'{value:g}' for value in centre)}) mm"

@@ -69,7 +69,7 @@ class Movement:
     @classmethod
     def none(cls, grid: Grid) -> Movement:
         """Return the movement of a camera that did not move."""
-        return cls(shift_mm=np.zeros(3), rotation_rad=np.zeros(3), centre_mm=_centre_mm(grid), std=np.zeros(6))
+        return cls(shift_mm=np.zeros(3), rotation_rad=np.zeros(3), centre_mm=grid.centre_mm, std=np.zeros(6))
 
     def after(self, step: Movement) -> Movement:
         """Return the movement that applies `step` first, then this one."""
@@ -185,9 +185,8 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
             variance = max(float(trust @ residual**2) / free, least**2)
     relative = np.kron(np.eye(count) - 1 / count, np.eye(6))  # the mean of all cameras has no error, by definition
     std = np.sqrt(np.diag(relative @ covariance @ relative.T)).reshape(-1, 6)
-    centre = _centre_mm(grid)
     return {
-        name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=centre, std=std[number])
+        name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=grid.centre_mm, std=std[number])
         for number, (name, value) in enumerate(zip(cameras, values.reshape(-1, 6), strict=True))
     }
 
@@ -201,14 +200,10 @@ def explained_mm(found: Sequence[Disparity], movements: Mapping[str, Movement], 
 
 def _row(disparity: Disparity, cameras: Sequence[str], grid: Grid) -> np.ndarray:
     """Return the matrix from all cameras' shifts and rotations to a disparity, shape (3, 6 cameras)."""
-    x, y, z = disparity.centre_mm - _centre_mm(grid)
+    x, y, z = disparity.centre_mm - grid.centre_mm
     movement = np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
     row = np.zeros((3, 6 * len(cameras)))
     for name, sign in zip(disparity.cameras, (-1, 1), strict=True):
         at = 6 * cameras.index(name)
         row[:, at : at + 6] = sign * movement
     return row
-
-
-def _centre_mm(grid: Grid) -> np.ndarray:
-    return np.array([grid.axis_mm(axis)[[0, -1]].mean() for axis in (2, 1, 0)])

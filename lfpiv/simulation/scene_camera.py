@@ -8,13 +8,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
-from lfpiv.experiment.settings import Count, Flag, NominalCamera, Number, Positive, Table
+from lfpiv.experiment.settings import Count, Flag, NominalCamera, NonNegative, Number, Point, Positive, Table
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv_kernels.rendering import real_optics
 
-NonNegative = Annotated[float, Field(strict=True, ge=0)]
 Pair = tuple[Number, Number]
-Point = tuple[Number, Number, Number]
 Pitches = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Index = Annotated[float, Field(strict=True, ge=1, le=4)]
 
