@@ -1,4 +1,4 @@
-"""`export_results`: vectors of a run in formats of other programs: ParaView (vti), one NetCDF file, CSV, pivpy.
+"""`export_results`: write vectors of a run in formats of other programs: ParaView (vti), one NetCDF file, CSV, pivpy.
 
 A file appears under its name only when it is complete. Existing files are replaced as a whole.
 """
@@ -45,7 +45,7 @@ _TIME = "first frame of the pair after that of pair 0"  # description of times i
 class Format(enum.Enum):
     """Formats of exported vectors. The text describes the files."""
 
-    VTI = "one .vti image per pair and one per kept volume, with .pvd collections over the pairs: ParaView, pyvista"
+    VTI = "one .vti image per pair and one per stored volume, with .pvd collections over the pairs: ParaView, pyvista"
     NETCDF = "vectors.nc, one NetCDF4 file over all pairs: xarray, MATLAB"
     CSV = "one table per pair, a row per vector, units in the header"
     PIVPY = "one NetCDF file per depth, planes of u and v over all pairs: pivpy"

@@ -1,7 +1,7 @@
-"""Files of one pair in an output folder: two volumes and the vectors, each with the stamp of what it depends on.
+"""Files of one pair in an output folder: two volumes and the vectors, each with a stamp of its origin.
 
-`PairFiles` checks whether they still fit the experiment, reads and writes them. `PairVolumes` holds two volumes and
-the figures and warnings of the images they were made from.
+`PairFiles` checks whether they still fit the experiment, reads and writes them. `PairVolumes` holds two volumes with
+figures and warnings of their images.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Read particle images: light without background, its noise, and warnings about the images.
 
-`frame_light` takes the calibrated cameras and their dark images, and returns everything that is known about the images
-of one frame before they are reconstructed. `pair_light` does so for both frames of a pair and compares them.
+`frame_light` takes the calibrated cameras and their dark images, and returns light, noise and warnings of one frame.
+`pair_light` does so for both frames of a pair and compares them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameLight:
-    """The images of one frame and what they show; every mapping is by camera name."""
+    """Images of one frame and figures measured in them; every mapping is by camera name."""
 
     frame: str
     images: Mapping[str, np.ndarray]

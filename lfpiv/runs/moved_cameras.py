@@ -69,12 +69,12 @@ class SelfCalibrationFigures:
     """Camera -> its movement."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a file stores."""
+        """Return the form that a file stores."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> SelfCalibrationFigures:
-        """Read what a file stores."""
+        """Read the form that a file stores."""
         movements = {name: MovementFigures(**one) for name, one in stored["movements"].items()}
         return cls(**{**stored, "movements": movements})
 

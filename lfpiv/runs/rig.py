@@ -1,6 +1,6 @@
 """Steps that a run does once for all pairs: calibration, self-calibration and weights.
 
-Each step keeps what is in the output folder if it still fits the experiment.
+Each step reuses the result in the output folder if it still fits the experiment.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.warn import Code, Warning, collected
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
     from lfpiv.runs.run import Run
     from lfpiv.weights.operator import Weights
 
@@ -40,7 +40,7 @@ def load_calibration(run: Run) -> Calibrated:
     InputError
         If there is none that fits the experiment.
     """
-    from lfpiv.calibration.cameras import load_calibration
+    from lfpiv.calibration.camera import load_calibration
 
     path = run.folder.calibration
     if not run.calibration_stamp.fits(provenance.read_marks(path)):
@@ -98,7 +98,7 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
 
 
 def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
-    """Self-calibrate if asked for, build the weights of the grid, and check that no camera moved.
+    """Self-calibrate if the experiment demands it, build the weights of the grid, and check that no camera moved.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """One invocation on one experiment and one output folder: its checks, the pairs to do, its summary and report.
 
-`open_run` checks everything, starts the device and yields a `Run`. A `Run` does not change; its methods return what
-they find, and `Run.finish` puts the results of all steps together.
+`open_run` checks everything, starts the device and yields a frozen `Run`. `Run.finish` combines the results of all steps
+into summary and report.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> ran
 
 @dataclass(frozen=True)
 class Todo:
-    """The pairs that an invocation has to do, and what it reuses."""
+    """Unfinished pairs of an invocation, and the results that it reuses."""
 
     pairs: list[int]
     reused: tuple[str, ...]
@@ -117,7 +117,7 @@ class Run:
     """Pairs selected for this invocation."""
     progress: Progress
     device_request: str
-    """Device that the user asked for; workers of a cluster choose their own by it."""
+    """Device requested by the user; workers of a cluster choose their own by it."""
     device: runtime.Device
     warnings: Sequence[Warning]
     """Warnings of this invocation so far; grows while `open_run` collects them."""
@@ -138,7 +138,7 @@ class Run:
         return self.files(pair).fitting_volumes() is not None
 
     def unfinished(self, *, vectors: bool = True, volumes: bool = False) -> Todo:
-        """Find the selected pairs whose vectors or volumes are missing or do not fit; log what is kept and why."""
+        """Find the selected pairs whose vectors or volumes are missing or do not fit; log the changes."""
         changed: dict[str, list[int]] = {}
         for pair in self.numbers:
             changes = self.files(pair).outdated(vectors=vectors, volumes=volumes)
@@ -189,7 +189,7 @@ class Run:
         return outcome
 
     def finish(self, calibrated: Calibrated, done: Invocation, *, report: bool) -> dict[str, Any]:
-        """Write summary.json about all results in the folder, and report.html if asked for; return the summary."""
+        """Write summary.json about all results in the folder, and optionally report.html; return the summary."""
         contents = self._contents()
         reused = (*(("calibration",) if calibrated.reused else ()), *done.reused)
         done = replace(
