@@ -181,8 +181,8 @@ SENTENCES: Mapping[Code, str] = {
     Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
     Code.FEWER_WORKERS: (
-        "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to {weights_gib:.1f} GiB "
-        "of weights"
+        "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "
+        "{weights_gib:.1f} GiB of weights"
     ),
     Code.ONE_GPU: (
         "one of {gpus} GPUs is used: several processes need the package `distributed`. Install it: pip install "

@@ -47,7 +47,7 @@ class CameraSetup:
     optics: Optics
     """Nominal optics; ``sensor_shape`` is that of the white image."""
     nominal_angle_deg: float
-    """Angle about y [degree]; it names the board's dots and enters the thin-lens mapping, never the network."""
+    """Angle about y [degree]; it numbers the board's dots and enters the thin-lens mapping, never the network."""
     image_flip: str
     """Mirroring of the camera's images, reversed on reading."""
     white_path: Path
@@ -77,10 +77,10 @@ class Experiment:
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
-        for camera in self.cameras:
-            if camera.name == name:
-                return camera
-        raise ValueError(f"camera: expected one of {', '.join(c.name for c in self.cameras)}, got {name!r}.")
+        by_name = {camera.name: camera for camera in self.cameras}
+        if name not in by_name:
+            raise ValueError(f"camera: expected one of {', '.join(by_name)}, got {name!r}.")
+        return by_name[name]
 
     def white(self, name: str) -> np.ndarray:
         """Return the white image of a camera [counts], dark image not subtracted, float32 (rows, columns)."""

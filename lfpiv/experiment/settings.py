@@ -53,8 +53,8 @@ class Smart(Table):
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
     """Relative decrease of the misfit per iteration below which SMART stops; 0 runs all iterations."""
     motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
-    """Number of times the motion is measured and both frames are reconstructed again with the light they share along
-    it; 0 reconstructs each frame separately."""
+    """Number of times the motion is measured and both frames are reconstructed again from their common light along it;
+    0 reconstructs each frame separately."""
 
     def of_one_frame(self) -> dict[str, Any]:
         """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame."""
@@ -137,7 +137,7 @@ class NominalCamera(Table):
     microlens_layout: Literal["square", "hexagonal"] = "square"
     """Arrangement of the microlenses."""
     nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
-    """Angle of the camera about y, correct to about 10, which names the board's dots but never enters the mapping
+    """Angle of the camera about y, correct to about 10. It numbers the board's dots and never enters the mapping
     [degree]."""
     image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirroring of the camera's images."""

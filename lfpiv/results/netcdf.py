@@ -1,6 +1,6 @@
 """NetCDF files of vectors and volumes: their writers, readers and validator.
 
-A file gets its name when it is complete. Therefore an existing file is a finished result, which a rerun does not repeat.
+A file gets its name when it is complete. So an existing file is a finished result, which a rerun does not repeat.
 """
 
 from __future__ import annotations

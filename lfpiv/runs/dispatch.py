@@ -123,7 +123,6 @@ class _Dispatch:
             future.add_done_callback(self.arrived.put)
 
     def _fraction(self) -> float:
-        """Return the finished fraction of all pairs."""
         running = sum(self.fractions.get(pair, 0.0) for _, pair in list(self.running.values()))
         return (self.done + min(running, len(self.running))) / self.total
 

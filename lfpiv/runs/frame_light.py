@@ -53,20 +53,7 @@ def frame_light(
     pair: int,
     frame: str,
 ) -> FrameLight:
-    """Read and check the images of one frame of a pair.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Names the images.
-    cameras : dict
-        Camera name -> calibrated camera, whose decoder finds background and microimages.
-    darks : dict
-        Camera name -> dark image, from `read_darks`.
-    pair : int
-        Number of the pair.
-    frame : str
-        Name of the frame in the experiment.
+    """Read and check the images of one frame of a pair. `darks` is from `read_darks`.
 
     Raises
     ------

@@ -100,17 +100,7 @@ def read_figures(path: Path, marks: Marks) -> PairFigures:
 
 
 def measure(vectors: xr.Dataset, condensed: xr.Dataset | None, warnings: Iterable[Warning]) -> PairFigures:
-    """Measure the figures of a pair.
-
-    Parameters
-    ----------
-    vectors : Dataset
-        The vectors with the attributes of their file.
-    condensed : Dataset, optional
-        The volumes as `netcdf.build_reconstruction` returns them.
-    warnings : iterable of Warning
-        Warnings about the images.
-    """
+    """Measure the figures of a pair from its vectors and, if known, its volumes from `netcdf.build_reconstruction`."""
     valid = vectors["valid"].values
     finite = np.isfinite(vectors["u"].values) & np.isfinite(vectors["v"].values) & np.isfinite(vectors["w"].values)
     known = {} if condensed is None else _of_volumes(condensed)

@@ -214,7 +214,6 @@ def _process(current: Run, calibration: Calibration, checked: _Checked, keep_vol
 
 
 def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
-    """Return what to do with each pair."""
     return PairWork(
         experiment=current.experiment,
         folder=current.folder,

@@ -70,15 +70,7 @@ def calibrate(run: Run) -> Calibrated:
 
 
 def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, SelfCalibrationFigures | None]:
-    """Correct the calibration by particle images if the experiment asks for it.
-
-    Returns
-    -------
-    calibration : Calibration
-        The corrected calibration, or `calibration` without self-calibration.
-    figures : SelfCalibrationFigures or None
-        None without self-calibration.
-    """
+    """Correct the calibration by particle images. Return it unchanged, and no figures, without self-calibration."""
     from lfpiv.calibration.camera import load_calibration
 
     stamp = provenance.of_self_calibration(run.experiment, run.calibration_stamp.hash)
@@ -100,14 +92,7 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
 def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
     """Self-calibrate if the experiment demands it, build the weights of the grid, and check that no camera moved.
 
-    Parameters
-    ----------
-    run : Run
-        The invocation.
-    calibration : Calibration
-        Calibration from the board.
-    todo : sequence of int
-        Pairs to do; the first ones are used to check the cameras.
+    `calibration` is the one from the board. The check uses the first pairs of `todo`.
     """
     from lfpiv.calibration.coverage import require_seen, warn_outside
     from lfpiv.weights.operator import build_weights, compare_with_count
@@ -151,7 +136,6 @@ def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tu
 
 
 def _write(calibration: Calibration, path: Path, attributes: Mapping[str, Any]) -> None:
-    """Write a calibration with attributes, atomically."""
     import h5py
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk

@@ -1,7 +1,7 @@
 """One invocation on one experiment and one output folder: its checks, the pairs to do, its summary and report.
 
-`open_run` checks everything, starts the device and yields a frozen `Run`. `Run.finish` combines the results of all steps
-into summary and report.
+`open_run` checks everything, starts the device and yields a frozen `Run`. `Run.finish` writes summary and report from
+the results of all steps.
 """
 
 from __future__ import annotations

@@ -80,30 +80,10 @@ def build(
     done: Invocation,
     earlier: EarlierSummary,
 ) -> dict[str, Any]:
-    """Build the summary of everything in a folder.
+    """Build the content of ``summary.json`` without ``timings_s.total`` and ``peak_memory_mib``, which the run adds.
 
     ``timings_s`` is the time that the results took, also those of earlier invocations. ``warnings`` are
     sentences for people. ``warning_records`` are the same warnings, in the same order, with code and figures.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    device : Device
-        Where the kernels of this process ran.
-    calibrated : Calibrated
-        The calibration.
-    contents : Contents
-        Results in the folder.
-    done : Invocation
-        Results of this invocation's steps.
-    earlier : EarlierSummary
-        The summary that was in the folder.
-
-    Returns
-    -------
-    dict
-        Content of ``summary.json`` without ``timings_s.total`` and ``peak_memory_mib``, which the run adds at its end.
     """
     reports = {name: _report(camera, experiment.grid) for name, camera in calibrated.calibration.cameras.items()}
     weights = done.weights.to_json() if done.weights else dict(earlier.weights)

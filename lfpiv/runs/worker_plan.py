@@ -91,16 +91,7 @@ def gpu_names(listed: str | None, count: int) -> tuple[str, ...]:
 
 
 def require_memory(experiment: Experiment, weights: int, workers: int) -> None:
-    """Log the memory that the run needs; refuse more workers than fit, before any work.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    weights : int
-        Memory of the weights [byte].
-    workers : int
-        Number of worker processes.
+    """Log the memory that the run needs with weights [byte] and a number of workers; refuse more workers than fit.
 
     Raises
     ------

@@ -42,7 +42,7 @@ LEAST_OVERLAP = 0.6
 FIT_REACH = 2
 """Lags on either side of the highest one to which a peak's paraboloid is fitted."""
 SIGNIFICANT = 1.5
-"""Least ratio of a peak to the highest coefficient with one volume mirrored, which particles cannot explain."""
+"""Least ratio of a peak to the highest coefficient with one volume mirrored, which is due to chance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Disparity:
     centre_mm: np.ndarray
     """Centre of the part, shape (3,) [mm]."""
     shift_mm: np.ndarray
-    """Position at which the second camera shows what the first one shows at 0, shape (3,) [mm]."""
+    """Position in the second camera's volume of a particle at 0 in the first camera's, shape (3,) [mm]."""
     sharpness: np.ndarray
     """Curvature of the peak over its height, shape (3, 3) [1/mm^2]: small along the lines of sight, large across."""
     peak: float
@@ -81,7 +81,7 @@ def disparities(
     images: Sequence[Mapping[str, np.ndarray]],
     progress: StepProgress | None = None,
 ) -> tuple[Disparity, ...]:
-    """Measure the disparities of all pairs of cameras in the parts of a volume, without those that have no clear peak.
+    """Measure the disparities of all pairs of cameras in the parts of a volume that have a clear peak.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def masked_correlation(
 ) -> np.ndarray:
     """Correlate a window of volumes with other volumes at every lag: masked normalised cross-correlation [1]_.
 
-    At each lag only voxels count that both volumes have.
+    At each lag only voxels inside both volumes count.
 
     Parameters
     ----------

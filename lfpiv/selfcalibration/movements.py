@@ -1,9 +1,9 @@
 """Volume self-calibration: correct a calibration for cameras that moved since the board was recorded [1]_.
 
-Input: a calibration, the grid, and particle images of some instants. The disparities of the cameras
-(`lfpiv.selfcalibration.disparity`) are explained by rigid movements, six numbers per camera. A movement of all cameras
-together cannot be distinguished from a moved volume; it is set to zero. Output: the corrected calibration, the
-movements and their standard errors. Focused images allow triangulation instead; light-field images do not.
+Input: a calibration, the grid, and particle images of some instants. Rigid movements, six numbers per camera, are
+fitted to the disparities of the cameras (`lfpiv.selfcalibration.disparity`). The mean movement of all cameras is set to
+zero: it cannot be distinguished from a moved volume. Output: the corrected calibration, the movements and their
+standard errors. Focused images allow triangulation instead; light-field images do not.
 
 .. [1] B. Wieneke, "Volume self-calibration for 3D particle image velocimetry", Exp. Fluids 45 (2008) 549-556,
    doi:10.1007/s00348-008-0521-5.
@@ -24,7 +24,7 @@ from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, Disparity, disparities
 from lfpiv.weights.operator import build_weights
 
 PRIOR_MM, PRIOR_RAD = 0.3, 0.02
-"""Standard deviations of the prior: shift [mm] and rotation [rad]. Movements that no disparity shows stay near zero."""
+"""Standard deviations of the prior: shift [mm] and rotation [rad]."""
 LEAST_STD_VOXEL, ASSUMED_STD_VOXEL = 0.02, 0.1
 """Least standard deviation of a disparity in its sharpest direction, and the one assumed if too few are known
 [voxel]."""
@@ -121,7 +121,7 @@ def self_calibrate(
     Raises
     ------
     ValueError
-        If there are fewer than two cameras, no images, or a camera shows nothing that another one shows.
+        If there are fewer than two cameras, no images, or a camera shows no particle that another one shows.
     """
     if len(calibration.cameras) < 2 or not images:
         raise ValueError(
@@ -161,8 +161,8 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
     """Fit the rigid movements of cameras that explain disparities, by reweighted least squares.
 
     A disparity is the difference of two cameras' movements. Its weight is its `Disparity.weight` over the variance of
-    the residuals. Outliers get less weight (Geman and McClure). A weak prior keeps movements that no disparity shows
-    near zero, among them the mean of all cameras.
+    the residuals. Outliers get less weight (Geman and McClure). A weak prior holds movements without an effect on
+    disparities near zero, among them the mean of all cameras.
     """
     rows = [_row(one, cameras, grid) for one in found]
     count, least = len(cameras), LEAST_STD_VOXEL * grid.voxel_mm
@@ -183,7 +183,7 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
         free = 3 * trust.sum() - 6 * (count - 1)
         if free > 0:
             variance = max(float(trust @ residual**2) / free, least**2)
-    relative = np.kron(np.eye(count) - 1 / count, np.eye(6))  # the mean of all cameras has no error, by definition
+    relative = np.kron(np.eye(count) - 1 / count, np.eye(6))  # the mean of all cameras is zero by definition
     std = np.sqrt(np.diag(relative @ covariance @ relative.T)).reshape(-1, 6)
     return {
         name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=grid.centre_mm, std=std[number])

@@ -59,7 +59,7 @@ class SceneParticles(Table):
     count: Count | None = None
     """Particles of each pair."""
     pairs: Count = 1
-    """Number of image pairs, each with particles of its own."""
+    """Number of image pairs, each with other particles."""
     fill: Positive = 1.0
     """Edges of the seeded region relative to the volume's. Above 1, particles are outside the volume too."""
     intensity_sd: NonNegative = 0.0
@@ -122,9 +122,9 @@ class Scene(Table):
     """Time between the two frames of a pair [s]."""
     camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1)]
     window: Windows = ()
-    """Windows of the cameras without windows of their own."""
+    """Windows of all cameras that state none."""
     aberrations: Aberrations | None = None
-    """Aberrations of the cameras without aberrations of their own."""
+    """Aberrations of all cameras that state none."""
     board: SceneBoard
     volume: SceneVolume
     particles: SceneParticles

@@ -84,7 +84,7 @@ class Aberrations(Table):
 
 
 class SceneCamera(NominalCamera):
-    """Table ``[[camera]]``: nominal optics, which the experiment file contains, and the truth, which it does not."""
+    """Table ``[[camera]]``: nominal optics for the experiment file, and the truth, which is not in that file."""
 
     sensor_width_px: Count
     """Columns of the sensor."""

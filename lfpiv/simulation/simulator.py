@@ -199,7 +199,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
 
 
 def _check_positions(scene: Scene, camera: SceneCamera, pairs: list[PlacedParticles]) -> None:
-    """Refuse dots and particles too near the lens, and log what part of them is in the field of view."""
+    """Refuse dots and particles too near the lens, and log the share of them in the field of view."""
     optics = camera.optics
     half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
     dots = np.concatenate([scene.board.dots_mm(depth) for depth in scene.board.planes_mm])
@@ -351,7 +351,7 @@ def _write_image(path: Path, image: np.ndarray) -> None:
 def _experiment_text(scene: Scene) -> str:
     """Return the text of the experiment file. It contains nominal values only, none of the truth."""
     lines = [
-        "# Light-field PIV experiment: what the user knows. Paths are relative to this file.",
+        "# Light-field PIV experiment: nominal values. Paths are relative to this file.",
         "",
         *_rows({"name": scene.name, "dt_s": scene.dt_s}),
     ]
