@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from lfpiv.version import __version__ as __version__
 
-if TYPE_CHECKING:  # what the names below stand for
+if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv import derived as derived
     from lfpiv import metrics as metrics
     from lfpiv import statistics as statistics

@@ -164,7 +164,7 @@ def print_demo(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_case(key: str, result: dict[str, Any]) -> None:
-    """Print the result of a case of `lfpiv reproduce` beside the paper's value and the goal."""
+    """Print the result of a case of `lfpiv reproduce`, the paper's value and the goal."""
     print(f"{key}: {result['title']}")
     for row in result["comparison"]:
         ours, paper = (

@@ -276,16 +276,7 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
 def _camera(path: Path, table: CameraTable) -> CameraSetup:
     white_path = path.parent / table.white_image
     shape = _white_shape(white_path, f"white_image of camera {table.name!r}")
-    optics = Optics(
-        focal_length_mm=table.focal_length_mm,
-        magnification=table.magnification,
-        f_number=table.f_number,
-        microlens_pitch_mm=table.microlens_pitch_mm,
-        microlens_focal_length_mm=table.microlens_focal_length_mm,
-        pixel_mm=table.pixel_um / 1000,
-        sensor_shape=shape,
-        layout=table.microlens_layout,
-    )
+    optics = table.optics_of(shape)
     if table.microlens_focal_length_mm > MICROLENS_SHARE * optics.image_distance_mm:
         raise InputError(
             f"{path}: camera {table.name!r}, microlens_focal_length_mm: expected far less than the image distance "

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from lfpiv.geometry.optics import Optics
+
 # Strict types refuse text and `true` in place of a number; an integer is a number. TOML's lists become tuples.
 Number = Annotated[float, Field(strict=True)]
 Positive = Annotated[float, Field(strict=True, gt=0)]
@@ -148,6 +150,19 @@ class NominalCamera(Table):
         if value == 0:
             raise ValueError("a number other than 0")
         return value
+
+    def optics_of(self, sensor_shape: tuple[int, int]) -> Optics:
+        """Return the nominal optics with a sensor of (rows, columns) pixels."""
+        return Optics(
+            focal_length_mm=self.focal_length_mm,
+            magnification=self.magnification,
+            f_number=self.f_number,
+            microlens_pitch_mm=self.microlens_pitch_mm,
+            microlens_focal_length_mm=self.microlens_focal_length_mm,
+            pixel_mm=self.pixel_um / 1000,
+            sensor_shape=sensor_shape,
+            layout=self.microlens_layout,
+        )
 
 
 class CameraTable(NominalCamera):

@@ -117,8 +117,4 @@ async def _count(client: Any) -> int:
 
 def _release(client: Any, shared: Path) -> None:
     with contextlib.suppress(Exception):  # the cluster may be lost
-        client.run(_release_in_worker, str(shared))
-
-
-def _release_in_worker(shared: str) -> None:
-    worker.release(Path(shared))
+        client.run(worker.release, shared)

@@ -61,7 +61,7 @@ def calibrate(run: Run) -> Calibrated:
     if run.calibration_stamp.fits(marks):
         return load_calibration(run)
     if marks is not None:
-        log.info("%s changed: calibration made anew", ", ".join(run.calibration_stamp.changes(marks)))
+        log.info("%s changed: calibration made again", ", ".join(run.calibration_stamp.changes(marks)))
     start = time.perf_counter()
     calibration = calibrate(run.experiment, progress=run.step("calibration"))
     seconds = time.perf_counter() - start

@@ -150,7 +150,7 @@ class Run:
             log.info("%d of %d pairs: finished before with the same settings, kept", len(finished), len(self.numbers))
         for reason, pairs in changed.items():
             if reason:
-                log.info("%s changed: %s made anew", reason, name_pairs(pairs))
+                log.info("%s changed: %s made again", reason, name_pairs(pairs))
         kind = "vectors" if vectors else "volumes"
         return Todo(todo, tuple(f"{kind} of pair {pair}" for pair in finished))
 
@@ -181,7 +181,7 @@ class Run:
         return found.fitting_vectors() is not None or found.fitting_volumes() is not None
 
     def record(self, outcome: Outcome) -> Outcome:
-        """Log the failure of a pair, retire its results that were made of other images, and return the outcome."""
+        """Log the failure of a pair, rename its results from earlier images, and return the outcome."""
         if outcome.reason:
             log.error("pair %d failed and is left out: %s", outcome.pair, outcome.reason)
             for path, aside in self.files(outcome.pair).retire_those_of_other_images():

@@ -207,7 +207,7 @@ def _report(camera: CalibratedCamera, grid: Grid) -> dict[str, Any]:
 
 
 def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
-    """Return the root mean square of what the network adds to the thin lens over a volume [microlens pitch].
+    """Return the root mean square of the network's correction to the thin lens over a volume [microlens pitch].
 
     Uses rays through the whole pupil from random voxels. None without a thin lens, where the network is the mapping.
     """

@@ -118,7 +118,7 @@ def disparities(
 
 
 def unlinked(found: Sequence[Disparity], cameras: Iterable[str]) -> list[str]:
-    """Name the cameras that show no particles of any other one."""
+    """Name the cameras that share no particles with any other one."""
     linked = {name for one in found for name in one.cameras}
     return [name for name in cameras if name not in linked]
 

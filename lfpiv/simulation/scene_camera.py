@@ -148,16 +148,7 @@ class SceneCamera(NominalCamera):
     @property
     def optics(self) -> Optics:
         """Nominal optics."""
-        return Optics(
-            focal_length_mm=self.focal_length_mm,
-            magnification=self.magnification,
-            f_number=self.f_number,
-            microlens_pitch_mm=self.microlens_pitch_mm,
-            microlens_focal_length_mm=self.microlens_focal_length_mm,
-            pixel_mm=self.pixel_um / 1000,
-            sensor_shape=(self.sensor_height_px, self.sensor_width_px),
-            layout=self.microlens_layout,
-        )
+        return self.optics_of((self.sensor_height_px, self.sensor_width_px))
 
     @property
     def rotation(self) -> np.ndarray:

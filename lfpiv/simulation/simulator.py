@@ -305,7 +305,7 @@ def _board_images(
             yield path, exposure.dot_counts * image
             continue
         dots = board.dots_mm(depth)
-        # microlenses that the image of a dot covers: each lights its whole microimage
+        # number of microlenses that the image of a dot covers; each lights its whole microimage
         lenses = np.pi / 4 * board.dot_diameter_mm**2 * image_area(camera, dots)
         lenses /= abs(np.linalg.det(renderer.basis_mm))
         rng = np.random.default_rng([scene.seed, 5, number, plane])

@@ -1,4 +1,4 @@
-"""Two volumes as a caller gives them to `lfpiv.correlate`: check, normalise, smooth, and locate their voxels."""
+"""Prepare the two volumes of `lfpiv.correlate`: check, normalise and smooth them, and locate their voxels."""
 
 from __future__ import annotations
 
