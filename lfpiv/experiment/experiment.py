@@ -30,7 +30,7 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
 
 DECODED_PIXELS = 100_000_000
-"""Particle images that are decoded before the work starts [pixel]; of the others only header and length are checked."""
+"""Largest number of pixels of particle images that are decoded before the work starts [pixel]."""
 
 MICROLENS_SHARE = 0.2
 """Largest focal length of the microlenses over the main lens's image distance; more is a wrong unit."""
@@ -165,15 +165,10 @@ def read_experiment(path: str | Path) -> Experiment:
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
-    _check_pattern(
-        path, "board.images", table.board.images, {"camera": names, "plane": range(len(table.board.planes_mm))}
-    )
-    _check_pattern(
-        path,
-        "particles.images",
-        table.particles.images,
-        {"camera": names, "pair": range(table.particles.pairs), "frame": table.particles.frames},
-    )
+    board, particles = table.board, table.particles
+    _check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
+    fields = {"camera": names, "pair": range(particles.pairs), "frame": particles.frames}
+    _check_pattern(path, "particles.images", particles.images, fields)
     grid = _grid(path, table.volume)
     _check_windows(path, table.correlation, grid)
     experiment = Experiment(
@@ -181,16 +176,16 @@ def read_experiment(path: str | Path) -> Experiment:
         name=table.name,
         dt_s=table.dt_s,
         cameras=tuple(_camera(path, camera) for camera in table.camera),
-        board=table.board,
+        board=board,
         grid=grid,
-        pairs=table.particles.pairs,
-        frames=table.particles.frames,
+        pairs=particles.pairs,
+        frames=particles.frames,
         smart=table.smart,
         self_calibration=table.self_calibration,
         correlation=table.correlation,
         network=table.network,
         compute=table.compute,
-        particle_images=table.particles.images,
+        particle_images=particles.images,
     )
     for camera in experiment.cameras:
         nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)

@@ -15,7 +15,7 @@ VIEWS = "views"
 """Name of a volume's coordinate with the number of cameras that see each voxel."""
 
 SPACING_TOLERANCE = 1e-3
-"""Largest unevenness of coordinates, relative to the spacing; float32 decimals have some."""
+"""Largest unevenness of coordinates, relative to the spacing. Coordinates stored as float32 are slightly uneven."""
 
 POSITION_TOLERANCE_MM = 1e-4
 """Largest difference of equal coordinates [mm]."""

@@ -63,11 +63,11 @@ class Folder:
         return self.path / ".shared"
 
     def vectors(self, pair: int) -> Path:
-        """Vectors of one pair."""
+        """Return the path of one pair's vectors."""
         return self.path / "vectors" / f"pair_{pair:04d}.nc"
 
     def volume(self, pair: int, frame: int) -> Path:
-        """Volume of one frame (0 or 1) of a pair."""
+        """Return the path of a pair's volume of frame 0 or 1."""
         return self.path / "volumes" / f"pair_{pair:04d}_{FRAME_NAMES[frame]}.nc"
 
     def sweep(self) -> None:

@@ -23,7 +23,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.version import versions
 
 SCHEMA_VERSION = 3
-"""Version of the files' form; readers refuse newer ones. 2: the group has its own dimensions. 3: adds ``profile_z``."""
+"""Version of the files. 2: the group has its own dimensions. 3: adds ``profile_z``."""
 
 VECTOR_UNITS = {
     "u": "m/s",

@@ -1,4 +1,4 @@
-"""`open_results`: the vectors of all pairs of a run as one dataset that reads its files lazily."""
+"""`open_results`: open the vectors of all pairs of a run as one dataset that reads its files lazily."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CHUNK_BYTES = 8 << 20
 """Largest size of a dask chunk, which holds one variable of at least one pair [byte]."""
 
 COMMON = ("dt_s", "voxel_mm", "smart", "correlation", "settings")
-"""Attributes that must be equal in all pairs, as must be everything that the vectors depend on except the images."""
+"""Attributes that must be equal in all pairs."""
 
 _NAME = re.compile(r"pair_(\d+)\.nc")
 
@@ -32,7 +32,7 @@ _NAME = re.compile(r"pair_(\d+)\.nc")
 def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = None) -> xr.Dataset:
     """Open the vectors of all finished pairs in the folder of a run.
 
-    Only attributes and axes of each file are read at once, in about a millisecond. With dask installed, the variables
+    This reads only attributes and axes of each file, in about a millisecond. With dask installed, the variables
     are dask arrays with chunks along pair. Without dask, values are read from the files when they are used. No file
     stays open.
 
@@ -192,7 +192,7 @@ class _Stack(BackendArray):
         return np.asarray(indexing.explicit_indexing_adapter(key, self.shape, support, self._read))
 
     def _read(self, key: tuple[Any, ...]) -> np.ndarray:
-        """Values at an outer index: each part an integer, a slice or a list of integers."""
+        """Return the values at an outer index: each part is an integer, a slice or a list of integers."""
         which, where = key[0], key[1:]
         chosen = np.arange(self.shape[0])[which]
         if np.ndim(chosen) == 0:

@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster that the user started. The run watches the scheduler and leaves the cluster as it was."""
+"""Workers of a Dask cluster that the user started. The run watches the scheduler and does not stop the cluster."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Hand out pairs: one after the other in this process, or in parallel to worker processes that Dask watches.
+"""Distribute pairs: one after the other in this process, or in parallel to worker processes that Dask watches.
 
-If a worker dies, its pair is tried once more, in another worker and after all other pairs. Then the pair has failed.
+If a worker dies, its pair is tried once more, in another worker and after all other pairs. If that worker dies too, the
+pair has failed.
 """
 
 from __future__ import annotations

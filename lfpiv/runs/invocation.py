@@ -1,4 +1,4 @@
-"""Results of the steps of one invocation, from which its summary is made."""
+"""Results of the steps of one invocation, the input of its summary."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ CLOSE_S = 10.0
 """Time that Dask is given to close [s]."""
 
 Capacity = Callable[[], float]
-"""Returns how many pairs may be submitted at once; raises ClusterError if the scheduler is lost."""
+"""Return how many pairs may be submitted at once; raise ClusterError if the scheduler is lost."""
 
 SETTINGS = {
     "distributed.worker.profile.enabled": False,  # would look at the workers' stacks 100 times a second

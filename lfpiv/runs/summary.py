@@ -1,4 +1,4 @@
-"""Build ``summary.json``, the machine-readable figures of a run, and read what an earlier invocation wrote there.
+"""Build ``summary.json``, the machine-readable figures of a run, and read that of an earlier invocation.
 
 `build` takes the calibration, the figures of all results in the folder and the `Invocation`. It returns the content of
 the file, with equal warnings about several pairs merged into one.
@@ -128,10 +128,7 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
             "voxel_mm": experiment.grid.voxel_mm,
         },
         "settings": {
-            "smart": experiment.smart.model_dump(),
-            "correlation": experiment.correlation.model_dump(),
-            "network": experiment.network.model_dump(),
-            "compute": experiment.compute.model_dump(),
+            name: getattr(experiment, name).model_dump() for name in ("smart", "correlation", "network", "compute")
         },
     }
 

@@ -38,7 +38,7 @@ class SceneBoard(NominalBoard):
     """Dark dots on a bright board."""
 
     def dots_mm(self, plane_mm: float) -> np.ndarray:
-        """Dot centres (x, y, z) at one depth, x fastest, shape (dot, 3) [mm]."""
+        """Return the dot centres (x, y, z) at one depth, x fastest, shape (dot, 3) [mm]."""
         x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing_mm for n in self.dots)
         y, x = np.meshgrid(y, x, indexing="ij")
         return np.stack([x.ravel(), y.ravel(), np.full(x.size, float(plane_mm))], axis=1)

@@ -1,4 +1,4 @@
-"""Simulated experiments: a scene file to white, board and particle images with their truth, as a complete data set.
+"""Simulate an experiment: render a scene's white, board and particle images and write them with their truth.
 
 A camera consists of main lens, microlens array and sensor, misaligned as the scene states (Eqs. 1-3 and 9), with
 windows and third-order aberrations. Images are rendered by rays, blurred, exposed, and read out with noise to 12 bits.

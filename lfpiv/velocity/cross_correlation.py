@@ -1,7 +1,7 @@
-"""`correlate`: two particle volumes to a displacement field by multi-pass 3D cross-correlation.
+"""`correlate`: measure the displacement between two particle volumes by multi-pass 3D cross-correlation.
 
-`volume_pair` prepares the volumes, `multi_pass` correlates and validates. Here a verdict is added, and the result takes
-the form of a dataset in physical units.
+`volume_pair` prepares the volumes, `multi_pass` correlates and validates. This module adds a verdict and returns a
+dataset in physical units.
 """
 
 from __future__ import annotations
