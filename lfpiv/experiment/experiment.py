@@ -26,7 +26,7 @@ from lfpiv.experiment.settings import (
     Volume,
 )
 from lfpiv.experiment.toml import read_toml
-from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.optics import Optics
 
 DECODED_PIXELS = 100_000_000
@@ -259,7 +259,7 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
     for window in correlation.windows or ():
         if not isinstance(window, tuple):
             continue  # a single edge is cut to the volume
-        for axis, edge, n in zip("zyx", window, grid.shape, strict=True):
+        for axis, edge, n in zip(AXES, window, grid.shape, strict=True):
             if edge > n:
                 raise InputError(
                     f"{path}: correlation.windows: expected windows inside the volume, found {edge} voxels "

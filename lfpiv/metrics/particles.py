@@ -119,7 +119,7 @@ def truth_volume(
     return xr.DataArray(
         volume.astype(np.float32),
         dims=AXES,
-        coords={name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")},
+        coords=grid.coordinates(),
         name="intensity",
         attrs={"long_name": "light of the true particles", "sigma_voxel": sigma_voxel, "voxel_mm": grid.voxel_mm},
     )
