@@ -325,7 +325,7 @@ def warn(log: logging.Logger, warning: Warning) -> None:
 
 @dataclass(frozen=True)
 class FirstOfEachCode:
-    """Log for the warnings of many pairs: the first warning of each code only. The summary names all pairs."""
+    """Log the warnings of many pairs: only the first of each code. The summary names all pairs."""
 
     log: logging.Logger
     logged: set[Code] = field(default_factory=set)

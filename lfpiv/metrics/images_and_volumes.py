@@ -40,7 +40,7 @@ def reconstruction_quality(
         Finite intensities on the same voxels.
     zero_mean : bool
         Subtract the mean of each volume first, which gives the correlation coefficient, -1 to 1. A uniform haze does
-        not raise it. The paper's figures are without. For sparse particles the two nearly agree.
+        not raise it. The paper does not subtract the mean. For sparse particles the two nearly agree.
 
     Returns
     -------

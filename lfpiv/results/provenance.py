@@ -42,7 +42,7 @@ class Stamp:
     """The parts that a result depends on."""
 
     parts: Mapping[str, Any]
-    """Name -> settings, a hash, or the identity of images; None for images that are gone."""
+    """Name -> settings, a hash, or the identity of images; None for missing images."""
 
     @cached_property
     def hash(self) -> str:
@@ -55,9 +55,9 @@ class Stamp:
         return {"settings_hash": self.hash, "depends_on": json.dumps(files.plain(self.parts))}
 
     def changes(self, marks: Marks) -> list[str]:
-        """Name what changed since a file was made; empty if the file still fits.
+        """Return the names of the parts that changed since a file was made; empty if the file still fits.
 
-        Images that are gone did not change: a result outlives its raw data.
+        Missing images count as unchanged, because raw data may be deleted.
         """
         if marks.settings_hash == self.hash:
             return []
@@ -170,7 +170,7 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
 
 
 def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
-    """Return path from `start`, size and time of the last change of images; None if one is gone. Reads no pixels."""
+    """Return path from `start`, size and time of the last change of images; None if one is missing."""
     try:
         found = [(path, split_frame(path)[0].stat()) for path in paths]
     except OSError:

@@ -184,7 +184,7 @@ class Run:
         """Log the failure of a pair, rename its results from earlier images, and return the outcome."""
         if outcome.reason:
             log.error("pair %d failed and is left out: %s", outcome.pair, outcome.reason)
-            for path, aside in self.files(outcome.pair).retire_those_of_other_images():
+            for path, aside in self.files(outcome.pair).retire_outdated():
                 log.warning("%s: made of other images than there are now; renamed %s", path, aside.name)
         return outcome
 

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 GOOD_SHARE = 0.8
 """Smallest part of valid vectors of a good measurement."""
 POOR_SHARE = 0.3
-"""Smallest part of valid vectors of a poor measurement; below it has failed."""
+"""Smallest part of valid vectors of a poor measurement. With less, the measurement has failed."""
 
 Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
 """Dims, values and attributes of a variable."""

@@ -164,7 +164,7 @@ def standard_error(vectors: xr.Dataset) -> xr.Dataset:
     -------
     Dataset
         ``standard_error_u``, ``_v``, ``_w`` [m/s] over z, y, x, NaN where fewer than two pairs are used. Their
-        attribute ``pairs_per_independent`` is the bracket in the equation above.
+        attribute ``pairs_per_independent`` is the factor in parentheses above.
 
     References
     ----------
