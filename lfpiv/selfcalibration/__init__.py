@@ -1,1 +1,1 @@
-"""Measure disparities between cameras with particles, and find the camera movements that explain them."""
+"""Self-calibration: measure how far apart cameras show the same particles, and the movements that explain it."""
