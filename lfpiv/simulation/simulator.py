@@ -253,7 +253,9 @@ def _write(scene: Scene, pairs: list[PlacedParticles], folder: Path, progress: P
     for number, camera in enumerate(scene.camera):
         for path, image in _images(scene, number, pairs):
             rng = np.random.default_rng([scene.seed, 2, number, done])
-            _write_image(folder / path, expose(image, camera, scene.noise, rng))
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            exposed = expose(image, camera, scene.noise, rng)
+            tifffile.imwrite(folder / path, exposed, compression="zlib", metadata=None)
             done += 1
             progress("simulated images", done / total)
     (folder / "truth").mkdir()
@@ -341,11 +343,6 @@ def expose(image: np.ndarray, camera: SceneCamera, noise: Noise, rng: np.random.
         log.warning("camera %s: %.1f %% of an image's pixels saturate; lower [exposure]", camera.name, 100 * saturated)
     image = np.clip(np.rint(image), 0, FULL_SCALE).astype(np.uint16)
     return np.ascontiguousarray(image[FLIPS[camera.image_flip]])
-
-
-def _write_image(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tifffile.imwrite(path, image, compression="zlib", metadata=None)
 
 
 def _experiment_text(scene: Scene) -> str:
