@@ -10,28 +10,34 @@ from typing import TYPE_CHECKING, Any
 
 from lfpiv.version import __version__ as __version__
 
-if TYPE_CHECKING:  # what the names below stand for
+if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv import derived as derived
     from lfpiv import metrics as metrics
     from lfpiv import statistics as statistics
-    from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
-    from lfpiv.errors import InputError
-    from lfpiv.experiment.experiment import Experiment, open_experiment
-    from lfpiv.geometry.grid import Grid
-    from lfpiv.geometry.optics import LensLattice, Optics
-    from lfpiv.lightfield.lens_array import LensArray, find_lens_array
-    from lfpiv.reconstruction.motion import reconstruct_pair
-    from lfpiv.reconstruction.volume import reconstruct
-    from lfpiv.report import write_report
-    from lfpiv.results.export import export_results
-    from lfpiv.results.reader import open_results
-    from lfpiv.runs.pipeline import run
-    from lfpiv.selfcalibration.movements import self_calibrate
-    from lfpiv.velocity.cross_correlation import correlate
-    from lfpiv.weights.operator import build_weights
+    from lfpiv.calibration.camera import Calibration as Calibration
+    from lfpiv.calibration.camera import load_calibration as load_calibration
+    from lfpiv.calibration.cameras import calibrate as calibrate
+    from lfpiv.calibration.cameras import thin_lens as thin_lens
+    from lfpiv.errors import InputError as InputError
+    from lfpiv.experiment.experiment import Experiment as Experiment
+    from lfpiv.experiment.experiment import open_experiment as open_experiment
+    from lfpiv.geometry.grid import Grid as Grid
+    from lfpiv.geometry.optics import LensLattice as LensLattice
+    from lfpiv.geometry.optics import Optics as Optics
+    from lfpiv.lightfield.lens_array import LensArray as LensArray
+    from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
+    from lfpiv.reconstruction.motion import reconstruct_pair as reconstruct_pair
+    from lfpiv.reconstruction.volume import reconstruct as reconstruct
+    from lfpiv.report import write_report as write_report
+    from lfpiv.results.export import export_results as export_results
+    from lfpiv.results.reader import open_results as open_results
+    from lfpiv.runs.pipeline import run as run
+    from lfpiv.selfcalibration.movements import self_calibrate as self_calibrate
+    from lfpiv.velocity.cross_correlation import correlate as correlate
+    from lfpiv.weights.operator import build_weights as build_weights
 
 _MODULES = {
-    "Calibration": "lfpiv.calibration.cameras",
+    "Calibration": "lfpiv.calibration.camera",
     "Experiment": "lfpiv.experiment.experiment",
     "Grid": "lfpiv.geometry.grid",
     "InputError": "lfpiv.errors",
@@ -43,7 +49,7 @@ _MODULES = {
     "correlate": "lfpiv.velocity.cross_correlation",
     "export_results": "lfpiv.results.export",
     "find_lens_array": "lfpiv.lightfield.lens_array",
-    "load_calibration": "lfpiv.calibration.cameras",
+    "load_calibration": "lfpiv.calibration.camera",
     "open_experiment": "lfpiv.experiment.experiment",
     "open_results": "lfpiv.results.reader",
     "reconstruct": "lfpiv.reconstruction.volume",
@@ -57,29 +63,7 @@ _MODULES = {
 _SUBMODULES = ("derived", "metrics", "statistics")
 """Modules that are public as a whole, such as `lfpiv.metrics`."""
 
-__all__ = [
-    "Calibration",
-    "Experiment",
-    "Grid",
-    "InputError",
-    "LensArray",
-    "LensLattice",
-    "Optics",
-    "build_weights",
-    "calibrate",
-    "correlate",
-    "export_results",
-    "find_lens_array",
-    "load_calibration",
-    "open_experiment",
-    "open_results",
-    "reconstruct",
-    "reconstruct_pair",
-    "run",
-    "self_calibrate",
-    "thin_lens",
-    "write_report",
-]
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

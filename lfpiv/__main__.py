@@ -1,4 +1,4 @@
-"""``python -m lfpiv``: the command line."""
+"""Run the command line with ``python -m lfpiv``."""
 
 from lfpiv.cli.commands import main
 

@@ -87,6 +87,6 @@ def writing(path: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             free = f", {shutil.disk_usage(path.parent).free / MIB:,.0f} MiB free there"
         raise StorageError(
-            f"{path}: cannot be written: {reason}{free}. What is finished is kept and whole; mend that, and the same "
+            f"{path}: cannot be written: {reason}{free}. Finished results are complete. Solve this, and the same "
             "command goes on from there."
         ) from error

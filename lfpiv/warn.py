@@ -1,7 +1,7 @@
-"""Warnings of a run: one value from where a doubt arises to the log, the summary, the report and the exit status.
+"""Warnings of a run, for the log, the summary, the report and the exit status.
 
-A `Warning` holds a code, a subject and figures. Files store these three. `Warning.sentence` makes the text where people
-read it, so that a reworded sentence does not break older files.
+A `Warning` holds a code, a subject and figures. Files store these three. `Warning.sentence` makes the text for people,
+so that a reworded sentence does not break older files.
 """
 
 from __future__ import annotations
@@ -181,8 +181,8 @@ SENTENCES: Mapping[Code, str] = {
     Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
     Code.FEWER_WORKERS: (
-        "{fits} {noun} instead of {planned}: beside {weights_gib:.1f} GiB of weights each takes {each_gib:.1f} GiB "
-        "of memory"
+        "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "
+        "{weights_gib:.1f} GiB of weights"
     ),
     Code.ONE_GPU: (
         "one of {gpus} GPUs is used: several processes need the package `distributed`. Install it: pip install "
@@ -209,7 +209,7 @@ class Warning:
 
     code: Code
     subject: str = ""
-    """What it concerns, such as a camera, or "left, frame a"; empty for the run as a whole."""
+    """Object of the doubt, such as a camera, or "left, frame a"; empty for the whole run."""
     figures: Mapping[str, object] = field(default_factory=dict)
     """Numbers and names that the sentence shows."""
     pairs: tuple[int, ...] = ()
@@ -227,14 +227,14 @@ class Warning:
         return replace(self, pairs=(pair,))
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a file stores."""
+        """Return the form that a file stores."""
         figures = {name: asdict(value) if isinstance(value, Span) else value for name, value in self.figures.items()}
         stored = {"code": self.code.value, "subject": self.subject, "figures": figures}
         return stored | {"pairs": list(self.pairs)} if self.pairs else stored
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
-        """Read what a file stores; sentences and findings of version 0.1.0 too."""
+        """Read the form that a file stores; sentences and findings of version 0.1.0 too."""
         if isinstance(stored, str):
             return cls(code=Code.OTHER, figures={"text": stored})
         if "what" in stored:
@@ -325,7 +325,7 @@ def warn(log: logging.Logger, warning: Warning) -> None:
 
 @dataclass(frozen=True)
 class FirstOfEachCode:
-    """Log for the warnings of many pairs: the first warning of each code only. The summary names all pairs."""
+    """Log the warnings of many pairs: only the first of each code. The summary names all pairs."""
 
     log: logging.Logger
     logged: set[Code] = field(default_factory=set)

@@ -5,7 +5,7 @@ import logging
 
 import pytest
 
-from lfpiv.runs import summary_warnings
+from lfpiv.runs import summary
 from lfpiv.runs.pair_figures import PairFigures, Spread
 from lfpiv.warn import SENTENCES, Code, FirstOfEachCode, Warning, collected, gather, warn
 
@@ -59,7 +59,7 @@ def test_warnings_of_other_versions_are_read(stored, sentence):
 def test_many_pairs_with_the_same_trouble_are_one_line():
     (found,) = gather(dark(0.1 + number / 1e4).of_pair(number) for number in range(1000))
     assert found.sentence.startswith("left, frame a, pairs 0, 1, 2, 3, 4 and 995 more: 10 to 20 % of the bright pixels")
-    (few,) = summary_warnings.pair_warnings({pair: figures("look", 0.01 * pair) for pair in (3, 5)})
+    (few,) = summary.pair_warnings({pair: figures("look", 0.01 * pair) for pair in (3, 5)})
     assert few.sentence == "pairs 3, 5: 3 to 5 % of the vectors are valid; look"
 
 

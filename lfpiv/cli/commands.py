@@ -104,9 +104,9 @@ def _run(
         typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the pairs instead."),
     ] = None,
 ) -> None:
-    """Do the whole job: calibrate, reconstruct, correlate, report. Finished parts in DIR are kept.
+    """Do all steps: calibrate, reconstruct, correlate, report. Finished parts in DIR are not repeated.
 
-    A pair that cannot be done is left out and named; then the exit status is 3.
+    A pair that fails is left out and named; then the exit status is 3.
     """
     selected = _parse_pairs(pairs)
     with _output.progress() as progress:
@@ -129,11 +129,7 @@ def _run(
 @_command(
     "calibrate", "lfpiv calibrate experiment.toml --out results", "lfpiv calibrate experiment.toml --out results --json"
 )
-def _calibrate(
-    experiment: ExperimentFile,
-    out: Out,
-    device: Device = None,
-) -> None:
+def _calibrate(experiment: ExperimentFile, out: Out, device: Device = None) -> None:
     """Calibrate the cameras: first step of a run."""
     with _output.progress() as progress:
         from lfpiv.runs import pipeline
@@ -143,13 +139,8 @@ def _calibrate(
 
 
 @_command("reconstruct", "lfpiv reconstruct experiment.toml --out results --pairs 0:10")
-def _reconstruct(
-    experiment: ExperimentFile,
-    out: Out,
-    pairs: Pairs = ":",
-    device: Device = None,
-) -> None:
-    """Reconstruct volumes and keep them in DIR/volumes."""
+def _reconstruct(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", device: Device = None) -> None:
+    """Reconstruct volumes into DIR/volumes."""
     selected = _parse_pairs(pairs)
     with _output.progress() as progress:
         from lfpiv.runs import pipeline
@@ -160,12 +151,7 @@ def _reconstruct(
 
 
 @_command("correlate", "lfpiv correlate experiment.toml --out results --pairs 0:10")
-def _correlate(
-    experiment: ExperimentFile,
-    out: Out,
-    pairs: Pairs = ":",
-    device: Device = None,
-) -> None:
+def _correlate(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", device: Device = None) -> None:
     """Correlate the volumes in DIR/volumes into vectors."""
     selected = _parse_pairs(pairs)
     with _output.progress() as progress:
@@ -177,11 +163,8 @@ def _correlate(
 
 
 @_command("report", "lfpiv report experiment.toml --out results")
-def _report(
-    experiment: ExperimentFile,
-    out: Out,
-) -> None:
-    """Write summary and report anew from what DIR holds."""
+def _report(experiment: ExperimentFile, out: Out) -> None:
+    """Write summary and report again from the results in DIR."""
     with _output.progress():
         from lfpiv.runs import pipeline
 
@@ -229,15 +212,12 @@ def _simulate(
     with _output.progress() as progress:
         from lfpiv.simulation.simulator import simulate
 
-        path = simulate(scene, out, progress=lambda step, done, total: progress(step, done / total))
+        path = simulate(scene, out, progress=progress)
     _output.show({"experiment": str(path)}, lambda: print(f"experiment: {path}"))
 
 
 @_command("demo", "lfpiv demo", "lfpiv demo --out somewhere --device cpu")
-def _demo(
-    out: Out = Path("lfpiv-demo"),
-    device: Device = None,
-) -> None:
+def _demo(out: Out = Path("lfpiv-demo"), device: Device = None) -> None:
     """Simulate a small two-camera experiment and run everything on it."""
     with _output.progress() as progress:
         from lfpiv.cli import demo
@@ -257,7 +237,7 @@ def _reproduce(
     ] = "small",
     seed: Annotated[int, typer.Option("--seed", help="Whole number that every random draw derives from.")] = 0,
 ) -> None:
-    """Compute the paper's tables and figures, ours beside the paper's. Finished cases in DIR are kept."""
+    """Compute the paper's tables and figures, ours beside the paper's. Finished cases in DIR are not repeated."""
     with _output.progress() as progress:
         from lfpiv.reproduce import reproduce
 
@@ -267,9 +247,7 @@ def _reproduce(
 
 
 @_command("doctor", "lfpiv doctor", "lfpiv doctor --device cuda")
-def _doctor(
-    device: Literal["auto", "cpu", "cuda"] = "auto",
-) -> None:
+def _doctor(device: Literal["auto", "cpu", "cuda"] = "auto") -> None:
     """Show devices, versions and memory, and test the kernels."""
     with _output.progress():
         from lfpiv.cli.doctor import examine
@@ -305,7 +283,7 @@ def call(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _fail(2, str(error), error)
     except (Interrupted, KeyboardInterrupt, typer.Abort) as error:
-        return _fail(1, "interrupted. What is finished is kept; the same command goes on from there.", error)
+        return _fail(1, "interrupted. Finished results are complete; the same command goes on from there.", error)
     except (StorageError, ClusterError) as error:
         return _fail(1, str(error), error)
     except MemoryError as error:
@@ -345,7 +323,3 @@ def _end(summary: dict[str, Any]) -> None:
         terminal.print_failed(summary, sys.stdout if _output.is_text else sys.stderr)
     if terminal.failed_now(summary):
         raise typer.Exit(3)
-
-
-if __name__ == "__main__":
-    main()

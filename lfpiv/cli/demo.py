@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib.resources
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lfpiv.geometry.grid import AXES
+from lfpiv.progress import Progress, ignore_progress
 from lfpiv.results import netcdf
 from lfpiv.results.folder import Folder
 from lfpiv.runs import pipeline
@@ -21,9 +22,7 @@ from lfpiv.velocity.settings import CorrelationSettings
 log = logging.getLogger(__name__)
 
 
-def run(
-    out: str | Path, *, device: str | None = None, progress: Callable[[str, float], None] | None = None
-) -> dict[str, Any]:
+def run(out: str | Path, *, device: str | None = None, progress: Progress | None = None) -> dict[str, Any]:
     """Simulate the demo scene into ``out/experiment`` unless it exists, and run all steps on it into `out`.
 
     Parameters
@@ -43,14 +42,14 @@ def run(
     InputError
         If the folder cannot be written.
     """
-    out, update = Path(out), progress or (lambda step, fraction: None)
+    out, report = Path(out), progress or ignore_progress
     with importlib.resources.as_file(importlib.resources.files("lfpiv.cli") / "demo_scene.toml") as path:
         scene = open_scene(path)
         experiment = out / "experiment" / "experiment.toml"
         if experiment.exists():
             log.info("simulated experiment: made before, kept")
         else:
-            simulate(scene, experiment.parent, progress=lambda step, done, total: update("simulation", done / total))
+            simulate(scene, experiment.parent, progress=lambda _, fraction: report("simulation", fraction))
     summary = pipeline.run(experiment, out, device=device, progress=progress)
     return summary | {"demo": compare_with_truth(scene, out)}
 
@@ -63,8 +62,8 @@ def compare_with_truth(scene: Scene, out: Path) -> dict[str, float]:
     vectors = netcdf.read_vectors(Folder(out).vectors(0))
     voxel_mm = scene.volume.voxel_mm
     window_mm = np.array(CorrelationSettings.of(vectors).windows[-1][::-1]) * voxel_mm
-    inner = vectors.isel({axis: slice(1, -1) for axis in "zyx" if vectors.sizes[axis] > 2})
-    z, y, x = np.meshgrid(*(inner[axis].values for axis in "zyx"), indexing="ij")
+    inner = vectors.isel({axis: slice(1, -1) for axis in AXES if vectors.sizes[axis] > 2})
+    z, y, x = np.meshgrid(*(inner[axis].values for axis in AXES), indexing="ij")
     truth = window_mean(scene.flow_of(0), np.stack([x, y, z], axis=-1).reshape(-1, 3), tuple(window_mm)) / voxel_mm
     measured = np.stack([inner[f"displacement_{axis}"].values.ravel() for axis in "xyz"], axis=1)
     error = np.linalg.norm(measured - truth, axis=1)

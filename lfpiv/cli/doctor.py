@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lfpiv.geometry.grid import AXES
 from lfpiv.runs import memory
 from lfpiv.version import versions
 from lfpiv_kernels import runtime
@@ -110,7 +111,7 @@ def _test_correlation() -> tuple[str, bool]:
     half = np.asarray(SHIFT_VOXEL) / 2
     first, second = _blobs(shape, centres - half), _blobs(shape, centres + half)
     vectors = correlate(first, second, windows=(16, 16), voxel_mm=1.0, dt_s=1.0)
-    names = [f"displacement_{axis}" for axis in "zyx"]
+    names = [f"displacement_{axis}" for axis in AXES]
     middle = tuple(slice(1, -1) if n > 2 else slice(None) for n in vectors["u"].shape)
     miss = max(abs(float(np.median(vectors[n].values[middle])) - d) for n, d in zip(names, SHIFT_VOXEL, strict=True))
     return f"known shift recovered to {miss:.3f} voxel", miss < TOLERANCE_SHIFT_VOXEL

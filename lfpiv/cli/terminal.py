@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from lfpiv.progress import Progress
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -26,9 +28,6 @@ LISTED_PAIRS = 20
 """Largest number of pairs listed at the end of a run."""
 LISTED_WARNINGS = 20
 """Largest number of warnings listed at the end of a run. ``summary.json`` contains all."""
-
-Progress = Callable[[str, float], None]
-"""Called as ``progress(step, fraction)``, fraction from 0 to 1."""
 
 
 class Interrupted(Exception):
@@ -165,7 +164,7 @@ def print_demo(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_case(key: str, result: dict[str, Any]) -> None:
-    """Print the result of a case of `lfpiv reproduce` beside the paper's value and the goal."""
+    """Print the result of a case of `lfpiv reproduce`, the paper's value and the goal."""
     print(f"{key}: {result['title']}")
     for row in result["comparison"]:
         ours, paper = (

@@ -26,11 +26,11 @@ from lfpiv.experiment.settings import (
     Volume,
 )
 from lfpiv.experiment.toml import read_toml
-from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.optics import Optics
 
 DECODED_PIXELS = 100_000_000
-"""Particle images that are decoded before the work starts [pixel]; of the others only header and length are checked."""
+"""Largest number of pixels of particle images that are decoded before the work starts [pixel]."""
 
 MICROLENS_SHARE = 0.2
 """Largest focal length of the microlenses over the main lens's image distance; more is a wrong unit."""
@@ -47,7 +47,7 @@ class CameraSetup:
     optics: Optics
     """Nominal optics; ``sensor_shape`` is that of the white image."""
     nominal_angle_deg: float
-    """Angle about y [degree]; it names the board's dots and enters the thin-lens mapping, never the network."""
+    """Angle about y [degree]; it numbers the board's dots and enters the thin-lens mapping, never the network."""
     image_flip: str
     """Mirroring of the camera's images, reversed on reading."""
     white_path: Path
@@ -77,10 +77,10 @@ class Experiment:
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
-        for camera in self.cameras:
-            if camera.name == name:
-                return camera
-        raise ValueError(f"camera: expected one of {', '.join(c.name for c in self.cameras)}, got {name!r}.")
+        by_name = {camera.name: camera for camera in self.cameras}
+        if name not in by_name:
+            raise ValueError(f"camera: expected one of {', '.join(by_name)}, got {name!r}.")
+        return by_name[name]
 
     def white(self, name: str) -> np.ndarray:
         """Return the white image of a camera [counts], dark image not subtracted, float32 (rows, columns)."""
@@ -165,15 +165,10 @@ def read_experiment(path: str | Path) -> Experiment:
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
-    _check_pattern(
-        path, "board.images", table.board.images, {"camera": names, "plane": range(len(table.board.planes_mm))}
-    )
-    _check_pattern(
-        path,
-        "particles.images",
-        table.particles.images,
-        {"camera": names, "pair": range(table.particles.pairs), "frame": table.particles.frames},
-    )
+    board, particles = table.board, table.particles
+    _check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
+    fields = {"camera": names, "pair": range(particles.pairs), "frame": particles.frames}
+    _check_pattern(path, "particles.images", particles.images, fields)
     grid = _grid(path, table.volume)
     _check_windows(path, table.correlation, grid)
     experiment = Experiment(
@@ -181,16 +176,16 @@ def read_experiment(path: str | Path) -> Experiment:
         name=table.name,
         dt_s=table.dt_s,
         cameras=tuple(_camera(path, camera) for camera in table.camera),
-        board=table.board,
+        board=board,
         grid=grid,
-        pairs=table.particles.pairs,
-        frames=table.particles.frames,
+        pairs=particles.pairs,
+        frames=particles.frames,
         smart=table.smart,
         self_calibration=table.self_calibration,
         correlation=table.correlation,
         network=table.network,
         compute=table.compute,
-        particle_images=table.particles.images,
+        particle_images=particles.images,
     )
     for camera in experiment.cameras:
         nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)
@@ -264,7 +259,7 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
     for window in correlation.windows or ():
         if not isinstance(window, tuple):
             continue  # a single edge is cut to the volume
-        for axis, edge, n in zip("zyx", window, grid.shape, strict=True):
+        for axis, edge, n in zip(AXES, window, grid.shape, strict=True):
             if edge > n:
                 raise InputError(
                     f"{path}: correlation.windows: expected windows inside the volume, found {edge} voxels "
@@ -276,16 +271,7 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
 def _camera(path: Path, table: CameraTable) -> CameraSetup:
     white_path = path.parent / table.white_image
     shape = _white_shape(white_path, f"white_image of camera {table.name!r}")
-    optics = Optics(
-        focal_length_mm=table.focal_length_mm,
-        magnification=table.magnification,
-        f_number=table.f_number,
-        microlens_pitch_mm=table.microlens_pitch_mm,
-        microlens_focal_length_mm=table.microlens_focal_length_mm,
-        pixel_mm=table.pixel_um / 1000,
-        sensor_shape=shape,
-        layout=table.microlens_layout,
-    )
+    optics = table.optics_of(shape)
     if table.microlens_focal_length_mm > MICROLENS_SHARE * optics.image_distance_mm:
         raise InputError(
             f"{path}: camera {table.name!r}, microlens_focal_length_mm: expected far less than the image distance "

@@ -1,6 +1,6 @@
 """Check the stated volume and board against the nominal field of view of each camera.
 
-The nominal rig is correct to some degrees and millimetres only. The checks refuse what no such error explains.
+The nominal rig is correct to some degrees and millimetres only. The checks refuse larger differences only.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from lfpiv.geometry.optics import Optics
 ANGLE_ERROR_DEG = 10.0
 """Largest error of a nominal angle that a calibration tolerates [degree]."""
 FIELDS_AWAY = 1.5
-"""Distance of a volume from the edge of the field that no misalignment explains [fields of view]."""
+"""Distance of a volume from the edge of the field above which it is refused [fields of view]."""
 LARGEST_BOARD = 4.0
-"""Largest size of a board, along x or y, relative to what a camera may see of it."""
+"""Largest size of a board, along x or y, relative to the part that a camera may see."""
 STEEPEST_COSINE = 0.17
 """Cosine of the steepest angle at which a camera may see a board, 80 degrees."""
 
@@ -35,7 +35,7 @@ def require_volume(path: Path, grid: Grid, name: str, optics: Optics, angle_deg:
     Raises
     ------
     InputError
-        If the volume lies behind the camera's main lens, or several fields of view beside the field.
+        If the volume lies behind the camera's main lens, or several fields of view away from the field.
     """
     low, high = (np.array([grid.axis_mm(axis)[end] for axis in (2, 1, 0)]) for end in (0, -1))
     alpha = np.radians(angle_deg)

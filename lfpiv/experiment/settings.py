@@ -9,12 +9,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from lfpiv.geometry.optics import Optics
+
 # Strict types refuse text and `true` in place of a number; an integer is a number. TOML's lists become tuples.
 Number = Annotated[float, Field(strict=True)]
-Whole = Annotated[int, Field(strict=True)]
 Positive = Annotated[float, Field(strict=True, gt=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
+NonNegative = Annotated[float, Field(strict=True, ge=0)]
 Flag = Annotated[bool, Field(strict=True)]
+Point = tuple[Number, Number, Number]
 
 SMALLEST_WINDOW = 4
 """Smallest edge of an interrogation window that holds a correlation peak [voxel]."""
@@ -52,8 +55,8 @@ class Smart(Table):
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
     """Relative decrease of the misfit per iteration below which SMART stops; 0 runs all iterations."""
     motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
-    """Number of times the motion is measured and both frames are reconstructed again with the light they share along
-    it; 0 reconstructs each frame separately."""
+    """Number of times the motion is measured and both frames are reconstructed again from their common light along it;
+    0 reconstructs each frame separately."""
 
     def of_one_frame(self) -> dict[str, Any]:
         """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame."""
@@ -136,7 +139,7 @@ class NominalCamera(Table):
     microlens_layout: Literal["square", "hexagonal"] = "square"
     """Arrangement of the microlenses."""
     nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
-    """Angle of the camera about y, correct to about 10, which names the board's dots but never enters the mapping
+    """Angle of the camera about y, correct to about 10. It numbers the board's dots and never enters the mapping
     [degree]."""
     image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirroring of the camera's images."""
@@ -148,6 +151,19 @@ class NominalCamera(Table):
             raise ValueError("a number other than 0")
         return value
 
+    def optics_of(self, sensor_shape: tuple[int, int]) -> Optics:
+        """Return the nominal optics with a sensor of (rows, columns) pixels."""
+        return Optics(
+            focal_length_mm=self.focal_length_mm,
+            magnification=self.magnification,
+            f_number=self.f_number,
+            microlens_pitch_mm=self.microlens_pitch_mm,
+            microlens_focal_length_mm=self.microlens_focal_length_mm,
+            pixel_mm=self.pixel_um / 1000,
+            sensor_shape=sensor_shape,
+            layout=self.microlens_layout,
+        )
+
 
 class CameraTable(NominalCamera):
     """Table ``[[camera]]``: nominal optics and calibration images of one camera."""
@@ -158,8 +174,8 @@ class CameraTable(NominalCamera):
     """Path of an image with the lens capped; absent: the gaps between microimages give the dark level."""
 
 
-class Board(Table):
-    """Table ``[board]``: the dot board and the depths of its planes."""
+class NominalBoard(Table):
+    """Keys of ``[board]``, in experiments and in scenes of the simulator."""
 
     dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
     """Number of dots along x and y."""
@@ -169,6 +185,17 @@ class Board(Table):
     """Diameter of a dot, less than their distance [mm]."""
     planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
     """Depth z of each plane, all different [mm]."""
+
+    @model_validator(mode="after")
+    def _dots_apart(self) -> NominalBoard:
+        if self.dot_diameter_mm >= self.spacing_mm:
+            raise ValueError("dot_diameter_mm smaller than spacing_mm")
+        return self
+
+
+class Board(NominalBoard):
+    """Table ``[board]``: the dot board and the depths of its planes."""
+
     images: Annotated[str, Field(min_length=1)]
     """Path of the board images with ``{camera}`` and ``{plane}``; planes count from 0."""
 
@@ -179,17 +206,11 @@ class Board(Table):
             raise ValueError("a different depth for each plane")
         return planes
 
-    @model_validator(mode="after")
-    def _dots_apart(self) -> Board:
-        if self.dot_diameter_mm >= self.spacing_mm:
-            raise ValueError("dot_diameter_mm smaller than spacing_mm")
-        return self
-
 
 class Volume(Table):
     """Table ``[volume]``: the voxel grid, in the order (x, y, z)."""
 
-    centre_mm: tuple[Number, Number, Number]
+    centre_mm: Point
     """Centre (x, y, z) of the volume [mm]."""
     size_mm: tuple[Positive, Positive, Positive]
     """Size (x, y, z) of the volume, at least 4 voxels along each axis [mm]."""

@@ -80,7 +80,7 @@ def _key(location: tuple[int | str, ...], values: Any) -> str:
     key = ""
     for part in location:
         if isinstance(part, str) and isinstance(values, Mapping):
-            key += f"{part}" if not key or key.endswith(", ") else f".{part}"
+            key += part if not key or key.endswith(", ") else f".{part}"
             values = values.get(part)
         elif isinstance(part, int) and isinstance(values, list):
             values = values[part] if part < len(values) else None
@@ -128,10 +128,10 @@ def _show(value: Any) -> str:
         return "these values together"
     if isinstance(value, str):
         text = f"the text {value!r}"
+    elif isinstance(value, bool):
+        text = str(value).lower()
     else:
-        text = (
-            str(value).lower() if isinstance(value, bool) else str(list(value) if isinstance(value, tuple) else value)
-        )
+        text = str(list(value) if isinstance(value, tuple) else value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 

@@ -76,12 +76,21 @@ class Grid:
         """Return the voxel centres along one axis (0: z, 1: y, 2: x) [mm]."""
         return self.first_centre_mm[axis] + self.voxel_mm * np.arange(self.shape[axis])
 
+    def coordinates(self) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
+        """Return the voxel centres along z, y, x as coordinates of a DataArray [mm]."""
+        return {name: (name, self.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate(AXES)}
+
     def centres_mm(self) -> np.ndarray:
         """Return all voxel centres (x, y, z), in C order of the axes (z, y, x) [mm], shape (voxel, 3)."""
         z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in range(3)), indexing="ij")
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
+    @property
+    def centre_mm(self) -> np.ndarray:
+        """Centre (x, y, z) of the volume, shape (3,) [mm]."""
+        return np.array([self.axis_mm(axis)[[0, -1]].mean() for axis in (2, 1, 0)])
+
     def centre_text(self) -> str:
         """Return the centre (x, y, z) as text for messages."""
-        centre = (round(float(self.axis_mm(axis).mean()), 6) + 0.0 for axis in (2, 1, 0))
+        centre = (round(value, 6) + 0.0 for value in self.centre_mm.tolist())
         return f"({', '.join(f'{value:g}' for value in centre)}) mm"

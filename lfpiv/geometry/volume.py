@@ -14,7 +14,11 @@ from lfpiv.geometry.grid import AXES, Grid
 VIEWS = "views"
 """Name of a volume's coordinate with the number of cameras that see each voxel."""
 
-_SPACING_TOLERANCE = 1e-3  # largest unevenness of coordinates, relative to the spacing
+SPACING_TOLERANCE = 1e-3
+"""Largest unevenness of coordinates, relative to the spacing. Coordinates stored as float32 are slightly uneven."""
+
+POSITION_TOLERANCE_MM = 1e-4
+"""Largest difference of equal coordinates [mm]."""
 
 
 def checked_points(points: np.ndarray, name: str) -> np.ndarray:
@@ -64,7 +68,7 @@ def _grid_of(volume: xr.DataArray, name: str) -> Grid:
     axes = [np.asarray(volume[axis], float) for axis in AXES]
     steps = np.concatenate([np.diff(axis) for axis in axes])
     voxel_mm = float(np.median(steps)) if len(steps) else float(volume.attrs.get("voxel_mm", 1.0))
-    if not voxel_mm > 0 or (np.abs(steps - voxel_mm) > _SPACING_TOLERANCE * voxel_mm).any():
+    if not voxel_mm > 0 or (np.abs(steps - voxel_mm) > SPACING_TOLERANCE * voxel_mm).any():
         raise ValueError(
             f"{name}: expected evenly spaced cubic voxels, got steps of {steps.min()} to {steps.max()} mm."
         )

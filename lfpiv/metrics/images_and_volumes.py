@@ -14,14 +14,12 @@ from numpy.typing import ArrayLike
 from skimage.metrics import structural_similarity
 
 from lfpiv.geometry.grid import Grid
-from lfpiv.geometry.volume import checked_volume
+from lfpiv.geometry.volume import POSITION_TOLERANCE_MM, checked_volume
 
 SSIM_SIGMA = 1.5
 """Standard deviation of the Gaussian window of the structural similarity [pixel]."""
 SSIM_WINDOW = 11
 """Edge of the Gaussian window [pixel]."""
-
-_POSITION_TOLERANCE_MM = 1e-4  # largest difference of equal coordinates
 
 
 # -- volumes and images ------------------------------------------------------------------------------------------------
@@ -42,7 +40,7 @@ def reconstruction_quality(
         Finite intensities on the same voxels.
     zero_mean : bool
         Subtract the mean of each volume first, which gives the correlation coefficient, -1 to 1. A uniform haze does
-        not raise it. The paper's figures are without. For sparse particles the two nearly agree.
+        not raise it. The paper does not subtract the mean. For sparse particles the two nearly agree.
 
     Returns
     -------
@@ -80,7 +78,7 @@ def reconstruction_quality(
         grids += [np.append(grid.first_centre_mm, grid.voxel_mm)] if labelled else []
         if not values[-1].any():
             raise ValueError(f"{name}: expected some contrast, got {'a uniform' if zero_mean else 'an empty'} volume.")
-    if len(grids) == 2 and np.abs(grids[0] - grids[1]).max() > _POSITION_TOLERANCE_MM:
+    if len(grids) == 2 and np.abs(grids[0] - grids[1]).max() > POSITION_TOLERANCE_MM:
         raise ValueError("truth: expected the coordinates of the volume, got others. Draw the truth on the same grid.")
     return float(np.vdot(*values) / np.sqrt(np.vdot(values[0], values[0]) * np.vdot(values[1], values[1])))
 

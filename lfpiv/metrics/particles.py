@@ -119,7 +119,7 @@ def truth_volume(
     return xr.DataArray(
         volume.astype(np.float32),
         dims=AXES,
-        coords={name: (name, grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate("zyx")},
+        coords=grid.coordinates(),
         name="intensity",
         attrs={"long_name": "light of the true particles", "sigma_voxel": sigma_voxel, "voxel_mm": grid.voxel_mm},
     )
@@ -152,9 +152,9 @@ def _draw_blobs(place: np.ndarray, light: np.ndarray, shape: tuple[int, int, int
 def find_particles(volume: xr.DataArray | np.ndarray, threshold: float, *, grid: Grid | None = None) -> Particles:
     """Find the particles of a volume: local maxima among the 26 neighbours, with sub-voxel positions and widths.
 
-    A three-point Gaussian fit along each axis gives position and width. Of equal neighbours the first in storage order
-    is the peak. Particles are assumed to be about as small as a voxel. Those that merge into one maximum are found as
-    one.
+    A three-point Gaussian fit along each axis gives position and width. Among equal neighbours the first in storage
+    order is the peak. Particles are assumed to be about as small as a voxel. Particles that merge into one maximum are
+    found as one.
 
     Parameters
     ----------

@@ -11,13 +11,12 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
+from lfpiv.geometry.volume import POSITION_TOLERANCE_MM
 
 PERCENTILES = (50, 75, 90, 95, 99)
 """Reported percentiles of the displacement error."""
 BELOW_VOXEL = 0.43
 """Bound of Fig. 14(b) [voxel]: the paper reports the part of the vectors with a smaller error."""
-
-_POSITION_TOLERANCE_MM = 1e-4  # largest difference of equal coordinates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +76,7 @@ def displacement_difference(
         raise ValueError(f"truth: expected the shape of the vectors, {fields[0].shape}, got {fields[1].shape}.")
     if isinstance(vectors, xr.Dataset) and isinstance(truth, xr.Dataset):
         for axis in AXES:
-            if np.abs(vectors[axis].values - truth[axis].values).max() > _POSITION_TOLERANCE_MM:
+            if np.abs(vectors[axis].values - truth[axis].values).max() > POSITION_TOLERANCE_MM:
                 raise ValueError(f"truth: expected the window centres of the vectors, got others along {axis}.")
     selected = np.ones(fields[0].shape[:3], bool) if where is None else np.asarray(where)
     if selected.shape != fields[0].shape[:3] or selected.dtype != bool:

@@ -63,9 +63,7 @@ class Reconstruction:
 
     def to_dataarray(self) -> xr.DataArray:
         """Return the volume with its coordinates [mm] and all figures as attributes, see `lfpiv.reconstruct`."""
-        coordinates: dict[str, Any] = {
-            name: (name, self.grid.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate(AXES)
-        }
+        coordinates: dict[str, Any] = dict(self.grid.coordinates())
         if self.views is not None:
             about = {"units": "1", "long_name": "number of cameras that see the voxel"}
             coordinates[VIEWS] = (AXES, self.views, about)

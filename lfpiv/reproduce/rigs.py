@@ -174,7 +174,7 @@ def calibrated_rig(scene: Scene, folder: Path, progress: Callable[[str, float], 
         folder.mkdir(parents=True, exist_ok=True)
         files.write_json(content, marker)
     if not path.exists():
-        simulate(scene, path.parent, progress=lambda what, done, total: progress(what, done / total))
+        simulate(scene, path.parent, progress=progress)
     experiment = open_experiment(path)
     stored = folder / "calibration.h5"
     if not stored.exists():

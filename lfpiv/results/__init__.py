@@ -1,1 +1,1 @@
-"""The output folder and its files: written whole, marked with what they depend on, read back, exported."""
+"""The output folder and its files: write them atomically with stamps of their origin, read and export them."""

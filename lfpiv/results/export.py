@@ -1,4 +1,4 @@
-"""`export_results`: vectors of a run in formats of other programs: ParaView (vti), one NetCDF file, CSV, pivpy.
+"""`export_results`: write vectors of a run in formats of other programs: ParaView (vti), one NetCDF file, CSV, pivpy.
 
 A file appears under its name only when it is complete. Existing files are replaced as a whole.
 """
@@ -11,7 +11,7 @@ import logging
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from pyevtk.vtk import VtkGroup
 from lfpiv.errors import InputError
 from lfpiv.files import replacing, writing
 from lfpiv.geometry.grid import AXES
+from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.results import netcdf
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.reader import open_results
@@ -31,12 +32,6 @@ from lfpiv.version import versions
 
 log = logging.getLogger(__name__)
 
-Progress = Callable[[str, float], None]
-"""Called as ``progress(step, fraction)``, fraction from 0 to 1."""
-
-Update = Callable[[int, int], None]
-"""Called as ``update(done, total)``."""
-
 FOLDER = "export"
 """Default folder of exports inside the folder of the run."""
 
@@ -44,12 +39,13 @@ CSV_DIGITS = 9
 """Significant digits in text, enough for single precision."""
 
 _MM_PER_M = 1000.0
+_TIME = "first frame of the pair after that of pair 0"  # description of times in seconds
 
 
 class Format(enum.Enum):
     """Formats of exported vectors. The text describes the files."""
 
-    VTI = "one .vti image per pair and one per kept volume, with .pvd collections over the pairs: ParaView, pyvista"
+    VTI = "one .vti image per pair and one per stored volume, with .pvd collections over the pairs: ParaView, pyvista"
     NETCDF = "vectors.nc, one NetCDF4 file over all pairs: xarray, MATLAB"
     CSV = "one table per pair, a row per vector, units in the header"
     PIVPY = "one NetCDF file per depth, planes of u and v over all pairs: pivpy"
@@ -128,25 +124,23 @@ def export_results(
     planes = results["z"].values if depth_mm is None else _nearest(results["z"], depth_mm)
     target = Path(folder) / FOLDER if out is None else Path(out)
     made = make_writable(target)
-    update = _pair_progress(progress)
+
+    def step(fraction: float) -> None:
+        (progress or ignore_progress)("export", fraction)
+
     try:
         with writing(target):
             if form is Format.VTI:
-                return _write_vti(results, Folder(Path(folder)), target, interval_s, update)
+                return _write_vti(results, Folder(Path(folder)), target, interval_s, step)
             if form is Format.NETCDF:
-                return _write_netcdf(results, target, interval_s, update)
+                return _write_netcdf(results, target, interval_s, step)
             if form is Format.CSV:
-                return _write_csv(results, target, update)
-            return _write_pivpy(results, planes, target, interval_s, update)
+                return _write_csv(results, target, step)
+            return _write_pivpy(results, planes, target, interval_s, step)
     finally:
         for path in made:
             if path.is_dir() and not any(path.iterdir()):
                 path.rmdir()
-
-
-def _pair_progress(progress: Progress | None) -> Update:
-    """Return a function that reports finished parts as a fraction of the export."""
-    return (lambda done, total: None) if progress is None else (lambda done, total: progress("export", done / total))
 
 
 def _nearest(depths: xr.DataArray, depth_mm: float) -> np.ndarray:
@@ -166,25 +160,25 @@ def _times(results: xr.Dataset, interval_s: float | None) -> np.ndarray:
     return results["pair"].values * (1.0 if interval_s is None else interval_s)
 
 
-def _each_pair(results: xr.Dataset, update: Update) -> Iterator[tuple[int, xr.Dataset]]:
+def _each_pair(results: xr.Dataset, progress: StepProgress) -> Iterator[tuple[int, xr.Dataset]]:
     """Load and yield one pair after the other."""
     total = results.sizes["pair"]
     for done in range(total):
-        update(done, total)
+        progress(done / total)
         yield int(results["pair"][done]), results.isel(pair=done, drop=True).load()
-    update(total, total)
+    progress(1.0)
 
 
 # -- ParaView ----------------------------------------------------------------------------------------------------------
 
 
 def _write_vti(
-    results: xr.Dataset, folder: Folder, target: Path, interval_s: float | None, update: Update
+    results: xr.Dataset, folder: Folder, target: Path, interval_s: float | None, progress: StepProgress
 ) -> list[Path]:
     times = dict(zip(results["pair"].values.tolist(), _times(results, interval_s).tolist(), strict=True))
     collections: dict[str, dict[Path, float]] = {}
     mismatched: list[Path] = []
-    for pair, vectors in _each_pair(results, update):
+    for pair, vectors in _each_pair(results, progress):
         path = target / f"pair_{pair:04d}.vti"
         _write_image(_vector_arrays(vectors), vectors, path)
         collections.setdefault("vectors", {})[path] = times[pair]
@@ -270,24 +264,20 @@ def _write_collection(files: dict[Path, float], path: Path) -> None:
 # -- NetCDF, text, pivpy -----------------------------------------------------------------------------------------------
 
 
-def _write_netcdf(results: xr.Dataset, target: Path, interval_s: float | None, update: Update) -> list[Path]:
+def _write_netcdf(results: xr.Dataset, target: Path, interval_s: float | None, progress: StepProgress) -> list[Path]:
     path = target / "vectors.nc"
     if interval_s is not None:
-        attributes = {
-            "units": "s",
-            "standard_name": "time",
-            "long_name": "first frame of the pair after that of pair 0",
-        }
+        attributes = {"units": "s", "standard_name": "time", "long_name": _TIME}
         results = results.assign_coords(time=("pair", _times(results, interval_s), attributes))
-    update(0, 1)
+    progress(0.0)
     netcdf.write_dataset(results, path, attributes={"versions": versions()})
-    update(1, 1)
+    progress(1.0)
     return [path]
 
 
-def _write_csv(results: xr.Dataset, target: Path, update: Update) -> list[Path]:
+def _write_csv(results: xr.Dataset, target: Path, progress: StepProgress) -> list[Path]:
     written = []
-    for pair, vectors in _each_pair(results, update):
+    for pair, vectors in _each_pair(results, progress):
         units = {name: vectors[name].attrs.get("units", "1") for name in vectors.variables}
         names = ["x", "y", "z", *vectors.data_vars]
         titles = [str(name) if units[name] == "1" else f"{name} [{units[name]}]" for name in names]
@@ -302,19 +292,15 @@ def _write_csv(results: xr.Dataset, target: Path, update: Update) -> list[Path]:
 
 
 def _write_pivpy(
-    results: xr.Dataset,
-    depths: Sequence[float] | np.ndarray,
-    target: Path,
-    interval_s: float | None,
-    update: Update,
+    results: xr.Dataset, depths: np.ndarray, target: Path, interval_s: float | None, progress: StepProgress
 ) -> list[Path]:
     written = []
     for number, depth in enumerate(depths):
-        update(number, len(depths))
+        progress(number / len(depths))
         path = target / f"plane_z{depth:+.3f}mm.nc"
         netcdf.write_dataset(_plane(results.sel(z=depth), interval_s), path)
         written.append(path)
-    update(1, 1)
+    progress(1.0)
     return written
 
 
@@ -330,9 +316,9 @@ def _plane(results: xr.Dataset, interval_s: float | None) -> xr.Dataset:
         variables[variable] = (dims, values, {"units": "mm/s", "long_name": text, **standard})
     flags = results["valid"].transpose("y", "x", "pair").values.astype(float)
     variables["chc"] = (dims, flags, {"standard_name": "validity_flag", "long_name": "1: measured, 0: replaced"})
-    time = {"units": "frame" if interval_s is None else "s", "long_name": "number of the pair"}
+    time = {"units": "frame", "long_name": "number of the pair"}
     if interval_s is not None:
-        time["long_name"] = "first frame of the pair after that of pair 0"
+        time = {"units": "s", "long_name": _TIME}
     coordinates = {
         "x": ("x", results["x"].values, {"units": "mm"}),
         "y": ("y", results["y"].values, {"units": "mm"}),

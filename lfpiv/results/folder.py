@@ -54,7 +54,7 @@ class Folder:
 
     @property
     def lock(self) -> Path:
-        """Lock file of the run that writes here. It contains the process."""
+        """Lock file of the run that writes here. It names the process."""
         return self.path / ".lock"
 
     @property
@@ -63,11 +63,11 @@ class Folder:
         return self.path / ".shared"
 
     def vectors(self, pair: int) -> Path:
-        """Vectors of one pair."""
+        """Return the path of one pair's vectors."""
         return self.path / "vectors" / f"pair_{pair:04d}.nc"
 
     def volume(self, pair: int, frame: int) -> Path:
-        """Volume of one frame (0 or 1) of a pair."""
+        """Return the path of a pair's volume of frame 0 or 1."""
         return self.path / "volumes" / f"pair_{pair:04d}_{FRAME_NAMES[frame]}.nc"
 
     def sweep(self) -> None:
@@ -112,8 +112,8 @@ def _lock(path: Path) -> int | None:
                 return None
             raise InputError(
                 f"{path.parent}: expected a folder that no other run writes to, found it held by "
-                f"{_process_name(holder)}. Wait for its end, stop it, or choose another --out. `lfpiv report` may look "
-                "at it meanwhile."
+                f"{_process_name(holder)}. Wait for its end, stop it, or choose another --out. `lfpiv report` can "
+                "read it meanwhile."
             ) from None
         try:
             same = os.path.samestat(os.fstat(file), os.stat(path))

@@ -1,6 +1,6 @@
 """NetCDF files of vectors and volumes: their writers, readers and validator.
 
-A file gets its name when it is complete. So a file that exists is a finished result, and a rerun continues from it.
+A file gets its name when it is complete. So an existing file is a finished result, which a rerun does not repeat.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.version import versions
 
 SCHEMA_VERSION = 3
-"""Version of the files' form; readers refuse newer ones. 2: the group has its own dimensions. 3: adds ``profile_z``."""
+"""Version of the files. 2: the group has its own dimensions. 3: adds ``profile_z``."""
 
 VECTOR_UNITS = {
     "u": "m/s",
@@ -42,7 +42,7 @@ ROUNDING = 1e-5
 """Largest difference between a velocity and its displacement, relative or [voxel]: both have single precision."""
 
 RECONSTRUCTION = "reconstruction"
-"""NetCDF group beside the vectors of a pair: projections, profiles and residuals of its two volumes."""
+"""NetCDF group in the file of a pair's vectors: projections, profiles and residuals of its two volumes."""
 
 _GROUP_AXES = {axis: f"voxel_{axis}" for axis in AXES}  # in the file z, y, x are the axes of the vectors
 _DESCRIPTIONS: dict[str, dict[str, Any]] = {
@@ -194,7 +194,7 @@ def read_vectors(path: Path) -> xr.Dataset:
 
 
 def read_reconstruction(path: Path) -> xr.Dataset | None:
-    """Read the condensed volumes beside the vectors of a pair; None if the file has none."""
+    """Read the condensed volumes in the file of a pair's vectors; None if the file has none."""
     try:
         stored = _read(path, RECONSTRUCTION)
     except InputError:
@@ -289,7 +289,11 @@ def _read(path: Path, group: str | None) -> xr.Dataset:
         dataset = xr.load_dataset(path, engine="h5netcdf", group=group)
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{path}: expected a NetCDF4 file, found {error}. Remove it and run again.") from None
-    version = dataset.attrs.get("schema_version", 0)
+    require_schema(dataset.attrs.get("schema_version", 0), path)
+    return dataset
+
+
+def require_schema(version: int, path: Path) -> None:
+    """Refuse a file of a newer schema, or of none."""
     if not 1 <= version <= SCHEMA_VERSION:
         raise InputError(f"{path}: expected schema version 1 to {SCHEMA_VERSION}, found {version}. Update lfpiv.")
-    return dataset

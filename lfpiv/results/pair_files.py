@@ -1,7 +1,7 @@
-"""Files of one pair in an output folder: two volumes and the vectors, each with the stamp of what it depends on.
+"""Files of one pair in an output folder: two volumes and the vectors, each with a stamp of its origin.
 
-`PairFiles` checks whether they still fit the experiment, reads and writes them. `PairVolumes` holds two volumes and
-the figures and warnings of the images they were made from.
+`PairFiles` checks whether they still fit the experiment, reads and writes them. `PairVolumes` holds two volumes with
+figures and warnings of their images.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class PairFiles:
             yield from ((path, self.stamps.volumes) for path in self.volumes)
 
     def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:
-        """Name what changed since the wanted files were made: empty if one is missing, None if all fit."""
+        """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""
         for path, stamp in self._wanted(vectors, volumes):
             marks = provenance.read_marks(path)
             changes = [] if marks is None else stamp.changes(marks)
@@ -99,8 +99,8 @@ class PairFiles:
         marks = tuple(found for path in self.volumes if (found := provenance.read_marks(path)) is not None)
         return marks if len(marks) == 2 and all(map(self.stamps.volumes.fits, marks)) else None
 
-    def retire_those_of_other_images(self) -> Iterator[tuple[Path, Path]]:
-        """Rename the results that were made of other images than there are now; yield old and new paths."""
+    def retire_outdated(self) -> Iterator[tuple[Path, Path]]:
+        """Rename the results whose images changed; yield old and new paths."""
         for path, stamp in self._wanted(vectors=True, volumes=True):
             marks = provenance.read_marks(path)
             if marks is not None and "images" in stamp.changes(marks):

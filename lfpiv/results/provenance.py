@@ -1,6 +1,6 @@
-"""Stamps: what a finished file depends on, stored inside it.
+"""Stamps: settings and images that a finished file depends on, stored inside it.
 
-A later run compares the stamp of a file with the stamp that the present experiment asks for. It does again what differs
+A later run compares the stamp of a file with the stamp of the present experiment. It repeats the work if they differ,
 and names the differences.
 """
 
@@ -25,7 +25,7 @@ from lfpiv.warn import Warning
 
 @dataclass(frozen=True, kw_only=True)
 class Marks:
-    """What a finished file says about itself."""
+    """Stamp, figures and warnings that a finished file stores."""
 
     settings_hash: str = ""
     """Hash of its stamp."""
@@ -42,7 +42,7 @@ class Stamp:
     """The parts that a result depends on."""
 
     parts: Mapping[str, Any]
-    """Name -> settings, a hash, or the identity of images; None for images that are gone."""
+    """Name -> settings, a hash, or the identity of images; None for missing images."""
 
     @cached_property
     def hash(self) -> str:
@@ -55,9 +55,9 @@ class Stamp:
         return {"settings_hash": self.hash, "depends_on": json.dumps(files.plain(self.parts))}
 
     def changes(self, marks: Marks) -> list[str]:
-        """Name what changed since a file was made; empty if the file still fits.
+        """Return the names of the parts that changed since a file was made; empty if the file still fits.
 
-        Images that are gone did not change: a result outlives its raw data.
+        Missing images count as unchanged, because raw data may be deleted.
         """
         if marks.settings_hash == self.hash:
             return []
@@ -97,7 +97,8 @@ def read_marks(path: Path) -> Marks | None:
 
     try:
         with h5py.File(path, "r") as file:
-            found = {name: str(file.attrs[name]) for name in _MARKS if name in file.attrs}
+            names = ("settings_hash", "depends_on", "figures", "warnings", "findings")
+            found = {name: str(file.attrs[name]) for name in names if name in file.attrs}
     except OSError:
         return None
     return Marks(
@@ -106,9 +107,6 @@ def read_marks(path: Path) -> Marks | None:
         figures=json.loads(found["figures"]) if "figures" in found else None,
         warnings=stored_warnings(found),
     )
-
-
-_MARKS = ("settings_hash", "depends_on", "figures", "warnings", "findings")
 
 
 def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
@@ -134,15 +132,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
 
 
 def of_self_calibration(experiment: Experiment, calibration: str) -> Stamp | None:
-    """Return the stamp of the self-calibration; None if the experiment has none.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    calibration : str
-        Hash of the calibration's stamp.
-    """
+    """Return the stamp of the self-calibration; None if the experiment has none. `calibration` is a stamp's hash."""
     if not experiment.self_calibration.pairs:
         return None
     volume = dataclasses.asdict(experiment.grid)
@@ -150,17 +140,7 @@ def of_self_calibration(experiment: Experiment, calibration: str) -> Stamp | Non
 
 
 def of_pair(experiment: Experiment, calibration: str, pair: int) -> PairStamps:
-    """Return the stamps of the volumes and of the vectors of a pair.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    calibration : str
-        Hash of the calibration's stamp.
-    pair : int
-        Number of the pair.
-    """
+    """Return the stamps of the volumes and of the vectors of a pair. `calibration` is the hash of its stamp."""
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
     parts = {
@@ -190,7 +170,7 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
 
 
 def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
-    """Return path from `start`, size and time of the last change of images; None if one is gone. Reads no pixels."""
+    """Return path from `start`, size and time of the last change of images; None if one is missing."""
     try:
         found = [(path, split_frame(path)[0].stat()) for path in paths]
     except OSError:
@@ -199,7 +179,7 @@ def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
 
 
 def content_hash(paths: Iterable[Path]) -> str:
-    """Hash the bytes of several images, in order, and the frame's number where a file holds several."""
+    """Hash the bytes of several images, in order, and the frame's number if it is named."""
     digest = hashlib.blake2b(digest_size=16)
     for path in paths:
         image, frame = split_frame(path)

@@ -1,4 +1,4 @@
-"""`open_results`: the vectors of all pairs of a run as one dataset that reads its files lazily."""
+"""`open_results`: open the vectors of all pairs of a run as one dataset that reads its files lazily."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CHUNK_BYTES = 8 << 20
 """Largest size of a dask chunk, which holds one variable of at least one pair [byte]."""
 
 COMMON = ("dt_s", "voxel_mm", "smart", "correlation", "settings")
-"""Attributes that must be equal in all pairs, as must be everything that the vectors depend on except the images."""
+"""Attributes that must be equal in all pairs."""
 
 _NAME = re.compile(r"pair_(\d+)\.nc")
 
@@ -32,7 +32,7 @@ _NAME = re.compile(r"pair_(\d+)\.nc")
 def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = None) -> xr.Dataset:
     """Open the vectors of all finished pairs in the folder of a run.
 
-    Only attributes and axes of each file are read at once, in about a millisecond. With dask installed, the variables
+    This reads only attributes and axes of each file, in about a millisecond. With dask installed, the variables
     are dask arrays with chunks along pair. Without dask, values are read from the files when they are used. No file
     stays open.
 
@@ -104,17 +104,14 @@ def _files(folder: Path, pairs: tuple[int, int | None] | None) -> dict[int, Path
         raise InputError(f"{folder}: expected the folder of a finished run (its --out), found {what}.")
     found = {int(match[1]): path for path in vectors.iterdir() if (match := _NAME.fullmatch(path.name))}
     start, stop = (0, None) if pairs is None else pairs
+    text = "" if pairs is None else f"{start}:{'' if stop is None else stop}"
     if start < 0 or (stop is not None and stop <= start):
-        raise InputError(f"pairs: expected A:B with 0 <= A < B, found {start}:{'' if stop is None else stop}.")
+        raise InputError(f"pairs: expected A:B with 0 <= A < B, found {text}.")
     chosen = {number: found[number] for number in sorted(found) if number >= start and (stop is None or number < stop)}
     if not chosen:
         there = f"pairs {min(found)} to {max(found)}" if found else "none"
-        raise InputError(f"{vectors}: expected finished pairs {'' if pairs is None else _text(pairs)}, found {there}.")
+        raise InputError(f"{vectors}: expected finished pairs {text}, found {there}.")
     return chosen
-
-
-def _text(pairs: tuple[int, int | None]) -> str:
-    return f"{pairs[0]}:{'' if pairs[1] is None else pairs[1]}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,15 +139,12 @@ def _read_signature(path: Path) -> _Signature:
     except (OSError, KeyError, ValueError) as error:
         raise InputError(_unreadable(path, error)) from None
     attributes |= {key: json.dumps(value, sort_keys=True) for key, value in depends_on.items() if key != "images"}
-    if not 1 <= version <= netcdf.SCHEMA_VERSION:
-        raise InputError(
-            f"{path}: expected schema version 1 to {netcdf.SCHEMA_VERSION}, found {version}. Update lfpiv."
-        )
+    netcdf.require_schema(version, path)
     return _Signature(path=path, attributes=attributes, axes=axes, names=names)
 
 
 def _check_equal(signature: _Signature, reference: _Signature) -> None:
-    """Refuse a file whose settings, axes or variables differ from those of the first file."""
+    """Refuse a file whose settings, axes or variables differ from those of the reference."""
     for key in {**reference.attributes, **signature.attributes}:
         expected, found = reference.attributes.get(key, ""), signature.attributes.get(key, "")
         if not np.array_equal(expected, found):
@@ -198,7 +192,7 @@ class _Stack(BackendArray):
         return np.asarray(indexing.explicit_indexing_adapter(key, self.shape, support, self._read))
 
     def _read(self, key: tuple[Any, ...]) -> np.ndarray:
-        """Values at an outer index: each part an integer, a slice or a list of integers."""
+        """Return the values at an outer index: each part is an integer, a slice or a list of integers."""
         which, where = key[0], key[1:]
         chosen = np.arange(self.shape[0])[which]
         if np.ndim(chosen) == 0:

@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster that the user started. The run watches the scheduler and leaves the cluster as it was."""
+"""Workers of a Dask cluster that the user started. The run watches the scheduler and does not stop the cluster."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ log = logging.getLogger(__name__)
 CONNECT_S = 15.0
 """Longest time to connect to a scheduler, at the start and after a broken connection [s]."""
 ASK_S = 5.0
-"""Interval at which a scheduler is asked for its number of workers [s]."""
+"""Interval between two requests for the scheduler's number of workers [s]."""
 SILENT_S = 600.0
 """Time without an answer after which a scheduler counts as lost [s]."""
 REMIND_S = 60.0
 """Interval of log lines while a run waits for a worker or for an answer [s]."""
 
-RESUME = "What is finished is kept and whole; the same command goes on from there once the cluster runs again."
+RESUME = "Finished results are complete; the same command goes on from there once the cluster runs again."
 """Advice in messages about a lost cluster."""
 
 
@@ -63,7 +63,7 @@ def workers(address: str, shared: Path) -> Iterator[tuple[Any, Capacity]]:
 
 
 class _Watch:
-    """State of a scheduler, which is asked at intervals without waiting for its answer."""
+    """State of a scheduler. Requests are sent at intervals, without waiting for their answers."""
 
     def __init__(self, client: Any, address: str):
         self.client, self.address = client, address
@@ -73,7 +73,7 @@ class _Watch:
         self.broken = False
         """Whether the connection is broken."""
         self.answer: Future[int] | None = None
-        """Answer that is expected."""
+        """Answer to the last request; None if it arrived."""
 
     def capacity(self) -> float:
         """Return how many pairs may be submitted; raise ClusterError if the scheduler is lost."""
@@ -100,13 +100,13 @@ class _Watch:
         return math.inf
 
     def _ask(self, now: float) -> None:
-        """Take the expected answer if it is there; ask again at intervals."""
+        """Take the answer if it arrived; send the next request after the interval."""
         if self.answer is None:
             if now - self.asked_s > ASK_S:
                 self.asked_s = now
                 self.answer = asyncio.run_coroutine_threadsafe(_count(self.client), self.client.loop.asyncio_loop)
         elif self.answer.done():
-            with contextlib.suppress(Exception):  # the question failed
+            with contextlib.suppress(Exception):  # the request failed
                 self.count, self.answered_s = self.answer.result(), now
             self.answer = None
 
@@ -117,8 +117,4 @@ async def _count(client: Any) -> int:
 
 def _release(client: Any, shared: Path) -> None:
     with contextlib.suppress(Exception):  # the cluster may be lost
-        client.run(_release_in_worker, str(shared))
-
-
-def _release_in_worker(shared: str) -> None:
-    worker.release(Path(shared))
+        client.run(worker.release, shared)

@@ -1,6 +1,7 @@
-"""Hand out pairs: one after the other in this process, or in parallel to worker processes that Dask watches.
+"""Distribute pairs: one after the other in this process, or in parallel to worker processes that Dask watches.
 
-If a worker dies, its pair is tried once more, in another worker and after all other pairs. Then the pair has failed.
+If a worker dies, its pair is tried once more, in another worker and after all other pairs. If that worker dies too, the
+pair has failed.
 """
 
 from __future__ import annotations
@@ -58,13 +59,13 @@ def parallel(
     Raises
     ------
     InputError
-        If the scheduler does not answer, or a worker cannot use what it is given.
+        If the scheduler does not answer, or a worker cannot use the task.
     StorageError
         If results cannot be written.
     ClusterError
         If the cluster is lost.
     RuntimeError
-        If the workers cannot run what is sent to them.
+        If the workers cannot run the code that is sent to them.
     """
     found = (
         cluster_workers.workers(workers, shared) if isinstance(workers, str) else local_workers.workers(workers, shared)
@@ -123,7 +124,6 @@ class _Dispatch:
             future.add_done_callback(self.arrived.put)
 
     def _fraction(self) -> float:
-        """Return the finished fraction of all pairs."""
         running = sum(self.fractions.get(pair, 0.0) for _, pair in list(self.running.values()))
         return (self.done + min(running, len(self.running))) / self.total
 
@@ -158,7 +158,9 @@ def _fetched(future: Any, pair: int) -> worker.Result | None:
     try:
         found: worker.Result = future.result(timeout=FETCH_S)
     except TimeoutError:
-        raise ClusterError(f"the scheduler keeps the result of pair {pair} back. {cluster_workers.RESUME}") from None
+        raise ClusterError(
+            f"the scheduler does not deliver the result of pair {pair}. {cluster_workers.RESUME}"
+        ) from None
     except (CancelledError, OSError):
         return None
     return found
@@ -196,7 +198,7 @@ def _in_worker(shared: str, pair: int, topic: str) -> worker.Result:
 
 
 def _place() -> tuple[Any, ...]:
-    """Return what workers with the same cores have in common: the job of a queue, and the cores they may use."""
+    """Return the queue's job and the allowed cores of this worker; workers with equal places share cores."""
     affinity = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     return os.environ.get("SLURM_JOB_ID"), *affinity
 

@@ -1,7 +1,7 @@
 """Read particle images: light without background, its noise, and warnings about the images.
 
-`frame_light` takes the calibrated cameras and their dark images, and returns everything that is known about the images
-of one frame before they are reconstructed. `pair_light` does so for both frames of a pair and compares them.
+`frame_light` takes the calibrated cameras and their dark images, and returns light, noise and warnings of one frame.
+`pair_light` does so for both frames of a pair and compares them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameLight:
-    """The images of one frame and what they show; every mapping is by camera name."""
+    """Images of one frame and figures measured in them; every mapping is by camera name."""
 
     frame: str
     images: Mapping[str, np.ndarray]
@@ -53,20 +53,7 @@ def frame_light(
     pair: int,
     frame: str,
 ) -> FrameLight:
-    """Read and check the images of one frame of a pair.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Names the images.
-    cameras : dict
-        Camera name -> calibrated camera, whose decoder finds background and microimages.
-    darks : dict
-        Camera name -> dark image, from `read_darks`.
-    pair : int
-        Number of the pair.
-    frame : str
-        Name of the frame in the experiment.
+    """Read and check the images of one frame of a pair. `darks` is from `read_darks`.
 
     Raises
     ------

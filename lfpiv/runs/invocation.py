@@ -1,4 +1,4 @@
-"""Results of the steps of one invocation, from which its summary is made."""
+"""Results of the steps of one invocation, the input of its summary."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lfpiv.runs.pair import Outcome
 from lfpiv.warn import Warning
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class WeightsFigures:
     self_calibration: SelfCalibrationFigures | None
 
     def to_json(self) -> dict[str, Any]:
-        """Return what the summary stores."""
+        """Return the form that the summary stores."""
         stored: dict[str, Any] = {
             "method": self.method,
             "memory_mib": self.memory_mib,
@@ -81,7 +81,7 @@ class Workers:
 
 @dataclass(frozen=True, kw_only=True)
 class Invocation:
-    """What one invocation did."""
+    """Results of one invocation."""
 
     outcomes: Sequence[Outcome] = ()
     """Outcomes of the pairs that were tried."""

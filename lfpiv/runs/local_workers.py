@@ -1,4 +1,4 @@
-"""Worker processes of this machine. Dask starts and watches them; none is left when the run ends."""
+"""Worker processes of this machine. Dask starts and watches them. All of them end with the run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CLOSE_S = 10.0
 """Time that Dask is given to close [s]."""
 
 Capacity = Callable[[], float]
-"""Returns how many pairs may be submitted at once; raises ClusterError if the scheduler is lost."""
+"""Return how many pairs may be submitted at once; raise ClusterError if the scheduler is lost."""
 
 SETTINGS = {
     "distributed.worker.profile.enabled": False,  # would look at the workers' stacks 100 times a second
@@ -51,10 +51,10 @@ def import_distributed(key: str) -> Any:
 
 
 def start_preloading(kind: str) -> None:
-    """Start the process that workers are forked from, and let it import what they need; return at once.
+    """Start the process that workers are forked from, and let it import their modules; return at once.
 
-    It imports while this process works, on the calibration for example. It serves all later runs of this process too
-    and ends with it. CUDA drivers do not survive a fork, so on CUDA this does nothing.
+    It imports while this process works, on the calibration for example. It serves all later runs of this process and
+    ends with it. CUDA drivers do not survive a fork, so on CUDA this does nothing.
 
     Raises
     ------

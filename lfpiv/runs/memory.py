@@ -1,4 +1,4 @@
-"""Estimate the memory that a run needs, and find out how much this process may take."""
+"""Estimate the memory that a run needs, and find out how much memory this process may take."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import MIB
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
 
 log = logging.getLogger(__name__)
 
@@ -43,10 +43,8 @@ OWN_GROUPS = Path("/proc/self/cgroup")
 
 def least_bytes(experiment: Experiment) -> int:
     """Estimate the least memory a run of the experiment takes [byte], from the volume and the sensors only."""
-    cameras = len(experiment.cameras)
-    pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
-    voxel_bytes = BYTES_PER_VOXEL + BYTES_PER_VOXEL_AND_CAMERA * cameras
-    return BASE_BYTES + voxel_bytes * experiment.grid.size + BYTES_PER_PIXEL * pixels
+    rays = BYTES_PER_VOXEL_AND_CAMERA * len(experiment.cameras) * experiment.grid.size
+    return worker_bytes(experiment) + rays
 
 
 def weights_bytes(experiment: Experiment) -> int:
@@ -92,7 +90,7 @@ def allowed_bytes(experiment: Experiment) -> int:
 
 
 def available_bytes() -> int:
-    """Return the memory this process may take [byte]: what is free, limited by its control groups."""
+    """Return the memory this process may take [byte]: the free memory, limited by its control groups."""
     free = _meminfo("MemAvailable")
     if free is None:
         free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
@@ -100,7 +98,7 @@ def available_bytes() -> int:
 
 
 def left_for_weights(experiment: Experiment) -> int:
-    """Return the memory that the weights may take [byte] beside the volumes, which are allocated later."""
+    """Return the memory left for the weights [byte], after the volumes, which are allocated later."""
     left = available_bytes() - BYTES_PER_VOXEL * experiment.grid.size
     if experiment.compute.memory_gib is not None:
         left = min(left, int(experiment.compute.memory_gib * GIB) - least_bytes(experiment))
@@ -186,7 +184,7 @@ def _left_in(group: Path, names: tuple[str, str, str, str]) -> int:
 
 def _nominal_cameras(experiment: Experiment) -> Calibration:
     """Return the nominal rig of the experiment file. Reads no image."""
-    from lfpiv.calibration.cameras import CalibratedCamera, Calibration
+    from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.calibration.thin_lens_model import thin_lens_model
     from lfpiv.geometry.optics import LensLattice
 

@@ -33,7 +33,7 @@ LARGE_VOXEL = 0.5
 """Disparity of the cameras above which `check` warns [voxel]."""
 
 TRIED = 3
-"""Number of pairs that `check` tries if the first ones show too little."""
+"""Largest number of pairs that `check` tries."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,12 +69,12 @@ class SelfCalibrationFigures:
     """Camera -> its movement."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a file stores."""
+        """Return the form that a file stores."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> SelfCalibrationFigures:
-        """Read what a file stores."""
+        """Read the form that a file stores."""
         movements = {name: MovementFigures(**one) for name, one in stored["movements"].items()}
         return cls(**{**stored, "movements": movements})
 
@@ -116,8 +116,8 @@ def correct(
 def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> CameraDisparity | None:
     """Measure with the first usable pair how far apart the cameras show the same particles; warn if it is far.
 
-    Returns None if there is one camera only, if no pair shows particles, or if the cameras show none in common. The
-    last case is warned of.
+    Return None if there is one camera only, if no pair shows particles, or if the cameras show none in common. Warn in
+    the last case.
     """
     if len(weights.cameras) < 2 or weights.method != "footprint":
         return None
@@ -157,7 +157,7 @@ def _apart(disparity: float, experiment: Experiment, cameras: Mapping[str, Calib
 
 
 def _nothing_in_common(lost: Mapping[int, Sequence[str]], cameras: int) -> Warning:
-    """Return the warning about the cameras, by pair, that show no particle that another camera shows."""
+    """Return the warning about the cameras, by pair, that share no particle with another camera."""
     names = dict.fromkeys(name for some in lost.values() for name in some)
     others = "" if len(names) == cameras else " and the other cameras"
     figures = {"names": f"{' and '.join(names)}{others}", "search": SEARCH_VOXEL}

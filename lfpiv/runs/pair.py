@@ -61,7 +61,7 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class PairWork:
-    """What to do with each pair of an experiment, and everything that this needs."""
+    """The work on each pair of an experiment, with all its inputs."""
 
     experiment: Experiment
     folder: Folder

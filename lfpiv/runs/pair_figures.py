@@ -73,13 +73,13 @@ class PairFigures:
     """Frame -> why the iteration ended."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a file stores; figures that are not known are left out."""
+        """Return the form that a file stores; figures that are not known are left out."""
         stored = asdict(self) | {"warnings": [warning.to_json() for warning in self.warnings]}
         return {name: value for name, value in stored.items() if name not in _OPTIONAL or value is not None}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> PairFigures:
-        """Read what a file stores; the findings of version 0.1.0 are warnings."""
+        """Read the form that a file stores; the findings of version 0.1.0 are warnings."""
         known = {name: stored[name] for name in cls.__dataclass_fields__ if name in stored}
         known["warnings"] = tuple(map(Warning.from_json, stored.get("warnings", stored.get("findings", ()))))
         known["velocity_m_per_s"] = {name: Spread(**one) for name, one in stored["velocity_m_per_s"].items()}
@@ -100,17 +100,7 @@ def read_figures(path: Path, marks: Marks) -> PairFigures:
 
 
 def measure(vectors: xr.Dataset, condensed: xr.Dataset | None, warnings: Iterable[Warning]) -> PairFigures:
-    """Measure the figures of a pair.
-
-    Parameters
-    ----------
-    vectors : Dataset
-        The vectors with the attributes of their file.
-    condensed : Dataset, optional
-        The volumes as `netcdf.build_reconstruction` returns them.
-    warnings : iterable of Warning
-        Warnings about the images.
-    """
+    """Measure the figures of a pair from its vectors and, if known, its volumes from `netcdf.build_reconstruction`."""
     valid = vectors["valid"].values
     finite = np.isfinite(vectors["u"].values) & np.isfinite(vectors["v"].values) & np.isfinite(vectors["w"].values)
     known = {} if condensed is None else _of_volumes(condensed)

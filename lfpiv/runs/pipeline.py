@@ -1,6 +1,6 @@
 """The steps of one experiment in order: calibrate, weights, reconstruct, correlate, report.
 
-Each function opens a run on an output folder, does what is not finished there, and returns the content of summary.json.
+Each function opens a run on an output folder, does the unfinished work, and returns the content of summary.json.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
     from lfpiv.weights.operator import Weights
 
 PAIRS = "image pairs"
@@ -42,8 +42,8 @@ def run(
 ) -> dict[str, Any]:
     """Do all steps: raw images to vectors, summary and report.
 
-    Finished results in `out` that still fit the experiment are kept. A pair that fails is left out and listed under
-    ``failed``; the other pairs are done.
+    Finished results in `out` that still fit the experiment are not made again. A pair that fails is left out and listed
+    under ``failed``.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def correlate(
 
 
 def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, Any]:
-    """Write summary and report anew from what a folder holds, also during a run on it. Return the summary.
+    """Write summary and report again from the results in a folder, also during a run on it. Return the summary.
 
     Raises
     ------
@@ -214,7 +214,6 @@ def _process(current: Run, calibration: Calibration, checked: _Checked, keep_vol
 
 
 def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
-    """Return what to do with each pair."""
     return PairWork(
         experiment=current.experiment,
         folder=current.folder,

@@ -1,6 +1,6 @@
 """Steps that a run does once for all pairs: calibration, self-calibration and weights.
 
-Each step keeps what is in the output folder if it still fits the experiment.
+Each step reuses the result in the output folder if it still fits the experiment.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.warn import Code, Warning, collected
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
     from lfpiv.runs.run import Run
     from lfpiv.weights.operator import Weights
 
@@ -40,7 +40,7 @@ def load_calibration(run: Run) -> Calibrated:
     InputError
         If there is none that fits the experiment.
     """
-    from lfpiv.calibration.cameras import load_calibration
+    from lfpiv.calibration.camera import load_calibration
 
     path = run.folder.calibration
     if not run.calibration_stamp.fits(provenance.read_marks(path)):
@@ -61,7 +61,7 @@ def calibrate(run: Run) -> Calibrated:
     if run.calibration_stamp.fits(marks):
         return load_calibration(run)
     if marks is not None:
-        log.info("%s changed: calibration made anew", ", ".join(run.calibration_stamp.changes(marks)))
+        log.info("%s changed: calibration made again", ", ".join(run.calibration_stamp.changes(marks)))
     start = time.perf_counter()
     calibration = calibrate(run.experiment, progress=run.step("calibration"))
     seconds = time.perf_counter() - start
@@ -70,15 +70,7 @@ def calibrate(run: Run) -> Calibrated:
 
 
 def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, SelfCalibrationFigures | None]:
-    """Correct the calibration by particle images if the experiment asks for it.
-
-    Returns
-    -------
-    calibration : Calibration
-        The corrected calibration, or `calibration` without self-calibration.
-    figures : SelfCalibrationFigures or None
-        None without self-calibration.
-    """
+    """Correct the calibration by particle images. Return it unchanged, and no figures, without self-calibration."""
     from lfpiv.calibration.camera import load_calibration
 
     stamp = provenance.of_self_calibration(run.experiment, run.calibration_stamp.hash)
@@ -98,16 +90,9 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
 
 
 def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
-    """Self-calibrate if asked for, build the weights of the grid, and check that no camera moved.
+    """Self-calibrate if the experiment demands it, build the weights of the grid, and check that no camera moved.
 
-    Parameters
-    ----------
-    run : Run
-        The invocation.
-    calibration : Calibration
-        Calibration from the board.
-    todo : sequence of int
-        Pairs to do; the first ones are used to check the cameras.
+    `calibration` is the one from the board. The check uses the first pairs of `todo`.
     """
     from lfpiv.calibration.coverage import require_seen, warn_outside
     from lfpiv.weights.operator import build_weights, compare_with_count
@@ -151,7 +136,6 @@ def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tu
 
 
 def _write(calibration: Calibration, path: Path, attributes: Mapping[str, Any]) -> None:
-    """Write a calibration with attributes, atomically."""
     import h5py
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk

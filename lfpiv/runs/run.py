@@ -1,7 +1,7 @@
 """One invocation on one experiment and one output folder: its checks, the pairs to do, its summary and report.
 
-`open_run` checks everything, starts the device and yields a `Run`. A `Run` does not change; its methods return what
-they find, and `Run.finish` puts the results of all steps together.
+`open_run` checks everything, starts the device and yields a frozen `Run`. `Run.finish` writes summary and report from
+the results of all steps.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> ran
 
 @dataclass(frozen=True)
 class Todo:
-    """The pairs that an invocation has to do, and what it reuses."""
+    """Unfinished pairs of an invocation, and the results that it reuses."""
 
     pairs: list[int]
     reused: tuple[str, ...]
@@ -117,7 +117,7 @@ class Run:
     """Pairs selected for this invocation."""
     progress: Progress
     device_request: str
-    """Device that the user asked for; workers of a cluster choose their own by it."""
+    """Device requested by the user; workers of a cluster choose their own by it."""
     device: runtime.Device
     warnings: Sequence[Warning]
     """Warnings of this invocation so far; grows while `open_run` collects them."""
@@ -138,7 +138,7 @@ class Run:
         return self.files(pair).fitting_volumes() is not None
 
     def unfinished(self, *, vectors: bool = True, volumes: bool = False) -> Todo:
-        """Find the selected pairs whose vectors or volumes are missing or do not fit; log what is kept and why."""
+        """Find the selected pairs whose vectors or volumes are missing or do not fit; log the changes."""
         changed: dict[str, list[int]] = {}
         for pair in self.numbers:
             changes = self.files(pair).outdated(vectors=vectors, volumes=volumes)
@@ -150,7 +150,7 @@ class Run:
             log.info("%d of %d pairs: finished before with the same settings, kept", len(finished), len(self.numbers))
         for reason, pairs in changed.items():
             if reason:
-                log.info("%s changed: %s made anew", reason, name_pairs(pairs))
+                log.info("%s changed: %s made again", reason, name_pairs(pairs))
         kind = "vectors" if vectors else "volumes"
         return Todo(todo, tuple(f"{kind} of pair {pair}" for pair in finished))
 
@@ -181,15 +181,15 @@ class Run:
         return found.fitting_vectors() is not None or found.fitting_volumes() is not None
 
     def record(self, outcome: Outcome) -> Outcome:
-        """Log the failure of a pair, retire its results that were made of other images, and return the outcome."""
+        """Log the failure of a pair, rename its results from earlier images, and return the outcome."""
         if outcome.reason:
             log.error("pair %d failed and is left out: %s", outcome.pair, outcome.reason)
-            for path, aside in self.files(outcome.pair).retire_those_of_other_images():
+            for path, aside in self.files(outcome.pair).retire_outdated():
                 log.warning("%s: made of other images than there are now; renamed %s", path, aside.name)
         return outcome
 
     def finish(self, calibrated: Calibrated, done: Invocation, *, report: bool) -> dict[str, Any]:
-        """Write summary.json about all results in the folder, and report.html if asked for; return the summary."""
+        """Write summary.json about all results in the folder, and optionally report.html; return the summary."""
         contents = self._contents()
         reused = (*(("calibration",) if calibrated.reused else ()), *done.reused)
         done = replace(

@@ -1,7 +1,7 @@
-"""Build ``summary.json``, the machine-readable figures of a run, and read what an earlier invocation wrote there.
+"""Build ``summary.json``, the machine-readable figures of a run, and read that of an earlier invocation.
 
-`build` takes the calibration, the figures of all results in the folder and what the invocation did. It returns the
-content of the file; nothing else in the package knows its keys.
+`build` takes the calibration, the figures of all results in the folder and the `Invocation`. It returns the content of
+the file, with equal warnings about several pairs merged into one.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lfpiv import files, version
+from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.runs import summary_warnings
+from lfpiv.reconstruction.result import SmartStop
 from lfpiv.runs.invocation import Calibrated, Invocation
 from lfpiv.runs.pair_figures import PairFigures
-from lfpiv.warn import Warning
+from lfpiv.velocity.cross_correlation import Verdict
+from lfpiv.warn import Code, Warning, gather
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import CalibratedCamera
+    from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.geometry.grid import Grid
     from lfpiv_kernels.runtime import Device
 
@@ -44,7 +46,7 @@ class Contents:
 
 @dataclass(frozen=True, kw_only=True)
 class EarlierSummary:
-    """What the present summary takes over from that of an earlier invocation."""
+    """Parts of an earlier invocation's summary that the present one reuses."""
 
     weights: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the weights as stored; empty if there were none."""
@@ -78,30 +80,10 @@ def build(
     done: Invocation,
     earlier: EarlierSummary,
 ) -> dict[str, Any]:
-    """Build the summary of everything in a folder.
+    """Build the content of ``summary.json`` without ``timings_s.total`` and ``peak_memory_mib``, which the run adds.
 
     ``timings_s`` is the time that the results took, also those of earlier invocations. ``warnings`` are
     sentences for people. ``warning_records`` are the same warnings, in the same order, with code and figures.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    device : Device
-        Where the kernels of this process ran.
-    calibrated : Calibrated
-        The calibration.
-    contents : Contents
-        Results in the folder.
-    done : Invocation
-        What this invocation did.
-    earlier : EarlierSummary
-        The summary that was in the folder.
-
-    Returns
-    -------
-    dict
-        Content of ``summary.json`` without ``timings_s.total`` and ``peak_memory_mib``, which the run adds at its end.
     """
     reports = {name: _report(camera, experiment.grid) for name, camera in calibrated.calibration.cameras.items()}
     weights = done.weights.to_json() if done.weights else dict(earlier.weights)
@@ -122,7 +104,10 @@ def build(
         },
         "calibration": reports,
         "weights": weights,
-        "pairs": [_pair_entry(pair, figures) for pair, figures in contents.vectors.items()],
+        "pairs": [
+            {"pair": pair, "file": f"pair_{pair:04d}.nc", **figures.to_json()}
+            for pair, figures in contents.vectors.items()
+        ],
         "failed": _failures(experiment, contents, done, earlier),
         "valid_fraction": _mean(figures.valid_fraction for figures in pairs),
         "finite_fraction": _mean(figures.finite_fraction for figures in pairs),
@@ -143,10 +128,7 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
             "voxel_mm": experiment.grid.voxel_mm,
         },
         "settings": {
-            "smart": experiment.smart.model_dump(),
-            "correlation": experiment.correlation.model_dump(),
-            "network": experiment.network.model_dump(),
-            "compute": experiment.compute.model_dump(),
+            name: getattr(experiment, name).model_dump() for name in ("smart", "correlation", "network", "compute")
         },
     }
 
@@ -157,16 +139,45 @@ def _warnings(
     """Collect all warnings by their sentences, each once."""
     images = {pair: figures.warnings for pair, figures in contents.vectors.items()} | dict(contents.volumes)
     found = [
-        *summary_warnings.rig_warnings(calibrated.calibration, experiment.grid),
+        *rig_warnings(calibrated.calibration, experiment.grid),
         *map(Warning.from_json, weights.get("warnings", ())),
-        *summary_warnings.image_warnings(images),
-        *summary_warnings.pair_warnings(contents.vectors),
+        *image_warnings(images),
+        *pair_warnings(contents.vectors),
         *done.warnings,
     ]
     by_sentence: dict[str, Warning] = {}
     for warning in found:
         by_sentence.setdefault(warning.sentence, warning)
     return by_sentence
+
+
+def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
+    """Return the warnings about the calibration, and about the position of the cameras relative to the volume."""
+    found = [warning for camera in calibration.cameras.values() for warning in camera.warnings]
+    found += [*outside_warnings(calibration, grid), *sight_warnings(calibration, grid)]
+    return [*found, Warning(code=Code.ONE_CAMERA)] if len(calibration.cameras) == 1 else found
+
+
+def image_warnings(pairs: Mapping[int, Iterable[Warning]]) -> list[Warning]:
+    """Return the warnings about the images of all pairs, given those of each pair."""
+    return gather(warning.of_pair(pair) for pair, warnings in pairs.items() for warning in warnings)
+
+
+def pair_warnings(pairs: Mapping[int, PairFigures]) -> list[Warning]:
+    """Return the warnings about volumes and vectors of finished pairs, given the figures of each pair."""
+    found = []
+    for pair, figures in pairs.items():
+        if figures.stop is not None and SmartStop.DIVERGED.value in figures.stop.values():
+            found.append(Warning(code=Code.DIVERGED, pairs=(pair,), figures={"verdict": SmartStop.DIVERGED.value}))
+        motion = figures.motion
+        if motion is not None and not motion.followed:
+            shares = motion.valid_fraction
+            words = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion.verdict}
+            found.append(Warning(code=Code.MOTION_LOST, pairs=(pair,), figures=words))
+        if figures.verdict != Verdict.GOOD.value:
+            words = {"share": figures.valid_fraction, "verdict": figures.verdict}
+            found.append(Warning(code=Code.FEW_VALID, pairs=(pair,), figures=words))
+    return gather(found)
 
 
 def _failures(
@@ -193,7 +204,7 @@ def _report(camera: CalibratedCamera, grid: Grid) -> dict[str, Any]:
 
 
 def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
-    """Return the root mean square of what the network adds to the thin lens over a volume [microlens pitch].
+    """Return the root mean square of the network's correction to the thin lens over a volume [microlens pitch].
 
     Uses rays through the whole pupil from random voxels. None without a thin lens, where the network is the mapping.
     """
@@ -206,10 +217,6 @@ def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
     pupil = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     correction = camera.network(np.hstack([points, pupil]))
     return float(np.sqrt((correction**2).sum(1).mean()) / camera.lattice.pitch_mm)
-
-
-def _pair_entry(pair: int, figures: PairFigures) -> dict[str, Any]:
-    return {"pair": pair, "file": f"pair_{pair:04d}.nc", **figures.to_json()}
 
 
 def _mean(values: Iterable[float]) -> float | None:

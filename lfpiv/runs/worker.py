@@ -40,14 +40,11 @@ _TASK, _WEIGHTS = "task.pickle", "weights"
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Settings of a run for its workers. Arrays lie in files of the run's folder."""
+    """Settings of a run for its workers."""
 
     version: str
-    experiment: Experiment
-    out: Path
-    calibration_hash: str
-    keep_volumes: bool
-    vectors: bool
+    work: PairWork
+    """Without weights and dark images, which the workers read from files."""
     weights: str | None
     """Hash of the weights' content; None if no volume has to be reconstructed."""
     device: str
@@ -90,11 +87,13 @@ def share(work: PairWork, device: str, threads: int | None) -> Path:
             )
     task = Task(
         version=__version__,
-        experiment=_absolute(work.experiment),
-        out=work.folder.path.absolute(),
-        calibration_hash=work.calibration_hash,
-        keep_volumes=work.keep_volumes,
-        vectors=work.vectors,
+        work=dataclasses.replace(
+            work,
+            experiment=_absolute(work.experiment),
+            folder=Folder(work.folder.path.absolute()),
+            weights=None,
+            darks={},
+        ),
         weights=None if work.weights is None else save_weights(work.weights, shared / _WEIGHTS),
         device=device,
         threads=threads,
@@ -163,7 +162,7 @@ def release(shared: Path) -> None:
 def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
     if shared in _opened:
         return _opened[shared]
-    from lfpiv.calibration.cameras import load_calibration
+    from lfpiv.calibration.camera import load_calibration
     from lfpiv.weights.storage import open_weights
 
     where = f"{shared}, worker on {socket.gethostname()}"
@@ -180,21 +179,14 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
         runtime.start(task.device, threads=task.threads or threads())
     except (RuntimeError, ValueError) as error:
         raise InputError(f"{where}: {error}") from None
-    folder, weights = Folder(task.out), None
+    work = task.work
     if task.weights is not None:
-        cameras = load_calibration(folder.calibration).cameras
+        cameras = load_calibration(work.folder.calibration).cameras
         weights = open_weights(shared / _WEIGHTS, cameras, task.weights)
+        work = dataclasses.replace(work, weights=weights, darks=read_darks(work.experiment))
     _opened.clear()  # the task of an earlier run
-    _opened[shared] = PairWork(
-        experiment=task.experiment,
-        folder=folder,
-        calibration_hash=task.calibration_hash,
-        weights=weights,
-        darks={} if weights is None else read_darks(task.experiment),
-        keep_volumes=task.keep_volumes,
-        vectors=task.vectors,
-    )
-    return _opened[shared]
+    _opened[shared] = work
+    return work
 
 
 def _throttled(shared: Path, pair: int, report: Callable[[int, float], None]) -> StepProgress:

@@ -17,7 +17,7 @@ from lfpiv_kernels.runtime import Device
 log = logging.getLogger(__name__)
 
 MAX_WORKERS = 1024
-"""Largest number of workers that is accepted; more are taken for a typing error."""
+"""Largest accepted number of workers; more is a typing error."""
 
 
 @dataclass(frozen=True)
@@ -91,16 +91,7 @@ def gpu_names(listed: str | None, count: int) -> tuple[str, ...]:
 
 
 def require_memory(experiment: Experiment, weights: int, workers: int) -> None:
-    """Log the memory that the run needs; refuse more workers than fit, before any work.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    weights : int
-        Memory of the weights [byte].
-    workers : int
-        Number of worker processes.
+    """Log the memory that the run needs with weights [byte] and a number of workers; refuse more workers than fit.
 
     Raises
     ------
@@ -123,7 +114,7 @@ def require_memory(experiment: Experiment, weights: int, workers: int) -> None:
 
 
 def fit_memory(planned: Plan, experiment: Experiment, weights: int, device: Device) -> Plan:
-    """Return a plan with as many workers as fit into the memory beside weights [byte]; warn if these are fewer."""
+    """Return a plan with as many workers as fit into the memory after the weights [byte]; warn if these are fewer."""
     fits = memory.fitting_workers(experiment, weights, planned.workers)
     if fits == planned.workers:
         return planned

@@ -7,7 +7,7 @@ particle images of some instants. Output: a `Disparity` per pair of cameras and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ import numpy as np
 import scipy.fft
 from scipy.ndimage import gaussian_filter
 
+from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 
@@ -41,7 +42,7 @@ LEAST_OVERLAP = 0.6
 FIT_REACH = 2
 """Lags on either side of the highest one to which a peak's paraboloid is fitted."""
 SIGNIFICANT = 1.5
-"""Least ratio of a peak to the highest coefficient with one volume mirrored, which particles cannot explain."""
+"""Least ratio of a peak to the highest coefficient with one volume mirrored, which is due to chance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +53,7 @@ class Disparity:
     centre_mm: np.ndarray
     """Centre of the part, shape (3,) [mm]."""
     shift_mm: np.ndarray
-    """Position at which the second camera shows what the first one shows at 0, shape (3,) [mm]."""
+    """Position in the second camera's volume of a particle at 0 in the first camera's, shape (3,) [mm]."""
     sharpness: np.ndarray
     """Curvature of the peak over its height, shape (3, 3) [1/mm^2]: small along the lines of sight, large across."""
     peak: float
@@ -78,9 +79,9 @@ class Disparity:
 def disparities(
     weights: Weights,
     images: Sequence[Mapping[str, np.ndarray]],
-    progress: Callable[[float], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> tuple[Disparity, ...]:
-    """Measure the disparities of all pairs of cameras in the parts of a volume, without those that have no clear peak.
+    """Measure the disparities of all pairs of cameras in the parts of a volume that have a clear peak.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ def disparities(
 
 
 def unlinked(found: Sequence[Disparity], cameras: Iterable[str]) -> list[str]:
-    """Name the cameras that show no particles of any other one."""
+    """Name the cameras that share no particles with any other one."""
     linked = {name for one in found for name in one.cameras}
     return [name for name in cameras if name not in linked]
 
@@ -188,7 +189,7 @@ def masked_correlation(
 ) -> np.ndarray:
     """Correlate a window of volumes with other volumes at every lag: masked normalised cross-correlation [1]_.
 
-    At each lag only voxels count that both volumes have.
+    At each lag only voxels inside both volumes count.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Volume self-calibration: correct a calibration for cameras that moved since the board was recorded [1]_.
 
-Input: a calibration, the grid, and particle images of some instants. The disparities of the cameras
-(`lfpiv.selfcalibration.disparity`) are explained by rigid movements, six numbers per camera. A movement of all cameras
-together cannot be distinguished from a moved volume; it is set to zero. Output: the corrected calibration, the
-movements and their standard errors. Focused images allow triangulation instead; light-field images do not.
+Input: a calibration, the grid, and particle images of some instants. Rigid movements, six numbers per camera, are
+fitted to the disparities of the cameras (`lfpiv.selfcalibration.disparity`). The mean movement of all cameras is set to
+zero: it cannot be distinguished from a moved volume. Output: the corrected calibration, the movements and their
+standard errors. Focused images allow triangulation instead; light-field images do not.
 
 .. [1] B. Wieneke, "Volume self-calibration for 3D particle image velocimetry", Exp. Fluids 45 (2008) 549-556,
    doi:10.1007/s00348-008-0521-5.
@@ -11,7 +11,7 @@ movements and their standard errors. Focused images allow triangulation instead;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,11 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from lfpiv.calibration.camera import Calibration
 from lfpiv.geometry.grid import Grid
+from lfpiv.progress import StepProgress, part_of
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, Disparity, disparities, unlinked
 from lfpiv.weights.operator import build_weights
 
 PRIOR_MM, PRIOR_RAD = 0.3, 0.02
-"""Standard deviations of the prior: shift [mm] and rotation [rad]. Movements that no disparity shows stay near zero."""
+"""Standard deviations of the prior: shift [mm] and rotation [rad]."""
 LEAST_STD_VOXEL, ASSUMED_STD_VOXEL = 0.02, 0.1
 """Least standard deviation of a disparity in its sharpest direction, and the one assumed if too few are known
 [voxel]."""
@@ -68,7 +69,7 @@ class Movement:
     @classmethod
     def none(cls, grid: Grid) -> Movement:
         """Return the movement of a camera that did not move."""
-        return cls(shift_mm=np.zeros(3), rotation_rad=np.zeros(3), centre_mm=_centre_mm(grid), std=np.zeros(6))
+        return cls(shift_mm=np.zeros(3), rotation_rad=np.zeros(3), centre_mm=grid.centre_mm, std=np.zeros(6))
 
     def after(self, step: Movement) -> Movement:
         """Return the movement that applies `step` first, then this one."""
@@ -98,7 +99,7 @@ def self_calibrate(
     grid: Grid,
     images: Sequence[Mapping[str, np.ndarray]],
     *,
-    progress: Callable[[float], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> SelfCalibration:
     """Correct a calibration for movements of its cameras, using images of particles.
 
@@ -120,7 +121,7 @@ def self_calibrate(
     Raises
     ------
     ValueError
-        If there are fewer than two cameras, no images, or a camera shows nothing that another one shows.
+        If there are fewer than two cameras, no images, or a camera shows no particle that another one shows.
     """
     if len(calibration.cameras) < 2 or not images:
         raise ValueError(
@@ -131,12 +132,8 @@ def self_calibrate(
     movements = {name: Movement.none(grid) for name in calibration.cameras}
     found, apart = [], list[float]()
     for number in range(ROUNDS + 1):
-
-        def step(fraction: float, number: int = number) -> None:
-            if progress is not None:
-                progress((number + fraction) / (ROUNDS + 1))
-
-        found.append(disparities(build_weights(corrected, grid), images, step))
+        part = None if progress is None else part_of(progress, number / (ROUNDS + 1), (number + 1) / (ROUNDS + 1))
+        found.append(disparities(build_weights(corrected, grid), images, part))
         lost = unlinked(found[-1], movements)
         if lost:
             raise ValueError(
@@ -164,8 +161,8 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
     """Fit the rigid movements of cameras that explain disparities, by reweighted least squares.
 
     A disparity is the difference of two cameras' movements. Its weight is its `Disparity.weight` over the variance of
-    the residuals. Outliers get less weight (Geman and McClure). A weak prior keeps movements that no disparity shows
-    near zero, among them the mean of all cameras.
+    the residuals. Outliers get less weight (Geman and McClure). A weak prior holds movements without an effect on
+    disparities near zero, among them the mean of all cameras.
     """
     rows = [_row(one, cameras, grid) for one in found]
     count, least = len(cameras), LEAST_STD_VOXEL * grid.voxel_mm
@@ -186,11 +183,10 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
         free = 3 * trust.sum() - 6 * (count - 1)
         if free > 0:
             variance = max(float(trust @ residual**2) / free, least**2)
-    relative = np.kron(np.eye(count) - 1 / count, np.eye(6))  # the mean of all cameras has no error, by definition
+    relative = np.kron(np.eye(count) - 1 / count, np.eye(6))  # the mean of all cameras is zero by definition
     std = np.sqrt(np.diag(relative @ covariance @ relative.T)).reshape(-1, 6)
-    centre = _centre_mm(grid)
     return {
-        name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=centre, std=std[number])
+        name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=grid.centre_mm, std=std[number])
         for number, (name, value) in enumerate(zip(cameras, values.reshape(-1, 6), strict=True))
     }
 
@@ -204,14 +200,10 @@ def explained_mm(found: Sequence[Disparity], movements: Mapping[str, Movement], 
 
 def _row(disparity: Disparity, cameras: Sequence[str], grid: Grid) -> np.ndarray:
     """Return the matrix from all cameras' shifts and rotations to a disparity, shape (3, 6 cameras)."""
-    x, y, z = disparity.centre_mm - _centre_mm(grid)
+    x, y, z = disparity.centre_mm - grid.centre_mm
     movement = np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
     row = np.zeros((3, 6 * len(cameras)))
     for name, sign in zip(disparity.cameras, (-1, 1), strict=True):
         at = 6 * cameras.index(name)
         row[:, at : at + 6] = sign * movement
     return row
-
-
-def _centre_mm(grid: Grid) -> np.ndarray:
-    return np.array([grid.axis_mm(axis)[[0, -1]].mean() for axis in (2, 1, 0)])

@@ -14,19 +14,15 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial import cKDTree
 
-from lfpiv.experiment.settings import Flag, Number, Positive, Table
+from lfpiv.experiment.settings import Flag, Number, Point, Positive, Table
 from lfpiv.simulation.swirl import injector_profiles
 from lfpiv.simulation.tracers import TracerScaling, TracerSet, load_tracers
-from lfpiv.simulation.turbulence import TurbulentFlow
+from lfpiv.simulation.turbulence import CHUNK, TurbulentFlow, checked_points
 
-Point = tuple[Number, Number, Number]
 Axis = Literal["x", "y", "z"]
 
 LAMB_OSEEN = 1.2564312086261697
 """Root a of exp(a) = 1 + 2 a. It places the largest displacement of a Lamb-Oseen vortex at the core radius."""
-
-CHUNK = 20_000
-"""Points in one batch of a quadrature."""
 
 
 class Uniform(Table):
@@ -38,7 +34,7 @@ class Uniform(Table):
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement (n, 3) at points (n, 3) [mm]."""
-        return np.broadcast_to(np.asarray(self.displacement_mm, float), _points(points_mm).shape).copy()
+        return np.broadcast_to(np.asarray(self.displacement_mm, float), checked_points(points_mm).shape).copy()
 
 
 class Shear(Table):
@@ -62,7 +58,7 @@ class Shear(Table):
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement (n, 3) at points (n, 3) [mm]."""
-        points_mm = _points(points_mm)
+        points_mm = checked_points(points_mm)
         across, along = "xyz".index(self.across), "xyz".index(self.along)
         displacement = np.zeros(points_mm.shape)
         displacement[:, along] = self.rate * (points_mm[:, across] - self.centre_mm[across])
@@ -87,7 +83,7 @@ class Ring(Table):
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement (n, 3) at points (n, 3) [mm]."""
-        x, y, z = (_points(points_mm) - self.centre_mm).T
+        x, y, z = (checked_points(points_mm) - self.centre_mm).T
         from_axis = np.hypot(x, y)
         outward = from_axis - self.radius_mm
         r = np.hypot(outward, z)
@@ -117,7 +113,7 @@ class Swirl(Table):
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement (n, 3) at points (n, 3) [mm]."""
-        arm = _points(points_mm) - self.centre_mm
+        arm = checked_points(points_mm) - self.centre_mm
         axis = "xyz".index(self.axis)
         arm[:, axis] = 0
         square = (arm**2).sum(1) / self.core_mm**2
@@ -171,7 +167,7 @@ class SwirlingJet(Table):
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement (n, 3) at points (n, 3) [mm]."""
         radius, axis = self.nozzle_radius_mm, "xyz".index(self.axis)
-        arm = (_points(points_mm) - self.centre_mm) / radius
+        arm = (checked_points(points_mm) - self.centre_mm) / radius
         along = np.eye(3)[axis]
         height = arm[:, axis].copy()
         arm[:, axis] = 0
@@ -234,7 +230,7 @@ class Tracers(Table):
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement (n, 3) at points (n, 3) [mm]."""
-        return self._loaded().interpolate(_points(points_mm))
+        return self._loaded().interpolate(checked_points(points_mm))
 
     def _loaded(self) -> TracerSet:
         scaling = TracerScaling(size_mm=self.size_mm, centre_mm=self.centre_mm, box=self.box, peak_mm=self.peak_mm)
@@ -244,13 +240,6 @@ class Tracers(Table):
 Flow = Uniform | Shear | Ring | Swirl | SwirlingJet | Tracers
 KINDS = {model.model_fields["kind"].default: model for model in (Uniform, Shear, Ring, Swirl, SwirlingJet, Tracers)}
 """Flows by their ``kind`` in a scene file."""
-
-
-def _points(points_mm: np.ndarray) -> np.ndarray:
-    points_mm = np.asarray(points_mm, float)
-    if points_mm.ndim != 2 or points_mm.shape[1] != 3:
-        raise ValueError(f"points_mm: expected shape (n, 3), got {points_mm.shape}. Columns are x, y, z.")
-    return points_mm
 
 
 def _window(window_mm: float | tuple[float, float, float]) -> np.ndarray:
@@ -297,7 +286,7 @@ def window_mean(
     >>> (window_mean(vortex, [(0.5, 0, 0)], 1.0) + 0).round(3).tolist()
     [[0.0, 0.134, 0.0]]
     """
-    centres_mm, window = _points(centres_mm), _window(window_mm)
+    centres_mm, window = checked_points(centres_mm), _window(window_mm)
     if isinstance(flow, TurbulentFlow):
         turbulent = flow.fluctuation.window_mean(centres_mm, tuple(window))
         mean: np.ndarray = window_mean(flow.mean, centres_mm, tuple(window), order=order) + turbulent
@@ -336,7 +325,11 @@ def average_truth(
     ndarray, shape (n, 3)
         Mean displacement [mm]; NaN where a window contains no particle.
     """
-    points_mm, displacement_mm, centres_mm = _points(points_mm), _points(displacement_mm), _points(centres_mm)
+    points_mm, displacement_mm, centres_mm = (
+        checked_points(points_mm),
+        checked_points(displacement_mm),
+        checked_points(centres_mm),
+    )
     if points_mm.shape != displacement_mm.shape:
         raise ValueError(f"displacement_mm: expected one per point, {points_mm.shape}, got {displacement_mm.shape}.")
     half = np.maximum(_window(window_mm) / 2, 1e-12)

@@ -9,51 +9,46 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from lfpiv.experiment.settings import Compute, Correlation, Count, Flag, Network, Number, Positive, Smart, Table
+from lfpiv.experiment.settings import (
+    Compute,
+    Correlation,
+    Count,
+    Flag,
+    Network,
+    NominalBoard,
+    NonNegative,
+    Point,
+    Positive,
+    Smart,
+    Table,
+    Volume,
+)
 from lfpiv.experiment.toml import read_toml
 from lfpiv.simulation.flows import KINDS, Flow, Tracers
-from lfpiv.simulation.scene_camera import Aberrations, NonNegative, Point, SceneCamera, Windows, true_mapping
+from lfpiv.simulation.scene_camera import Aberrations, SceneCamera, Windows, true_mapping
 from lfpiv.simulation.turbulence import Turbulence, TurbulentFlow
 
 __all__ = ["Scene", "SceneCamera", "open_scene", "true_mapping"]
 
 
-class SceneBoard(Table):
+class SceneBoard(NominalBoard):
     """Table ``[board]``: the calibration board and its depths."""
 
-    dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
-    """Dots along x and y."""
-    spacing_mm: Positive
-    """Distance of neighbouring dots [mm]."""
-    dot_diameter_mm: Positive
-    """Diameter of a dot [mm]."""
-    planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
-    """Depth z of each plane [mm]."""
     inverted: Flag = False
     """Dark dots on a bright board."""
 
-    @model_validator(mode="after")
-    def _dots_apart(self) -> SceneBoard:
-        if self.dot_diameter_mm >= self.spacing_mm:
-            raise ValueError("dot_diameter_mm smaller than spacing_mm")
-        return self
-
     def dots_mm(self, plane_mm: float) -> np.ndarray:
-        """Dot centres (x, y, z) at one depth, x fastest, shape (dot, 3) [mm]."""
+        """Return the dot centres (x, y, z) at one depth, x fastest, shape (dot, 3) [mm]."""
         x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing_mm for n in self.dots)
         y, x = np.meshgrid(y, x, indexing="ij")
         return np.stack([x.ravel(), y.ravel(), np.full(x.size, float(plane_mm))], axis=1)
 
 
-class SceneVolume(Table):
+class SceneVolume(Volume):
     """Table ``[volume]``: the volume to reconstruct, (x, y, z) order."""
 
     centre_mm: Point = (0.0, 0.0, 0.0)
     """Centre (x, y, z) of the volume [mm]."""
-    size_mm: tuple[Positive, Positive, Positive]
-    """Size (x, y, z) of the volume [mm]."""
-    voxel_mm: Positive
-    """Edge of a voxel [mm]."""
 
 
 class SceneParticles(Table):
@@ -64,7 +59,7 @@ class SceneParticles(Table):
     count: Count | None = None
     """Particles of each pair."""
     pairs: Count = 1
-    """Number of image pairs, each with particles of its own."""
+    """Number of image pairs, each with other particles."""
     fill: Positive = 1.0
     """Edges of the seeded region relative to the volume's. Above 1, particles are outside the volume too."""
     intensity_sd: NonNegative = 0.0
@@ -127,9 +122,9 @@ class Scene(Table):
     """Time between the two frames of a pair [s]."""
     camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1)]
     window: Windows = ()
-    """Windows of the cameras without windows of their own."""
+    """Windows of all cameras that state none."""
     aberrations: Aberrations | None = None
-    """Aberrations of the cameras without aberrations of their own."""
+    """Aberrations of all cameras that state none."""
     board: SceneBoard
     volume: SceneVolume
     particles: SceneParticles

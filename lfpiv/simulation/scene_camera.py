@@ -8,13 +8,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
-from lfpiv.experiment.settings import Count, Flag, NominalCamera, Number, Positive, Table
+from lfpiv.experiment.settings import Count, Flag, NominalCamera, NonNegative, Number, Point, Positive, Table
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv_kernels.rendering import real_optics
 
-NonNegative = Annotated[float, Field(strict=True, ge=0)]
 Pair = tuple[Number, Number]
-Point = tuple[Number, Number, Number]
 Pitches = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Index = Annotated[float, Field(strict=True, ge=1, le=4)]
 
@@ -86,7 +84,7 @@ class Aberrations(Table):
 
 
 class SceneCamera(NominalCamera):
-    """Table ``[[camera]]``: nominal optics, which the experiment file contains, and the truth, which it does not."""
+    """Table ``[[camera]]``: nominal optics for the experiment file, and the truth, which is not in that file."""
 
     sensor_width_px: Count
     """Columns of the sensor."""
@@ -150,16 +148,7 @@ class SceneCamera(NominalCamera):
     @property
     def optics(self) -> Optics:
         """Nominal optics."""
-        return Optics(
-            focal_length_mm=self.focal_length_mm,
-            magnification=self.magnification,
-            f_number=self.f_number,
-            microlens_pitch_mm=self.microlens_pitch_mm,
-            microlens_focal_length_mm=self.microlens_focal_length_mm,
-            pixel_mm=self.pixel_um / 1000,
-            sensor_shape=(self.sensor_height_px, self.sensor_width_px),
-            layout=self.microlens_layout,
-        )
+        return self.optics_of((self.sensor_height_px, self.sensor_width_px))
 
     @property
     def rotation(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Simulated experiments: a scene file to white, board and particle images with their truth, as a complete data set.
+"""Simulate an experiment: render a scene's white, board and particle images and write them with their truth.
 
 A camera consists of main lens, microlens array and sensor, misaligned as the scene states (Eqs. 1-3 and 9), with
 windows and third-order aberrations. Images are rendered by rays, blurred, exposed, and read out with noise to 12 bits.
@@ -11,7 +11,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,8 @@ import tifffile
 from scipy.ndimage import gaussian_filter
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.images import FLIPS
+from lfpiv.progress import Progress, ignore_progress
 from lfpiv.simulation.flows import Tracers
 from lfpiv.simulation.scene import Noise, Scene, open_scene
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
@@ -38,9 +40,6 @@ AREA_STEP_MM = 1e-3
 
 LEAST_INTENSITY = 0.3
 """Lower limit of a particle's intensity, relative to the mean."""
-
-Progress = Callable[[str, int, int], None]
-"""Called as ``progress(step, done, total)``."""
 
 
 class PlacedParticles(NamedTuple):
@@ -164,7 +163,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     out : str or Path
         Folder to write, absent or empty. It appears only when it is complete.
     progress : callable, optional
-        Called as ``progress(step, done, total)``.
+        Called as ``progress(step, fraction)``.
 
     Returns
     -------
@@ -190,7 +189,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     except OSError as error:
         raise InputError(f"{out}: the folder cannot be written ({error.strerror}). Name another folder.") from None
     try:
-        _write(scene, pairs, scratch, progress or (lambda step, done, total: None))
+        _write(scene, pairs, scratch, progress or ignore_progress)
         scratch.chmod(0o755)
         os.replace(scratch, out)
     except BaseException:
@@ -200,7 +199,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
 
 
 def _check_positions(scene: Scene, camera: SceneCamera, pairs: list[PlacedParticles]) -> None:
-    """Refuse dots and particles too near the lens, and log what part of them is in the field of view."""
+    """Refuse dots and particles too near the lens, and log the share of them in the field of view."""
     optics = camera.optics
     half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
     dots = np.concatenate([scene.board.dots_mm(depth) for depth in scene.board.planes_mm])
@@ -254,9 +253,11 @@ def _write(scene: Scene, pairs: list[PlacedParticles], folder: Path, progress: P
     for number, camera in enumerate(scene.camera):
         for path, image in _images(scene, number, pairs):
             rng = np.random.default_rng([scene.seed, 2, number, done])
-            _write_image(folder / path, expose(image, camera, scene.noise, rng))
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            exposed = expose(image, camera, scene.noise, rng)
+            tifffile.imwrite(folder / path, exposed, compression="zlib", metadata=None)
             done += 1
-            progress("simulated images", done, total)
+            progress("simulated images", done / total)
     (folder / "truth").mkdir()
     truth: dict[str, Any] = {}
     for pair, placed in enumerate(pairs):
@@ -306,7 +307,7 @@ def _board_images(
             yield path, exposure.dot_counts * image
             continue
         dots = board.dots_mm(depth)
-        # microlenses that the image of a dot covers: each lights its whole microimage
+        # number of microlenses that the image of a dot covers; each lights its whole microimage
         lenses = np.pi / 4 * board.dot_diameter_mm**2 * image_area(camera, dots)
         lenses /= abs(np.linalg.det(renderer.basis_mm))
         rng = np.random.default_rng([scene.seed, 5, number, plane])
@@ -341,22 +342,13 @@ def expose(image: np.ndarray, camera: SceneCamera, noise: Noise, rng: np.random.
     if saturated > 1e-3:
         log.warning("camera %s: %.1f %% of an image's pixels saturate; lower [exposure]", camera.name, 100 * saturated)
     image = np.clip(np.rint(image), 0, FULL_SCALE).astype(np.uint16)
-    if camera.image_flip in ("horizontal", "both"):
-        image = image[:, ::-1]
-    if camera.image_flip in ("vertical", "both"):
-        image = image[::-1]
-    return np.ascontiguousarray(image)
-
-
-def _write_image(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tifffile.imwrite(path, image, compression="zlib", metadata=None)
+    return np.ascontiguousarray(image[FLIPS[camera.image_flip]])
 
 
 def _experiment_text(scene: Scene) -> str:
     """Return the text of the experiment file. It contains nominal values only, none of the truth."""
     lines = [
-        "# Light-field PIV experiment: what the user knows. Paths are relative to this file.",
+        "# Light-field PIV experiment: nominal values. Paths are relative to this file.",
         "",
         *_rows({"name": scene.name, "dt_s": scene.dt_s}),
     ]

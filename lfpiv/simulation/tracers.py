@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.settings import Point
 
-Point = tuple[float, float, float]
 NEIGHBOURS = 16
 """Tracers of each local linear fit."""
 

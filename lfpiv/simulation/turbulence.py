@@ -27,6 +27,14 @@ CHUNK = 20_000
 """Points in one batch."""
 
 
+def checked_points(points_mm: np.ndarray) -> np.ndarray:
+    """Return points as float64 of shape (n, 3), or raise ValueError."""
+    points_mm = np.asarray(points_mm, float)
+    if points_mm.ndim != 2 or points_mm.shape[1] != 3:
+        raise ValueError(f"points_mm: expected shape (n, 3), got {points_mm.shape}. Columns are x, y, z.")
+    return points_mm
+
+
 class Turbulence(Table):
     """Table ``[turbulence]``: homogeneous isotropic fluctuations with von Karman's energy spectrum.
 
@@ -89,9 +97,7 @@ class Fluctuation:
         return self._sum(centres_mm, self.amplitude_mm * damping[:, None])
 
     def _sum(self, points_mm: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        points_mm = np.asarray(points_mm, float)
-        if points_mm.ndim != 2 or points_mm.shape[1] != 3:
-            raise ValueError(f"points_mm: expected shape (n, 3), got {points_mm.shape}. Columns are x, y, z.")
+        points_mm = checked_points(points_mm)
         parts = (points_mm[first : first + CHUNK] for first in range(0, len(points_mm), CHUNK))
         return np.concatenate(
             [np.empty((0, 3)), *(np.cos(part @ self.wave.T + self.phase) @ amplitude for part in parts)]

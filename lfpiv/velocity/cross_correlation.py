@@ -1,7 +1,7 @@
-"""`correlate`: two particle volumes to a displacement field by multi-pass 3D cross-correlation.
+"""`correlate`: measure the displacement between two particle volumes by multi-pass 3D cross-correlation.
 
-`volume_pair` prepares the volumes, `multi_pass` correlates and validates. Here a verdict is added, and the result takes
-the form of a dataset in physical units.
+`volume_pair` prepares the volumes, `multi_pass` correlates and validates. This module adds a verdict and returns a
+dataset in physical units.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 GOOD_SHARE = 0.8
 """Smallest part of valid vectors of a good measurement."""
 POOR_SHARE = 0.3
-"""Smallest part of valid vectors of a poor measurement; below it has failed."""
+"""Smallest part of valid vectors of a poor measurement. With less, the measurement has failed."""
 
 Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
 """Dims, values and attributes of a variable."""

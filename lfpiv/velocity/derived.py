@@ -4,7 +4,7 @@ Vectors are datasets as `lfpiv.correlate` returns or `lfpiv.open_results` opens:
 [mm], with any further dimensions such as ``pair``. Dask arrays stay lazy.
 
 Derivatives are second-order differences, central inside and one-sided at the border. Nothing is smoothed. Replaced
-vectors (``valid`` false) take part. The coordinate ``valid`` of a derived field is true where the vector and all its
+vectors (``valid`` false) are used. The coordinate ``valid`` of a derived field is true where the vector and all its
 neighbours in the differences were measured: ``field.where(field.valid)`` depends on measured vectors only. NaN spreads
 to the neighbours. Uncorrelated noise of standard deviation s in the vectors gives derivatives a noise of 0.7 s/h inside
 and 2.5 s/h at the border, with h the spacing. Windows that overlap have correlated noise, which lowers both.
@@ -50,10 +50,8 @@ def velocity_gradient(vectors: xr.Dataset) -> xr.DataArray:
     --------
     >>> import numpy as np, xarray as xr
     >>> from lfpiv import derived
-    >>> z, y, x = np.meshgrid(np.arange(3.0), np.arange(4.0), np.arange(5.0), indexing="ij")  # mm
-    >>> parts = {"u": 0.002 * y, "v": 0 * x, "w": 0 * x}  # m/s: shear of 2 m/s per m
-    >>> axes = {"z": np.arange(3.0), "y": np.arange(4.0), "x": np.arange(5.0)}
-    >>> shear = xr.Dataset({name: (("z", "y", "x"), part) for name, part in parts.items()}, axes)
+    >>> z, y, x = xr.broadcast(*(xr.DataArray(np.arange(4.0), [(axis, np.arange(4.0))]) for axis in "zyx"))  # mm
+    >>> shear = xr.Dataset({"u": 0.002 * y, "v": 0 * x, "w": 0 * x})  # m/s: shear of 2 m/s per m
     >>> gradient = derived.velocity_gradient(shear)
     >>> gradient.dims, gradient.attrs["units"]
     (('component', 'direction', 'z', 'y', 'x'), '1/s')
@@ -84,10 +82,8 @@ def vorticity(vectors: xr.Dataset) -> xr.Dataset:
     --------
     >>> import numpy as np, xarray as xr
     >>> from lfpiv import derived
-    >>> z, y, x = np.meshgrid(np.arange(3.0), np.arange(4.0), np.arange(5.0), indexing="ij")  # mm
-    >>> parts = {"u": -0.003 * y, "v": 0.003 * x, "w": 0 * x}  # m/s: rotation by 3 rad/s
-    >>> axes = {"z": np.arange(3.0), "y": np.arange(4.0), "x": np.arange(5.0)}
-    >>> rotation = xr.Dataset({name: (("z", "y", "x"), part) for name, part in parts.items()}, axes)
+    >>> z, y, x = xr.broadcast(*(xr.DataArray(np.arange(4.0), [(axis, np.arange(4.0))]) for axis in "zyx"))  # mm
+    >>> rotation = xr.Dataset({"u": -0.003 * y, "v": 0.003 * x, "w": 0 * x})  # m/s: rotation by 3 rad/s
     >>> curl = derived.vorticity(rotation)
     >>> float(curl.vorticity_z.mean().round(6)), curl.vorticity_z.attrs["units"]
     (6.0, '1/s')
@@ -116,10 +112,8 @@ def divergence(vectors: xr.Dataset) -> xr.DataArray:
     --------
     >>> import numpy as np, xarray as xr
     >>> from lfpiv import derived
-    >>> z, y, x = np.meshgrid(np.arange(3.0), np.arange(4.0), np.arange(5.0), indexing="ij")  # mm
-    >>> parts = {"u": 0.001 * x, "v": 0.002 * y, "w": -0.004 * z}  # m/s
-    >>> axes = {"z": np.arange(3.0), "y": np.arange(4.0), "x": np.arange(5.0)}
-    >>> sink = xr.Dataset({name: (("z", "y", "x"), part) for name, part in parts.items()}, axes)
+    >>> z, y, x = xr.broadcast(*(xr.DataArray(np.arange(4.0), [(axis, np.arange(4.0))]) for axis in "zyx"))  # mm
+    >>> sink = xr.Dataset({"u": 0.001 * x, "v": 0.002 * y, "w": -0.004 * z})  # m/s
     >>> float(derived.divergence(sink).mean().round(6))  # 1/s
     -1.0
     """
@@ -144,10 +138,8 @@ def q_criterion(vectors: xr.Dataset) -> xr.DataArray:
     --------
     >>> import numpy as np, xarray as xr
     >>> from lfpiv import derived
-    >>> z, y, x = np.meshgrid(np.arange(3.0), np.arange(4.0), np.arange(5.0), indexing="ij")  # mm
-    >>> parts = {"u": -0.003 * y, "v": 0.003 * x, "w": 0 * x}  # m/s: rotation by 3 rad/s
-    >>> axes = {"z": np.arange(3.0), "y": np.arange(4.0), "x": np.arange(5.0)}
-    >>> rotation = xr.Dataset({name: (("z", "y", "x"), part) for name, part in parts.items()}, axes)
+    >>> z, y, x = xr.broadcast(*(xr.DataArray(np.arange(4.0), [(axis, np.arange(4.0))]) for axis in "zyx"))  # mm
+    >>> rotation = xr.Dataset({"u": -0.003 * y, "v": 0.003 * x, "w": 0 * x})  # m/s: rotation by 3 rad/s
     >>> q = derived.q_criterion(rotation)
     >>> float(q.mean().round(6)), q.attrs["units"]
     (9.0, '1/s^2')
@@ -174,10 +166,8 @@ def strain_rate(vectors: xr.Dataset) -> xr.Dataset:
     --------
     >>> import numpy as np, xarray as xr
     >>> from lfpiv import derived
-    >>> z, y, x = np.meshgrid(np.arange(3.0), np.arange(4.0), np.arange(5.0), indexing="ij")  # mm
-    >>> parts = {"u": 0.002 * y, "v": 0 * x, "w": 0 * x}  # m/s: shear of 2 m/s per m
-    >>> axes = {"z": np.arange(3.0), "y": np.arange(4.0), "x": np.arange(5.0)}
-    >>> shear = xr.Dataset({name: (("z", "y", "x"), part) for name, part in parts.items()}, axes)
+    >>> z, y, x = xr.broadcast(*(xr.DataArray(np.arange(4.0), [(axis, np.arange(4.0))]) for axis in "zyx"))  # mm
+    >>> shear = xr.Dataset({"u": 0.002 * y, "v": 0 * x, "w": 0 * x})  # m/s: shear of 2 m/s per m
     >>> strain = derived.strain_rate(shear)
     >>> float(strain.strain_xy.mean().round(6)), float(strain.strain_rate_magnitude.mean().round(6))
     (1.0, 2.0)

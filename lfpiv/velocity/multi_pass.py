@@ -1,6 +1,6 @@
 """Multi-pass correlation of two prepared volumes with window deformation.
 
-Each pass deforms both volumes by half of the field of the pass before, one back and one forth, correlates their
+Each pass deforms both volumes by half of the field of the pass before, one backward and one forward, correlates their
 windows, and validates the peaks. Fields are displacements averaged over a window, shape (z, y, x, 3) [voxel].
 """
 

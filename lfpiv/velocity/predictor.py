@@ -1,7 +1,7 @@
 """Displacement field between two passes: from window centres to the control points of the deformation, and back.
 
-A cubic spline leads from the window centres to the control points, between which the field is linear. Means over
-windows follow from that linear field. The field is not smoothed.
+A cubic spline interpolates the field from the window centres to the control points. Between these it is linear. Means
+over windows are those of the linear field. The field is not smoothed.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _apply(matrix: np.ndarray, field: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _spline_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the matrix from values at nodes to values at points: natural cubic spline, straight beyond the nodes."""
+    """Return the matrix from values at nodes to values at points: natural cubic spline, linear beyond the nodes."""
     if len(nodes) == 1:
         return np.ones((len(points), 1))
     spline = CubicSpline(nodes, np.eye(len(nodes)), bc_type="natural")

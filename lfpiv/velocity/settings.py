@@ -77,7 +77,7 @@ def triple(values: Iterable[int]) -> Triple:
 
 
 def windows_of(windows: Sequence[int | Sequence[int]] | None, shape: Triple) -> tuple[Triple, ...]:
-    """Check the windows that a caller gives for volumes of a shape, and return each as (z, y, x)."""
+    """Check the windows of all passes against the shape of the volumes, and return each as (z, y, x)."""
     if windows is None:
         return tuple(triple(min(edge, n) for n in shape) for edge in DEFAULT_WINDOWS)
     if isinstance(windows, (int, float, str)):

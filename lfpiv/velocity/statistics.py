@@ -164,7 +164,7 @@ def standard_error(vectors: xr.Dataset) -> xr.Dataset:
     -------
     Dataset
         ``standard_error_u``, ``_v``, ``_w`` [m/s] over z, y, x, NaN where fewer than two pairs are used. Their
-        attribute ``pairs_per_independent`` is the bracket in the equation above.
+        attribute ``pairs_per_independent`` is the factor in parentheses above.
 
     References
     ----------
@@ -235,21 +235,9 @@ def _with_axes(result: xr.Dataset, vectors: xr.Dataset) -> xr.Dataset:
 
 
 def _correlated(series: np.ndarray, order: np.ndarray) -> tuple[float, float]:
-    """Sum up the correlation between pairs, 1 + 2 sum (n_k / n) rho_k.
+    """Return 1 + 2 sum (n_k / n) rho_k, and n times the variance of the mean over the observed variance about it.
 
-    Parameters
-    ----------
-    series : ndarray, shape (pair, ...)
-        One component, NaN where it is not used.
-    order : ndarray of int, shape (pair,)
-        Numbers of the pairs, which may have gaps.
-
-    Returns
-    -------
-    pairs_per_independent : float
-        The sum.
-    factor : float
-        n times the variance of the mean over the observed variance about it.
+    `series` (pair, ...) is one component, NaN where it is not used. `order` holds the numbers of the pairs.
     """
     products, pairs, positions = _autocovariance(series.reshape(len(series), -1), order - order.min())
     if not products[0] > 0:

@@ -1,4 +1,4 @@
-"""Two volumes as a caller gives them to `lfpiv.correlate`: check, normalise, smooth, and locate their voxels."""
+"""Prepare the two volumes of `lfpiv.correlate`: check, normalise and smooth them, and locate their voxels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import fft
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.geometry.volume import VIEWS, is_finite
+from lfpiv.geometry.volume import SPACING_TOLERANCE, VIEWS, is_finite
 
 LARGEST_BLOCK = 128
 """Largest edge of the central block that is correlated as a whole [voxel]."""
@@ -21,7 +21,6 @@ CLEAR_SIGMA = 8.0
 """Smallest clear peak beyond the searched lags, as a multiple of the standard deviation over all lags."""
 
 _BACKGROUND_SAMPLES = 100_000  # voxels whose median is the background
-_SPACING_TOLERANCE = 1e-3  # unevenness of coordinates written as float32 decimals, relative to the spacing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,9 +115,9 @@ def _common_axis(volume_a: xr.DataArray, volume_b: xr.DataArray, axis: str) -> t
             )
     centres = np.asarray(volume_a[axis], float)
     distance = float((centres[-1] - centres[0]) / (len(centres) - 1))
-    if not distance > 0 or np.abs(np.diff(centres) - distance).max() > _SPACING_TOLERANCE * distance:
+    if not distance > 0 or np.abs(np.diff(centres) - distance).max() > SPACING_TOLERANCE * distance:
         raise ValueError(f"volume_a: expected increasing, evenly spaced coordinates {axis} [mm], got {centres}.")
-    if np.abs(np.asarray(volume_b[axis], float) - centres).max() > _SPACING_TOLERANCE * distance:
+    if np.abs(np.asarray(volume_b[axis], float) - centres).max() > SPACING_TOLERANCE * distance:
         raise ValueError(f"volume_b: expected the coordinates {axis} of volume_a, got others.")
     return centres, distance
 

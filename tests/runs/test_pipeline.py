@@ -132,7 +132,7 @@ def test_only_what_changed_is_done_anew(finished, tmp_path, caplog):
         summary = pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)
     redone = {path for path, time in files.items() if path.stat().st_mtime_ns != time}
     assert redone == {out / "vectors" / "pair_0000.nc"}
-    assert "correlation.max_displacement_voxel changed: pair 0 made anew" in caplog.text
+    assert "correlation.max_displacement_voxel changed: pair 0 made again" in caplog.text
     assert [pair["pair"] for pair in summary["pairs"]] == [0] and summary["timings_s"]["weights"] > 0
 
 

@@ -236,7 +236,7 @@ def test_a_scheduler_that_hangs_is_told_and_given_up(monkeypatch, caplog):
     assert len(caplog.messages) == cluster_workers.SILENT_S // cluster_workers.REMIND_S - 1
     assert all("tcp://there:1 has not answered for" in text for text in caplog.messages)
     now[0] = cluster_workers.SILENT_S + 1
-    with pytest.raises(ClusterError, match=r"tcp://there:1 has not answered for 601 s\. What is finished is kept"):
+    with pytest.raises(ClusterError, match=r"tcp://there:1 has not answered for 601 s\. Finished results are complete"):
         watch.capacity()
     watch.answer.set_result(0)
     assert watch.capacity() > 1e6 and watch.count == 0, "it answered after all"

@@ -33,7 +33,7 @@ def test_data_set_is_a_valid_experiment_with_truth(small):
     assert experiment.cameras[1].optics.layout == "hexagonal" and experiment.grid.shape == (4, 5, 6)
     assert experiment.smart.iterations == 3 and experiment.dt_s == 2e-4
     assert "true" not in path.read_text()  # the truth stays hidden
-    assert steps[-1][1:] == (len(steps), len(steps)) and len(list(path.parent.rglob("*.tif"))) == len(steps) == 15
+    assert steps[-1] == ("simulated images", 1.0) and len(list(path.parent.rglob("*.tif"))) == len(steps) == 15
     dark = experiment.dark("two")
     assert abs(dark.mean() - 40) < MONTE_CARLO * 3 / np.sqrt(dark.size) and experiment.dark("one") is None
 
@@ -138,7 +138,7 @@ def test_a_folder_with_files_is_left_alone(small, tmp_path):
 def test_interrupted_simulation_leaves_nothing(tmp_path):
     (tmp_path / "scene.toml").write_text(SMALL_SCENE)
 
-    def stop(what, done, total):
+    def stop(what, fraction):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
