@@ -14,7 +14,8 @@ if TYPE_CHECKING:  # what the names below stand for
     from lfpiv import derived as derived
     from lfpiv import metrics as metrics
     from lfpiv import statistics as statistics
-    from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
+    from lfpiv.calibration.camera import Calibration, load_calibration
+    from lfpiv.calibration.cameras import calibrate, thin_lens
     from lfpiv.errors import InputError
     from lfpiv.experiment.experiment import Experiment, open_experiment
     from lfpiv.geometry.grid import Grid
@@ -31,7 +32,7 @@ if TYPE_CHECKING:  # what the names below stand for
     from lfpiv.weights.operator import build_weights
 
 _MODULES = {
-    "Calibration": "lfpiv.calibration.cameras",
+    "Calibration": "lfpiv.calibration.camera",
     "Experiment": "lfpiv.experiment.experiment",
     "Grid": "lfpiv.geometry.grid",
     "InputError": "lfpiv.errors",
@@ -43,7 +44,7 @@ _MODULES = {
     "correlate": "lfpiv.velocity.cross_correlation",
     "export_results": "lfpiv.results.export",
     "find_lens_array": "lfpiv.lightfield.lens_array",
-    "load_calibration": "lfpiv.calibration.cameras",
+    "load_calibration": "lfpiv.calibration.camera",
     "open_experiment": "lfpiv.experiment.experiment",
     "open_results": "lfpiv.results.reader",
     "reconstruct": "lfpiv.reconstruction.volume",

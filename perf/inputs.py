@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from lfpiv.calibration.cameras import CalibratedCamera, Calibration
+from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.geometry.grid import Grid

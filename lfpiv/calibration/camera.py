@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lfpiv.calibration.board.board import BoardDots
+from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel

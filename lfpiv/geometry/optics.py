@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 LAYOUTS = ("square", "hexagonal")
+NEIGHBOURS = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
+"""Lattice steps to the eight neighbours of a node, shape (8, 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from lfpiv.report import markup, overview, pairs, volumes
 from lfpiv.report import vectors as vector_section
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
 
 __all__ = ["write_report"]
 

@@ -15,8 +15,9 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lfpiv import files, metrics
-from lfpiv.calibration.board.board import BoardDots
-from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
+from lfpiv.calibration.board.dots import BoardDots
+from lfpiv.calibration.camera import Calibration, load_calibration
+from lfpiv.calibration.cameras import calibrate, thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.experiment import Experiment, open_experiment
 from lfpiv.experiment.settings import Smart

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.calibration.board.board import BoardDots, DotBoard, measure_board
+from lfpiv.calibration.board.board import measure_board
+from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.cameras import MODEL_ERROR_PITCH
 from lfpiv.calibration.levenberg_marquardt import levenberg_marquardt
 from lfpiv.calibration.network import sigma_nor
@@ -194,17 +195,10 @@ def fit(
 def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
     """Label the board with the paper's estimator."""
     experiment, camera = rig.experiment, rig.calibration.cameras[name]
-    board = experiment.board
-    planes = range(len(board.planes_mm))
     return measure_board(
-        [experiment.board_image(name, plane) for plane in planes],
+        [experiment.board_image(name, plane) for plane in range(len(experiment.board.planes_mm))],
         camera.decoder,
-        DotBoard(
-            dots=board.dots,
-            spacing_mm=board.spacing_mm,
-            diameter_mm=board.dot_diameter_mm,
-            planes_mm=board.planes_mm,
-        ),
+        DotBoard.from_settings(experiment.board),
         nominal_angle_deg=experiment.camera(name).nominal_angle_deg,
         estimator="gaussian",
         dark=experiment.dark(name),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.calibration.board.board import BoardDots
+from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.camera import Calibration
 from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.geometry.grid import Grid

@@ -11,7 +11,7 @@ from lfpiv.runs.pair import Outcome
 from lfpiv.warn import Warning
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import MIB
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
 
 log = logging.getLogger(__name__)
 
@@ -186,7 +186,7 @@ def _left_in(group: Path, names: tuple[str, str, str, str]) -> int:
 
 def _nominal_cameras(experiment: Experiment) -> Calibration:
     """Return the nominal rig of the experiment file. Reads no image."""
-    from lfpiv.calibration.cameras import CalibratedCamera, Calibration
+    from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.calibration.thin_lens_model import thin_lens_model
     from lfpiv.geometry.optics import LensLattice
 

@@ -22,7 +22,7 @@ from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
     from lfpiv.weights.operator import Weights
 
 PAIRS = "image pairs"

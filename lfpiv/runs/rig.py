@@ -25,7 +25,7 @@ from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.warn import Code, Warning, collected
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
     from lfpiv.runs.run import Run
     from lfpiv.weights.operator import Weights
 
@@ -40,7 +40,7 @@ def load_calibration(run: Run) -> Calibrated:
     InputError
         If there is none that fits the experiment.
     """
-    from lfpiv.calibration.cameras import load_calibration
+    from lfpiv.calibration.camera import load_calibration
 
     path = run.folder.calibration
     if not run.calibration_stamp.fits(provenance.read_marks(path)):

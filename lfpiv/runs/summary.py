@@ -22,7 +22,7 @@ from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.warn import Warning
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import CalibratedCamera
+    from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.geometry.grid import Grid
     from lfpiv_kernels.runtime import Device
 

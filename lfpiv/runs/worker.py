@@ -163,7 +163,7 @@ def release(shared: Path) -> None:
 def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
     if shared in _opened:
         return _opened[shared]
-    from lfpiv.calibration.cameras import load_calibration
+    from lfpiv.calibration.camera import load_calibration
     from lfpiv.weights.storage import open_weights
 
     where = f"{shared}, worker on {socket.gethostname()}"

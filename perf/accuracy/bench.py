@@ -16,8 +16,8 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lfpiv import metrics
-from lfpiv.calibration.camera import CalibratedCamera
-from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration
+from lfpiv.calibration.camera import CalibratedCamera, Calibration, load_calibration
+from lfpiv.calibration.cameras import calibrate
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import AXES
 from lfpiv.reproduce import rigs, store

@@ -13,7 +13,8 @@ import xarray as xr
 from bench import DEFAULT, Bench, Judged
 from numpy.typing import ArrayLike
 
-from lfpiv.calibration.cameras import Calibration, thin_lens
+from lfpiv.calibration.camera import Calibration
+from lfpiv.calibration.cameras import thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import AXES

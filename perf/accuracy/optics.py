@@ -12,7 +12,8 @@ import numpy as np
 import xarray as xr
 from bench import DEFAULT, Bench, Judged
 
-from lfpiv.calibration.cameras import Calibration, thin_lens
+from lfpiv.calibration.camera import Calibration
+from lfpiv.calibration.cameras import thin_lens
 from lfpiv.reproduce import page, plots, rigs
 from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.scene import Scene, true_mapping

@@ -28,7 +28,7 @@ import numpy as np
 from scipy import fft, special
 from scipy.spatial import Voronoi
 
-from lfpiv.geometry.optics import LensLattice, Optics, float_pair, spread_over_pupil
+from lfpiv.geometry.optics import NEIGHBOURS, LensLattice, Optics, float_pair, spread_over_pupil
 
 _BEND_ORDER = 3
 _POWERS = [(order - j, j) for order in range(_BEND_ORDER + 1) for j in range(order + 1)]  # of (u, v)
@@ -304,6 +304,5 @@ def _cell_spectrum(basis: Basis, step_mm: float) -> np.ndarray:
 
 def _neighbours(basis: Basis) -> np.ndarray:
     """Return the vectors to the eight lattice neighbours of a lens [mm], shape (8, 2)."""
-    steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)], float)
-    neighbours: np.ndarray = steps @ np.asarray(basis)
+    neighbours: np.ndarray = NEIGHBOURS @ np.asarray(basis)
     return neighbours

@@ -17,6 +17,7 @@ from scipy import stats
 from lfpiv.calibration.board.dot_fit import BoardPixels, DotFit, converged, fit_dots
 from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
 from lfpiv.calibration.board.dots import ExpectedDot
+from lfpiv.lightfield.decoder import NORMAL_MAD
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
@@ -32,7 +33,6 @@ _CHANCE = 1e-3  # probability that dots without a bend show one by chance
 _OUTLIER_CHI2 = 2.0  # fits with this many times the typical residual are left out
 _SHARE = 0.3  # pixels with at least this share of a dot measure noise and pixel response
 _CALM_SIGMA, _CALM_DEVIATION = 4.0, 0.5  # pixels further off in light or response are left out
-_NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 def estimate_shared(
@@ -181,8 +181,8 @@ def estimate_pixels(pixels: BoardPixels, fits: Sequence[DotFit | None]) -> Board
         return pixels.measured(1.0, decoder.counts_per_photon)
     deviation, expected, miss = (np.concatenate(part).astype(float) for part in (deviations, lights, misses))
     relative = miss / expected
-    limit = _CALM_SIGMA * _NORMAL_MAD * np.median(np.abs(relative))
+    limit = _CALM_SIGMA * NORMAL_MAD * np.median(np.abs(relative))
     calm = (np.abs(relative) < limit) & (np.abs(deviation) < _CALM_DEVIATION)
     share = float(np.clip((deviation * relative)[calm].sum() / max((deviation**2)[calm].sum(), 1e-12), 0, 1))
     left = (miss - share * deviation * expected) ** 2 / expected
-    return pixels.measured(share, max(float(np.median(left)) * _NORMAL_MAD**2, 1e-3))
+    return pixels.measured(share, max(float(np.median(left)) * NORMAL_MAD**2, 1e-3))

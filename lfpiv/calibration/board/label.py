@@ -22,7 +22,7 @@ from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
-from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.decoder import NORMAL_MAD, LightFieldDecoder
 
 _MARGIN_PITCHES = (0.5, 0.25)  # pixels this far beyond a dot's light are fitted too, first and second round
 _PRIOR_PITCHES = (0.5, 0.3, 0.1)  # prior of the first round on position, slope and curvature over the pupil
@@ -32,7 +32,6 @@ _OUTLIER_LIGHT = 3.0  # a dot is at most this many times fainter or brighter tha
 _OUTLIER_SIGMA, _OUTLIER_PITCHES = 6.0, 0.15  # a dot is less than one of them off its expected position
 _VIEWS = 37  # labels per dot
 _SEEN_PIXELS = 1.5  # a label lies at most this far from a pixel that saw the dot
-_NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _TUKEY = 4.685  # residual without weight in Tukey's biweight [standard deviations]
 _ROBUST_ROUNDS = 15
 
@@ -168,7 +167,7 @@ def _robust_fit(
         root = np.sqrt(weight)[:, None]
         coefficients = np.linalg.lstsq(have * root, y * root[:, 0], rcond=None)[0]
         residual = y - have @ coefficients
-        typical = (_NORMAL_MAD * np.median(np.abs(residual[sharp]))) ** 2
+        typical = (NORMAL_MAD * np.median(np.abs(residual[sharp]))) ** 2
         scatter2 = max(typical - np.median(variance[sharp]), 0.0)
         ratio = np.abs(residual) / (_TUKEY * np.sqrt(variance + max(scatter2, 0.1 * typical) + 1e-16))
         robust = np.where(ratio < 1, (1 - np.minimum(ratio, 1) ** 2) ** 2, 0) + 1e-9
