@@ -187,7 +187,6 @@ def _decode(experiment: Experiment, setup: CameraSetup) -> _Sensor:
 def _measure_dots(
     experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, step: StepProgress
 ) -> BoardDots:
-    """Check the board images and measure the dots in them."""
     board, dark = experiment.board, experiment.dark(setup.name)
     images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
     checks.check_light(experiment, setup, decoder, images, dark)
@@ -206,7 +205,7 @@ def _measure_dots(
         except np.linalg.LinAlgError:
             raise InputError(
                 "expected images of the board's dots, found blobs that no camera sees as a board. Check that these are "
-                "board images and what [board] says."
+                "board images, and check the numbers in [board]."
             ) from None
     checks.check_planes(experiment, setup, dots)
     return dots
@@ -245,7 +244,6 @@ def _fit_mapping(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pi
 
 
 def _disagreeing_per_plane(dots: BoardDots, agreeing: np.ndarray, dots_per_plane: int) -> np.ndarray:
-    """Count the dots of each plane that disagree with their neighbours."""
     return np.bincount(np.unique(dots.dot[~agreeing]) // dots_per_plane, minlength=len(dots.found))
 
 

@@ -211,8 +211,6 @@ def _sum_over_blocks(terms_of: Callable[[int, int], Terms], count: int, rows: in
 
 
 def _sum_of_squares(layers: Sequence[np.ndarray], samples: Samples) -> float:
-    """Return the weighted sum of squared residuals."""
-
     def squares(first: int, last: int) -> Terms:
         part = slice(first, last)
         residual = samples.weights[part] * (samples.outputs[part] - forward(layers, samples.inputs[part])[-1])

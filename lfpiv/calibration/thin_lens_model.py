@@ -149,8 +149,8 @@ def fit_thin_lens(
 
     Linear least squares of s, t = a + A (x, y, z) + (k + b (x, y, z)) (u, v) start the fit: the rows of A are the
     camera's axes times the magnification, and b is its optical axis times s_i / s_o^2. A robust fit of pose, image
-    distance, focal length, pupil scale and optical axis follows. Mislabelled dots have next to no weight in it, and the
-    data sheet decides only what the labels leave open.
+    distance, focal length, pupil scale and optical axis follows. Mislabelled dots have next to no weight in it. The
+    data sheet decides only parameters that the labels do not determine.
 
     Parameters
     ----------

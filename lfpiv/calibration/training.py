@@ -46,7 +46,7 @@ class TrainingSettings:
     shrink: bool = False
     """Multiply the network by the factor from 0 to 1 that fits the validation part best.
 
-    For a network that corrects a baseline, such as a fitted thin lens: one that learned only noise vanishes.
+    For a network that corrects a baseline, such as a fitted thin lens. A correction that fits only noise becomes 0.
     """
     seed: int = 0
     """Seed of the split and the first weights. Equal seeds give equal networks."""

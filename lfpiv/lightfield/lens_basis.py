@@ -78,7 +78,6 @@ def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndar
 
 
 def _middle(image: np.ndarray) -> np.ndarray:
-    """Return the middle part of an image."""
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape]
     return image[start[0] : start[0] + TILE_PX, start[1] : start[1] + TILE_PX]
 

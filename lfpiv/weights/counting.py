@@ -254,7 +254,7 @@ def _pack_windows(
 ) -> tuple[np.ndarray, ...]:
     """Pack windows of weights, shape (voxel, rows, columns), into blocks of one column of tiles each.
 
-    Returns the number of blocks and of rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
+    Return the number of blocks and of rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
     """
     row = corner[:, 1, None] + np.arange(windows.shape[1])
     column = corner[:, 0, None] + np.arange(windows.shape[2])

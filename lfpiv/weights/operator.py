@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ import numpy as np
 from lfpiv.calibration.coverage import SEEN_SHARE, warn_seen_by_one
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
+from lfpiv.progress import StepProgress, part_of
 from lfpiv.weights.blocks import (
     BLOCK_BYTES,
     CHUNK_VOXELS,
@@ -230,7 +231,7 @@ class Weights:
 
     @cached_property
     def even_light(self) -> dict[str, EvenLight]:
-        """Camera name -> what it records of an evenly lit volume. Empty if the cameras share too little of it."""
+        """Camera name -> its record of an evenly lit volume. Empty if the cameras share too little of it."""
         projectors = {name: self.projector(name) for name in self.cameras}
         gains = {name: self.gain(name) for name in self.cameras}
         return project_even_light(projectors, gains, self.camera_sums)
@@ -260,7 +261,7 @@ class Weights:
         return sum(projector.blocks.nbytes for projector in self._projectors.values())
 
     def counted(self, name: str) -> CountedVoxels:
-        """Return a few voxels of a camera, counted when first asked for."""
+        """Return a few voxels of a camera, counted when first needed."""
         if name not in self._counted:
             self._counted[name] = CountedVoxels(self.stored, self.cameras[name])
         return self._counted[name]
@@ -312,7 +313,7 @@ def build_weights(
     *,
     form: str = "auto",
     limit_bytes: float = math.inf,
-    progress: Callable[[float], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> Weights:
     """Build the weights of every voxel of a grid on every pixel of every camera (Eq. 10).
 
@@ -341,8 +342,9 @@ def build_weights(
     Raises
     ------
     ValueError
-        If `method` or `form` is unknown, profiles are requested for a hexagonal microlens layout, or the weights do not
-        fit into `limit_bytes`: before they are stored.
+        If `method` or `form` is unknown, or profiles are requested for a hexagonal microlens layout.
+    InputError
+        If the weights would not fit into `limit_bytes`. Raised before they are computed.
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}.")
@@ -357,12 +359,8 @@ def build_weights(
         return Weights(stored, cameras, {}, method)
     runtime.device()
     projectors, choices, counted = dict[str, Projector](), dict[str, Choice](), dict[str, CountedVoxels]()
+    whole = progress or (lambda fraction: None)
     for number, (name, camera) in enumerate(cameras.items()):
-
-        def step(fraction: float, number: int = number) -> None:
-            if progress is not None:
-                progress((number + fraction) / len(cameras))
-
         if form == "auto" and camera.lattice.layout == "square":
             counted[name] = CountedVoxels(stored, camera)
             choices[name] = choose_form(counted[name])
@@ -370,6 +368,7 @@ def build_weights(
             choices[name] = choose_uncounted(stored, camera, form)
         chosen, used = choices[name], sum(projector.blocks.nbytes for projector in projectors.values())
         allow = memory_check(name, grid, chosen, limit_bytes - used)
+        step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
         projectors[name] = Projector(footprint_blocks(stored, camera, chosen.form, step, allow, chosen.cuts))
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)
     text = "weights of %d voxels on %d cameras: %.0f MiB"
@@ -396,7 +395,7 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     """Compare stored weights with counted rays in a few random voxels of every camera.
 
-    Warns of weights whose error exceeds the aim, unless `choose_form` did so before.
+    Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
 
     Returns
     -------

@@ -135,7 +135,6 @@ def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) ->
 
 
 def _count(labels: Labels, board: DotBoard, detection: Detection) -> BoardDots:
-    """Add the world points, and the number of dots of each plane."""
     planes = len(board.planes_mm)
     found = np.bincount(labels.measured_dot // board.size, minlength=planes)
     visible = detection.in_field.copy()

@@ -288,8 +288,6 @@ class _Problem:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """Result of one iteration."""
-
     state: _State
     damping: float
     converged: bool

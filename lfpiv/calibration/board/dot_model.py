@@ -5,7 +5,7 @@ point u. Phi holds the powers of u up to the second; each dot has its own coeffi
 all dots of a camera share their coefficients b, the bend. A ray that leaves the dot at d from its centre lands at
 s(u) + A(u) d, where A is d(s, t)/d(x, y) of the board, linear in u where the board is tilted. The pixel at X under the
 lens s_l sees the pupil point u_i = -(X - X_c) s_i / f_m through the lens's centre (see `lfpiv.lightfield.decoder`). Its
-rays obey X = s_l + (f_m/s_i)(s - u) (Eq. 9), hence they land at
+rays obey X = s_l + (f_m/s_i)(s - u) (Eq. 9), so they land at
 
     s - s_l = g + (I - K)^-1 (A d + K h),      g = (I - K)^-1 (s(u_i) - s_l),
 
@@ -286,7 +286,6 @@ _PER_U, _PER_V = _derivative(0), _derivative(1)
 
 @functools.lru_cache(maxsize=8)
 def _spread_terms(pupil_radius_mm: float) -> np.ndarray:
-    """Return `ray_terms` at points spread evenly over the pupil."""
     return ray_terms(spread_over_pupil(pupil_radius_mm), pupil_radius_mm)
 
 

@@ -107,9 +107,8 @@ def expect_dots(
 
     Parameters
     ----------
-    pose : CameraPose
-    board : DotBoard
-    optics : Optics
+    pose, board, optics
+        Camera pose, stated board and nominal optics.
     dots : ndarray, shape (d,)
         Numbers of the dots.
     theta : ndarray, shape (d, 6, 2)

@@ -126,7 +126,7 @@ def require_stated(extents: tuple[Extent, Extent], found: np.ndarray) -> None:
     raise InputError(
         f"board.dots: expected the {stated} dots stated (columns x rows), found {seen}, and no dots beyond them where "
         f"the camera would see some ({_per_plane(found)}). Set dots = [{columns}, {rows}], or uncover the board's "
-        "edge: with another number of dots than there are all of them get wrong names."
+        "edge: all dots get wrong names if their stated number is wrong."
     )
 
 

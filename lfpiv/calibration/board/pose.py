@@ -45,7 +45,7 @@ class CameraPose:
 
     @property
     def _lens(self) -> tuple[float, float, float]:
-        """Magnification, object distance [mm] and the factor of the slope k."""
+        """Return the magnification, the object distance [mm] and the factor of the slope k."""
         ratio = np.exp(self.parameters[6:])
         return self.nominal[1] * ratio[0], self.nominal[2] * ratio[1], ratio[2]
 
