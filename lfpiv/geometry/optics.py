@@ -89,6 +89,12 @@ def spread_over_pupil(radius_mm: float) -> np.ndarray:
     return radius_mm * np.concatenate(rings)
 
 
+def random_on_pupil(radius_mm: float, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw points evenly over the pupil, shape (count, 2) [mm]."""
+    radius, angle = radius_mm * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
 def float_pair(values: ArrayLike) -> tuple[float, float]:
     """Return two numbers as a tuple of Python floats."""
     first, second = np.asarray(values, float).tolist()

@@ -114,11 +114,11 @@ def gradient_descent(
     Parameters
     ----------
     layers, training, validation : as for `lfpiv.calibration.levenberg_marquardt.levenberg_marquardt`
-        The epoch with the lowest validation error is kept.
+        The result is the epoch with the lowest validation error.
     epochs : int
         Passes over the samples at most.
     patience, tolerance
-        Not used: descent ends by its epochs, or when the rate has fallen to `LAST_RATE`.
+        Not used. Training ends by its epochs, or when the rate has fallen to `LAST_RATE`.
     """
     pack, unpack = _packing(layers)
     theta = best_theta = pack(layers)
@@ -153,7 +153,7 @@ def gradient_descent(
 def _packing(
     layers: Sequence[np.ndarray],
 ) -> tuple[Callable[[Sequence[np.ndarray]], np.ndarray], Callable[[np.ndarray], list[np.ndarray]]]:
-    """Functions from layers to one vector and back."""
+    """Return the functions from layers to one vector and back."""
     shapes = [layer.shape for layer in layers]
     edges = np.cumsum([layer.size for layer in layers])[:-1]
 
@@ -172,7 +172,7 @@ def _hyperparameters(gamma: float, values: int, squares: float, theta: np.ndarra
 
 
 def _factor(matrix: np.ndarray, shift: float) -> tuple[np.ndarray, bool] | None:
-    """Cholesky factor of matrix + shift I, or None where rounding leaves it indefinite."""
+    """Return the Cholesky factor of matrix + shift I, or None where rounding leaves it indefinite."""
     try:
         factor, lower = cho_factor(matrix + shift * np.eye(len(matrix)), overwrite_a=True, check_finite=False)
     except LinAlgError:
@@ -195,7 +195,7 @@ def _rms(layers: Sequence[np.ndarray], samples: Samples) -> float:
 
 
 def _gradient(layers: Sequence[np.ndarray], samples: Samples) -> list[np.ndarray]:
-    """Gradient of the mean squared error by the layers, by backpropagation."""
+    """Return the gradient of the mean squared error by the layers, by backpropagation."""
     outputs = forward(layers, samples.inputs)
     residual = _residual(outputs[-1], samples)
     delta = -2 / residual.size * samples.weights * residual

@@ -1,4 +1,4 @@
-"""One, two and three cameras beside one another on the same particles and flow."""
+"""Compare one, two and three cameras on the same particles and flow."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 from bench import Bench, Judged, Pair
 
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots, rigs
-from lfpiv.reproduce.study import Progress
 
 TITLE = "One, two and three cameras"
 
@@ -98,7 +98,7 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
             _about_depth(judged, densest),
             f"One pair of each seeding. {bench.ABOUT_STANDARD_ERROR}",
             "The correlation of the true particles, drawn as blobs on the voxels, shows what the windows themselves "
-            "leave: no camera can do better.",
+            "leave. No camera can do better.",
             "R_acc, R_g and ghosts count peaks: a single camera's are few and long. Where particles touch, peaks of "
             "the true volume are displaced or lost too.",
             "A single camera's vectors pass the validation although their depth is wrong: neighbours share the error.",
@@ -107,7 +107,7 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
 
 
 def _about_depth(judged: Mapping[tuple[str, float], Judged], ppm: float) -> str:
-    """Say what each set of cameras makes of depth."""
+    """Describe the depth error of each set of cameras."""
     parts = []
     for name in SETS:
         x, y, z = judged[name, ppm].error.mean_absolute

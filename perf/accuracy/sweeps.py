@@ -10,8 +10,8 @@ from typing import Any
 import bench
 from bench import DEFAULT, Bench, Judged, Pair
 
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots
-from lfpiv.reproduce.study import Progress
 
 TITLE = "Noise and seeding"
 
@@ -20,7 +20,7 @@ PPM = {"small": (0.05, 0.2, 0.5, 1.0, 2.0), "paper": (0.02, 0.05, 0.1, 0.2, 0.5,
 COUNTS = {"small": (300.0, 30.0, 8.0, 2.5), "paper": (300.0, 100.0, 30.0, 15.0, 8.0, 4.0, 2.5)}
 """Level of a pixel lit by one particle [count], at the bench's seeding; the noise stays as it is."""
 Signal = dict[str, float]
-"""What the images of a run were like; see `Bench.volumes`."""
+"""Signal and noise of the images of a run, see `Bench.volumes`."""
 AXES = {"x": "#2f81d6", "y": "#2ca36b", "z": "#e0762a"}
 
 
@@ -98,9 +98,9 @@ def compute(
             f"{own.rig.scene.noise.read_noise:g} counts, {own.rig.scene.noise.full_well_e:g} electrons at full scale. "
             "Particles become dimmer, the noise stays; at a low exposure a longer one or more laser power is the "
             "remedy.",
-            "Dense volumes are nearly full, the true ones too, and their means alone agree: Q does not tell how well "
+            "Dense volumes are nearly full, the true ones too, and their means agree. So Q does not show how well "
             "particles are found there. With the means subtracted it is a correlation coefficient.",
-            "Sparse seeding: few particles to a window, so the true particles' correlation has errors of its own. "
+            "Sparse seeding: few particles in a window, so the true particles' correlation has errors as well. "
             "Dense seeding: particles and ghosts merge, so fewer peaks stand for either and R_acc falls.",
             *_about_saturation(seeding),
         ],
@@ -108,7 +108,7 @@ def compute(
 
 
 def _electrons(signal: Signal) -> int:
-    """Electrons of a particle, to what is worth reading."""
+    """Return the electrons of a particle, rounded to two digits."""
     return int(float(f"{signal['electrons']:.2g}"))
 
 
