@@ -119,8 +119,6 @@ def write(out: Path, settings: Mapping[str, Any], title: str, about: str, keys: 
 ROUNDING = 1e-12
 """Magnitude below which a number is shown as 0."""
 
-# -- the page ----------------------------------------------------------------------------------------------------------
-
 STYLE = """
 :root { --ink: #1d2329; --dim: #5c6670; --line: #d9dee3; --paper: #fff; --good: #1f7a4d; --bad: #b3431e; }
 @media (prefers-color-scheme: dark) {

@@ -74,6 +74,12 @@ PARTICLE_COUNTS = 400.0
 """Level of a pixel lit by one particle in focus [count]: at 1 ppm the brightest pixels stay below full scale."""
 PARTICLE_RAYS = 32_768
 """Rays per particle. It lights some 1,500 pixels, so a pixel receives about 20 rays."""
+UNUSED_TABLES = {
+    "volume": {"size_mm": (1.0, 1.0, 1.0), "voxel_mm": VOXEL_MM},
+    "particles": {"count": 8, "sigma_mm": BLOB_VOXEL * VOXEL_MM},
+    "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
+}
+"""Tables that a scene requires. The cases do not use them, because each renders its own particles."""
 DT_S = 1e-4
 """Time between the frames [s]; the figures are in voxels and do not depend on it."""
 RADIUS, CORE, PEAK = 0.25, 1 / 7, 0.3 / 14
@@ -154,10 +160,7 @@ def numerical_scene(scale: str, seed: int) -> Scene:
                 "dot_diameter_mm": 0.1,
                 "planes_mm": tuple(float(z) for z in DEPTHS_MM[scale]),
             },
-            # required by the scene, not used: each case renders its own particles
-            "volume": {"size_mm": (1.0, 1.0, 1.0), "voxel_mm": VOXEL_MM},
-            "particles": {"count": 8, "sigma_mm": BLOB_VOXEL * VOXEL_MM},
-            "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
+            **UNUSED_TABLES,
             "quality": {"pixel_rays": WHITE_RAYS},
             "noise": {"background": 0.0, "read_noise": 0.0, "full_well_e": 0.0},
         }

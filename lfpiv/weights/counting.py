@@ -121,9 +121,6 @@ def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
     np.add.at(image.ravel(), blocks.microimages.pixel[ray[lit]], weight[lit] * share[lit])
 
 
-# -- a few voxels, to compare integrated weights with
-
-
 class CountedVoxels:
     """A few random voxels that a camera sees, counted twice with independent rays.
 
@@ -218,9 +215,6 @@ def _window(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np
     on_sensor, in_window = _overlap(image.shape, shape, corner)
     out[in_window] = image[on_sensor]
     return out
-
-
-# -- all voxels of a grid
 
 
 def count_blocks(stored: StoredGrid, camera: CalibratedCamera) -> Blocks:

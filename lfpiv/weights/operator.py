@@ -98,8 +98,6 @@ class Weights:
         """Return the weights of one of the cameras. They share memory with these."""
         return Weights(self.stored, {name: self.cameras[name]}, {name: self.projector(name)}, self.method)
 
-    # -- the operator ----------------------------------------------------------------------------------------------
-
     def __call__(self, volume: np.ndarray, out: Images | None = None) -> Images:
         """Project a volume: image[pixel] = sum over voxels of weight * volume (Eq. 4).
 
@@ -171,8 +169,6 @@ class Weights:
         if name not in self._projectors:
             self._projectors[name] = Projector(count_blocks(self.stored, self.cameras[name]))
         return self._projectors[name]
-
-    # -- properties of the weights -----------------------------------------------------------------------------------
 
     @property
     def grid(self) -> Grid:

@@ -226,10 +226,14 @@ class Bench:
             return {"volumes": np.stack([volume.values for volume in found]), **means}
 
         arrays = store.cached_arrays(self.folder / f"{name}.npz", settings, compute)
+        return self.unpacked(arrays)
+
+    def unpacked(self, arrays: Mapping[str, np.ndarray]) -> tuple[list[xr.DataArray], dict[str, float]]:
+        """Return the volumes of both frames and the other figures from stored arrays."""
+        figures = {key: float(value) for key, value in arrays.items() if key != "volumes"}
         coords = {axis: (axis, self.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
-        pair_values, signal = arrays.pop("volumes"), {key: float(value) for key, value in arrays.items()}
-        attributes = {"sieve_voxel": signal["sieve_voxel"]}  # the correlation adds the missing smoothing
-        return [xr.DataArray(values, coords, AXES, attrs=attributes) for values in pair_values], signal
+        attributes = {"sieve_voxel": figures["sieve_voxel"]}  # the correlation adds the missing smoothing
+        return [xr.DataArray(values, coords, AXES, attrs=attributes) for values in arrays["volumes"]], figures
 
     def judge(
         self,
@@ -333,10 +337,7 @@ def scene(scale: str, seed: int, cameras: Mapping[str, Mapping[str, Any]], *, na
                 "dot_diameter_mm": 0.1,
                 "planes_mm": tuple(float(z) for z in PLANES_MM[scale]),
             },
-            # required by the scene, not used: each case renders its own particles
-            "volume": {"size_mm": (1.0, 1.0, 1.0), "voxel_mm": rigs.VOXEL_MM},
-            "particles": {"count": 8, "sigma_mm": rigs.BLOB_VOXEL * rigs.VOXEL_MM},
-            "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
+            **rigs.UNUSED_TABLES,
             **SHARED,
             **shared,
         }

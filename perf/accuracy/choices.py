@@ -17,7 +17,6 @@ from lfpiv.calibration.camera import Calibration
 from lfpiv.calibration.cameras import thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.settings import Correlation, Smart
-from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.motion import reconstruct_pair
 from lfpiv.reproduce import page, plots, rigs, store
@@ -223,11 +222,7 @@ def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray
             "sieve_voxel": np.mean([volume.attrs["sieve_voxel"] for volume in found]),
         }
 
-    arrays = store.cached_arrays(own.folder / f"{name}.npz", settings, compute)
-    coords = {axis: (axis, own.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
-    smooth = {"sieve_voxel": float(arrays["sieve_voxel"])}
-    volumes = [xr.DataArray(values, coords, AXES, attrs=smooth) for values in arrays["volumes"]]
-    return volumes, {"iterations": float(arrays["iterations"])}
+    return own.unpacked(store.cached_arrays(own.folder / f"{name}.npz", settings, compute))
 
 
 def _traced(own: Bench, choice: Choice) -> Calibration:

@@ -242,18 +242,8 @@ def on_lattice(miss: np.ndarray, sites_mm: np.ndarray, board: DotBoard, bin_mm: 
     """Return whether blobs found near the expected sites are a board's dots, not chance.
 
     The misses of a board's dots vary smoothly over the sites, here by a robust linear function. Chance spreads the
-    misses over the whole search radius.
-
-    Parameters
-    ----------
-    miss : ndarray, shape (n, 2)
-        Position of each blob minus its site [mm].
-    sites_mm : ndarray, shape (n, 2)
-        The sites (x, y) [mm].
-    board : DotBoard
-        The stated board.
-    bin_mm : float
-        Spacing of the elements of the rectified image [mm].
+    misses over the whole search radius. `miss` is the position of each blob minus its site, `bin_mm` the spacing of the
+    elements of the rectified image [mm].
     """
     radius = search_radius_mm(board)
     if len(miss) < _JUDGED_DOTS or radius < _JUDGED_BINS * bin_mm:

@@ -44,18 +44,8 @@ def estimate_shared(
     """Fit the shared parameters to a sample of the dots.
 
     A model dot of the wrong size is fitted in the wrong position where a lens's edge cuts its light. The diameter acts
-    at all depths, the blur grows with the slope of the rays, so planes at different depths separate the two.
-
-    Parameters
-    ----------
-    pixels : BoardPixels
-        Pixels of all planes.
-    expected : sequence of ExpectedDot
-        The dots.
-    stated_diameter_mm : float
-        Diameter in the experiment file [mm].
-    margin_mm : float
-        Distance beyond the expected light of a dot that is fitted too [mm].
+    at all depths, the blur grows with the slope of the rays, so planes at different depths separate the two. The
+    fitted pixels reach `margin_mm` beyond the expected light of a dot.
     """
     optics, lattice = pixels.decoder.optics, pixels.decoder.lattice
     chosen = np.unique(np.linspace(0, len(expected) - 1, _SAMPLE).astype(int))
@@ -105,16 +95,8 @@ def estimate_bend(shared: SharedParameters, fits: Sequence[DotFit | None], pitch
     """Return the shared parameters with the bend that all dots show; no bend where chance explains it.
 
     The bends of single dots scatter about the common bend, by model errors too. An F-test compares the common bend with
-    that scatter. Without the test the noise would give a perfect lens a bend.
-
-    Parameters
-    ----------
-    shared : SharedParameters
-        Parameters that the dots were fitted with.
-    fits : sequence of DotFit or None
-        Fits of all dots, by weak priors.
-    pitch_mm : float
-        Microlens pitch [mm].
+    that scatter. Without the test the noise would give a perfect lens a bend. `fits` are the fits of all dots by
+    `shared` and by weak priors.
     """
     sure, typical = _typical(fits)
     start = shared.bend_mm.T.ravel()
@@ -136,15 +118,7 @@ def estimate_bend(shared: SharedParameters, fits: Sequence[DotFit | None], pitch
 
 
 def follow_bend(fits: Sequence[DotFit | None], change_mm: np.ndarray) -> list[DotFit | None]:
-    """Return the fits with the coefficients that belong to a changed bend, to first order.
-
-    Parameters
-    ----------
-    fits : sequence of DotFit or None
-        Fits by the former bend.
-    change_mm : ndarray, shape (BENDS, 2)
-        New bend minus former bend [mm].
-    """
+    """Return the fits with the coefficients that belong to a bend changed by `change_mm`, to first order."""
     change = change_mm.T.ravel()
     return [
         fit and replace(fit, coefficients=fit.coefficients + (fit.following[:, 2:] @ change).reshape(2, TERMS).T)

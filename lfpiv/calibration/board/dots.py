@@ -103,18 +103,9 @@ class ExpectedDot:
 def expect_dots(
     pose: CameraPose, board: DotBoard, optics: Optics, dots: np.ndarray, theta: np.ndarray, sigma: np.ndarray
 ) -> list[ExpectedDot]:
-    """Return the prior knowledge of dots.
+    """Return the prior knowledge of dots, given by number.
 
-    Parameters
-    ----------
-    pose, board, optics
-        Camera pose, stated board and nominal optics.
-    dots : ndarray, shape (d,)
-        Numbers of the dots.
-    theta : ndarray, shape (d, 6, 2)
-        Expected ray models [mm].
-    sigma : ndarray, shape (d, 6, 2)
-        Their standard deviations [mm].
+    `theta` and `sigma` are the means and standard deviations of their ray models, shape (d, 6, 2) [mm].
     """
     points = board.of_dots_mm(dots)
     jacobians, tilts = pose.board_jacobian(points, optics.pupil_radius_mm)
