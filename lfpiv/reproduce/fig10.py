@@ -35,8 +35,8 @@ CAPTION = (
 NOTES = (
     "The paper does not state its SSIM settings. Over the whole sensor nearly all pixels are dark in both images and "
     "SSIM is close to 1 for any weights, so the goal applies to the lit pixels only.",
-    "The cameras of this rig are ideal and stand at exactly 45 degrees: DRT knows the truth here, and a count through "
-    "DRT's mapping is a count through the true optics.",
+    "The cameras of this rig are ideal and stand at exactly 45 degrees. So DRT is exact, and a count through DRT's "
+    "mapping is a count through the true optics.",
 )
 
 

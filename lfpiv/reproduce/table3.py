@@ -29,7 +29,7 @@ PARTS = (0.70, 0.15, 0.15)
 EPOCHS = {"small": 300, "paper": 1000}
 """Largest number of epochs. Training stops earlier when the validation error no longer falls."""
 VOLUME_MM = {"small": (4.0, 4.0, 4.0), "paper": (10.0, 10.0, 10.0)}
-VIEWS = {"small": 37, "paper": 192}
+DOT_RAYS = {"small": 37, "paper": 192}
 """Rays of each dot. 192 rays of 21 planes of 49 dots are the paper's 197,570 samples."""
 PUPIL_PART = 0.92
 """Rays of the dots lie within this part of the pupil's radius, as the labels do."""
@@ -61,7 +61,7 @@ def compute(rig: Rig, scale: str, *, seed: int, progress: Progress) -> dict[str,
 def _time_training(rig: Rig, name: str, scale: str, seed: int) -> dict[str, Any]:
     """Train one camera's network on the paper's number of samples."""
     camera = rig.calibration.cameras[name]
-    points, pupil, array, dot = dense_labels(rig.labels(name), VIEWS[scale], camera.optics.pupil_radius_mm)
+    points, pupil, array, dot = dense_labels(rig.labels(name), DOT_RAYS[scale], camera.optics.pupil_radius_mm)
     cpu = time.process_time()
     training = train(
         np.hstack([points, pupil]),
@@ -142,7 +142,7 @@ def _result(
         notes=[
             "Times are wall times of this run, with the machine's other load. CPU time is the sum over all threads.",
             *([] if at_paper else [small]),
-            f"Each dot gives {VIEWS[scale]} rays, evaluated from its fitted rays over the pupil; training stops "
+            f"Each dot gives {DOT_RAYS[scale]} rays, evaluated from its fitted rays over the pupil; training stops "
             "when the error of the validation dots no longer falls.",
         ],
     )
@@ -181,16 +181,16 @@ def _cpu(trained: Mapping[str, Mapping[str, Any]], built: Mapping[str, Mapping[s
     return f"{sum(camera['cpu_s'] for camera in trained.values()):.1f}, {built['network']['cpu_s']:.1f}"
 
 
-def dense_labels(dots: BoardDots, views: int, pupil_radius_mm: float) -> tuple[np.ndarray, ...]:
-    """Sample rays of every dot at `views` points of the pupil, from a quadratic fit to the dot's labels.
+def dense_labels(dots: BoardDots, rays: int, pupil_radius_mm: float) -> tuple[np.ndarray, ...]:
+    """Sample rays of every dot at `rays` points of the pupil, from a quadratic fit to the dot's labels.
 
     Returns
     -------
     tuple of ndarray
         Points (n, 3), pupil points (n, 2), array positions (n, 2) [mm], and each ray's dot (n,).
     """
-    number = np.arange(views) + 0.5
-    radius, angle = np.sqrt(number / views), np.pi * (1 + np.sqrt(5)) * number  # sunflower: evenly over the disc
+    number = np.arange(rays) + 0.5
+    radius, angle = np.sqrt(number / rays), np.pi * (1 + np.sqrt(5)) * number  # sunflower: evenly over the disc
     wanted = PUPIL_PART * np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
     def terms(pupil: np.ndarray) -> np.ndarray:
@@ -203,8 +203,8 @@ def dense_labels(dots: BoardDots, views: int, pupil_radius_mm: float) -> tuple[n
         if mine.sum() < 2 * terms(wanted).shape[1]:
             continue
         fitted = np.linalg.lstsq(terms(dots.pupil_mm[mine] / pupil_radius_mm), dots.array_mm[mine], rcond=None)[0]
-        points.append(np.broadcast_to(dots.points_mm[mine][0], (views, 3)))
+        points.append(np.broadcast_to(dots.points_mm[mine][0], (rays, 3)))
         array.append(terms(wanted) @ fitted)
-        names.append(np.full(views, name))
+        names.append(np.full(rays, name))
     pupil = np.tile(pupil_radius_mm * wanted, (len(points), 1))
     return np.concatenate(points), pupil, np.concatenate(array), np.concatenate(names)

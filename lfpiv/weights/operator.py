@@ -64,7 +64,7 @@ class Weights:
     cameras : mapping of str to CalibratedCamera
         The cameras.
     projectors : mapping of str to Projector
-        Weights of each camera. Of cameras that are not in it every voxel is counted when they are first needed.
+        Weights of each camera. The weights of other cameras are counted when first needed.
     method : {"footprint", "count"}
         How the weights were made.
     choices : mapping of str to Choice, optional
@@ -131,7 +131,7 @@ class Weights:
 
     @property
     def T(self) -> Adjoint:
-        """The adjoint operator: ``weights.T(images)`` sums weight * image over each voxel's pixels."""
+        """Adjoint operator: ``weights.T(images)`` sums weight * image over each voxel's pixels."""
         return Adjoint(self)
 
     def image(self, camera: str, voxel: tuple[int, int, int]) -> np.ndarray:
@@ -147,6 +147,11 @@ class Weights:
         Returns
         -------
         ndarray, shape (rows, columns), float32
+
+        Raises
+        ------
+        ValueError
+            If the camera is unknown or the voxel lies outside the grid.
         """
         if camera not in self.cameras:
             raise ValueError(f"camera: expected one of {', '.join(self.cameras)}, got {camera!r}.")
