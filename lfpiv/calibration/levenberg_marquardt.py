@@ -110,8 +110,8 @@ def levenberg_marquardt(
     Fit
         Holds the layers of the epoch with the lowest validation error.
     """
-    unpack = _unpacker(layers)
-    theta = np.concatenate([layer.ravel() for layer in layers])
+    unpack = unpacker(layers)
+    theta = flattened(layers)
     gram, gradient, squares = normal_equations(layers, training)
     training_rms, validation_rms = [math.sqrt(squares / training.outputs.size)], [_rms_error(layers, validation)]
     best, best_theta, mark, mark_epoch = validation_rms[0], theta, validation_rms[0], 0
@@ -148,7 +148,12 @@ def levenberg_marquardt(
     return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 
 
-def _unpacker(layers: Sequence[np.ndarray]) -> Callable[[np.ndarray], list[np.ndarray]]:
+def flattened(layers: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the parameters of all layers as one vector."""
+    return np.concatenate([layer.ravel() for layer in layers])
+
+
+def unpacker(layers: Sequence[np.ndarray]) -> Callable[[np.ndarray], list[np.ndarray]]:
     """Return the function that cuts one vector of parameters into layers of these shapes."""
     shapes, edges = [layer.shape for layer in layers], np.cumsum([layer.size for layer in layers])[:-1]
 

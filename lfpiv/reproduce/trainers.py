@@ -13,12 +13,20 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
 
-from lfpiv.calibration.levenberg_marquardt import Fit, Samples, TrainingStop, forward, normal_equations
+from lfpiv.calibration.levenberg_marquardt import (
+    Fit,
+    Samples,
+    TrainingStop,
+    flattened,
+    forward,
+    normal_equations,
+    unpacker,
+)
 
 FIRST_DAMPING, LEAST_DAMPING, LAST_DAMPING = 5e-3, 1e-20, 1e10
 """Damping of the first step, smallest damping, and damping at which training stops: the customary values for [1]_."""
@@ -60,8 +68,8 @@ def bayesian_regularisation(
     patience, tolerance
         Training stops when the training error has fallen by less than the fraction `tolerance` in `patience` epochs.
     """
-    pack, unpack = _packing(layers)
-    theta = pack(layers)
+    unpack = unpacker(layers)
+    theta = flattened(layers)
     values = training.outputs.size
     gram, gradient, squares = normal_equations(layers, training)
     training_rms, validation_rms = [np.sqrt(squares / values)], [_rms(layers, validation)]
@@ -120,8 +128,8 @@ def gradient_descent(
     patience, tolerance
         Not used. Training ends by its epochs, or when the rate has fallen to `LAST_RATE`.
     """
-    pack, unpack = _packing(layers)
-    theta = best_theta = pack(layers)
+    unpack = unpacker(layers)
+    theta = best_theta = flattened(layers)
     step, rate, stalled = np.zeros_like(theta), FIRST_RATE, 0
     training_rms, validation_rms = [_rms(layers, training)], [_rms(layers, validation)]
     best, stop = validation_rms[0], TrainingStop.EPOCH_LIMIT
@@ -132,7 +140,7 @@ def gradient_descent(
             part = Samples(
                 inputs=training.inputs[batch], outputs=training.outputs[batch], weights=training.weights[batch]
             )
-            gradient = pack(_gradient(unpack(theta), part))
+            gradient = flattened(_gradient(unpack(theta), part))
             gradient *= min(1.0, LONGEST_GRADIENT / max(float(np.linalg.norm(gradient)), 1e-300))
             step = MOMENTUM * step - rate * gradient
             theta = theta + step
@@ -148,22 +156,6 @@ def gradient_descent(
                 stop = TrainingStop.VALIDATION
                 break
     return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
-
-
-def _packing(
-    layers: Sequence[np.ndarray],
-) -> tuple[Callable[[Sequence[np.ndarray]], np.ndarray], Callable[[np.ndarray], list[np.ndarray]]]:
-    """Return the functions from layers to one vector and back."""
-    shapes = [layer.shape for layer in layers]
-    edges = np.cumsum([layer.size for layer in layers])[:-1]
-
-    def pack(parts: Sequence[np.ndarray]) -> np.ndarray:
-        return np.concatenate([part.ravel() for part in parts])
-
-    def unpack(vector: np.ndarray) -> list[np.ndarray]:
-        return [part.reshape(shape) for part, shape in zip(np.split(vector, edges), shapes, strict=True)]
-
-    return pack, unpack
 
 
 def _hyperparameters(gamma: float, values: int, squares: float, theta: np.ndarray) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,10 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
             shown[name] = volumes[0]
     progress("cameras", 1.0)
     _draw(judged, ppms, shown, work / "cameras.png")
+    return _result(own, judged, ppms, seed)
+
+
+def _result(own: Bench, judged: Mapping[tuple[str, float], Judged], ppms: Sequence[float], seed: int) -> dict[str, Any]:
     densest = ppms[-1]
     rows = [[NAMES[name], ppm, *one.cells(), one.elongation] for (name, ppm), one in judged.items()]
     return page.result(

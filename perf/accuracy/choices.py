@@ -139,6 +139,17 @@ def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int,
             )
         judged[key] = own.judge(*made, pair=pair, correlation=Correlation(**choice.correlation))
     progress("choices", 1.0)
+    return _result(own, {key: choices[key] for key in judged}, default, judged, mapping, work)
+
+
+def _result(
+    own: Bench,
+    choices: Mapping[str, Choice],
+    default: Judged,
+    judged: Mapping[str, Judged],
+    mapping: Mapping[str, float],
+    work: Path,
+) -> dict[str, Any]:
     gaps = {key: bench.difference(one, default) for key, one in judged.items()}
     _draw(choices, judged, gaps, default, work / "choices.png")
     return page.result(

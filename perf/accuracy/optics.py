@@ -34,13 +34,18 @@ class Optics:
 
     label: str
     short: str
-    """Label in pictures."""
+    """Label in pictures, with line breaks."""
     shared: Mapping[str, Any] = field(default_factory=dict)
     """Tables of the scene."""
     water: bool = False
     """The particles are in water, behind 8 mm of acrylic glass facing each camera."""
     measured: bool = False
     """Whether both cameras measure a pair through it. Otherwise the rays of one camera are compared."""
+
+    @property
+    def name(self) -> str:
+        """Label on one line."""
+        return self.short.replace("\n", " ")
 
 
 OPTICS = {
@@ -101,7 +106,7 @@ def compute(scale: str, work: Path, optics: Mapping[str, Optics], *, seed: int, 
     for done, (key, one) in enumerate(optics.items()):
 
         def step(what: str, fraction: float, done: int = done, one: Optics = one) -> None:
-            progress(f"{one.short.replace(chr(10), ' ')}: {what}", (done + fraction) / len(optics))
+            progress(f"{one.name}: {what}", (done + fraction) / len(optics))
 
         rig = rigs.calibrated_rig(optics_scene(scale, seed, one), work / key / "rig", step)
         own = Bench(rig, size, work / key / "runs", seed)
@@ -169,28 +174,13 @@ def _result(
     size: tuple[float, float, float],
 ) -> dict[str, Any]:
     measured = [key for key, one in optics.items() if one.measured]
-    rows = []
-    for key in optics:
-        for name in ("drt", "network"):
-            rows.append(
-                page.compare(
-                    f"rays off by, {NAMES[name]}, {optics[key].short.replace(chr(10), ' ')}",
-                    errors[key][name]["mean"],
-                    at_most=0.015 if name == "network" else None,
-                    unit="pitch",
-                )
-            )
-    for key in measured:
-        for name in ("drt", "network"):
-            what = f"{NAMES[name]}, {optics[key].short.replace(chr(10), ' ')}"
-            rows.append(page.compare(f"displacement error, {what}", judged[key, name].error.mean, unit="voxel"))
     return page.result(
         {
             "mapping_error_pitch": errors,
             "pairs": {key: {name: judged[key, name].row() for name in (*CORRELATED, "truth")} for key in measured},
             "size_mm": size,
         },
-        comparison=rows,
+        comparison=_comparison(optics, errors, judged),
         figures=[
             (
                 "optics.png",
@@ -217,7 +207,7 @@ def _result(
                 "flow's mean over each window",
                 "columns": ["optics", "mapping", "error", "x", "y", "z", "valid", "Q", "R_acc", "R_g", "ghosts"],
                 "rows": [
-                    [optics[key].short.replace("\n", " "), NAMES[name], one.error.mean, *one.error.mean_absolute]
+                    [optics[key].name, NAMES[name], one.error.mean, *one.error.mean_absolute]
                     + [one.valid, one.q, one.accuracy, one.ghost_ratio, one.ghosts]
                     for (key, name), one in judged.items()
                 ],
@@ -238,6 +228,22 @@ def _result(
             *(_about_pair(optics[key], {name: judged[key, name] for name in CORRELATED}) for key in measured),
         ],
     )
+
+
+def _comparison(
+    optics: Mapping[str, Optics], errors: Mapping[str, RayErrors], judged: Mapping[tuple[str, str], Judged]
+) -> list[dict[str, Any]]:
+    rows = []
+    for key, one in optics.items():
+        for name in ("drt", "network"):
+            goal = 0.015 if name == "network" else None
+            what = f"rays off by, {NAMES[name]}, {one.name}"
+            rows.append(page.compare(what, errors[key][name]["mean"], at_most=goal, unit="pitch"))
+    for key, one in optics.items():
+        for name in ("drt", "network") if one.measured else ():
+            what = f"displacement error, {NAMES[name]}, {one.name}"
+            rows.append(page.compare(what, judged[key, name].error.mean, unit="voxel"))
+    return rows
 
 
 def _about_fits(optics: Mapping[str, Optics], errors: Mapping[str, RayErrors]) -> list[str]:
@@ -291,7 +297,7 @@ def _draw(
             place = np.arange(3) + (number + 0.5) * width - 0.4
             panel.bar(place, one.error.mean_absolute, width, color=COLOURS[name], label=f"Q {one.q:.2f}")
         panel.set_xticks(range(3), ["x", "y", "z"])
-        panel.set_title(optics[key].short.replace("\n", " "), fontsize=9)
+        panel.set_title(optics[key].name, fontsize=9)
         panel.set_ylabel("mean absolute error [voxel]")
     top = max(one.error.mean_absolute[k] for (_, name), one in judged.items() if name in CORRELATED for k in range(3))
     for panel in axes:
@@ -308,6 +314,5 @@ def _draw_slices(optics: Mapping[str, Optics], shown: Mapping[tuple[str, str], x
     columns = ("truth", *CORRELATED)
     for row, key in zip(drawn.subplots(len(measured), len(columns), squeeze=False), measured, strict=True):
         for axes, name in zip(row, columns, strict=True):
-            short = optics[key].short.replace("\n", " ")
-            plots.draw_slice(axes, shown[key, name], SLICE_VOXEL, f"{short}:\n{NAMES[name]}")
+            plots.draw_slice(axes, shown[key, name], SLICE_VOXEL, f"{optics[key].name}:\n{NAMES[name]}")
     plots.save(drawn, path)
