@@ -53,6 +53,18 @@ class TrainingStop(enum.Enum):
     EPOCH_LIMIT = "epoch limit reached while the validation error still fell: raise network.epochs"
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingRules:
+    """Rules that end a training."""
+
+    epochs: int = 200
+    """Largest number of epochs."""
+    patience: int = 15
+    """Epochs without a fall of the validation error after which training stops."""
+    tolerance: float = 1e-3
+    """Relative fall of the validation error that counts."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Samples:
     """Scaled samples of a trainer."""
@@ -79,15 +91,11 @@ class Fit:
     """Reason why training ended."""
 
 
-def levenberg_marquardt(
-    layers: list[np.ndarray],
-    training: Samples,
-    validation: Samples,
-    *,
-    epochs: int,
-    patience: int,
-    tolerance: float,
-) -> Fit:
+Trainer = Callable[[list[np.ndarray], Samples, Samples, TrainingRules], Fit]
+"""Train first layers on scaled samples: ``trainer(layers, training, validation, rules)``."""
+
+
+def levenberg_marquardt(layers: list[np.ndarray], training: Samples, validation: Samples, rules: TrainingRules) -> Fit:
     """Train by Levenberg-Marquardt with geodesic acceleration and early stopping.
 
     D is the largest diagonal of J^T J so far (Marquardt's scaling).
@@ -98,12 +106,8 @@ def levenberg_marquardt(
         First layers.
     training, validation : Samples
         Scaled samples. The validation part decides when to stop and which epoch is returned.
-    epochs : int
-        Largest number of accepted steps.
-    patience : int
-        Epochs without a fall of the validation error by `tolerance` after which training stops.
-    tolerance : float
-        Relative fall of the validation error that counts.
+    rules : TrainingRules
+        Rules that end the training. An epoch is an accepted step.
 
     Returns
     -------
@@ -117,7 +121,7 @@ def levenberg_marquardt(
     best, best_theta, mark, mark_epoch = validation_rms[0], theta, validation_rms[0], 0
     damping, growth, scale = FIRST_DAMPING, 2.0, np.zeros(theta.size)
     stop = TrainingStop.EPOCH_LIMIT
-    while len(training_rms) <= epochs:
+    while len(training_rms) <= rules.epochs:
         scale = np.maximum(scale, gram.diagonal())
         scale = np.maximum(scale, LEAST_SCALE * scale.max())
         while damping < LAST_DAMPING:
@@ -140,9 +144,9 @@ def levenberg_marquardt(
         validation_rms.append(_rms_error(unpack(theta), validation))
         if validation_rms[-1] < best:
             best, best_theta = validation_rms[-1], theta
-        if best < mark * (1 - tolerance):
+        if best < mark * (1 - rules.tolerance):
             mark, mark_epoch = best, len(training_rms) - 1
-        elif len(training_rms) - 1 - mark_epoch >= patience:
+        elif len(training_rms) - 1 - mark_epoch >= rules.patience:
             stop = TrainingStop.VALIDATION
             break
     return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)

@@ -14,7 +14,7 @@ import numpy as np
 from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.cameras import MODEL_ERROR_PITCH
-from lfpiv.calibration.levenberg_marquardt import levenberg_marquardt
+from lfpiv.calibration.levenberg_marquardt import Trainer, levenberg_marquardt
 from lfpiv.calibration.network import sigma_nor
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
 from lfpiv.calibration.training import TrainingSettings, train
@@ -28,7 +28,7 @@ from lfpiv.simulation.scene import true_mapping
 
 TITLE = "Table 1: error of the mapping by trainer and depth of the network"
 
-TRAINERS = {"LM": levenberg_marquardt, "BR": bayesian_regularisation, "GDM": gradient_descent}
+TRAINERS: dict[str, Trainer] = {"LM": levenberg_marquardt, "BR": bayesian_regularisation, "GDM": gradient_descent}
 NAMES = {
     "LM": "Levenberg-Marquardt",
     "BR": "Bayesian regularisation",

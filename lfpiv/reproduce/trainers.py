@@ -21,6 +21,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
 from lfpiv.calibration.levenberg_marquardt import (
     Fit,
     Samples,
+    TrainingRules,
     TrainingStop,
     flattened,
     forward,
@@ -43,13 +44,7 @@ LONGEST_GRADIENT = 1.0
 
 
 def bayesian_regularisation(
-    layers: list[np.ndarray],
-    training: Samples,
-    validation: Samples,
-    *,
-    epochs: int,
-    patience: int,
-    tolerance: float,
+    layers: list[np.ndarray], training: Samples, validation: Samples, rules: TrainingRules
 ) -> Fit:
     """Train by Levenberg-Marquardt on beta E_D + alpha E_W, alpha and beta estimated from the data ([1]_, [2]_).
 
@@ -63,10 +58,9 @@ def bayesian_regularisation(
         First weights, each (inputs + 1, nodes) with the bias in the last row.
     training, validation : Samples
         Scaled samples.
-    epochs : int
-        Accepted steps at most.
-    patience, tolerance
-        Training stops when the training error has fallen by less than the fraction `tolerance` in `patience` epochs.
+    rules : TrainingRules
+        An epoch is an accepted step. Training stops when the training error has fallen by less than the fraction
+        `tolerance` in `patience` epochs.
     """
     unpack = unpacker(layers)
     theta = flattened(layers)
@@ -75,7 +69,7 @@ def bayesian_regularisation(
     training_rms, validation_rms = [np.sqrt(squares / values)], [_rms(layers, validation)]
     gamma, damping, stop = float(theta.size), FIRST_DAMPING, TrainingStop.EPOCH_LIMIT
     alpha, beta = _hyperparameters(min(gamma, 0.9 * values), values, squares, theta)
-    while len(training_rms) <= epochs:
+    while len(training_rms) <= rules.epochs:
         objective = beta * squares + alpha * (theta @ theta)
         while damping < LAST_DAMPING:
             factor = _factor(beta * gram, alpha + damping)
@@ -99,21 +93,14 @@ def bayesian_regularisation(
         alpha, beta = _hyperparameters(gamma, values, squares, theta)
         training_rms.append(np.sqrt(squares / values))
         validation_rms.append(_rms(unpack(theta), validation))
-        if len(training_rms) > patience and training_rms[-1] > (1 - tolerance) * training_rms[-1 - patience]:
+        patience = rules.patience
+        if len(training_rms) > patience and training_rms[-1] > (1 - rules.tolerance) * training_rms[-1 - patience]:
             stop = TrainingStop.MINIMUM
             break
     return Fit(layers=unpack(theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 
 
-def gradient_descent(
-    layers: list[np.ndarray],
-    training: Samples,
-    validation: Samples,
-    *,
-    epochs: int,
-    patience: int,
-    tolerance: float,
-) -> Fit:
+def gradient_descent(layers: list[np.ndarray], training: Samples, validation: Samples, rules: TrainingRules) -> Fit:
     """Train by gradient descent with momentum ([3]_) on small batches of samples in random order.
 
     With the gradient of all samples, one step per epoch, deep networks hardly train in a thousand epochs. Batches give
@@ -123,10 +110,8 @@ def gradient_descent(
     ----------
     layers, training, validation : as for `lfpiv.calibration.levenberg_marquardt.levenberg_marquardt`
         The result is the epoch with the lowest validation error.
-    epochs : int
-        Passes over the samples at most.
-    patience, tolerance
-        Not used. Training ends by its epochs, or when the rate has fallen to `LAST_RATE`.
+    rules : TrainingRules
+        Only the number of epochs is used. Training also stops when the rate has fallen to `LAST_RATE`.
     """
     unpack = unpacker(layers)
     theta = best_theta = flattened(layers)
@@ -134,7 +119,7 @@ def gradient_descent(
     training_rms, validation_rms = [_rms(layers, training)], [_rms(layers, validation)]
     best, stop = validation_rms[0], TrainingStop.EPOCH_LIMIT
     rng = np.random.default_rng(len(training.inputs))
-    for _ in range(epochs):
+    for _ in range(rules.epochs):
         order = rng.permutation(len(training.inputs))
         for batch in np.array_split(order, max(1, len(order) // BATCH)):
             part = Samples(
