@@ -1,4 +1,4 @@
-"""Kernels of lfpiv: arrays in, arrays out. Taichi traces and counts rays, Warp weighs, projects and correlates."""
+"""Kernels of lfpiv, arrays in and arrays out: Taichi traces and counts rays, Warp weights, projects and correlates."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Slow, obvious NumPy twins of the kernels: specification and oracle. Nobody may optimise them."""
+"""Slow, obvious NumPy twins of the kernels: their specification and the oracle of their tests. Do not optimise them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 
 def position(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
-    """(s, t) [mm] of a voxel's rays through pupil points, shape (..., 2); `model` as in ``footprint.MODEL_SIZE``."""
+    """Return (s, t) [mm] of a voxel's rays through pupil points, shape (..., 2); `model`: ``ray_model.MODEL_SIZE``."""
     u, v = pupil[..., 0], pupil[..., 1]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     return np.stack([terms @ model[:6], terms @ model[6:12]], axis=-1)
 
 
 def slope(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
-    """K = d(s, t)/d(u, v) at one pupil point, shape (2, 2)."""
+    """Return K = d(s, t)/d(u, v) at one pupil point, shape (2, 2)."""
     u, v = pupil
     return np.array(
         [[c[1] + 2 * c[3] * u + c[4] * v, c[2] + c[4] * u + 2 * c[5] * v] for c in (model[:6], model[6:12])]
@@ -21,7 +21,7 @@ def slope(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
 
 
 def smeared_step(x, widths):
-    """Integral from -infinity to x of a unit mass smeared by the two boxes."""
+    """Return the integral from -infinity to x of a unit mass smeared by two boxes, the wider one first."""
     wide, narrow = widths
 
     def ramp(y):
@@ -31,14 +31,14 @@ def smeared_step(x, widths):
 
 
 def two_widths(smears):
-    """Return the widest smear and one box with the variance of the others, widest first."""
+    """Return the widest smear and one box with the variance of the others, the wider one first."""
     smears = np.sort(np.abs(smears))
     rest = np.sqrt((smears[:-1] ** 2).sum())
     return max(smears[-1], rest, 1e-4), max(min(smears[-1], rest), 1e-4)
 
 
 def footprint(model, *, optics, lattice, frame, rectangles, local=False):
-    """Sensor image of one voxel's weights, the formulas of ``lfpiv_kernels.weights.footprint`` pixel by pixel.
+    """Return the sensor image of one voxel's weights: the formulas of ``weights.footprint`` pixel by pixel.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
     frame, rectangles
         From ``lattice.cell_frame`` and ``lattice.cell_rectangles``.
     local : bool
-        Slopes followed pixel by pixel instead of taken under the lens's middle.
+        Take the slopes of each pixel instead of those of the lens's middle.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
             for k in np.flatnonzero(seen):
                 distance = np.linalg.norm(points[k])
                 normal = np.sort(np.abs(points[k]) / max(distance, 1e-9))[::-1]
-                bent = width / (24 * radius)  # the pupil's edge, straight within a pixel, moved by its mean curvature
+                bent = width / (24 * radius)  # the edge is taken as straight, moved by its mean curvature
                 covered = float(
                     np.clip(smeared_step((radius - distance) / width - bent, np.maximum(normal, 1e-4)), 0, 1)
                 )
@@ -112,7 +112,7 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
 
 
 def count(rays, shift, window, first_pixel, *, optics, lattice, samples, shape):
-    """Rays per pixel, ray by ray; arguments and result as ``trace.count_rays``."""
+    """Count the rays per pixel, ray by ray; arguments and results as in ``rays.count.count_rays``."""
     counts = np.zeros((len(first_pixel), *shape), np.int64)
     total = np.zeros(len(first_pixel), np.int64)
     step = 2 * optics.pupil_radius_mm / samples
@@ -136,7 +136,7 @@ def count(rays, shift, window, first_pixel, *, optics, lattice, samples, shape):
 
 
 def dense(blocks) -> np.ndarray:
-    """Matrix of a ``project.Blocks``, shape (sensor pixel, voxel), float64: every ray's weight times its share."""
+    """Return a ``projector.Blocks`` as a matrix, shape (sensor pixel, voxel), float64: weights of rays times shares."""
     rays = blocks.microimages
     matrix = np.zeros((rays.sensor_shape[0] * rays.sensor_shape[1], len(blocks.scale)))
     for voxel in range(len(blocks.scale)):
@@ -157,7 +157,7 @@ def dense(blocks) -> np.ndarray:
 
 
 def smart(matrix, image, volume, *, iterations, relaxation=1.0, floor=0.0, paper=False):
-    """SMART with a dense matrix (pixel, voxel): Eq. 5, normalised by column, or as printed with `paper`."""
+    """Return SMART's volume with a dense matrix (pixel, voxel): Eq. 5 normalised by column, or as printed (`paper`)."""
     column_sum = matrix.sum(0)
     pixels = (matrix > 0).sum(0)
     for _ in range(iterations):

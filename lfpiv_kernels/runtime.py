@@ -1,6 +1,6 @@
-"""The only owner of Taichi's and Warp's global state: picks the device, starts both, runs Warp launches on threads.
+"""The global state of Taichi and Warp: pick the device, start both once per process, run launches on threads.
 
-A second ``ti.init`` would kill every live Taichi field, so the runtime starts once per process.
+Nothing else may call ``ti.init`` or ``wp.init``. A second ``ti.init`` would destroy every live Taichi field.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 CHUNKS = 8
-"""Parts into which a CPU launch is cut. Fixed, so that results do not depend on the number of threads."""
+"""Parts of work that `run_chunks` cuts on the CPU. Fixed, so that results do not depend on the number of threads."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class Device:
     kind: str
     """ "cpu" or "cuda"."""
     threads: int
-    """Threads used by CPU launches."""
+    """Threads that run CPU launches."""
     reason: str = ""
-    """Why this device was picked, where the request left a choice."""
+    """Why this device was picked; empty if it was the one requested."""
 
     @property
     def warp(self) -> str:
-        """Warp's name of the device."""
+        """Name of the device in Warp."""
         return "cuda:0" if self.kind == "cuda" else "cpu"
 
 
@@ -43,22 +43,22 @@ _forked = False
 
 
 def start(request: str = "auto", *, threads: int | None = None) -> Device:
-    """Start the kernels' runtime once per process and return its device.
+    """Start the runtime once per process and return its device.
 
     Parameters
     ----------
     request : {"auto", "cpu", "cuda"}
-        "auto" takes a CUDA device where there is one and says once why not; "cuda" never falls back.
+        "auto" takes a CUDA device if there is one, else it takes the CPU and logs why. "cuda" never takes the CPU.
     threads : int, optional
-        CPU threads; default: the cores this process may use.
+        CPU threads. Default: the cores that this process may use.
 
     Raises
     ------
     ValueError
         If `request` is none of the three.
     RuntimeError
-        If "cuda" was requested and none is visible, the runtime already runs on another device, or it ran when this
-        process was forked: its threads stayed behind.
+        If "cuda" was requested and no device is visible, if the runtime already runs on another device, or if it ran
+        when this process was forked: its threads are not in this process.
     """
     if request not in ("auto", "cpu", "cuda"):
         raise ValueError(f"device: expected 'auto', 'cpu' or 'cuda', got {request!r}.")
@@ -82,8 +82,8 @@ def _start(request: str, threads: int | None) -> Device:
 
     import warp as wp
 
-    wp.config.log_level = wp.LOG_ERROR  # no banner, no compilation notes on the user's terminal
-    with _quiet_stderr():  # where there is no CUDA driver, Warp's native code says so whatever the log level
+    wp.config.log_level = wp.LOG_ERROR  # no banner, no notes on compilation
+    with _quiet_stderr():  # without a CUDA driver, native code writes whatever the log level
         wp.init()
     if request == "cuda" and not wp.is_cuda_available():
         raise RuntimeError("device: 'cuda' was requested but none is visible; use 'auto' to allow the CPU.")
@@ -104,28 +104,28 @@ def _start(request: str, threads: int | None) -> Device:
     _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
     _device = Device(kind, count, reason)
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=_leave_behind)
+        os.register_at_fork(after_in_child=_forget_threads)
     if reason:
         log.info("kernels run on the CPU (%d %s): %s", count, "thread" if count == 1 else "threads", reason)
     return _device
 
 
-def _leave_behind() -> None:
-    """In a process forked from this one: neither the pool's threads nor Taichi's are there, so jobs would never end."""
+def _forget_threads() -> None:
+    """Refuse work in a forked process: it has neither the pool's threads nor Taichi's, so jobs would never end."""
     global _device, _pool, _forked
     _device, _pool, _forked = None, None, True
 
 
 def cores() -> int:
-    """Return the number of cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextlib.contextmanager
 def _quiet_stderr() -> Iterator[None]:
-    """Send what native code writes to standard error to nowhere; where that is closed, it goes there anyway."""
+    """Discard what native code writes to standard error. Do nothing where standard error is closed."""
     try:
-        kept = os.dup(2)
+        saved = os.dup(2)
     except OSError:
         yield
         return
@@ -134,21 +134,21 @@ def _quiet_stderr() -> Iterator[None]:
         os.dup2(nowhere, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved, 2)
+        os.close(saved)
         os.close(nowhere)
 
 
 def device() -> Device:
-    """Return the running device; starts it with "auto" where nothing ran yet."""
+    """Return the running device. Start it with "auto" if nothing runs yet."""
     return _device or start("auto")
 
 
 def run_chunks(size: int, job: Callable[[int, int, int], None], *, chunks: int = CHUNKS) -> None:
-    """Call ``job(chunk, first, last)`` for contiguous parts of ``range(size)``: threaded on the CPU, once on CUDA.
+    """Call ``job(chunk, first, last)`` for contiguous parts of ``range(size)``: on threads on the CPU, once on CUDA.
 
     A Warp launch on the CPU runs on one thread and releases the GIL, so Python threads scale. Jobs must write disjoint
-    memory. Exceptions of a job are raised here.
+    memory. Exceptions of a job are raised here. Kernels whose parts need nothing else are launched by ``launch``.
     """
     where = device()
     if where.kind == "cuda":
@@ -156,7 +156,7 @@ def run_chunks(size: int, job: Callable[[int, int, int], None], *, chunks: int =
         return
     edges = [size * part // chunks for part in range(chunks + 1)]
     parts = [(part, edges[part], edges[part + 1]) for part in range(chunks) if edges[part + 1] > edges[part]]
-    if where.threads == 1:  # handing chunks to another thread took a tenth of the time of small volumes
+    if where.threads == 1:  # another thread would cost time and bring none
         for part in parts:
             job(*part)
         return

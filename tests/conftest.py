@@ -21,7 +21,7 @@ def pytest_addoption(parser):
 
 @pytest.fixture(scope="session", autouse=True)
 def device(request):
-    """The running kernel device, started once and before any test can pick another."""
+    """Start the kernel device once, before any test can choose another."""
     from lfpiv_kernels import runtime
 
     return runtime.start(request.config.getoption("--device"))
@@ -29,7 +29,7 @@ def device(request):
 
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory, device):
-    """Return a small simulated experiment, run from images to vectors: see `small_run.SmallRun`."""
+    """Return a small simulated experiment, run from images to vectors; see `small_run.SmallRun`."""
     from support.small_run import make_small_run
 
     return make_small_run(tmp_path_factory.mktemp("small"), device.kind)
@@ -45,7 +45,7 @@ def reported(tmp_path_factory, device):
 
 @pytest.fixture(scope="session")
 def sample_data():
-    """Folder of the sample data; its tests are skipped where it is absent, unless it is required."""
+    """Return the folder of the sample data. Skip the test where it is missing, or fail if it is required."""
     if SAMPLE_DATA.is_dir():
         return SAMPLE_DATA
     message = f"the sample data folder {os.path.relpath(SAMPLE_DATA, SAMPLE_DATA.parents[1])} is not there"
@@ -65,12 +65,12 @@ CHROMIUM_OPTIONS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 )
-"""No network, no profile, and WebGL in software."""
+"""Options of Chromium: no network, no profile, WebGL in software."""
 
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory):
-    """Headless Chromium with WebGL; its tests are skipped where it is absent, unless it is required."""
+    """Start headless Chromium with WebGL. Skip the test where it is missing, or fail if it is required."""
     missing = [name for name in ("chromium", "chromedriver") if shutil.which(name) is None]
     missing += ["selenium"] if importlib.util.find_spec("selenium") is None else []
     if missing:
@@ -138,7 +138,7 @@ pairs = 2
 
 @pytest.fixture
 def tiny_experiment(tmp_path):
-    """Experiment file whose images are small random arrays: right in form, without any physics."""
+    """Write an experiment whose images are small random arrays: valid files without physics."""
     import numpy as np
     import tifffile
 

@@ -4,11 +4,13 @@
 """
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from support.public_names import public_modules, public_names
 
 import lfpiv
 
@@ -249,11 +251,12 @@ def test_import_is_light_and_silent():
 
 
 def test_type_checkers_see_every_public_name_where_it_is():
-    block = next(node for node in ast.parse(Path(lfpiv.__file__).read_text()).body if isinstance(node, ast.If))
-    assert ast.unparse(block.test) == "TYPE_CHECKING"
-    seen = {alias.name: node.module for node in block.body for alias in node.names}
-    assert seen == lfpiv._MODULES | dict.fromkeys(lfpiv._SUBMODULES, "lfpiv")
-    assert set(lfpiv._MODULES) == set(lfpiv.__all__) and (ROOT / "lfpiv" / "py.typed").exists()
+    seen = public_names()
+    assert set(lfpiv.__all__) <= set(seen) <= set(dir(lfpiv)) and (ROOT / "lfpiv" / "py.typed").exists()
+    for name in lfpiv.__all__:
+        assert getattr(lfpiv, name) is getattr(importlib.import_module(seen[name]), name), name
+    for name in public_modules():
+        assert seen[name] == "lfpiv" and getattr(lfpiv, name) is importlib.import_module(f"lfpiv.{name}"), name
 
 
 @pytest.mark.parametrize("name", lfpiv.__all__)

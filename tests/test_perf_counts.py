@@ -112,13 +112,14 @@ def test_blocks_lie_gap_free_inside_the_rays_and_end_where_they_are_lit(form, de
     for name in weights.cameras:
         blocks = weights.projector(name).blocks
         height, width = blocks.height.astype(np.int64), blocks.width.astype(np.int64)
-        assert height.min() > 0 and width.min() > 0 and width.max() <= ray_model.LANES
+        assert height.min() > 0 and width.min() > 0 and width.max() <= ray_model.BLOCK_WIDTH
         size = width + height if form == "profiles" else width * height
         start = np.concatenate([[0], np.cumsum(size)])
         assert (start[blocks.first_block] == blocks.first_value).all()
-        assert len(blocks.value) == start[-1] + ray_model.LANES
+        assert len(blocks.value) == start[-1] + ray_model.BLOCK_WIDTH
         assert blocks.ray.min() >= 0
-        assert (blocks.ray + (height - 1) * blocks.microimages.edge + ray_model.LANES <= blocks.microimages.size).all()
+        last_ray = blocks.ray + (height - 1) * blocks.microimages.edge + ray_model.BLOCK_WIDTH
+        assert (last_ray <= blocks.microimages.size).all()
         for block in range(0, len(height), 7):
             value = blocks.value[start[block] : start[block + 1]]
             if form == "pixels":

@@ -12,7 +12,7 @@ import numpy as np
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv_kernels.weights import microimages
 from lfpiv_kernels.weights.microimages import Microimages
-from lfpiv_kernels.weights.ray_model import LANES
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 
 def microimage_edge(optics: Optics) -> int:
@@ -61,21 +61,21 @@ def microimages_of(optics: Optics, lattice: LensLattice) -> Microimages:
     """
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
     first, centre = microimage_centres(optics, lattice, radius + 1)
-    rays: Microimages = microimages.lay_out(
+    rays: Microimages = microimages.lens_rays(
         (int(first[0]), int(first[1])), centre, radius, microimage_edge(optics), optics.sensor_shape
     )
     return rays
 
 
 def plain(sensor_shape: tuple[int, int]) -> Microimages:
-    """Return every pixel as one ray, in rows padded by LANES, for weights that were counted per pixel."""
+    """Return every pixel as one ray, in rows padded by BLOCK_WIDTH, for weights that were counted per pixel."""
     rows, columns = sensor_shape
-    pixel = np.full((rows, columns + LANES), -1, np.int32)
+    pixel = np.full((rows, columns + BLOCK_WIDTH), -1, np.int32)
     pixel[:, :columns] = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     return Microimages(
         first_lens=(0, 0),
         corner=np.zeros((1, 1, 2), np.int32),
-        edge=columns + LANES,
+        edge=columns + BLOCK_WIDTH,
         pixel=pixel.ravel(),
         share=(pixel.ravel() >= 0).astype(np.float32),
         sensor_shape=(rows, columns),

@@ -62,7 +62,7 @@ class ImageEquations:
         """Exclude other threads from the projectors."""
         with contextlib.ExitStack() as locks:
             for camera in self.cameras:
-                locks.enter_context(camera.projector.kept())
+                locks.enter_context(camera.projector.reserved())
             yield
 
     def compare(self, volume: np.ndarray) -> Misfit:

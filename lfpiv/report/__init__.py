@@ -1,8 +1,8 @@
-"""`write_report`: one self-contained HTML page for people, its pictures, data and scripts inside.
+"""Write the report of a run: one HTML page for people, with its pictures, data and scripts inside.
 
-The page opens without a network. Its size and the time it takes are bounded however many pairs a run has: charts over
-pairs are drawn from the summary, `fields.MOST_READ` vector files are read at most. Views that move are drawn by the
-scripts beside this file; still pictures stand in where scripts or WebGL are missing, and in print.
+The page opens without a network. Its size and the time to write it are bounded for any number of pairs: charts over
+pairs are drawn from the summary, and at most `fields.MOST_READ` vector files are read. The scripts in ``static`` draw
+the interactive views. Still pictures replace them where scripts or WebGL are missing, and in print.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.report import calibration as calibration_section
 from lfpiv.report import markup, overview, pairs, volumes
 from lfpiv.report import vectors as vector_section
+from lfpiv.report.summary import Summary
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
@@ -40,33 +41,36 @@ def write_report(
     Parameters
     ----------
     experiment : Experiment
-        What was run; its white and board images are shown.
+        Experiment of the run. The report shows its white and board images.
     calibration : Calibration
-        The calibration that was used.
+        Calibration of the run.
     summary : dict
-        The content of ``summary.json``; ``failed``, a list of ``{"pair": int, "reason": str}``, may be missing.
+        Content of ``summary.json``. ``failed``, a list of ``{"pair": int, "reason": str}``, may be missing.
     vectors : dict
-        Pair -> file of its vectors; a sample of them is read.
+        Pair -> file of its vectors. A sample of the files is read.
     path : Path
-        Target; written whole or not at all.
+        Target file, written completely or not at all.
 
     Raises
     ------
     InputError
-        If an image or a file of vectors that is shown cannot be read.
+        If an image or a file of vectors that the report shows cannot be read.
+    pydantic.ValidationError
+        If a figure of the summary is missing or has the wrong type.
     """
+    figures = Summary.model_validate(summary)
     sections = {
-        "run": overview.what_was_run(experiment, summary),
-        "calibration": calibration_section.section(experiment, calibration, summary),
-        "volumes": volumes.section(summary, vectors) if vectors else "",
+        "run": overview.run_facts(experiment, figures),
+        "calibration": calibration_section.section(experiment, calibration, figures.calibration),
+        "volumes": volumes.section(figures.pairs, vectors) if vectors else "",
         "vectors": vector_section.section(vectors),
-        "pairs": pairs.section(summary) if summary["pairs"] else "",
-        "time": overview.timings(summary),
-        "settings": overview.small_print(summary),
+        "pairs": pairs.section(figures.pairs, figures.failed) if figures.pairs else "",
+        "time": overview.timings(figures),
+        "settings": overview.settings_and_versions(figures),
     }
     body = [
-        overview.head(experiment, summary),
-        overview.warnings(summary),
+        overview.head(experiment, figures),
+        overview.warnings(figures),
         overview.contents(sections),
         *sections.values(),
     ]
@@ -84,12 +88,12 @@ def write_report(
 
 
 def _asset(name: str) -> str:
-    """Text of a file beside this module."""
+    """Return the text of a file in ``static``."""
     return (importlib.resources.files("lfpiv.report") / "static" / name).read_text("utf-8")
 
 
 def _plotly() -> str:
-    """Pack the library that draws in space; the script that needs it unpacks it."""
+    """Return plotly.js, gzipped, in a script element that ``space.js`` unpacks."""
     from plotly.offline import get_plotlyjs
 
     packed = base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode()

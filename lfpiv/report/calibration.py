@@ -1,22 +1,33 @@
-"""The report's section on the calibration: figures of each camera, its microimages, its board, its mapping."""
+"""Write the report's section on the calibration: figures, microimages, board images and mapping of each camera."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
+import cv2
 import numpy as np
+from matplotlib.colors import Normalize
+from matplotlib.patches import PathPatch, Polygon, Rectangle
 
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.experiment.experiment import CameraSetup, Experiment
-from lfpiv.report import calibration_panels as panels
+from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.optics import LensLattice, Optics, float_pair
 from lfpiv.report import markup
-from lfpiv.report.dot_map import DotMap, dot_map, dot_outlines_px
-from lfpiv.report.lens_map import LensMap, lens_map
+from lfpiv.report.dot_map import DotMap, dot_map, dot_outlines_px, rms_by
+from lfpiv.report.lens_map import LensMap, lattice_px, lens_map
 from lfpiv.report.markup import number
+from lfpiv.report.summary import CameraFigures
+from lfpiv.report.svg import INK, SERIES, arrows, colour_bar, new_panel, spread_ticks, style, to_svg
 
 PERCENTILES = (50, 75, 90, 95, 99)
-"""Percentiles of the errors of held-out labels."""
+"""Percentiles of the errors of held-out labels in the table [%]."""
+CROP_LENSES = 7
+"""Number of microimages along the edge of a crop of the white image."""
+PHOTO_WIDTH = 640
+"""Largest edge of a board image in the page [pixel], twice the width of a panel."""
+BINS = 50
+"""Number of bins of a histogram of errors."""
 
 _ROWS = (
     ("error on held-out dots, σ_nor (Eq. 8) [pitch]", "sigma_nor_test", 4),
@@ -34,27 +45,27 @@ _ROWS = (
 )
 
 
-def section(experiment: Experiment, calibration: Calibration, summary: Mapping[str, Any]) -> str:
-    """Write the section on the calibration.
+def section(experiment: Experiment, calibration: Calibration, figures: Mapping[str, CameraFigures]) -> str:
+    """Return the section on the calibration, as HTML.
 
     Parameters
     ----------
     experiment : Experiment
-        Its white and board images are shown.
+        Source of the white and board images.
     calibration : Calibration
-        The calibration that was used.
-    summary : dict
-        The content of ``summary.json``.
+        Calibration of the run.
+    figures : dict
+        Camera -> figures of its calibration.
     """
-    reports = summary["calibration"]
+    values = {key: [getattr(camera, key) for camera in figures.values()] for _, key, _ in _ROWS}
     rows = [
-        [title, *(number(report.get(key), digits) for report in reports.values())]
+        [title, *(number(value, digits) for value in values[key])]
         for title, key, digits in _ROWS
-        if any(report.get(key) is not None for report in reports.values())
+        if any(value is not None for value in values[key])
     ]
     parts = [
         '<h2 id="calibration">Calibration</h2>',
-        markup.table(["camera", *reports], rows, caption="Figures of the calibration by camera"),
+        markup.table(["camera", *figures], rows, caption="Figures of the calibration by camera"),
         markup.paragraph("A pitch is the distance between microlenses; errors in pitches lie on the microlens array."),
     ]
     for setup in experiment.cameras:
@@ -69,15 +80,16 @@ def section(experiment: Experiment, calibration: Calibration, summary: Mapping[s
 
 
 def _lens_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedCamera) -> str:
+    """Draw how the microimages of a camera fit their lattice; tabulate the cells of the sensor."""
     white, optics = experiment.white(setup.name), setup.optics
     found = lens_map(white, experiment.dark(setup.name), optics, camera.lattice)
-    edge = panels.crop_edge(white.shape, optics)
+    edge = crop_edge(white.shape, optics)
     corner, name = _worst_corner(found, white.shape, edge)
     middle = tuple((n - edge) // 2 for n in white.shape)
     shown = [
-        panels.lens_residuals(found, white.shape),
-        panels.white_crop(white, optics, camera.lattice, middle, "middle of the sensor"),
-        panels.white_crop(white, optics, camera.lattice, corner, f"{name}: the worst corner"),
+        lens_residuals(found, white.shape),
+        white_crop(white, optics, camera.lattice, middle, "middle of the sensor"),
+        white_crop(white, optics, camera.lattice, corner, f"{name}: the worst corner"),
     ]
     rows = [
         [
@@ -94,7 +106,7 @@ def _lens_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedC
     caption = (
         f"Microlens array of {setup.name}: {found.measured:,} microimages lie {found.total_rms_px:.3f} px (rms) off "
         f"the lattice; {found.left_out:,} were left out as dark or far off. Arrows are the mean of a cell, measured "
-        "minus lattice: where they follow a pattern, the lattice is wrong; at random, they are noise. Crosses should "
+        "minus lattice: a pattern means a wrong lattice, random directions mean noise. Crosses should "
         "sit in the middle of every microimage."
     )
     table = markup.table(titles, rows, caption=f"Microimages of {setup.name} off the lattice, by cell of the sensor")
@@ -102,7 +114,7 @@ def _lens_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedC
 
 
 def _worst_corner(found: LensMap, shape: tuple[int, int], edge: int) -> tuple[tuple[int, int], str]:
-    """Corner of the sensor whose cell is farthest off the lattice: its first row and column, and its name."""
+    """Find the corner with the largest rms distance from the lattice; return the crop's (row, column) and a name."""
     places = {
         "top left": (0, 0, 0, 0),
         "top right": (0, -1, 0, shape[1] - edge),
@@ -115,7 +127,7 @@ def _worst_corner(found: LensMap, shape: tuple[int, int], edge: int) -> tuple[tu
 
 
 def _board_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedCamera, found: DotMap | None) -> str:
-    """First, middle and last plane by depth; figures of all planes."""
+    """Draw the first, middle and last plane by depth; tabulate all planes."""
     board = experiment.board
     per_plane = board.dots[0] * board.dots[1]
     order = np.argsort(board.planes_mm)
@@ -126,7 +138,7 @@ def _board_figure(experiment: Experiment, setup: CameraSetup, camera: Calibrated
         outlines = dot_outlines_px(camera.map, setup.optics, board.dots, board.spacing_mm, depth)
         measured = np.isin(plane * per_plane + np.arange(per_plane), known)
         photo = experiment.board_image(setup.name, int(plane))
-        shown.append(panels.board_photo(photo, outlines, measured, f"z = {markup.general(depth)} mm"))
+        shown.append(board_photo(photo, outlines, measured, f"z = {markup.general(depth)} mm"))
     caption = (
         f"Board of {setup.name}, brightness by its square root, with the outline of each dot's light as the calibrated "
         "mapping predicts it. Dots and outlines should coincide in all planes. Dashed: not measured."
@@ -135,6 +147,7 @@ def _board_figure(experiment: Experiment, setup: CameraSetup, camera: Calibrated
 
 
 def _plane_table(experiment: Experiment, camera: CalibratedCamera, found: DotMap, order: np.ndarray) -> str:
+    """Tabulate counts and errors of the dots, by plane of the board."""
     board, dots = experiment.board, found.dots
     plane_of = found.number // (board.dots[0] * board.dots[1])
     rows = []
@@ -165,8 +178,9 @@ def _plane_table(experiment: Experiment, camera: CalibratedCamera, found: DotMap
 
 
 def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: DotMap) -> str:
+    """Draw the errors of the mapping at the dots and of the held-out labels; tabulate the worst."""
     board, grid = experiment.board, experiment.grid
-    shown = [panels.mapping_field(found, board.dots, grid, depth=depth) for depth in (False, True)]
+    shown = [mapping_field(found, board.dots, grid, depth=depth) for depth in (False, True)]
     numbers = markup.table(
         ["x, y, z [mm]", "labels", "mapping [pitch]", "labels, rms [pitch]"],
         _worst_dots(found),
@@ -174,7 +188,7 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
     )
     held_out = camera.test_errors
     if held_out is not None and len(held_out):
-        shown.append(panels.error_histogram(np.asarray(held_out)))
+        shown.append(error_histogram(np.asarray(held_out)))
         rows = [["mean, σ_nor", number(float(held_out.mean()), 4)]]
         rows += [[f"{share} % below", number(float(np.percentile(held_out, share)), 4)] for share in PERCENTILES]
         rows += [["largest", number(float(held_out.max()), 4)], ["labels", f"{len(held_out):,}"]]
@@ -185,14 +199,15 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
     rms = float(np.sqrt((found.error**2).mean()))
     caption = (
         f"Mapping of {camera.name} against its dots, over the field and over the depth: for each dot the mean over its "
-        f"rays, {rms:.4f} pitch (rms of {len(found.number):,} dots), rms over the third axis. What a dot's own place "
-        "errs by is part of it. The dashed frame is the volume: where it holds no dots, nothing is known of the "
-        "mapping. Held-out labels are single rays of dots that the training did not see."
+        f"rays, {rms:.4f} pitch (rms of {len(found.number):,} dots), rms over the third axis. Position errors of the "
+        "dots are included. The dashed frame is the volume: where it holds no dots, the mapping is not checked. "
+        "Held-out labels are single rays of dots that the training did not see."
     )
     return markup.figure(shown, caption, numbers)
 
 
 def _worst_dots(found: DotMap, most: int = 15) -> list[list[str]]:
+    """Return table rows of the dots with the largest error."""
     worst = np.argsort(-found.error, kind="stable")[:most]
     return [
         [
@@ -203,3 +218,142 @@ def _worst_dots(found: DotMap, most: int = 15) -> list[list[str]]:
         ]
         for dot in worst
     ]
+
+
+def lens_residuals(found: LensMap, shape: tuple[int, int]) -> str:
+    """Draw the distance of microimages from their lattice over the sensor: rms as colour, mean as arrows."""
+    rows, columns = shape
+    figure, (axes,) = new_panel(2.5 if columns >= rows else 3.4)
+    extent = (-0.5, columns - 0.5, rows - 0.5, -0.5)
+    shown = axes.imshow(found.rms_px, cmap="viridis", extent=extent, interpolation="none", vmin=0)
+    longest = float(np.nanmax(np.hypot(*np.moveaxis(found.mean_px, -1, 0)), initial=0.0))
+    cell = columns / len(found.column_px)
+    if longest > 0:
+        start = np.stack(np.meshgrid(found.column_px, found.row_px), axis=-1).reshape(-1, 2)
+        step = found.mean_px.reshape(-1, 2) * (cell / longest)
+        axes.add_patch(PathPatch(arrows(start - step / 2, step, 0.35 * cell), edgecolor="#ffffff", fill=False, lw=1.1))
+    axes.set(xlim=extent[:2], ylim=extent[2:])
+    title = f"off the lattice; longest mean {longest:.3f} px"
+    style(axes, title=title, xlabel="column [px]", ylabel="row [px]")
+    spread_ticks(axes)
+    colour_bar(figure, shown, axes, "rms [px]")
+    return to_svg(
+        figure, f"Map over the sensor: microimages lie {found.total_rms_px:.3f} px rms off the lattice; {title}."
+    )
+
+
+def white_crop(white: np.ndarray, optics: Optics, lattice: LensLattice, corner: tuple[int, int], title: str) -> str:
+    """Draw the part of the white image that starts at `corner` (row, column), with the fitted microimage centres."""
+    size = crop_edge(white.shape, optics)
+    row, column = corner
+    crop = white[row : row + size, column : column + size]
+    figure, (axes,) = new_panel(3.1)
+    extent = (column - 0.5, column + size - 0.5, row + size - 0.5, row - 0.5)
+    top = max(float(np.percentile(crop, 99.5)), 1e-9)
+    axes.imshow(crop, cmap="gray", extent=extent, vmin=0, vmax=top, interpolation="none")
+    centres = _centres_inside(optics, lattice, extent)
+    axes.plot(*centres.T, "+", color="#ff8a3c", markersize=8, markeredgewidth=1.3)
+    axes.set(xlim=extent[:2], ylim=extent[2:])
+    style(axes, title=title, xlabel="column [px]", ylabel="row [px]")
+    spread_ticks(axes)
+    return to_svg(figure, f"White image, {title}: each microimage with the fitted centre marked.")
+
+
+def crop_edge(shape: tuple[int, int], optics: Optics) -> int:
+    """Return the edge of a crop of the white image [pixel]."""
+    return int(min(*shape, np.ceil(CROP_LENSES * optics.microimage_pitch_px)))
+
+
+def board_photo(image: np.ndarray, outlines_px: np.ndarray, measured: np.ndarray, title: str) -> str:
+    """Draw a raw board image with the outline of each dot's light, dashed for dots that were not measured."""
+    rows, columns = image.shape
+    low, high = np.zeros(2), np.array([columns, rows]) - 1.0
+    if len(outlines_px):
+        ends = outlines_px.reshape(-1, 2).min(0), outlines_px.reshape(-1, 2).max(0)
+        margin = 0.06 * (ends[1] - ends[0]).max()
+        low, high = np.clip([ends[0] - margin, ends[1] + margin], 0, high)
+    left, top = np.floor(low).astype(int)
+    right, bottom = np.maximum(np.ceil(high).astype(int), [left + 1, top + 1])
+    crop = np.asarray(image[top : bottom + 1, left : right + 1], np.float32)
+    dim, bright = np.percentile(crop, [1, 99.9])
+    crop = np.sqrt(np.clip((crop - dim) / max(bright - dim, 1e-9), 0, 1))
+    shrink = min(PHOTO_WIDTH / max(crop.shape), 1.0)
+    if shrink < 1:
+        crop = cv2.resize(crop, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    figure, (axes,) = new_panel(float(np.clip(3.2 * (bottom - top) / (right - left), 1.6, 3.4)) + 0.5)
+    extent = (left - 0.5, right + 0.5, bottom + 0.5, top - 0.5)
+    axes.imshow(crop, cmap="gray", extent=extent, vmin=0, vmax=1, interpolation="none")
+    for outline, good in zip(outlines_px, measured, strict=True):
+        colour, dashes = ("#ff8a3c", "-") if good else ("#59b2ff", "--")
+        axes.add_patch(Polygon(outline, closed=True, fill=False, edgecolor=colour, linestyle=dashes, linewidth=0.9))
+    axes.set(xlim=extent[:2], ylim=extent[2:])
+    style(axes, title=title, xlabel="column [px]", ylabel="row [px]")
+    spread_ticks(axes)
+    return to_svg(figure, f"Board image, {title}: {int(measured.sum())} of {len(measured)} dots measured, outlined.")
+
+
+def mapping_field(dots: DotMap, board_dots: tuple[int, int], grid: Grid, *, depth: bool) -> str:
+    """Draw the error of the mapping at the dots over x and y, or over x and z: rms over the third axis."""
+    nx, per_plane = board_dots[0], board_dots[0] * board_dots[1]
+    plane, place = np.divmod(dots.number, per_plane)
+    key = np.stack([plane, place % nx], axis=1) if depth else place[:, None]
+    first, rms = rms_by(key, dots.error)
+    up = 2 if depth else 1
+    at = dots.position_mm[first][:, [0, up]]
+    figure, (axes,) = new_panel(2.8)
+    side = 150 / (1 + max(len(np.unique(column)) for column in at.T))
+    shown = axes.scatter(
+        *at.T,
+        c=rms,
+        s=min(side, 16) ** 2,
+        marker="s",
+        cmap="viridis",
+        norm=Normalize(0, max(float(rms.max()), 1e-12)),
+        linewidths=0,
+    )
+    low, high = ([grid.axis_mm(axis)[end] for axis in (2, 2 - up)] for end in (0, -1))
+    corner, size = np.array(low) - grid.voxel_mm / 2, np.array(high) - np.array(low) + grid.voxel_mm
+    axes.add_patch(Rectangle(float_pair(corner), *size, fill=False, edgecolor=INK, linestyle="--", linewidth=1))
+    axes.margins(0.08)
+    axes.autoscale_view()
+    name = "yz"[depth]
+    style(axes, title=f"over x and {name}", xlabel="x [mm]", ylabel=f"{name} [mm]")
+    if not depth:
+        axes.set_aspect("equal")
+    spread_ticks(axes)
+    colour_bar(figure, shown, axes, "rms error [pitch]")
+    return to_svg(
+        figure,
+        f"Error of the mapping at the dots over x and {name}: {rms.min():.4f} to {rms.max():.4f} microlens pitch; "
+        "the dashed frame is the volume.",
+    )
+
+
+def error_histogram(errors_pitch: np.ndarray) -> str:
+    """Draw a histogram of the errors of held-out labels [microlens pitch]."""
+    figure, (axes,) = new_panel(2.8)
+    largest = max(float(np.percentile(errors_pitch, 99.5)), 1e-9)
+    axes.hist(errors_pitch, np.linspace(0, largest, BINS + 1), color=SERIES[0], alpha=0.8)
+    mean = float(errors_pitch.mean())
+    axes.axvline(mean, color=INK, linewidth=1.2, linestyle="--")
+    axes.set(xlim=(0, largest))
+    style(
+        axes,
+        title=f"held-out labels; mean {mean:.4f} (dashed)",
+        xlabel="mapping to label [microlens pitch]",
+        ylabel="labels",
+    )
+    spread_ticks(axes)
+    return to_svg(figure, f"Histogram of the distance between mapping and held-out labels, mean {mean:.4f} pitch.")
+
+
+def _centres_inside(optics: Optics, lattice: LensLattice, extent: tuple[float, float, float, float]) -> np.ndarray:
+    """Return the microimage centres (column, row) [pixel] in a part of the sensor (left, right, bottom, top)."""
+    left, right, bottom, top = extent
+    origin, basis = lattice_px(optics, lattice)
+    corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom]])
+    index = (corners - origin) @ np.linalg.inv(basis)
+    low, high = np.floor(index.min(0)).astype(int), np.ceil(index.max(0)).astype(int)
+    lenses = np.moveaxis(np.mgrid[low[0] : high[0] + 1, low[1] : high[1] + 1], 0, -1).reshape(-1, 2)
+    centres: np.ndarray = origin + lenses @ basis
+    return centres[((centres >= (left, top)) & (centres <= (right, bottom))).all(1)]

@@ -1,4 +1,4 @@
-"""Errors of a calibrated mapping at the board's dots: by dot, by plane, over the field and the depth."""
+"""Compare a calibrated mapping with the labels of the board's dots; outline the dots' light on the sensor (Eq. 9)."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.geometry.optics import Optics
 
 RIM_POINTS = (12, 48)
-"""Fewest and most points on the pupil's edge that draw the outline of a dot's light."""
+"""Smallest and largest number of points of the outline of a dot's light."""
 OUTLINE_POINTS = 6000
-"""Points of all outlines of a plane: boards of many dots have fewer for each."""
+"""Number of points of all outlines of a plane, shared by its dots."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DotMap:
-    """Mapping against the labels of each dot, in microlens pitches.
+    """Errors of the mapping at each dot, in microlens pitches.
 
-    The mean over a dot's labels, some dozens of rays through the whole pupil, is free of what each label errs by alone,
-    not of what they share, the error of the dot's place: its length bounds the error of the mapping there.
+    Averaging over the labels of a dot, some dozens of rays through the whole pupil, removes the noise of single labels.
+    It leaves the error of the mapping plus the position error of the dot, which all its labels share.
     """
 
     dots: BoardDots
-    """The labels."""
+    """Labels of the dots."""
     number: np.ndarray
     """Numbers of the dots, plane * (nx ny) + row * nx + column, shape (dot,)."""
     position_mm: np.ndarray
-    """Their places (x, y, z) [mm], shape (dot, 3)."""
+    """Positions (x, y, z) [mm], shape (dot, 3)."""
     labels: np.ndarray
-    """Labels of each, shape (dot,)."""
+    """Number of labels of each dot, shape (dot,)."""
     error: np.ndarray
-    """Length of the mean over a dot's labels [pitch], shape (dot,)."""
+    """Length of the mean difference between labels and mapping [pitch], shape (dot,)."""
     label_rms: np.ndarray
-    """Root mean square of its labels' errors [pitch], shape (dot,)."""
+    """Root mean square difference between labels and mapping [pitch], shape (dot,)."""
 
 
 def dot_map(camera: CalibratedCamera) -> DotMap | None:
-    """Hold a camera's mapping against all labels of its dots, those of the training included; None without dots."""
+    """Compare a camera's mapping with all labels of its dots, training labels included; None without dots."""
     dots = camera.dots
     if dots is None:
         return None
@@ -59,7 +59,7 @@ def dot_map(camera: CalibratedCamera) -> DotMap | None:
 
 
 def rms_by(key: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Root mean square of values by their key: the first place of each key, and the figures in the same order."""
+    """Return the first index of each distinct key and the root mean square of its values, in the same order."""
     _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
     inverse = inverse.ravel()
     return first, np.sqrt(np.bincount(inverse, values**2) / np.bincount(inverse))
@@ -72,7 +72,18 @@ def dot_outlines_px(
     spacing_mm: float,
     depth_mm: float,
 ) -> np.ndarray:
-    """Outline of each dot's light on the sensor: the rays through the pupil's edge, Eq. 9.
+    """Trace the outline of each dot's light on the sensor, by the rays through the edge of the pupil (Eq. 9).
+
+    Parameters
+    ----------
+    mapping : callable
+        Maps points (n, 3) and pupil positions (n, 2) [mm] to the microlens array (n, 2) [mm].
+    optics : Optics
+        Nominal optics of the camera.
+    dots : (int, int)
+        Dots of the board along x and y.
+    spacing_mm, depth_mm : float
+        Spacing of the dots and z of the plane [mm].
 
     Returns
     -------

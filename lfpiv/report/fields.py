@@ -1,6 +1,7 @@
-"""Vector fields for the page: a sample of the pairs, their mean and fluctuation, in a compact form for the scripts.
+"""Put vector fields into the page: a sample of the pairs, their mean and their fluctuation.
 
-However many pairs there are, at most `MOST_READ` files are read and `MOST_VECTORS` vectors put into the page.
+At most `MOST_READ` files are read and `MOST_VECTORS` vectors stored, for any number of pairs. Values are quantised to
+two bytes, gzipped and written in base64; ``static/fields.js`` unpacks them.
 """
 
 from __future__ import annotations
@@ -28,40 +29,39 @@ from lfpiv.velocity import derived
 log = logging.getLogger(__name__)
 
 MOST_READ = 500
-"""Files that mean and fluctuation are taken over: the mean is then good to 4.5 % of the fluctuation, for seconds of
-reading."""
+"""Largest number of files read for mean and fluctuation."""
 MOST_SHOWN = 6
-"""Pairs that can be chosen on the page."""
+"""Largest number of pairs that can be selected on the page."""
 MOST_VECTORS = 240_000
-"""Vectors of all fields in the page: about 3 MB of it."""
+"""Largest number of vectors of all fields together."""
 MOST_IN_FIELD = 40_000
-"""Vectors of one field; larger ones are thinned out along x and y."""
+"""Largest number of vectors of one field. Larger fields are thinned out along x and y."""
 
 NO_NUMBER = -32768
-"""Stands for not-a-number among the whole numbers that the page stores."""
+"""Stored integer that means not-a-number."""
 STEPS = 32767
-"""Steps from zero to the largest value: values are stored to 1 in 65,000 of their range."""
+"""Quantisation steps from zero to the largest magnitude."""
 
 COLOUR_STOPS = 33
-"""Colours that a colour map is given by; between them the page interpolates."""
+"""Number of colours that define a colour map in the page, which interpolates between them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Survey:
-    """What was read of the finished pairs."""
+    """Fields of a sample of the finished pairs."""
 
     shown: dict[int, xr.Dataset]
-    """Pair -> vectors, of the pairs that can be chosen."""
+    """Pair -> vectors of the pairs that can be selected."""
     mean: xr.Dataset | None
-    """Mean ``u``, ``v``, ``w`` [m/s] of the valid vectors and ``valid`` where there are any; None for a single pair."""
+    """Mean ``u``, ``v``, ``w`` [m/s] over the valid vectors, ``valid`` where there is one; None for a single pair."""
     fluctuation: xr.Dataset | None
-    """Their standard deviations over the pairs [m/s], `valid` where two or more pairs are; None for a single pair."""
+    """Standard deviations over the pairs [m/s], ``valid`` where there are two or more; None for a single pair."""
     read: int
-    """Pairs that mean and fluctuation were taken over."""
+    """Number of pairs in mean and fluctuation."""
 
 
 def survey(vectors: Mapping[int, Path]) -> Survey:
-    """Read an even sample of the pairs, one file after the other.
+    """Read an evenly spaced sample of the pairs; average one file after the other.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def survey(vectors: Mapping[int, Path]) -> Survey:
 
 
 def _read_velocity(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Velocity (component, z, y, x) [m/s], validity and axes [mm] of a file: 20 times faster than as a dataset."""
+    """Read velocity (component, z, y, x) [m/s], validity and axes [mm] directly from HDF5, faster than as a dataset."""
     try:
         with h5py.File(path, "r") as file:
             velocity = np.stack([file[name][()] for name in "uvw"]).astype(float)
@@ -108,40 +108,38 @@ def _read_velocity(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 
 def evenly(items: Sequence[int], most: int) -> list[int]:
-    """At most so many items, spread evenly, the first and the last among them."""
+    """Return at most `most` evenly spread items, including the first and the last."""
     if len(items) <= most:
         return list(items)
     return [items[place] for place in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
 
 
 def _like(first: xr.Dataset, velocity: np.ndarray, valid: np.ndarray) -> xr.Dataset:
+    """Build a dataset of a velocity field on the axes of another."""
     variables = {name: (AXES, part, {"units": "m/s"}) for name, part in zip("uvw", velocity, strict=True)}
     coordinates = {axis: first[axis].variable for axis in "zyx"}
     return xr.Dataset({**variables, "valid": (AXES, valid)}, coordinates)
 
 
-# What the scripts read -----------------------------------------------------------------------------------------------
-
-
 def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
-    """Put the fields of a survey into the page.
+    """Encode the fields of a survey for the scripts.
 
-    Values are whole numbers of two bytes times a scale, little-endian, all fields in one block; the block is gzipped
-    and written in base64. A JSON text beside it says what lies where.
+    All fields share one block of little-endian 16-bit integers, which is gzipped and written in base64. A JSON text
+    gives the offset and scale of each quantity.
 
     Parameters
     ----------
     found : Survey
         From `survey`.
     names : dict
-        Pair -> what the page calls it.
+        Pair -> its name on the page.
 
     Returns
     -------
     html : str
-        Two script elements that hold data.
+        Two script elements, the JSON text and the block.
     thinning : int
-        Every how many vectors along x and y are in the page.
+        Largest step along x and y at which vectors are in the page.
     """
     fields = [(names[pair], vectors, "velocity") for pair, vectors in found.shown.items()]
     if found.mean is not None and found.fluctuation is not None:
@@ -158,7 +156,7 @@ def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
         for name, values in {**{name: thin[name] for name in "uvw"}, **derivatives}.items():
             values = values.isel(cut) if name in derivatives else values
             stored, scale = quantise(values.values)
-            entry["values"][name] = {"at": len(block), "scale": scale}
+            entry["values"][name] = {"offset": len(block), "scale": scale}
             block += stored.tobytes()
         entry["valid"] = len(block)
         block += thin["valid"].values.astype("<i2").tobytes()
@@ -178,7 +176,7 @@ _COLOUR_MAPS = {"signed": "RdBu_r", "positive": "viridis"}
 
 
 def quantise(values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Whole numbers of two bytes and the scale that turns them back into values."""
+    """Return 16-bit integers and the scale that converts them back to values."""
     values = np.asarray(values, float)
     finite = np.isfinite(values)
     largest = float(np.abs(values[finite]).max(initial=0.0))
@@ -189,13 +187,13 @@ def quantise(values: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def colour_stops(name: str) -> list[str]:
-    """Colours of a matplotlib colour map at even places, as #rrggbb."""
+    """Return evenly spaced colours of a matplotlib colour map, as #rrggbb."""
     colours = matplotlib.colormaps[name](np.linspace(0, 1, COLOUR_STOPS))
     return [matplotlib.colors.to_hex(colour) for colour in colours]
 
 
 def _derivatives(vectors: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Magnitude of the vorticity [1/s] and Q [1/s^2]; nothing where a field is too thin to be differentiated."""
+    """Return the vorticity's magnitude [1/s] and Q [1/s^2]; nothing for fields of fewer than three layers."""
     if min(vectors.sizes[axis] for axis in "zyx") < 3:
         return {}
     return {"vorticity": derived.vorticity(vectors)["vorticity_magnitude"], "q": derived.q_criterion(vectors)}

@@ -1,4 +1,7 @@
-"""How far the microimages of a white image lie off the lattice of a calibration, over the sensor."""
+"""Measure the distance of microimages from the lattice of a calibration, over the sensor.
+
+A white image and the lattice of the microlenses go in; mean and rms distance by cell of the sensor come out.
+"""
 
 from __future__ import annotations
 
@@ -16,37 +19,37 @@ from lfpiv.lightfield.microimage_fit import (
 )
 
 MOST_LENSES = 6000
-"""Microimages measured, drawn evenly by chance: 60 and more in each cell of the map."""
+"""Largest number of microimages measured, drawn at random."""
 CELLS = 10
-"""Cells of the map along the longer side of the sensor."""
+"""Number of cells of the map along the longer side of the sensor."""
 LEAST_IN_CELL = 3
-"""Fewest microimages whose scatter a cell shows."""
+"""Smallest number of microimages for which a cell shows mean and rms."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensMap:
-    """Distance of measured microimage centres from the lattice in cells of the sensor, in pixels (column, row)."""
+    """Distance of measured microimage centres from the lattice, by cell of the sensor."""
 
     column_px: np.ndarray
-    """Middles of the cells along the columns [pixel], shape (columns,)."""
+    """Centres of the cells along the columns [pixel], shape (columns,)."""
     row_px: np.ndarray
-    """Middles of the cells along the rows [pixel], shape (rows,)."""
+    """Centres of the cells along the rows [pixel], shape (rows,)."""
     count: np.ndarray
     """Microimages in each cell, shape (rows, columns)."""
     mean_px: np.ndarray
-    """Mean of measured minus lattice [pixel], nan where a cell is empty, shape (rows, columns, 2)."""
+    """Mean of measured minus lattice (column, row) [pixel], nan where few microimages are, shape (rows, columns, 2)."""
     rms_px: np.ndarray
     """Root mean square distance [pixel], shape (rows, columns)."""
     total_rms_px: float
-    """The same over all cells [pixel]."""
+    """Root mean square distance over the whole sensor [pixel]."""
     left_out: int
-    """Microimages left out: dark, dead or far off."""
+    """Number of microimages left out as dark, dead or far off."""
     measured: int
-    """Microimages that count."""
+    """Number of microimages measured."""
 
 
 def lens_map(white: np.ndarray, dark: np.ndarray | None, optics: Optics, lattice: LensLattice) -> LensMap:
-    """Measure microimages as `find_lens_array` does and compare them with a lattice.
+    """Measure microimage centres as `find_lens_array` does and compare them with a lattice.
 
     Parameters
     ----------
@@ -71,18 +74,22 @@ def lens_map(white: np.ndarray, dark: np.ndarray | None, optics: Optics, lattice
     fit = measure_microimages(cut_patches(image, centres, half), centres, basis, fit.mean_microimage)
     lit, shift = fit.lit, (centres + fit.shift_px - nodes)[fit.lit]
     nodes = nodes[lit]
-    kept = robust_fit(np.column_stack([np.ones(len(nodes)), nodes / max(image.shape)]), shift)[1]
-    return _in_cells(nodes[kept], shift[kept], image.shape, int(len(lit) - kept.sum()))
+    inlier = robust_fit(np.column_stack([np.ones(len(nodes)), nodes / max(image.shape)]), shift)[1]
+    return _in_cells(nodes[inlier], shift[inlier], image.shape, int(len(lit) - inlier.sum()))
 
 
 def lattice_px(optics: Optics, lattice: LensLattice) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of microimage (0, 0) and lattice vectors on the sensor as (column, row) [pixel], X = s_l (1 + f_m/s_i)."""
+    """Return the centre of microimage (0, 0) and the lattice vectors on the sensor (column, row) [pixel].
+
+    A microlens at s_l has its microimage at X = s_l (1 + f_m / s_i).
+    """
     widening = 1 + optics.sensor_per_pupil
     origin = optics.sensor_px(np.asarray(lattice.origin_mm) * widening)
     return origin, np.asarray(lattice.basis_mm) * widening / optics.pixel_mm
 
 
 def _in_cells(nodes: np.ndarray, shift: np.ndarray, shape: tuple[int, int], left_out: int) -> LensMap:
+    """Average the distances in cells of the sensor."""
     rows, columns = shape
     edge = max(rows, columns) / CELLS
     size = max(round(rows / edge), 1), max(round(columns / edge), 1)

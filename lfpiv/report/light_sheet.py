@@ -1,8 +1,7 @@
-"""Where a light sheet ends inside a volume, and how much brighter the volume is inside it than outside.
+"""Find the edges of a light sheet inside a volume and its contrast, the brightness inside over that outside.
 
-Outside the sheet there are no particles: all light that a reconstruction puts there is ghosts. The ratio of the mean
-brightness inside to that outside is how tomographic PIV judges a reconstruction whose truth nobody knows; 2 is commonly
-asked for.
+Outside the sheet there are no particles, so all intensity reconstructed there is due to ghosts. Tomographic PIV judges
+reconstructions of real images by this contrast; values above 2 are commonly required.
 """
 
 from __future__ import annotations
@@ -12,29 +11,29 @@ from dataclasses import dataclass
 import numpy as np
 
 ENOUGH = 2.0
-"""Ratio of the brightness inside to that outside that a good reconstruction reaches."""
+"""Contrast of an acceptable reconstruction."""
 
-_CONTRAST = 1.4  # lower ones are also met where particles happen to be uneven over the depth
-_EXPLAINED = 0.8  # of the variance of the profile by two levels; a slope reaches 0.75, uneven particles 0.5
-_EDGE = 0.1  # of the sheet's thickness on either side of an edge belongs to neither level
-_FEWEST, _LEAST = 3, 0.08  # planes outside, and their share of the depth; fewer are how any volume ends
-_AT_END = 0.25  # of the depth; a thinner bright part at the volume's end is light from beyond it
+_CONTRAST = 1.4  # smallest contrast of a sheet
+_EXPLAINED = 0.8  # smallest share of the profile's variance that the two levels explain
+_EDGE = 0.1  # margin on either side of an edge that counts to neither level, in thicknesses of the sheet
+_FEWEST, _LEAST = 3, 0.08  # smallest number of planes outside the sheet, and their smallest share of the depth
+_AT_END = 0.25  # smallest thickness of a sheet that reaches an end of the volume, as a share of the depth
 
 
 @dataclass(frozen=True, kw_only=True)
 class LightSheet:
-    """A light sheet that ends inside the volume, at one side at least."""
+    """A light sheet with at least one edge inside the volume."""
 
     low_mm: float
     high_mm: float
-    """Its edges along z [mm], halfway between planes; the volume's own edge where it goes on beyond that."""
+    """Edges along z [mm], halfway between planes; the edge of the volume where the sheet continues beyond it."""
     inside: float
     outside: float
-    """Mean brightness inside and outside it [counts], without the planes about its edges."""
+    """Mean brightness inside and outside the sheet [counts], without the planes near its edges."""
 
     @property
     def ratio(self) -> float:
-        """Brightness inside over that outside."""
+        """Return the brightness inside over that outside."""
         return self.inside / max(self.outside, 1e-30)
 
 
@@ -51,8 +50,8 @@ def find_sheet(z_mm: np.ndarray, profile: np.ndarray) -> LightSheet | None:
     Returns
     -------
     LightSheet or None
-        The interval of planes whose mean, with the mean of the others, comes nearest to the profile; None where that is
-        no bright interval on a dark ground.
+        The interval of planes that, as one level above another, fits the profile best in least squares. None where
+        this interval is no clear light sheet.
     """
     n = len(profile)
     total = np.concatenate([[0.0], np.cumsum(profile, dtype=float)])

@@ -1,4 +1,4 @@
-"""Pieces of the report's HTML: figures with their numbers, tables, words for numbers. Every text is escaped here."""
+"""Build the report's HTML: figures with tables of their numbers, paragraphs, formatted numbers. Escape all texts."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 NONE = "–"
-"""Stands for a number that is not known."""
+"""Text in place of an unknown number."""
 
 
 def figure(panels: Sequence[str], caption: str, numbers: str = "", *, title: str = "Numbers") -> str:
-    """Figure of SVG panels with its caption, and the table of its numbers folded away."""
+    """Return a figure of SVG panels with its caption and a folded table of its numbers."""
     folded = details(title, numbers) if numbers else ""
     return (
         f'<figure><div class="panels">{"".join(panels)}</div><figcaption>{html.escape(caption)}</figcaption>'
@@ -21,9 +21,9 @@ def figure(panels: Sequence[str], caption: str, numbers: str = "", *, title: str
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str, words: bool = False) -> str:
-    """Table whose first column names its rows, the others being numbers unless they are `words`.
+    """Return a table whose first column names the rows. The other cells are numbers, or texts if `words`.
 
-    `caption` says what it holds to those who do not see the page.
+    `caption` is hidden on screen and read aloud by screen readers.
     """
     mark = ' class="words"' if words else ""
     head = "".join(f'<th scope="col">{html.escape(title)}</th>' for title in titles)
@@ -40,34 +40,34 @@ def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str,
 
 
 def facts(rows: Iterable[tuple[str, str]]) -> str:
-    """Names and what is said of each, as text."""
+    """Return a list of names and texts."""
     body = "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(text)}</dd>" for name, text in rows)
     return f'<dl class="facts">{body}</dl>'
 
 
 def details(title: str, content: str) -> str:
-    """Content under a line that opens it; `content` is HTML."""
+    """Return HTML `content` folded under a line of text."""
     return f"<details><summary>{html.escape(title)}</summary>{content}</details>"
 
 
 def paragraph(text: str, kind: str = "") -> str:
-    """One paragraph of text."""
+    """Return one paragraph of text, with `kind` as its CSS class."""
     mark = f' class="{kind}"' if kind else ""
     return f"<p{mark}>{html.escape(text)}</p>"
 
 
 def escape(text: str) -> str:
-    """Text for HTML, quotes included."""
+    """Escape a text for HTML, quotes included."""
     return html.escape(text)
 
 
 def number(value: float | None, digits: int) -> str:
-    """Put a number with so many decimals."""
+    """Format a number with `digits` decimals."""
     return NONE if value is None or not np.isfinite(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Put a number with so many significant digits."""
+    """Format a number with `digits` significant digits."""
     if value is None or not np.isfinite(value):
         return NONE
     rounded = float(f"{value:.{digits}g}")
@@ -79,15 +79,15 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def general(value: float) -> str:
-    """Put a number that a person chose as that person wrote it."""
+    """Format a number of the experiment file as it is written there."""
     return f"{value:g}".replace("-", "−")
 
 
 def percent(share: float | None, digits: int = 0) -> str:
-    """Put a share in percent."""
+    """Format a share in percent."""
     return NONE if share is None or not np.isfinite(share) else f"{100 * share:.{digits}f} %"
 
 
 def count(value: int, noun: str) -> str:
-    """Put a count and its noun: 1 pair, 5,000 pairs."""
+    """Format a count with its noun: 1 pair, 5,000 pairs."""
     return f"{value:,} {noun}{'' if value == 1 else 's'}"

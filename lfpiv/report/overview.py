@@ -1,36 +1,36 @@
-"""The report's plain sections: what was run, what went wrong, time and memory, settings and versions."""
+"""Write the report's sections of text: the run, its warnings, time and memory, settings and versions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.report import markup
 from lfpiv.report.markup import number, percent
+from lfpiv.report.summary import Summary, WeightFigures
 
 WARNINGS_SHOWN, WARNINGS_MOST = 12, 300
-"""Warnings that are shown at once, and with those folded away; `summary.json` holds all."""
+"""Warnings shown openly, and shown in total with the folded ones. ``summary.json`` holds all."""
 
 
-def head(experiment: Experiment, summary: Mapping[str, Any]) -> str:
-    """Name the experiment and its main figures."""
-    finished, failed = len(summary["pairs"]), len(summary.get("failed", ()))
+def head(experiment: Experiment, summary: Summary) -> str:
+    """Return the title of the page and the main figures of the run."""
+    finished, failed = len(summary.pairs), len(summary.failed)
     cards = [(f"{finished:,}", f"image {'pair' if finished == 1 else 'pairs'} finished")]
     if failed:
         cards.append((f"{failed:,}", f"image {'pair' if failed == 1 else 'pairs'} failed"))
     if finished:
-        cards.append((percent(summary["valid_fraction"]), "valid vectors"))
-        uncertainty = [item["uncertainty_voxel"] for item in summary["pairs"] if item["uncertainty_voxel"] is not None]
+        cards.append((percent(summary.valid_fraction), "valid vectors"))
+        uncertainty = [pair.uncertainty_voxel for pair in summary.pairs if pair.uncertainty_voxel is not None]
         if uncertainty:
             cards.append((number(float(np.mean(uncertainty)), 2), "voxel, median uncertainty"))
-    reports = summary["calibration"].values()
-    sigma = [report["sigma_nor_test"] for report in reports if report.get("sigma_nor_test") is not None]
+    cameras = summary.calibration.values()
+    sigma = [camera.sigma_nor_test for camera in cameras if camera.sigma_nor_test is not None]
     if sigma:
         cards.append((number(max(sigma), 4), "pitch, error on held-out dots, worst camera"))
-    found, expected = (sum(report.get(key) or 0 for report in reports) for key in ("dots_found", "dots_expected"))
+    found, expected = sum(c.dots_found or 0 for c in cameras), sum(c.dots_expected or 0 for c in cameras)
     if expected:
         cards.append((f"{found:,} / {expected:,}", "board dots measured"))
     boxes = "".join(
@@ -40,17 +40,17 @@ def head(experiment: Experiment, summary: Mapping[str, Any]) -> str:
         f"<h1>{markup.escape(experiment.name)}</h1>"
         + markup.paragraph(
             f"Multi-camera light-field PIV, {markup.count(len(experiment.cameras), 'camera')}, "
-            f"lfpiv {summary['versions']['lfpiv']}",
+            f"lfpiv {summary.versions['lfpiv']}",
             "quiet",
         )
         + f'<dl class="cards">{boxes}</dl>'
     )
 
 
-def warnings(summary: Mapping[str, Any]) -> str:
-    """List what went wrong, failed pairs first."""
-    failed = [f"Pair {entry['pair']} failed: {entry['reason']}" for entry in summary.get("failed", ())]
-    texts = [*failed, *summary["warnings"]]
+def warnings(summary: Summary) -> str:
+    """List the failed pairs, then the warnings."""
+    failed = [f"Pair {failure.pair} failed: {failure.reason}" for failure in summary.failed]
+    texts = [*failed, *summary.warnings]
     if not texts:
         return ""
     shown = _list(texts[:WARNINGS_SHOWN])
@@ -67,7 +67,7 @@ def _list(texts: Sequence[str]) -> str:
 
 
 def contents(sections: Mapping[str, str]) -> str:
-    """Link the sections that are there."""
+    """Return links to the sections that are not empty."""
     names = {
         "run": "What was run",
         "calibration": "Calibration",
@@ -81,12 +81,11 @@ def contents(sections: Mapping[str, str]) -> str:
     return f'<nav aria-label="Sections">{links}</nav>'
 
 
-def what_was_run(experiment: Experiment, summary: Mapping[str, Any]) -> str:
-    """Say what the experiment file states and what the run chose."""
+def run_facts(experiment: Experiment, summary: Summary) -> str:
+    """Tabulate what the experiment file states and what the run chose."""
     nz, ny, nx = experiment.grid.shape
     voxel, size = experiment.grid.voxel_mm, [n * experiment.grid.voxel_mm for n in (nx, ny, nz)]
     board = experiment.board
-    device = summary["device"]
     optics = experiment.cameras[0].optics
     same = all(camera.optics == optics for camera in experiment.cameras)
     rows = [
@@ -107,17 +106,17 @@ def what_was_run(experiment: Experiment, summary: Mapping[str, Any]) -> str:
             f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm",
         ),
         ("Axes", _axes(experiment)),
-        ("Image pairs", f"{len(summary['pairs']):,} of {experiment.pairs:,} finished"),
+        ("Image pairs", f"{len(summary.pairs):,} of {experiment.pairs:,} finished"),
         ("Motion passes", _motion(summary)),
-        ("Weights", _weights(summary.get("weights") or {})),
-        ("Cameras against each other", _agreement(summary.get("weights") or {})),
-        ("Computed on", f"{device['kind']}, {device['threads']} threads"),
+        ("Weights", _weights(summary.weights)),
+        ("Cameras against each other", _agreement(summary.weights)),
+        ("Computed on", f"{summary.device.kind}, {summary.device.threads} threads"),
     ]
     return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
 
 
 def _axes(experiment: Experiment) -> str:
-    """Say under which condition x, y, z are right-handed: no image tells, see the conventions."""
+    """State when x, y, z are right-handed: images alone do not show it, see ``docs/conventions.md``."""
     mirrored = {camera.name: camera.image_flip in ("none", "both") for camera in experiment.cameras}
     words = {True: "are mirrored, as through one mirror", False: "show the scene as it is, not mirrored"}
     if len(set(mirrored.values())) == 1:
@@ -127,26 +126,26 @@ def _axes(experiment: Experiment) -> str:
     return f"right-handed if {condition}; otherwise left-handed, and vorticity has the other sign"
 
 
-def _motion(summary: Mapping[str, Any]) -> str:
-    """Say where both frames were reconstructed from what they share along the motion; nothing where none was asked."""
-    passes = summary["settings"]["smart"].get("motion_passes", 0)
+def _motion(summary: Summary) -> str:
+    """State in how many pairs the motion passes followed the motion; empty without motion passes."""
+    passes = summary.settings["smart"].get("motion_passes", 0)
     if not passes:
         return ""
-    followed = sum(bool(pair.get("motion", {}).get("followed")) for pair in summary["pairs"])
+    followed = sum(pair.motion.followed for pair in summary.pairs)
     return (
-        f"{passes}: the motion was followed in {markup.count(followed, 'pair')} of {len(summary['pairs']):,}; the "
-        "uncertainty is that of each frame's volume by itself"
+        f"{passes}: the motion was followed in {markup.count(followed, 'pair')} of {len(summary.pairs):,}; the "
+        "uncertainty is that of volumes reconstructed frame by frame"
     )
 
 
-def _weights(report: Mapping[str, Any]) -> str:
-    """How the weights were made and how far they are from counted rays."""
-    if not report:
+def _weights(weights: WeightFigures) -> str:
+    """State the method and memory of the weights and their difference from counted rays."""
+    if not weights.method:
         return ""
-    text = f"{report['method']}, {report['memory_mib']:.0f} MiB"
-    forms = sorted(set(report.get("form", {}).values()))
+    text = f"{weights.method}, {weights.memory_mib:.0f} MiB"
+    forms = sorted(set(weights.form.values()))
     text += f", stored as {' and '.join(forms)}" if forms else ""
-    errors = report.get("count_check_l2")
+    errors = weights.count_check_l2
     if errors:
         text += (
             f"; {percent(float(np.mean(errors)), 1)} (mean of {len(errors)} voxels), at most "
@@ -155,55 +154,55 @@ def _weights(report: Mapping[str, Any]) -> str:
     return text
 
 
-def _agreement(report: Mapping[str, Any]) -> str:
-    """How far apart the cameras show the same particles, and what self-calibration did about it."""
+def _agreement(weights: WeightFigures) -> str:
+    """State the disparity between the cameras, and how self-calibration changed it."""
     text = ""
-    if "disparity_voxel" in report:
-        text = f"particles of pair {report['disparity_pair']} within {report['disparity_voxel']:.2f} voxel"
-    corrected = report.get("self_calibration")
-    if corrected:
+    if weights.disparity_voxel is not None:
+        text = f"particles of pair {weights.disparity_pair} within {weights.disparity_voxel:.2f} voxel"
+    corrected = weights.self_calibration
+    if corrected is not None:
         moved = ", ".join(
-            f"{name} by {1000 * float(np.linalg.norm(move['shift_mm'])):.0f} µm and "
-            f"{float(np.linalg.norm(move['rotation_deg'])):.2f}°"
-            for name, move in corrected["movements"].items()
+            f"{name} by {1000 * float(np.linalg.norm(move.shift_mm)):.0f} µm and "
+            f"{float(np.linalg.norm(move.rotation_deg)):.2f}°"
+            for name, move in corrected.movements.items()
         )
         text += (
-            f"{'; ' if text else ''}self-calibrated by {markup.count(len(corrected['pairs']), 'pair')}: "
-            f"{corrected['disparity_before_voxel']:.2f} voxel before, {corrected['disparity_voxel']:.2f} after; {moved}"
+            f"{'; ' if text else ''}self-calibrated by {markup.count(len(corrected.pairs), 'pair')}: "
+            f"{corrected.disparity_before_voxel:.2f} voxel before, {corrected.disparity_voxel:.2f} after; {moved}"
         )
     return text
 
 
-def timings(summary: Mapping[str, Any]) -> str:
-    """Tabulate what each stage took."""
+def timings(summary: Summary) -> str:
+    """Tabulate the time of each stage; list what was reused, and the peak memory."""
     names = {
-        "calibration": "calibration, network training included",
-        "network_training": "of it network training",
+        "calibration": "calibration, including network training",
+        "network_training": "network training alone",
         "weights": "weights",
         "reconstruction": "reconstruction, all volumes",
         "correlation": "correlation, all pairs",
-        "total": "this invocation, until the report",
+        "total": "this run, until the report",
     }
-    rows = [[text, number(summary["timings_s"].get(key), 1)] for key, text in names.items()]
-    reused = list(summary["reused"])
-    kept = ""
-    if reused:
-        named = ", ".join(reused[:WARNINGS_SHOWN])
-        more = f" and {len(reused) - WARNINGS_SHOWN:,} more" if len(reused) > WARNINGS_SHOWN else ""
-        kept = markup.paragraph(f"Kept from an earlier invocation: {named}{more}.", "quiet")
-    memory = markup.paragraph(f"Peak memory: {number(summary['peak_memory_mib'], 0)} MiB.")
+    rows = [[text, number(summary.timings_s.get(key), 1)] for key, text in names.items()]
+    reused = ""
+    if summary.reused:
+        named = ", ".join(summary.reused[:WARNINGS_SHOWN])
+        left = len(summary.reused) - WARNINGS_SHOWN
+        more = f" and {left:,} more" if left > 0 else ""
+        reused = markup.paragraph(f"Reused from an earlier run: {named}{more}.", "quiet")
+    memory = markup.paragraph(f"Peak memory: {number(summary.peak_memory_mib, 0)} MiB.")
     table = markup.table(["stage", "time [s]"], rows, caption="Time of each stage")
-    return f'<h2 id="time">Time and memory</h2>{table}{memory}{kept}'
+    return f'<h2 id="time">Time and memory</h2>{table}{memory}{reused}'
 
 
-def small_print(summary: Mapping[str, Any]) -> str:
-    """Tabulate settings and versions, folded away."""
+def settings_and_versions(summary: Summary) -> str:
+    """Tabulate settings and versions, folded."""
     settings = [
         [f"{table}.{key}", "default" if value is None else str(value)]
-        for table, values in summary["settings"].items()
+        for table, values in summary.settings.items()
         for key, value in values.items()
     ]
-    versions = [[name, version] for name, version in summary["versions"].items()]
+    versions = [[name, version] for name, version in summary.versions.items()]
     return (
         '<h2 id="settings">Settings and versions</h2>'
         + markup.details(

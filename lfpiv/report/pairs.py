@@ -1,53 +1,54 @@
-"""The report's section on all pairs: valid share, uncertainty and mean velocity over them, from the summary alone."""
+"""Write the report's section on all pairs: valid share, uncertainty and mean velocity of each, from the summary."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, SupportsFloat
+from typing import SupportsFloat
 
 import numpy as np
 
 from lfpiv.report import markup
 from lfpiv.report.fields import evenly
 from lfpiv.report.markup import number, percent
+from lfpiv.report.summary import Failure, PairFigures
 from lfpiv.report.svg import SERIES, new_panel, spread_ticks, style, to_svg
 
 MOST_ROWS = 100
-"""Rows of the table over the pairs and points of its lines: more pairs are put together, neighbours with neighbours."""
+"""Largest number of rows of the table and of points of a line. More pairs are merged into groups of neighbours."""
 WORST = 20
-"""Pairs with the lowest valid share that are named."""
+"""Number of pairs with the lowest valid share in the table of the worst pairs."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Groups:
-    """Pairs put together in the order of their numbers; arrays with one value per group."""
+    """Figures of groups of neighbouring pairs, in arrays with one value per group."""
 
     first: np.ndarray
     """Number of the first pair."""
     last: np.ndarray
     """Number of the last pair."""
     pairs: np.ndarray
-    """Finished pairs in it."""
+    """Count of finished pairs."""
     mean: dict[str, np.ndarray]
-    """Key -> mean over its pairs, nan where none is known."""
+    """Figure -> mean over the pairs of the group, nan where no pair has it."""
     low: dict[str, np.ndarray]
-    """Key -> lowest of its pairs."""
+    """Figure -> lowest value of the group."""
     high: dict[str, np.ndarray]
-    """Key -> highest of its pairs."""
+    """Figure -> highest value of the group."""
 
 
 KEYS = ("valid", "uncertainty", "peak_ratio", "u", "v", "w", "sd_u", "sd_v", "sd_w")
-"""What is known of a pair: valid share, medians of uncertainty [voxel] and peak ratio, mean and standard deviation of
-the velocity over its valid vectors [m/s]."""
+"""Figures of a pair: valid share, and over its valid vectors the medians of uncertainty [voxel] and peak ratio and the
+mean and standard deviation of the velocity [m/s]."""
 
 
-def group(items: Sequence[Mapping[str, Any]], most: int = MOST_ROWS) -> Groups:
-    """Put the pairs of a summary together in at most so many groups of neighbours."""
-    numbers = np.array([item["pair"] for item in items])
-    values = np.array([_values(item) for item in items], float)
-    edges = np.unique(np.linspace(0, len(items), min(most, len(items)) + 1).round().astype(int))
+def group(pairs: Sequence[PairFigures], most: int = MOST_ROWS) -> Groups:
+    """Merge pairs, sorted by number, into at most `most` groups of neighbours."""
+    numbers = np.array([pair.number for pair in pairs])
+    values = np.array([_values(pair) for pair in pairs], float)
+    edges = np.unique(np.linspace(0, len(pairs), min(most, len(pairs)) + 1).round().astype(int))
     parts = [slice(low, high) for low, high in itertools.pairwise(edges)]
     return Groups(
         first=np.array([numbers[part][0] for part in parts]),
@@ -60,26 +61,36 @@ def group(items: Sequence[Mapping[str, Any]], most: int = MOST_ROWS) -> Groups:
     )
 
 
-def _values(item: Mapping[str, Any]) -> list[float | None]:
-    velocity = item["velocity_m_per_s"]
-    spread = [velocity[name][kind] for kind in ("mean", "sd") for name in "uvw"]
-    return [item["valid_fraction"], item["uncertainty_voxel"], item["peak_ratio"], *spread]
+def _values(pair: PairFigures) -> list[float | None]:
+    """Return the figures of a pair in the order of `KEYS`."""
+    spreads = [pair.velocity_m_per_s[name] for name in "uvw"]
+    moments = [*(spread.mean for spread in spreads), *(spread.sd for spread in spreads)]
+    return [pair.valid_fraction, pair.uncertainty_voxel, pair.peak_ratio, *moments]
 
 
 def _known(reduce: Callable[[np.ndarray], SupportsFloat], values: np.ndarray) -> float:
+    """Reduce the finite values; nan where there are none."""
     values = values[np.isfinite(values)]
     return float(reduce(values)) if values.size else float("nan")
 
 
-def section(summary: Mapping[str, Any]) -> str:
-    """Write the section on all pairs."""
-    items = sorted(summary["pairs"], key=lambda item: item["pair"])
-    groups = group(items)
-    failed = [int(entry["pair"]) for entry in summary.get("failed", ())]
+def section(pairs: Sequence[PairFigures], failures: Sequence[Failure]) -> str:
+    """Return the section on all pairs, as HTML.
+
+    Parameters
+    ----------
+    pairs : sequence of PairFigures
+        Finished pairs; at least one.
+    failures : sequence of Failure
+        Pairs without result, marked in the charts.
+    """
+    pairs = sorted(pairs, key=lambda pair: pair.number)
+    groups = group(pairs)
+    failed = [failure.pair for failure in failures]
     single = bool((groups.pairs == 1).all())
-    parts = ['<h2 id="pairs">All pairs</h2>', markup.paragraph(_said(items, failed))]
+    parts = ['<h2 id="pairs">All pairs</h2>', markup.paragraph(_overview(pairs, failed))]
     table = _table(groups, single)
-    if len(items) == 1:
+    if len(pairs) == 1:
         return "\n".join([*parts, table])
     shown = [_line(groups, ("valid",), "valid vectors [%]", failed, factor=100.0, bottom=0)]
     shown.append(_line(groups, ("uncertainty",), "median uncertainty [voxel]", failed, bottom=0))
@@ -87,26 +98,26 @@ def section(summary: Mapping[str, Any]) -> str:
     caption = "Each pair's figures over its valid vectors."
     if not single:
         caption = (
-            f"Each pair's figures over its valid vectors; {groups.pairs.max()} neighbouring pairs are put together: "
+            f"Each pair's figures over its valid vectors; {groups.pairs.max()} neighbouring pairs are merged: "
             "lines are their mean, bands reach from the lowest to the highest. summary.json holds every pair."
         )
     if failed:
         caption += " Marks on the lower edge: failed pairs."
-    parts.append(markup.figure(shown, caption, table + (_worst(items) if not single else "")))
+    parts.append(markup.figure(shown, caption, table + (_worst(pairs) if not single else "")))
     return "\n".join(parts)
 
 
-def _said(items: Sequence[Mapping[str, Any]], failed: Sequence[int]) -> str:
-    """Put the pairs' own figures into a sentence or two."""
-    shares = np.array([item["valid_fraction"] for item in items])
-    text = f"{markup.count(len(items), 'pair')} finished"
+def _overview(pairs: Sequence[PairFigures], failed: Sequence[int]) -> str:
+    """Count the pairs and state their mean and lowest valid share."""
+    shares = np.array([pair.valid_fraction for pair in pairs])
+    text = f"{markup.count(len(pairs), 'pair')} finished"
     text += f", {markup.count(len(failed), 'pair')} failed" if failed else ""
-    if len(items) == 1:
+    if len(pairs) == 1:
         return f"{text}: statistics over pairs need two or more."
     worst = int(shares.argmin())
     return (
         f"{text}. Valid vectors: {percent(float(shares.mean()), 1)} in the mean over pairs, "
-        f"{percent(float(shares.min()), 1)} in the worst, pair {items[worst]['pair']}."
+        f"{percent(float(shares.min()), 1)} in the worst, pair {pairs[worst].number}."
     )
 
 
@@ -119,6 +130,7 @@ def _line(
     factor: float = 1.0,
     bottom: float | None = None,
 ) -> str:
+    """Plot figures over the pairs, as mean and range of each group; mark the failed pairs on the lower edge."""
     figure, (axes,) = new_panel()
     middle = (groups.first + groups.last) / 2
     few = len(middle) <= 30
@@ -161,9 +173,10 @@ def _table(groups: Groups, single: bool) -> str:
     return markup.table(titles, rows, caption=caption) + markup.paragraph(f"{caption}.", "quiet")
 
 
-def _worst(items: Sequence[Mapping[str, Any]]) -> str:
-    lowest = sorted(items, key=lambda item: item["valid_fraction"])[:WORST]
-    rows = [[str(item["pair"]), percent(item["valid_fraction"], 1), str(item["verdict"])] for item in lowest]
+def _worst(pairs: Sequence[PairFigures]) -> str:
+    """Tabulate the pairs with the lowest valid share."""
+    lowest = sorted(pairs, key=lambda pair: pair.valid_fraction)[:WORST]
+    rows = [[str(pair.number), percent(pair.valid_fraction, 1), pair.verdict] for pair in lowest]
     caption = f"The {len(rows)} pairs with the lowest valid share"
     return markup.paragraph(f"{caption}:") + markup.table(
         ["pair", "valid", "verdict"], rows, caption=caption, words=True

@@ -1,8 +1,7 @@
-"""Panels of the report: small matplotlib figures as SVG inside the page, in the page's own colours and type.
+"""Draw panels, small matplotlib figures, as SVG elements with the colours and type of the page.
 
-A panel is as wide as a phone's screen, so that its text is read at the size it was set in; wider screens show several
-side by side. Ink and series colours are stand-ins that become ``currentColor`` and CSS variables: one picture serves
-light and dark pages.
+A panel is as wide as a phone's screen, so that its text keeps its size; wider screens show several side by side. The
+colours of ink and series are replaced by ``currentColor`` and CSS variables: one picture serves light and dark pages.
 """
 
 from __future__ import annotations
@@ -24,31 +23,31 @@ from matplotlib.figure import Figure
 from matplotlib.path import Path
 
 INK = "#7b8a91"
-"""Stands for the colour of the page's text."""
+"""Placeholder of the page's text colour."""
 SERIES = ("#2f81d7", "#e0762b", "#2ca36c", "#c24790", "#8a6fd2", "#9a8d2b")
-"""Stand for the page's colours of lines and marks, ``--series-0`` to ``--series-5``."""
+"""Placeholders of the page's colours of lines and marks, ``--series-0`` to ``--series-5``."""
 
 WIDTH_INCH = 3.6
-"""Width of a panel: 346 CSS pixels, what a phone's page holds."""
+"""Width of a panel [inch]: 346 CSS pixels, the text width on a phone."""
 TEXT_POINT, SMALL_POINT = 9.0, 8.5
 """Sizes of titles and labels, and of tick labels [point]."""
 
 PHOTO_PIXELS = 20_000
-"""Grey pictures of more pixels are stored as JPEG; small ones and colour maps exactly."""
+"""Largest number of pixels of a grey picture stored as PNG; larger ones are stored as JPEG."""
 JPEG_QUALITY = 82
 
-_numbers = itertools.count(1)  # tells the identifiers of a page's panels apart
+_numbers = itertools.count(1)  # makes the identifiers of panels unique in the page
 
 
 def new_panel(height_inch: float = 2.6, *, rows: int = 1, columns: int = 1) -> tuple[Figure, np.ndarray]:
-    """Make an empty panel.
+    """Create an empty panel.
 
     Parameters
     ----------
     height_inch : float
         Height of the panel [inch].
     rows, columns : int
-        Axes in it.
+        Number of axes along each direction.
 
     Returns
     -------
@@ -62,7 +61,7 @@ def new_panel(height_inch: float = 2.6, *, rows: int = 1, columns: int = 1) -> t
 
 
 def style(axes: Axes, *, title: str = "", xlabel: str = "", ylabel: str = "", legend: bool = False) -> None:
-    """Give axes the page's ink and type, and their names."""
+    """Set titles and labels of axes, in the ink and type of the page."""
     axes.patch.set_alpha(0)
     axes.set_title(title, color=INK, fontsize=TEXT_POINT)
     axes.set_xlabel(xlabel, color=INK, fontsize=TEXT_POINT)
@@ -77,7 +76,7 @@ def style(axes: Axes, *, title: str = "", xlabel: str = "", ylabel: str = "", le
 
 
 def colour_bar(figure: Figure, shown: ScalarMappable, axes: Axes, label: str, *, location: str = "right") -> None:
-    """Put a colour bar beside axes, as high as they are, or below them."""
+    """Add a colour bar beside axes, of the same height, or below them."""
     if location == "right":
         bar = figure.colorbar(shown, cax=axes.inset_axes((1.04, 0, 0.05, 1)))
     else:
@@ -89,12 +88,12 @@ def colour_bar(figure: Figure, shown: ScalarMappable, axes: Axes, label: str, *,
 
 
 def arrows(start: np.ndarray, step: np.ndarray, head: float) -> Path:
-    """Arrows as one path: shafts from `start` by `step`, heads of the length `head` or a third of a short shaft.
+    """Return arrows as one path. Heads have the length `head`, at most 0.4 of the shaft.
 
     Parameters
     ----------
     start, step : ndarray, shape (arrow, 2)
-        In the units of the axes; arrows that are not finite are left out.
+        Tail and vector of each arrow, in units of the axes. Arrows that are not finite are left out.
     head : float
         Length of a head in the same units.
     """
@@ -111,7 +110,7 @@ def arrows(start: np.ndarray, step: np.ndarray, head: float) -> Path:
 
 
 def to_svg(figure: Figure, alt: str) -> str:
-    """Turn a panel into an SVG element for the page, `alt` standing for it where it is not seen."""
+    """Return a panel as an SVG element. Screen readers read `alt`."""
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lfpiv"}):
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -119,7 +118,7 @@ def to_svg(figure: Figure, alt: str) -> str:
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
     text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)
-    text = re.sub(r"<style.*?</style>\s*", "", text, flags=re.DOTALL)  # would hold for the whole page; see report.css
+    text = re.sub(r"<style.*?</style>\s*", "", text, flags=re.DOTALL)  # as in report.css
     text = _own_identifiers(text)
     text = re.sub(r'href="data:image/png;base64,\s*([^"]+)"', _smaller_picture, text)
     text = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text)
@@ -136,7 +135,7 @@ def to_svg(figure: Figure, alt: str) -> str:
 
 
 def _own_identifiers(text: str) -> str:
-    """Keep the identifiers that are referred to, with a number of their own; drop the others."""
+    """Make referenced identifiers unique in the page; drop the others."""
     used = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
     mark = f"svg{next(_numbers)}-"
 
@@ -148,7 +147,7 @@ def _own_identifiers(text: str) -> str:
 
 
 def _smaller_picture(match: re.Match[str]) -> str:
-    """Store an opaque grey picture as grey, large ones as JPEG."""
+    """Encode an opaque grey picture with one channel, a large one as JPEG."""
     data = base64.b64decode(re.sub(r"\s", "", match[1]))
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None:
@@ -166,7 +165,13 @@ def _smaller_picture(match: re.Match[str]) -> str:
     return f'href="data:image/{kind};base64,{base64.b64encode(data).decode()}"'
 
 
+def cell_edges(centres: np.ndarray) -> tuple[float, float]:
+    """Return the outer edges of evenly spaced cells; a single cell has the width 1."""
+    half = float(np.median(np.diff(centres))) / 2 if centres.size > 1 else 0.5
+    return float(centres[0]) - half, float(centres[-1]) + half
+
+
 def spread_ticks(axes: Axes, count: Sequence[int] = (5, 5)) -> None:
-    """At most so many ticks along x and y."""
+    """Limit the number of ticks along x and y."""
     axes.locator_params(axis="x", nbins=count[0])
     axes.locator_params(axis="y", nbins=count[1])

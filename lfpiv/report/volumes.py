@@ -1,10 +1,9 @@
-"""The report's section on the volumes: projections, residual per iteration, brightness over the depth."""
+"""Write the report's section on the volumes: projections, residual per iteration, brightness over the depth."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,39 +12,40 @@ from matplotlib.colors import Normalize
 from lfpiv.report import markup
 from lfpiv.report.light_sheet import ENOUGH, LightSheet, find_sheet
 from lfpiv.report.markup import number, percent
-from lfpiv.report.svg import INK, SERIES, colour_bar, new_panel, spread_ticks, style, to_svg
+from lfpiv.report.summary import PairFigures
+from lfpiv.report.svg import INK, SERIES, cell_edges, colour_bar, new_panel, spread_ticks, style, to_svg
 from lfpiv.results import netcdf
 
 FEW_VOLUMES = 6
-"""So many volumes have a line of their own; of more, the median and the range are drawn."""
+"""Largest number of volumes with a line each in the chart of residuals. Of more, median and range are drawn."""
 BAND = (5, 95)
-"""Percentiles between which the range over many volumes lies."""
+"""Percentiles that bound the range drawn over many volumes."""
 
 
-def section(summary: Mapping[str, Any], vectors: Mapping[int, Path]) -> str:
-    """Write the section on the volumes; nothing where the first file says nothing of its own.
+def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path]) -> str:
+    """Return the section on the volumes, as HTML; empty where the first file holds nothing about its volumes.
 
     Parameters
     ----------
-    summary : dict
-        The content of ``summary.json``.
+    pairs : sequence of PairFigures
+        Finished pairs.
     vectors : dict
-        Pair -> file of its vectors; the volumes of the first are shown.
+        Pair -> file of its vectors. The volumes of the first pair are shown.
     """
     histories = {
-        f"pair {item['pair']}, {frame}": np.asarray(residual, float)
-        for item in summary["pairs"]
-        for frame, residual in item.get("residual", {}).items()
-        if len(residual)
+        f"pair {item.number}, {frame}": np.asarray(residual, float)
+        for item in pairs
+        for frame, residual in item.residual.items()
+        if residual
     }
     pair = next(iter(vectors))
     first = netcdf.read_reconstruction(vectors[pair])
     if first is None:
         return ""
     parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(pair, first)]
-    parts.append(_quality_figure(pair, first, histories))
-    parts.append(_images(summary))
-    stops = _stops(summary)
+    parts.append(quality_figure(pair, first, histories))
+    parts.append(_images(pairs))
+    stops = _stops(pairs)
     if stops:
         parts.append(
             markup.table(["volumes", "why the iteration ended"], stops, caption="Why the iterations ended", words=True)
@@ -54,6 +54,7 @@ def section(summary: Mapping[str, Any], vectors: Mapping[int, Path]) -> str:
 
 
 def _projection_figure(pair: int, first: xr.Dataset) -> str:
+    """Draw the largest intensity along each axis, with a table of percentiles."""
     frame = str(first["frame"].values[0])
     names = (("z", "x", "y"), ("y", "x", "z"), ("x", "y", "z"))
     top = float(np.percentile(first["projection_z"].values[0], 99.7)) or 1.0
@@ -82,7 +83,7 @@ def _projection_figure(pair: int, first: xr.Dataset) -> str:
 
 def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float) -> str:
     values = first[f"projection_{along}"].isel(frame=0).transpose(up, across).values
-    edges = [_edges(first[axis].values) for axis in (across, up)]
+    edges = [cell_edges(first[axis].values) for axis in (across, up)]
     spans = [high - low for low, high in edges]
     figure, (axes,) = new_panel(float(np.clip(2.8 * spans[1] / spans[0], 0.5, 3.4)) + 1.35)
     shown = axes.imshow(
@@ -99,13 +100,29 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
     return to_svg(figure, f"Largest intensity of the volume along {along}, over {across} and {up}.")
 
 
-def _quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray]) -> str:
+def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray]) -> str:
+    """Draw the residuals and the brightness over the depth.
+
+    Parameters
+    ----------
+    pair : int
+        Number of the pair that `first` belongs to.
+    first : Dataset
+        Condensed volumes of that pair, from `netcdf.read_reconstruction`.
+    histories : dict
+        Volume -> residual per iteration.
+
+    Returns
+    -------
+    str
+        A figure, or a paragraph where there is nothing to draw.
+    """
     shown, tables, captions = [], [], []
     if histories:
         panel, table = _residuals(histories)
         shown.append(panel)
         tables.append(table)
-        captions.append("What the projections of the volume leave unexplained of the images, per iteration of SMART.")
+        captions.append("Part of the images that the projections of the volume do not explain, per iteration of SMART.")
     if "profile_z" in first:
         profile = first["profile_z"].isel(frame=0).values
         sheet = find_sheet(first["z"].values, profile)
@@ -119,7 +136,7 @@ def _quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.nda
 
 
 def _judgement(profile: np.ndarray, sheet: LightSheet | None) -> str:
-    """Say what the brightness over the depth tells of ghosts."""
+    """Judge the level of ghosts by the brightness over the depth."""
     if sheet is None:
         quarter = len(profile) // 4
         middle = max(float(profile[quarter : len(profile) - quarter].mean()), 1e-30)
@@ -133,17 +150,17 @@ def _judgement(profile: np.ndarray, sheet: LightSheet | None) -> str:
     return (
         f"The light sheet (shaded) lies between z = {number(sheet.low_mm, 2)} and {number(sheet.high_mm, 2)} mm; all "
         f"light outside it is ghosts. The volume is {number(sheet.ratio, 1)} times as bright inside as outside, "
-        f"{verdict}; {ENOUGH:g} is the least that is commonly asked for."
+        f"{verdict}; a ratio of {ENOUGH:g} or more is commonly required."
     )
 
 
 def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
-    """Residual over the iterations: each volume's line, or of many the median and the range."""
+    """Draw and tabulate the residual over the iterations: a line per volume, or median and range of many."""
     length = max(map(len, histories.values()))
     every = np.full((len(histories), length), np.nan)
     for row, history in zip(every, histories.values(), strict=True):
         row[: len(history)] = history
-        row[len(history) :] = history[-1]  # an ended iteration keeps what it reached
+        row[len(history) :] = history[-1]  # volumes that stopped earlier keep their last residual
     iteration = np.arange(length)
     figure, (axes,) = new_panel()
     if len(histories) <= FEW_VOLUMES:
@@ -176,7 +193,7 @@ def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
 
 
 def _brightness(first: xr.Dataset, sheet: LightSheet | None) -> tuple[str, str]:
-    """Mean brightness over the depth in both frames; with the light sheet, where it ends inside the volume."""
+    """Draw and tabulate the mean brightness over the depth in both frames, with the light sheet if one was found."""
     z = first["z"].values
     profiles = dict(zip(map(str, first["frame"].values), first["profile_z"].values, strict=True))
     digits = 0 if max(profile.max() for profile in profiles.values()) >= 100 else 2
@@ -193,8 +210,8 @@ def _brightness(first: xr.Dataset, sheet: LightSheet | None) -> tuple[str, str]:
     axes.set(ylim=(0, 1.3 * axes.get_ylim()[1]))  # room for the legend
     style(axes, title="brightness over the depth", xlabel="z [mm]", ylabel="mean intensity [counts]", legend=True)
     spread_ticks(axes)
-    told = "" if sheet is None else f"; {number(sheet.ratio, 1)} times as bright inside the light sheet as outside"
-    svg = to_svg(figure, f"Mean brightness over z{told}.")
+    contrast = "" if sheet is None else f"; {number(sheet.ratio, 1)} times as bright inside the light sheet as outside"
+    svg = to_svg(figure, f"Mean brightness over z{contrast}.")
     rows = [
         [number(depth, 3), *(number(float(profile[k]), digits) for profile in profiles.values())]
         for k, depth in enumerate(z)
@@ -207,7 +224,7 @@ def _brightness(first: xr.Dataset, sheet: LightSheet | None) -> tuple[str, str]:
 
 
 def _sheet_table(z: np.ndarray, profiles: Mapping[str, np.ndarray]) -> str:
-    """Tabulate the light sheet of each frame by itself."""
+    """Tabulate the light sheet of each frame."""
     rows = []
     for frame, profile in profiles.items():
         sheet = find_sheet(z, profile)
@@ -220,12 +237,12 @@ def _sheet_table(z: np.ndarray, profiles: Mapping[str, np.ndarray]) -> str:
     return markup.table(titles, rows, caption="Brightness inside and outside the light sheet")
 
 
-def _images(summary: Mapping[str, Any]) -> str:
-    """Medians over all images of each camera: its structure, its brightness and its light beside the volume."""
+def _images(pairs: Sequence[PairFigures]) -> str:
+    """Tabulate medians over the images of each camera: structure, brightness and light beside the volume."""
     found: dict[str, dict[str, list[float]]] = {}
-    for item in summary["pairs"]:
+    for pair in pairs:
         for name in netcdf.OF_IMAGES:
-            for cameras in item.get(name, {}).values():
+            for cameras in getattr(pair, name).values():
                 for camera, value in cameras.items():
                     found.setdefault(camera, {}).setdefault(name, []).append(value)
     if not found:
@@ -237,24 +254,18 @@ def _images(summary: Mapping[str, Any]) -> str:
         )
         rows.append([camera, number(structure, 2), number(gain, 2), percent(outside)])
     text = (
-        "Medians over the images. Light of near pixels correlates by 0.2 or more where particles are clear of the "
-        "noise. Brightness is relative to the brightest camera. Light beside the volume falls where no voxel is seen: "
+        "Medians over the images. Near pixels correlate by 0.2 or more where particles stand out from the noise. "
+        "Brightness is relative to the brightest camera. Light beside the volume is light of pixels that see no voxel: "
         "the light sheet is wider than the volume, or there are reflections."
     )
     titles = ["camera", "correlation of near pixels", "brightness", "light beside the volume"]
-    return markup.paragraph(text) + markup.table(titles, rows, caption="What the images show by themselves")
+    return markup.paragraph(text) + markup.table(titles, rows, caption="Quality of the images of each camera")
 
 
-def _stops(summary: Mapping[str, Any]) -> list[list[str]]:
-    """How many volumes ended for which reason."""
+def _stops(pairs: Sequence[PairFigures]) -> list[list[str]]:
+    """Count the volumes by the reason why their iteration ended."""
     reasons: dict[str, int] = {}
-    for item in summary["pairs"]:
-        for stop in item.get("stop", {}).values():
+    for pair in pairs:
+        for stop in pair.stop.values():
             reasons[stop] = reasons.get(stop, 0) + 1
     return [[f"{count:,}", reason] for reason, count in sorted(reasons.items(), key=lambda entry: -entry[1])]
-
-
-def _edges(axis: np.ndarray) -> tuple[float, float]:
-    """Edges of the outermost voxels [mm]."""
-    half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
-    return float(axis[0] - half), float(axis[-1] + half)

@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +24,8 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.settings import Correlation
 from lfpiv.lightfield import image_checks
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.reconstruction.motion import Motion, reconstruct_pair, unshared_quality
+from lfpiv.reconstruction.motion import Motion, PairSolver, unshared_quality
+from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
 from lfpiv.runs import pair_figures
@@ -98,6 +100,21 @@ class PairWork:
         progress(1.0)
         return Outcome(pair=pair)
 
+    @cached_property
+    def solver(self) -> PairSolver:
+        """SMART for this rig, made once for all pairs.
+
+        The motion passes use default windows, so that other windows in `[correlation]` do not change the volumes.
+        """
+        assert self.weights is not None
+        smart, farthest = self.experiment.smart, self.experiment.correlation.max_displacement_voxel
+        return PairSolver(
+            self.weights,
+            SmartSettings(**smart.of_one_frame()),
+            motion_passes=smart.motion_passes,
+            correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
+        )
+
     def _do(self, pair: int, progress: StepProgress) -> None:
         files = PairFiles.of(self.experiment, self.calibration_hash, self.folder, pair)
         volumes = files.read_volumes()
@@ -118,7 +135,7 @@ class PairWork:
         light = pair_light(self.experiment, self.weights.cameras, self.darks, files.pair)
         self.log_first(warning.of_pair(files.pair) for frame in light for warning in frame.warnings)
         start = time.perf_counter()
-        volumes = _reconstruct_frames(self.experiment, self.weights, light, files.pair, progress)
+        volumes = _reconstruct_frames(self.solver, light, files.pair, progress)
         seconds = (time.perf_counter() - start) / 2
         first, second = (
             FrameRecord(
@@ -152,26 +169,16 @@ class PairWork:
 
 
 def _reconstruct_frames(
-    experiment: Experiment, weights: Weights, light: tuple[FrameLight, FrameLight], pair: int, progress: StepProgress
+    solver: PairSolver, light: tuple[FrameLight, FrameLight], pair: int, progress: StepProgress
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Reconstruct both volumes.
-
-    The motion passes use default windows, so that other windows in `[correlation]` do not change the volumes.
-    """
-    windows = Correlation(max_displacement_voxel=experiment.correlation.max_displacement_voxel)
+    """Reconstruct both volumes."""
     try:
-        first, second = reconstruct_pair(
-            weights,
-            [frame.images for frame in light],
-            floor=[frame.noise for frame in light],
-            correlation=windows.model_dump(),
-            progress=progress,
-            **experiment.smart.model_dump(),
-        )
+        result = solver.solve([frame.images for frame in light], [frame.noise for frame in light], progress)
     except ValueError as error:
         raise InputError(f"pair {pair}: {error}") from error
-    if experiment.smart.motion_passes:
-        log.info("pair %d: %s", pair, first.attrs["motion"])
+    if solver.motion_passes:
+        log.info("pair %d: %s", pair, result.motion.value)
+    first, second = result.to_dataarrays()
     return first, second
 
 

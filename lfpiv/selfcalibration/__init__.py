@@ -1,1 +1,1 @@
-"""Self-calibration: disparities between cameras, measured with particles, and the camera movements that explain them."""
+"""Self-calibration: measure how far apart cameras show the same particles, and the movements that explain it."""

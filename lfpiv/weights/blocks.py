@@ -24,7 +24,7 @@ from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.rays.lattice import Lattice, cell_frame, cell_steps, pack_lattice
 from lfpiv_kernels.reconstruction.projector import Blocks
 from lfpiv_kernels.weights import footprint
-from lfpiv_kernels.weights.ray_model import LANES, LEVELS
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS, Camera, pack_optics
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -49,7 +49,7 @@ class PackedCamera:
     """Constants of one camera in the form that the kernels take."""
 
     calibrated: CalibratedCamera
-    camera: footprint.Camera
+    camera: Camera
     lattice: Lattice
     cell_mm: float
     frame: np.ndarray
@@ -66,7 +66,7 @@ class PackedCamera:
             cell = lattice.pitch_mm / math.sqrt(3)
         return cls(
             calibrated=camera,
-            camera=footprint.pack_camera(
+            camera=pack_optics(
                 sensor_per_pupil=optics.sensor_per_pupil,
                 pixel_mm=optics.pixel_mm,
                 sensor_shape=optics.sensor_shape,
@@ -193,7 +193,7 @@ def blocks_of(
         Parts of a voxel along x, y, z, with the form "pixels".
     """
     footprints = packed.footprints(form, cuts)
-    blocks, values = (int(1.02 * count) + LANES for count in expected)
+    blocks, values = (int(1.02 * count) + BLOCK_WIDTH for count in expected)
     ray, height, width = (_Growing(dtype, blocks) for dtype in (np.int32, np.uint8, np.uint8))
     value = _Growing(np.uint8, values)
     counts, scales = [], []
@@ -204,7 +204,7 @@ def blocks_of(
             footprints.write(ray.take(some), height.take(some), width.take(some), room, scale)
             counts.append(count)
             scales.append(scale)
-    value.take(LANES)[:] = 0
+    value.take(BLOCK_WIDTH)[:] = 0
     first_block, first_value = (
         np.concatenate([[0], *(count[k] for count in counts)]).cumsum(dtype=np.int64) for k in range(2)
     )

@@ -21,7 +21,7 @@ from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.count import count_rays
 from lfpiv_kernels.reconstruction.projector import Blocks
-from lfpiv_kernels.weights.ray_model import LANES, LEVELS
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -233,11 +233,11 @@ def count_blocks(stored: StoredGrid, camera: CalibratedCamera) -> Blocks:
     return Blocks(
         form="pixels",
         first_block=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
-        first_value=np.concatenate([[0], LANES * np.cumsum(rows)]).astype(np.int64),
+        first_value=np.concatenate([[0], BLOCK_WIDTH * np.cumsum(rows)]).astype(np.int64),
         ray=ray,
         height=height,
-        width=np.full(len(ray), LANES, np.uint8),
-        value=np.append(value, np.zeros(LANES, np.uint8)),
+        width=np.full(len(ray), BLOCK_WIDTH, np.uint8),
+        value=np.append(value, np.zeros(BLOCK_WIDTH, np.uint8)),
         scale=scale,
         microimages=rays,
     )
@@ -254,8 +254,8 @@ def _pack_windows(
     column = corner[:, 0, None] + np.arange(windows.shape[2])
     seen = ((row >= 0) & (row < sensor_shape[0]))[:, :, None] & ((column >= 0) & (column < sensor_shape[1]))[:, None]
     windows = np.where(seen, windows, 0.0)
-    windows = np.pad(windows, ((0, 0), (0, 0), (0, -windows.shape[2] % LANES)))
-    tiles = windows.reshape(*windows.shape[:2], -1, LANES).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
+    windows = np.pad(windows, ((0, 0), (0, 0), (0, -windows.shape[2] % BLOCK_WIDTH)))
+    tiles = windows.reshape(*windows.shape[:2], -1, BLOCK_WIDTH).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
     scale = tiles.max((1, 2, 3)) / LEVELS
     lit = tiles.any(-1)
     place = np.arange(lit.shape[2]) % COUNT_TALLEST
@@ -263,7 +263,7 @@ def _pack_windows(
     ends = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (0, 1)))[:, :, 1:] & (place < COUNT_TALLEST - 1)))
     voxel, tile, first = starts.T
     # a tile that begins left of the sensor starts at the end of the row above, with weights of 0 there
-    pixel = (corner[voxel, 1] + first) * stride + corner[voxel, 0] + tile * LANES
+    pixel = (corner[voxel, 1] + first) * stride + corner[voxel, 0] + tile * BLOCK_WIDTH
     unit = np.where(scale > 0, scale, 1.0)
     value = np.rint(tiles[lit] / unit[np.nonzero(lit)[0], None]).astype(np.uint8)
     shift = np.maximum(-pixel, 0)  # before the sensor's first pixel: move the block's lanes instead

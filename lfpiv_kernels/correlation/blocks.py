@@ -11,8 +11,9 @@ import warp as wp
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation.layout import Lattice, Layers, Phased, make_layers
-from lfpiv_kernels.correlation.memory import Call, launch, new_array
+from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan
+from lfpiv_kernels.launch import Call, launch
 
 wp.set_module_options(native.options("blocks.h", contract="fast"))
 

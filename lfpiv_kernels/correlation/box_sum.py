@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.correlation.memory import Call, launch, to_device
 from lfpiv_kernels.correlation.plan import Triple, largest_factor, whole_groups
+from lfpiv_kernels.launch import Call, launch, to_device
 
 wp.set_module_options(native.options("windows.h"))
 
@@ -76,7 +76,7 @@ def _sum_along(volume: np.ndarray, axis: int, width: int) -> np.ndarray:
     factor = largest_factor(width)  # sums of sums: factor + width / factor terms
     source, sums = (np.zeros(whole_groups(volume.size) + width * pitch, np.float32) for _ in range(2))
     source[: volume.size] = volume.ravel()
-    source, sums = to_device(source), to_device(sums)
+    source, sums = to_device(source, float), to_device(sums, float)
     part = 1 if runtime.device().kind == "cuda" else PART
     for terms, distance in ((factor, pitch), (width // factor, factor * pitch)):
         if terms > 1:

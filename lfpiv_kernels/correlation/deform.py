@@ -15,6 +15,7 @@ import warp as wp
 from scipy import ndimage
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch
 
 wp.set_module_options(native.options("deform.h", contract="fast", unroll=4))
 
@@ -122,7 +123,6 @@ def deform_pair(
     if field.ndim != 4 or field.shape[3] != 3 or min(field.shape[:3]) < 2:
         raise ValueError(f"field: expected shape (>= 2, >= 2, >= 2, 3), got {field.shape}.")
     where = runtime.device()
-    wp.load_module(__name__, device=where.warp)  # before threads start: compilation is not thread-safe
     on_cpu = where.kind == "cpu"
     flat = [wp.array(c.ravel(), dtype=float, device=where.warp, copy=not on_cpu) for c in (first, second)]
     shape = tuple(n - 2 * MARGIN for n in first.shape)
@@ -130,10 +130,5 @@ def deform_pair(
     outputs = [wp.empty(shape, dtype=float, device=where.warp) for _ in range(2)]
     batch = shape[2] if on_cpu else 1
     inputs = [*flat, wp.vec3i(*first.shape), nodes, wp.vec3(*spacing), OFFSET, MARGIN, batch]
-
-    def part(chunk: int, begin: int, end: int) -> None:
-        dim = (end - begin, shape[1], -(-shape[2] // batch))
-        wp.launch(_deform_pair, dim=dim, inputs=[*inputs, begin], outputs=outputs, device=where.warp)
-
-    runtime.run_chunks(shape[0], part)
+    launch(Call(_deform_pair, shape[0], inputs, outputs, inner=(shape[1], -(-shape[2] // batch))))
     return outputs[0].numpy(), outputs[1].numpy()

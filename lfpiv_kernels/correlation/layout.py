@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels.correlation.memory import to_device
 from lfpiv_kernels.correlation.plan import LANES, Plan, Triple, whole_groups
+from lfpiv_kernels.launch import to_device
 
 
 @wp.struct

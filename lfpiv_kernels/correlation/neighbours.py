@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch
 
 wp.set_module_options(native.options("neighbours.h"))
 
@@ -98,17 +99,12 @@ def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Predicti
         if flags.shape != field.shape[:3]:
             raise ValueError(f"{name}: expected the shape of the field's grid, {field.shape[:3]}, got {flags.shape}.")
     where = runtime.device()
-    wp.load_module(__name__, device=where.warp)  # before threads start: compilation is not thread-safe
     points = np.flatnonzero(wanted).astype(np.int32)
     arrays = ((field, np.float32, float), (keep, np.int32, int), (points, np.int32, int))
     inputs = [wp.array(np.ascontiguousarray(a, kind).ravel(), dtype=t, device=where.warp) for a, kind, t in arrays]
     prediction = wp.empty((len(points), 3, 6), dtype=float, device=where.warp)
     count = wp.empty(len(points), dtype=int, device=where.warp)
     group = VECTORS if where.kind == "cpu" else 1
-    layout, outputs = [wp.vec3i(*keep.shape), group], [prediction.flatten(), count]
-
-    def part(chunk: int, begin: int, end: int) -> None:
-        wp.launch(_predict, dim=end - begin, inputs=[*inputs, *layout, begin], outputs=outputs, device=where.warp)
-
-    runtime.run_chunks(-(-len(points) // group), part)
+    inputs += [wp.vec3i(*keep.shape), group]
+    launch(Call(_predict, -(-len(points) // group), inputs, [prediction.flatten(), count]))
     return Prediction(*np.moveaxis(prediction.numpy(), -1, 0), count.numpy())

@@ -14,9 +14,10 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation.blocks import is_gathered
 from lfpiv_kernels.correlation.layout import Statistics
-from lfpiv_kernels.correlation.memory import Call, launch, new_array
+from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan
 from lfpiv_kernels.correlation.sides import Side
+from lfpiv_kernels.launch import Call, launch
 
 wp.set_module_options(native.options("peaks.h", contract="fast"))
 

@@ -4,8 +4,8 @@ import warp as wp
 
 from lfpiv_kernels import native
 from lfpiv_kernels.correlation.layout import Phased
-from lfpiv_kernels.correlation.memory import Call
 from lfpiv_kernels.correlation.transforms import PlaneTransform
+from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("planes.h", contract="fast"))
 

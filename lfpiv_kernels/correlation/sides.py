@@ -11,9 +11,10 @@ import warp as wp
 
 from lfpiv_kernels.correlation.blocks import split_call
 from lfpiv_kernels.correlation.layout import Phased, Statistics, Storage
-from lfpiv_kernels.correlation.memory import Call, launch, new_array, to_device
+from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import Plan, Triple
 from lfpiv_kernels.correlation.windows import plane_sums_call, plane_sums_shape, signal_floor, statistics_call
+from lfpiv_kernels.launch import Call, launch, to_device
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class _Volume:
         split, sums = new_array(voxels.size), math.prod(plane_sums_shape(plan, search))
         first_sums, second_sums = new_array(sums), new_array(sums)
         mean, scale = new_array(statistics.size), new_array(statistics.size)
-        flat = to_device(values.ravel())
+        flat = to_device(values.ravel(), float)
         return cls(values, flat, search, voxels, statistics, split, (first_sums, second_sums), (mean, scale))
 
     def calls(self, plan: Plan, square: float) -> tuple[Call, Call, Call]:

@@ -11,10 +11,11 @@ import warp as wp
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation.layout import Layers, Phased, make_layers
-from lfpiv_kernels.correlation.memory import Call, launch, new_array
+from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import GROUP, Plan, whole_groups
 from lfpiv_kernels.correlation.planes import PART, transform_call
 from lfpiv_kernels.correlation.transforms import ROWS, Spectrum, Transform
+from lfpiv_kernels.launch import Call, launch
 
 wp.set_module_options(native.options("spectra.h", contract="fast"))
 

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native
-from lfpiv_kernels.correlation.memory import to_device
+from lfpiv_kernels.launch import to_device
 
 ROWS = native.constant("spectra.h", "ROWS")
 """Frequencies that are computed at once; rows of the matrices along y are padded to a multiple of it."""
@@ -65,7 +65,7 @@ class Spectrum:
         transform = Transform()
         transform.quads = to_device(np.concatenate(self.folds).ravel(), int)
         transform.folds = wp.vec3i(len(first), len(second), int(first[:, 2:].max() >= 0))
-        transform.matrices, transform.size = to_device(self.matrices), wp.vec2i(*self.size)
+        transform.matrices, transform.size = to_device(self.matrices, float), wp.vec2i(*self.size)
         return transform
 
     @classmethod
@@ -107,7 +107,7 @@ class Planes:
         """Device arrays for the kernel."""
         transform = PlaneTransform()
         transform.quads, transform.rows = to_device(self.quads, int), to_device(self.rows, int)
-        transform.matrix = to_device(self.matrix)
+        transform.matrix = to_device(self.matrix, float)
         transform.folds, transform.counts = len(self.quads) // 4, wp.vec4i(*self.counts)
         return transform
 

@@ -10,8 +10,9 @@ import warp as wp
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation.layout import Lattice
-from lfpiv_kernels.correlation.memory import Call, new_array
+from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan, Triple, largest_factor, whole_groups
+from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("windows.h", contract="fast"))
 

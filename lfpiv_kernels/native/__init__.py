@@ -1,4 +1,4 @@
-"""C++ headers of the Warp kernels, which lie beside this file, and the options that compile a module with them.
+"""C++ headers of the Warp kernels, stored in this folder, and the options that compile a module with them.
 
 A kernel module names its header in ``wp.set_module_options(native.options("projector.h"))``; its ``wp.func_native``
 functions then call the header's functions in one line. Constants that C++ and Python share are written in the header.
@@ -10,7 +10,7 @@ from pathlib import Path
 import warp as wp
 
 FOLDER = Path(__file__).resolve().parent
-"""Where the headers lie."""
+"""Folder of the headers."""
 
 
 def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dict[str, object]:
@@ -19,10 +19,9 @@ def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dic
     Parameters
     ----------
     header : str
-        Name of the header. The module is compiled anew where it or a header that it includes has changed.
+        Name of the header. The module is compiled again if the header, or one that it includes, has changed.
     contract : {"fast", "off"}, optional
-        Whether the CPU's compiler fuses multiplications and additions across statements, or never; None: within
-        one expression.
+        Whether the CPU's compiler fuses multiplications and additions wherever it can, or never. Default: Warp decides.
     unroll : int
         Warp's limit for loops that it unrolls.
 
@@ -72,8 +71,3 @@ def _included(header: str) -> list[Path]:
             if FOLDER / name not in paths:
                 paths.append(FOLDER / name)
     return paths
-
-
-def read_native(name: str) -> str:
-    """Return the text of a source file of this folder, after an empty line."""
-    return "\n" + (FOLDER / name).read_text(encoding="utf-8")

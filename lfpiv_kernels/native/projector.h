@@ -76,17 +76,23 @@ LFPIV_INLINE float gather(const VoxelBlocks& blocks, const float* rays) {
 
 #if !defined(__CUDA_ARCH__)  // without atomics: each thread needs rays of its own
 
-/// Replace the rows of a block's rays; `update` returns a row's new light from the old one and the row's number.
+/// Replace the rows of a block's rays. A row's new light is update(old light, its levels); levels of neighbouring rows
+/// are `step` apart. Return the levels behind the last row.
 template <class Update>
-LFPIV_INLINE void update_rows(float* ray, int rows, int stride, Update update) {
+LFPIV_INLINE const unsigned char* update_rows(float* ray, int rows, int stride, const unsigned char* level, int step,
+                                              Update update) {
     int k = 0;
-    for (; k + 1 < rows; k += 2, ray += 2 * stride) {  // load two rows, then store two
-        const Row even = update(load<BLOCK_WIDTH>(ray), k);
-        const Row odd = update(load<BLOCK_WIDTH>(ray + stride), k + 1);
+    for (; k + 1 < rows; k += 2, ray += 2 * stride, level += 2 * step) {  // load two rows, then store two
+        const Row even = update(load<BLOCK_WIDTH>(ray), level);
+        const Row odd = update(load<BLOCK_WIDTH>(ray + stride), level + step);
         store(ray, even);
         store(ray + stride, odd);
     }
-    if (k < rows) store(ray, update(load<BLOCK_WIDTH>(ray), k));
+    if (k < rows) {
+        store(ray, update(load<BLOCK_WIDTH>(ray), level));
+        level += step;
+    }
+    return level;
 }
 
 /// Add a voxel's light, in units of one level, to its rays.
@@ -98,13 +104,12 @@ LFPIV_INLINE void scatter(const VoxelBlocks& blocks, float intensity, float* ray
         const Row light = first_lanes(splat<BLOCK_WIDTH>(intensity), columns);
         if (blocks.profiles) {
             const Row across = load_bytes<BLOCK_WIDTH>(level) * light;
-            level += columns;
-            update_rows(ray, rows, blocks.stride, [&](Row row, int k) { return row + across * (float)level[k]; });
-            level += rows;
+            level = update_rows(ray, rows, blocks.stride, level + columns, 1,
+                                [&](Row row, const unsigned char* down) { return row + across * (float)*down; });
         } else {
-            update_rows(ray, rows, blocks.stride,
-                        [&](Row row, int k) { return row + load_bytes<BLOCK_WIDTH>(level + k * columns) * light; });
-            level += rows * columns;
+            level = update_rows(ray, rows, blocks.stride, level, columns, [&](Row row, const unsigned char* values) {
+                return row + load_bytes<BLOCK_WIDTH>(values) * light;
+            });
         }
     }
 }

@@ -1,7 +1,7 @@
 """Taichi: trace rays from points in voxels through the pupil and the microlens array, count them per pixel (Eq. 10).
 
-Per point the mapping is a third-order polynomial of the pupil point, fitted to the calibrated mapping: it is smooth, so
-that evaluating the network per ray would buy nothing. Twin: ``reference.count``.
+The mapping of each point is a third-order polynomial of the pupil point, fitted to the calibrated mapping. The mapping
+is so smooth that evaluating it per ray would not be more accurate. Twin: ``reference.count``.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import taichi as ti
 
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
-from lfpiv_kernels.weights.footprint import Camera
+from lfpiv_kernels.weights.ray_model import Camera
 
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 """Exponents of u and v in the polynomial's terms."""
@@ -30,6 +30,7 @@ def _count_rays(
     count_out: ti.types.ndarray(dtype=ti.i32, ndim=3),
     total_out: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
+    """Count rays; see `count_rays`. Taichi takes arrays only as arguments of their own, hence their number."""
     step = 2.0 * camera[4] / samples
     for point in range(rays.shape[0]):
         w = window[point]
@@ -60,7 +61,9 @@ def _count_rays(
 
 
 def count_rays(rays, shift, window, first_pixel, camera, lattice, *, hexagonal, samples, shape):
-    """Trace a grid of `samples` x `samples` pupil points from every object point and count the rays per pixel.
+    """Trace rays from every object point through samples x samples pupil points and count them per pixel.
+
+    It has nine parameters because each is one array or number of the launch.
 
     Parameters
     ----------
@@ -69,15 +72,15 @@ def count_rays(rays, shift, window, first_pixel, camera, lattice, *, hexagonal, 
     shift : ndarray, shape (point, 2), float32
         Offset of each point's pupil grid, in [0, 1) of its step.
     window : ndarray, shape (point,), int32
-        Window (voxel) that a point's rays are counted in.
+        Window (voxel) in which a point's rays are counted.
     first_pixel : ndarray, shape (window, 2), int32
         (column, row) of each window's first pixel on the sensor. Rays outside a window are traced but not counted.
     camera, lattice
-        From `footprint.pack_camera` and `lattice.pack_lattice`.
+        From ``ray_model.pack_optics`` and `lattice.pack_lattice`.
     hexagonal : bool
         Layout of the array.
     samples : int
-        Pupil points per axis; those outside the pupil's disc are not traced.
+        Pupil points per axis. Those outside the pupil's disc are not traced.
     shape : tuple of int
         Rows and columns of a window.
 

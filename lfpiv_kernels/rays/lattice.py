@@ -1,4 +1,4 @@
-"""The microlens lattice as kernels take it: centres, cells, and Taichi functions that find the lens of a ray."""
+"""The microlens lattice for the kernels: centres and cells of lenses, and Taichi functions that find a ray's lens."""
 
 import numpy as np
 import taichi as ti
@@ -6,11 +6,11 @@ import taichi as ti
 Lattice = ti.types.vector(10, ti.f32)
 """Origin (s, t), basis vectors a (s, t) and b (s, t) [mm], and the rows of the inverse basis [1/mm]."""
 SLANT_STEPS = 4
-"""Steps that stand for a slanted side of a hexagonal cell."""
+"""Steps that replace a slanted side of a hexagonal cell."""
 
 
 def pack_lattice(origin_mm: np.ndarray, basis_mm: np.ndarray) -> Lattice:
-    """Pack a lattice for the kernels: lens (i, j) is centred at origin + i basis[0] + j basis[1] [mm]."""
+    """Return a lattice as the kernels take it. The centre of lens (i, j) is origin + i basis[0] + j basis[1] [mm]."""
     basis = np.asarray(basis_mm, float)
     inverse = np.linalg.inv(basis)  # offset @ inverse = (i, j)
     return Lattice(*np.asarray(origin_mm, float), *basis.ravel(), *inverse.T.ravel())
@@ -18,13 +18,13 @@ def pack_lattice(origin_mm: np.ndarray, basis_mm: np.ndarray) -> Lattice:
 
 @ti.func
 def lens_centre(lattice, i, j):
-    """Centre (s, t) [mm] of lens (i, j)."""
+    """Return the centre (s, t) [mm] of lens (i, j)."""
     return ti.Vector([lattice[0] + i * lattice[2] + j * lattice[4], lattice[1] + i * lattice[3] + j * lattice[5]])
 
 
 @ti.func
 def nearest_lens(lattice, s, t, hexagonal: ti.template()):
-    """Index (i, j) of the lens whose centre is nearest to (s, t); twin: ``LensLattice.nearest``."""
+    """Return the index (i, j) of the lens whose centre is nearest to (s, t). Twin: ``LensLattice.nearest``."""
     ds, dt = s - lattice[0], t - lattice[1]
     i = ti.round(lattice[6] * ds + lattice[7] * dt)
     j = ti.round(lattice[8] * ds + lattice[9] * dt)
@@ -41,10 +41,10 @@ def nearest_lens(lattice, s, t, hexagonal: ti.template()):
 
 
 def cell_steps(layout: str) -> np.ndarray:
-    """Outline of a lens's cell in its own frame, rows (half width along a, half height along b) [pitch].
+    """Return the outline of a lens's cell in its own frame: rows (half width along a, half height along b) [pitch].
 
-    Where |b| is above the height of the row before and at most its own, the cell reaches from -a to a. A square cell
-    is one row; the sides of a hexagonal one that face +-b are steps, its flat sides face +-a.
+    Between the height of the row before and its own height |b|, the cell reaches from -a to a. A square cell has one
+    row. The flat sides of a hexagonal cell face +-a; its slanted sides, which face +-b, are steps.
     """
     if layout == "square":
         return np.array([[0.5, 0.5]], np.float32)
@@ -55,7 +55,7 @@ def cell_steps(layout: str) -> np.ndarray:
 
 
 def cell_rectangles(layout: str) -> np.ndarray:
-    """Rectangles that make up a lens's cell, rows (a_low, a_high, b_low, b_high) in its own frame [pitch]."""
+    """Return the rectangles of a lens's cell: rows (a_low, a_high, b_low, b_high) in its own frame [pitch]."""
     (a, b), *steps = cell_steps(layout)
     rows, low = [(-a, a, -b, b)], b
     for a, high in steps:
@@ -65,10 +65,11 @@ def cell_rectangles(layout: str) -> np.ndarray:
 
 
 def cell_frame(basis_mm: np.ndarray, layout: str) -> np.ndarray:
-    """Matrix F, shape (2, 2): (a, b) = F (s, t) turns array millimetres into the frame of `cell_rectangles`.
+    """Return the matrix F, shape (2, 2), of (a, b) = F (s, t): from millimetres on the array to a cell's own frame.
 
-    A hexagonal cell has three such frames. The one nearest to the sensor's axes is taken: the projected edges of voxels
-    and pixels lie along these where a camera is upright, and along (a, b) they are integrated apart.
+    A hexagonal cell has three such frames. The one nearest to the sensor's axes is taken, because the projected edges
+    of voxels and pixels lie along these axes where a camera is upright, and weights are integrated along a and b
+    separately.
     """
     basis = np.asarray(basis_mm, float)
     if layout == "square":
@@ -76,6 +77,6 @@ def cell_frame(basis_mm: np.ndarray, layout: str) -> np.ndarray:
     pitch = np.sqrt(abs(np.linalg.det(basis)) * 2 / np.sqrt(3))
     third = basis[1] - basis[0] if basis[0] @ basis[1] > 0 else basis[1] + basis[0]
     neighbours = np.array([*basis, third])
-    a = neighbours[np.abs(neighbours).min(1).argmin()]  # equally long: the shorter part grows with the angle to an axis
+    a = neighbours[np.abs(neighbours).min(1).argmin()]  # the nearest to an axis: all are equally long
     a = a / np.linalg.norm(a)
     return np.array([a, [-a[1], a[0]]]) / pitch

@@ -1,4 +1,4 @@
-"""Taichi: evaluate the calibrated mapping, a network (Eqs. 6-7) and the thin lens under it, at many points.
+"""Taichi: evaluate the calibrated mapping, a network (Eqs. 6-7) plus a thin lens, at many points in single precision.
 
 Twins in float64: ``lfpiv.calibration.network.Network`` and ``lfpiv.calibration.thin_lens_model.ThinLensModel``.
 """
@@ -13,9 +13,9 @@ import taichi as ti
 from lfpiv_kernels import runtime
 
 BATCH = 8
-"""Points that a CPU thread carries through the network side by side, so that the compiler can use vector registers."""
+"""Points that a CPU thread evaluates side by side, so that the compiler can use vector registers."""
 CHUNK_RAYS = 1 << 24
-"""Rays per launch: far inside Taichi's 32-bit index space."""
+"""Rays per launch, far below the limit of Taichi's 32-bit indices."""
 
 _EXP2 = np.polynomial.Chebyshev.interpolate(np.exp2, 6, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial)
 _EXP2_TERMS = tuple(float(term) for term in _EXP2.convert(domain=[-1, 1]).coef[::-1])
@@ -24,7 +24,7 @@ _EXP2_TERMS = tuple(float(term) for term in _EXP2.convert(domain=[-1, 1]).coef[:
 
 @ti.func
 def _tanh(x):
-    """1 - 2 / (1 + exp(2x)) with an exponential that the compiler can vectorise, unlike a library call."""
+    """Return 1 - 2 / (1 + exp(2x)), with an exponential that the compiler can vectorise, unlike a library call."""
     power = ti.min(ti.max(x * 2.8853900817779268, -30.0), 30.0)  # exp(2x) = 2^power
     whole = ti.floor(power + 0.5)
     part = power - whole
@@ -35,19 +35,57 @@ def _tanh(x):
     return 1.0 - 2.0 / (1.0 + exponential)
 
 
-@functools.cache
-def _kernel(sizes, batch, fan, has_lens):
-    """Kernel for one architecture: `sizes` are inputs, nodes of each hidden layer, outputs.
+@ti.func
+def _read_inputs(
+    raw: ti.template(),
+    c,
+    ray,
+    points: ti.template(),
+    pupil: ti.template(),
+    inputs: ti.template(),
+    fan: ti.template(),
+):
+    """Write the inputs of a ray into column c of `raw`; with a fan the last two are the pupil point."""
+    if ti.static(fan):
+        for i in ti.static(range(inputs - 2)):
+            raw[i, c] = points[ray // pupil.shape[0], i]
+        for i in ti.static(range(2)):
+            raw[inputs - 2 + i, c] = pupil[ray % pupil.shape[0], i]
+    else:
+        for i in ti.static(range(inputs)):
+            raw[i, c] = points[ray, i]
 
-    Taichi compiles it at its first call. Only the loops over inputs, outputs and layers are unrolled: unrolled nodes
-    are no faster and take a minute to compile for fifteen layers.
-    """
-    hidden_layers = len(sizes) - 2
-    inputs, outputs = sizes[0], sizes[-1]
-    first = [0]  # where each layer begins in `layers`: per node its weights, then its bias
+
+@ti.func
+def _add_thin_lens(value: ti.template(), raw: ti.template(), c, lens: ti.template()):
+    """Add (s, t) behind the thin lens `lens`, see `_pack_lens`, to column c of `value`."""
+    x, y, z = raw[0, c] - lens[0], raw[1, c] - lens[1], raw[2, c] - lens[2]
+    camera_z = lens[9] * x + lens[10] * y + lens[11] * z
+    magnification = lens[13] / (lens[12] - camera_z)
+    gain = lens[15] * (lens[14] + magnification * camera_z / lens[12])
+    for o in ti.static(range(2)):
+        camera = lens[3 + 3 * o] * x + lens[4 + 3 * o] * y + lens[5 + 3 * o] * z
+        value[o, c] += lens[16 + o] + gain * raw[3 + o, c] - magnification * camera
+
+
+def _layer_starts(sizes):
+    """Return where each layer begins in the array of all layers, which holds the weights and the bias of each node."""
+    first = [0]
     for fan_in, nodes in pairwise(sizes):
         first.append(first[-1] + (fan_in + 1) * nodes)
-    width = max(sizes[:-2])  # nodes that are held; the last hidden layer's go straight into the outputs
+    return first
+
+
+@functools.cache
+def _kernel(sizes, batch, fan, has_lens):
+    """Return the kernel of one architecture: `sizes` are inputs, nodes of each hidden layer, outputs.
+
+    Taichi compiles it at its first call. Only the loops over inputs, outputs and layers are unrolled. Unrolled nodes
+    would take a minute to compile for fifteen layers.
+    """
+    inputs, outputs, hidden_layers = sizes[0], sizes[-1], len(sizes) - 2
+    first = _layer_starts(sizes)
+    width = max(sizes[:-2])  # nodes that are stored; those of the last hidden layer are added to the outputs at once
 
     @ti.kernel
     def _evaluate(
@@ -63,18 +101,11 @@ def _kernel(sizes, batch, fan, has_lens):
         rays = values_out.shape[0]
         for b in range((rays + batch - 1) // batch):
             raw = ti.Matrix.zero(ti.f32, inputs, batch)
-            held = ti.Matrix.zero(ti.f32, 2 * width, batch)  # a layer's inputs and outputs, by turns
+            held = ti.Matrix.zero(ti.f32, 2 * width, batch)  # inputs and outputs of a layer in turn
             value = ti.Matrix.zero(ti.f32, outputs, batch)
             for c in range(batch):
                 ray = ti.min(b * batch + c, rays - 1)
-                if ti.static(fan):
-                    for i in ti.static(range(inputs - 2)):
-                        raw[i, c] = points[ray // pupil.shape[0], i]
-                    for i in ti.static(range(2)):
-                        raw[inputs - 2 + i, c] = pupil[ray % pupil.shape[0], i]
-                else:
-                    for i in ti.static(range(inputs)):
-                        raw[i, c] = points[ray, i]
+                _read_inputs(raw, c, ray, points, pupil, inputs, fan)
             for c in range(batch):
                 for i in ti.static(range(inputs)):
                     held[i, c] = (raw[i, c] - scaling[0, i]) * scaling[1, i]
@@ -107,13 +138,7 @@ def _kernel(sizes, batch, fan, has_lens):
                 ray = b * batch + c
                 if ray < rays:
                     if ti.static(has_lens):
-                        x, y, z = raw[0, c] - lens[0], raw[1, c] - lens[1], raw[2, c] - lens[2]
-                        camera_z = lens[9] * x + lens[10] * y + lens[11] * z
-                        magnification = lens[13] / (lens[12] - camera_z)
-                        gain = lens[15] * (lens[14] + magnification * camera_z / lens[12])
-                        for o in ti.static(range(2)):
-                            camera = lens[3 + 3 * o] * x + lens[4 + 3 * o] * y + lens[5 + 3 * o] * z
-                            value[o, c] += lens[16 + o] + gain * raw[3 + o, c] - magnification * camera
+                        _add_thin_lens(value, raw, c, lens)
                     for o in ti.static(range(outputs)):
                         values_out[ray, o] = value[o, c]
 
@@ -127,29 +152,29 @@ def evaluate(
     *,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Evaluate a mapping at many points, in single precision on the running device.
+    """Evaluate a mapping at many points on the running device.
 
     Parameters
     ----------
     arrays : mapping of str to ndarray
         ``Network.to_arrays()``; with ``| ThinLensModel.to_arrays()`` the thin lens is added to the network's outputs.
     points : ndarray, shape (n, d), float32
-        Inputs, C-contiguous; for one camera (x, y, z, u, v) [mm]. Finite.
+        Inputs, C-contiguous and finite; for a camera (x, y, z, u, v) [mm].
     pupil : ndarray, shape (k, 2), float32, optional
-        Pupil points (u, v) [mm] that every point's rays cross: `points` then lacks its last two columns, (n, d - 2),
-        and n k rays are traced without an array of all their inputs.
+        Pupil points (u, v) [mm] of the rays from every point. Then `points` has the shape (n, d - 2), without u and v,
+        and n k rays are evaluated without an array of all their inputs.
     out : ndarray, shape (n, m) or (n, k, m), float32, optional
-        Receives the result.
+        Array for the result.
 
     Returns
     -------
     ndarray, shape (n, m), or (n, k, m) with `pupil`; float32
-        Outputs; for one camera (s, t) [mm].
+        Outputs; for a camera (s, t) [mm].
 
     Raises
     ------
     ValueError
-        If an array is missing, or has another shape or dtype or is not C-contiguous.
+        If an array is missing, has another shape or dtype, or is not C-contiguous.
     """
     sizes, scaling, layers, lens = pack_mapping(arrays)
     fan = pupil is not None
@@ -179,12 +204,12 @@ def evaluate(
 def pack_mapping(
     arrays: Mapping[str, np.ndarray],
 ) -> tuple[tuple[int, ...], np.ndarray, np.ndarray, np.ndarray | None]:
-    """Pack a mapping for the kernel: sizes, input scaling, layers (output scaling in the last), thin lens or None.
+    """Return a mapping as the kernel takes it: sizes, input scaling, layers with output scaling, thin lens or None.
 
     Raises
     ------
     ValueError
-        If an array is missing or a thin lens meets a network that does not map 5 inputs to 2 outputs.
+        If an array is missing, or if there is a thin lens and the network does not map 5 inputs to 2 outputs.
     """
     try:
         depth = sum(name.startswith("weight_") for name in arrays)
@@ -213,9 +238,9 @@ def pack_mapping(
 
 
 def _pack_lens(arrays):
-    """Thin lens as 18 numbers: offset (3), rotation (9), s_o, s_i, 1 - s_i/f + s_i/s_o, pupil scale, axis (2).
+    """Return a thin lens as 18 numbers: offset (3), rotation (9), s_o, s_i, 1 - s_i/f + s_i/s_o, pupil scale, axis (2).
 
-    The third but last difference is taken in double precision; it is zero for a camera focused at its offset.
+    1 - s_i/f + s_i/s_o is computed in double precision; it is zero for a camera focused at its offset.
     """
     distance, focus = (float(arrays[f"thin_lens_{name}_distance_mm"]) for name in ("object", "image"))
     focal_length = float(arrays["thin_lens_focal_length_mm"])
@@ -225,7 +250,7 @@ def _pack_lens(arrays):
 
 
 def _check(name, array, shape):
-    """Raise ValueError unless `array` is a C-contiguous float32 array of the shape; None stands for any length."""
+    """Raise ValueError unless `array` is a C-contiguous float32 array of the shape, in which None is any length."""
     expected = "(" + ", ".join("n" if length is None else str(length) for length in shape) + ")"
     found = getattr(array, "shape", None)
     fits = found is not None and len(found) == len(shape)

@@ -1,77 +1,100 @@
-"""Warp: the light of a sensor's pixels as rays, and back, for those rays that voxels light.
+"""Warp: the linear map between the rays of a camera and the pixels of its sensor, for those rays that voxels light.
 
-A pixel at the edge of two microimages sees two parts of the pupil through two lenses; its rays are kept apart, each
-with the share of the pixel's cell that lies inside the pupil. So a voxel's weights need no coverage of their own, and a
-microimage lies in one piece of memory. The loops are C++: as Warp's they take three times as long on the CPU. Twin:
-``reference.dense``.
+A pixel at the edge of two microimages sees two parts of the pupil through two lenses. It has a ray for each, with the
+share of the pixel's cell that lies inside the pupil: image[p] = sum of share[r] * light[r] over the rays r of pixel p.
+The rays of a microimage are neighbours in memory. The loops are C++, see ``pixel_rays.h``. Twin: ``reference.dense``.
 """
 
-import sys
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.native import read_native
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch, to_device
 from lfpiv_kernels.weights.microimages import Microimages
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+wp.set_module_options(native.options("pixel_rays.h"))
 
-RUN = 64
+RUN: int = native.constant("pixel_rays.h", "RUN")
 """Pixels that a thread goes through."""
 
 
 @wp.struct
-class Rays:
-    """The rays of every pixel, pixels in the order in which their first rays lie in memory."""
+class PixelRays:
+    """The rays of every pixel. Pixels are in the order in which their first rays lie in memory."""
 
     pixel: wp.array(dtype=int)
     """Sensor pixel."""
     first: wp.array(dtype=int)
-    """Index of its first ray, one more than pixels."""
+    """Index of its first ray; one element more than there are pixels."""
     place: wp.array(dtype=int)
-    """Where each ray lies."""
+    """Where each ray lies in memory."""
     share: wp.array(dtype=float)
-    """Fraction of the pixel's cell that it stands for."""
+    """Fraction of the pixel's cell that the ray stands for."""
     dark: wp.array(dtype=int)
-    """Where rays lie that no pixel sees, though voxels light them: corners of blocks."""
+    """Where rays lie that voxels light but no pixel sees: corners of blocks."""
     runs: int
     """Threads that go through all pixels."""
 
 
-# `for_pixels(work)` calls work(first pixel, number) for a run's pixels: on the CPU for all at once, so that its vectors
-# are full; on a GPU for each, and so that neighbouring threads have neighbouring pixels.
-RAYS = f"    const int RUN = {RUN};" + read_native("pixel_rays_rays.inc")
+@wp.struct
+class PlacedRays:
+    """Rays in memory, part after part, and what each ray of the camera belongs to."""
 
-_COLLECT = RAYS + read_native("pixel_rays_collect.inc")
-
-_SPREAD = RAYS + read_native("pixel_rays_spread.inc")
-
-
-# Two sweeps over the lit rays: the first numbers the pixels that see them, as they come, and counts their rays,
-# the second puts each pixel's rays side by side. One thread's work, bound by memory.
-_LIGHT = read_native("pixel_rays_light.inc")
-
-_NUMBER = _LIGHT + read_native("pixel_rays_number.inc")
-
-_SORT = _LIGHT + read_native("pixel_rays_sort.inc")
+    light: wp.array(dtype=float)
+    """Per place; not zero where voxels light the ray."""
+    parts: wp.array(dtype=int)
+    """Where each part's rays begin in `light`, and the end of the last."""
+    starts: wp.array(dtype=int)
+    """The first ray of each part."""
+    pixel: wp.array(dtype=int)
+    """Sensor pixel of each ray."""
+    share: wp.array(dtype=float)
+    """Fraction of the pixel's cell that each ray stands for."""
 
 
-@wp.func_native(_COLLECT)
-def _collect_run(run: int, map: Rays, rays: wp.array(dtype=float), image_out: wp.array(dtype=float)): ...
+@wp.func_native("lfpiv::collect(lfpiv::pixel_run(map, run), rays.data, image_out.data);")
+def _collect_run(run: int, map: PixelRays, rays: wp.array(dtype=float), image_out: wp.array(dtype=float)): ...
 
 
-@wp.func_native(_SPREAD)
-def _spread_run(run: int, map: Rays, image: wp.array(dtype=float), rays_out: wp.array(dtype=float)): ...
+@wp.func_native("lfpiv::spread(lfpiv::pixel_run(map, run), image.data, rays_out.data);")
+def _spread_run(run: int, map: PixelRays, image: wp.array(dtype=float), rays_out: wp.array(dtype=float)): ...
+
+
+@wp.func_native("""
+    lfpiv::number_pixels(lfpiv::placed_rays(placed), number_out.data, pixel_out.data, first_out.data, count_out.data);
+""")
+def _number(
+    placed: PlacedRays,
+    number_out: wp.array(dtype=int),
+    pixel_out: wp.array(dtype=int),
+    first_out: wp.array(dtype=int),
+    count_out: wp.array(dtype=int),
+): ...
+
+
+@wp.func_native("""
+    lfpiv::sort_rays(
+        lfpiv::placed_rays(placed), number.data, first_out.data, place_out.data, share_out.data, dark_out.data
+    );
+""")
+def _sort(
+    placed: PlacedRays,
+    number: wp.array(dtype=int),
+    first_out: wp.array(dtype=int),
+    place_out: wp.array(dtype=int),
+    share_out: wp.array(dtype=float),
+    dark_out: wp.array(dtype=int),
+): ...
 
 
 @wp.kernel
 def _collect(
     # in
-    first_run: int,
-    map: Rays,
+    map: PixelRays,
     rays: wp.array(dtype=float),
+    first_run: int,
     # out
     image_out: wp.array(dtype=float),
 ):
@@ -81,77 +104,40 @@ def _collect(
 @wp.kernel
 def _spread(
     # in
-    first_run: int,
-    map: Rays,
+    map: PixelRays,
     image: wp.array(dtype=float),
+    first_run: int,
     # out
     rays_out: wp.array(dtype=float),
 ):
     _spread_run(first_run + wp.tid(), map, image, rays_out)
 
 
-@wp.func_native(_NUMBER)
-def _number(
-    light: wp.array(dtype=float),
-    parts: wp.array(dtype=int),
-    starts: wp.array(dtype=int),
-    pixel: wp.array(dtype=int),
-    share: wp.array(dtype=float),
-    number_out: wp.array(dtype=int),
-    pixel_out: wp.array(dtype=int),
-    first_out: wp.array(dtype=int),
-    count_out: wp.array(dtype=int),
-): ...
-
-
-@wp.func_native(_SORT)
-def _sort(
-    light: wp.array(dtype=float),
-    parts: wp.array(dtype=int),
-    starts: wp.array(dtype=int),
-    pixel: wp.array(dtype=int),
-    share: wp.array(dtype=float),
-    number: wp.array(dtype=int),
-    first_out: wp.array(dtype=int),
-    place_out: wp.array(dtype=int),
-    share_out: wp.array(dtype=float),
-    dark_out: wp.array(dtype=int),
-): ...
-
-
 @wp.kernel
 def _number_pixels(
     # in
-    light: wp.array(dtype=float),
-    parts: wp.array(dtype=int),  # where each part's rays begin in `light`, and the end of the last
-    starts: wp.array(dtype=int),  # the first ray of each part
-    pixel: wp.array(dtype=int),  # of each ray
-    share: wp.array(dtype=float),
+    placed: PlacedRays,
     # out
-    number_out: wp.array(dtype=int),  # (sensor pixel,): 1, 2, ... as light comes to them; 0 in the dark
-    pixel_out: wp.array(dtype=int),
+    number_out: wp.array(dtype=int),  # (sensor pixel,): 1, 2, ... in the order of their first rays; 0 without light
+    pixel_out: wp.array(dtype=int),  # sensor pixel of each number
     first_out: wp.array(dtype=int),  # (sensor pixel + 2,): where the rays of each number begin
-    count_out: wp.array(dtype=int),  # pixels, rays, dark places
+    count_out: wp.array(dtype=int),  # numbers of pixels, rays and dark places
 ):
-    _number(light, parts, starts, pixel, share, number_out, pixel_out, first_out, count_out)
+    _number(placed, number_out, pixel_out, first_out, count_out)
 
 
 @wp.kernel
 def _sort_rays(
     # in
-    light: wp.array(dtype=float),
-    parts: wp.array(dtype=int),
-    starts: wp.array(dtype=int),
-    pixel: wp.array(dtype=int),
-    share: wp.array(dtype=float),
+    placed: PlacedRays,
     number: wp.array(dtype=int),
     # out
-    first_out: wp.array(dtype=int),  # where the rays of each number end, that is those of the next begin
+    first_out: wp.array(dtype=int),  # in: of `_number_pixels`; out: where the rays of each number end
     place_out: wp.array(dtype=int),
     share_out: wp.array(dtype=float),
     dark_out: wp.array(dtype=int),
 ):
-    _sort(light, parts, starts, pixel, share, number, first_out, place_out, share_out, dark_out)
+    _sort(placed, number, first_out, place_out, share_out, dark_out)
 
 
 class RayMap:
@@ -162,27 +148,26 @@ class RayMap:
     microimages : Microimages
         All rays of the camera.
     light : ndarray, shape (place,), float32
-        Light of the rays where they lie in memory, part after part; those that voxels light are not zero.
+        Light of the rays where they lie in memory, part after part. It is not zero where voxels light a ray.
     parts : sequence of int
         Where each part's rays begin, and the end of the last.
     starts : sequence of int
-        The first ray of each part; one ray may lie in several parts, whose light adds up.
+        The first ray of each part. A ray may lie in several parts; their light adds up.
     """
 
     def __init__(self, microimages: Microimages, light: np.ndarray, parts: Sequence[int], starts: Sequence[int]):
-        device = runtime.device().warp
-        for where in {"cpu", device}:
-            wp.load_module(sys.modules[__name__], device=where)  # before threads use it
         size = int(np.prod(microimages.sensor_shape))
-        rays = [light, *(np.array(ends, np.int32) for ends in (parts, starts)), microimages.pixel, microimages.share]
+        placed = PlacedRays()
+        placed.light, placed.pixel, placed.share = map(_on_cpu, (light, microimages.pixel, microimages.share))
+        placed.parts, placed.starts = (_on_cpu(np.array(ends, np.int32)) for ends in (parts, starts))
         number, seen, first, count = (np.zeros(length, np.int32) for length in (size, size, size + 2, 3))
-        _on_cpu(_number_pixels, rays, [number, seen, first, count])
+        _run_once(_number_pixels, [placed], [number, seen, first, count])
         pixels, lit, darks = (int(n) for n in count)
         place, share, dark = np.empty(lit, np.int32), np.empty(lit, np.float32), np.empty(darks, np.int32)
-        _on_cpu(_sort_rays, [*rays, number], [first, place, share, dark])
+        _run_once(_sort_rays, [placed, _on_cpu(number)], [first, place, share, dark])
         self.pixel: np.ndarray = seen[:pixels].copy()
         """Sensor pixels that voxels light, in the order of their first rays, shape (pixel,), int32."""
-        self.rays = Rays()
+        self.rays = PixelRays()
         arrays = {
             "pixel": self.pixel,
             "first": first[: pixels + 1].copy(),
@@ -191,27 +176,23 @@ class RayMap:
             "dark": dark,
         }
         for name, array in arrays.items():
-            setattr(self.rays, name, wp.array(array, device=device, copy=False))
+            setattr(self.rays, name, to_device(array))
         self.rays.runs = -(-max(pixels, min(darks, 1)) // RUN)
 
     def spread(self, image: wp.array, rays_out: wp.array) -> None:
-        """Give every ray its pixel's light times its share: the adjoint of `collect`."""
-        self._launch(_spread, [image], rays_out)
+        """Write each pixel's light, times their shares, on its rays: the adjoint of `collect`."""
+        launch(Call(_spread, self.rays.runs, [self.rays, image], [rays_out]), parts=runtime.CHUNKS)
 
     def collect(self, rays: wp.array, image_out: wp.array) -> None:
-        """Sum the rays of every pixel, each times its share; pixels without rays are left as they are."""
-        self._launch(_collect, [rays], image_out)
-
-    def _launch(self, kernel, inputs, out) -> None:
-        where = runtime.device().warp
-
-        def launch(_, first, last):
-            wp.launch(kernel, dim=last - first, inputs=[first, self.rays, *inputs], outputs=[out], device=where)
-
-        runtime.run_chunks(self.rays.runs, launch)
+        """Sum the rays of every pixel, each times its share. Pixels without rays do not change."""
+        launch(Call(_collect, self.rays.runs, [self.rays, rays], [image_out]), parts=runtime.CHUNKS)
 
 
-def _on_cpu(kernel, inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
-    """Run a kernel once on arrays in the CPU's memory."""
-    inputs, outputs = ([wp.array(array, device="cpu", copy=False) for array in some] for some in (inputs, outputs))
-    wp.launch(kernel, dim=1, inputs=inputs, outputs=outputs, device="cpu")
+def _on_cpu(array: np.ndarray) -> wp.array:
+    return to_device(array, device="cpu")
+
+
+def _run_once(kernel: wp.Kernel, inputs: list[object], outputs: list[np.ndarray]) -> None:
+    """Run one thread of a kernel on arrays in the CPU's memory: the work is bound by memory."""
+    runtime.device()
+    wp.launch(kernel, dim=1, inputs=inputs, outputs=[_on_cpu(array) for array in outputs], device="cpu")

@@ -1,15 +1,13 @@
-"""Warp: forward projection and its adjoint on weights stored as 8-bit blocks of rays.
+"""Warp: projection of voxels to pixels and its adjoint, with weights stored as 8-bit blocks of rays.
 
-A block is at most LANES rays wide, so that its row is one vector, and some rows high. It holds one value per ray, or a
-profile along the columns and one along the rows, whose products are the values. The backward pass gathers per voxel.
-The forward pass scatters: on the CPU every part of the voxels adds into rays of its own, which each pixel sums in a
-fixed order; on CUDA it adds atomically. The innermost loops are C++: as Warp's vectors they take two to three times as
-long on the CPU. Twin: ``reference.dense``.
+A block is at most `BLOCK_WIDTH` rays wide, so that its row is one vector. It holds one value per ray, or a profile
+along the columns and one along the rows, whose products are the values. The adjoint gathers per voxel. The projection
+scatters: on the CPU every part of the voxels adds to rays of its own, which each pixel sums in a fixed order; on CUDA
+it adds atomically. The innermost loops are C++, see ``projector.h``. Twin: ``reference.dense``.
 """
 
 import contextlib
 import itertools
-import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,20 +16,20 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch, to_device
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.weights.microimages import Microimages
-from lfpiv_kernels.weights.ray_model import LANES
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 wp.set_module_options(native.options("projector.h"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """Weights of all voxels for one camera; twin of a sparse matrix with 8-bit values and a scale per column.
+    """Weights of all voxels for one camera: a sparse matrix with 8-bit values and a scale per column.
 
-    A block is `width` rays wide and `height` rows high. In the form "pixels" its values are those of its rays, row by
-    row. In the form "profiles" they are `width` column values A, then `height` row values B; the value of column c and
-    row k is A[c] B[k].
+    A block is `width` rays wide and `height` rows high. In the form "pixels" it has one value per ray, row by row. In
+    the form "profiles" it has `width` values A, then `height` values B; the value of column c and row k is A[c] B[k].
     """
 
     form: str
@@ -45,13 +43,13 @@ class Blocks:
     height: np.ndarray
     """Rows of rays of each block, shape (block,), uint8."""
     width: np.ndarray
-    """Rays in a row of each block, at most LANES, shape (block,), uint8."""
+    """Rays in a row of each block, at most `BLOCK_WIDTH`, shape (block,), uint8."""
     value: np.ndarray
-    """Weights in levels, shape (value + LANES,), uint8: a vector may be read past the last one."""
+    """Weights in levels, shape (value + BLOCK_WIDTH,), uint8. A vector may be read past the last one."""
     scale: np.ndarray
     """Weight of one level, shape (voxel,), float32."""
     microimages: Microimages
-    """How the rays lie in memory."""
+    """Where the rays lie in memory."""
 
     @property
     def nbytes(self) -> int:
@@ -62,7 +60,7 @@ class Blocks:
         )
 
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rays of one voxel and their weights, shapes (entry,): a ray may occur twice."""
+        """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur twice."""
         value, rays, weights = int(self.first_value[voxel]), [], []
         for block in range(self.first_block[voxel], self.first_block[voxel + 1]):
             width, height = int(self.width[block]), int(self.height[block])
@@ -105,10 +103,10 @@ def _scatter(matrix: Matrix, voxel: int, intensity: float, rays_out: wp.array(dt
 @wp.kernel
 def _back_project(
     # in
-    first_voxel: int,
     matrix: Matrix,
     rays: wp.array(dtype=float),
     active: wp.array(dtype=float),
+    first_voxel: int,
     # out
     volume_out: wp.array(dtype=float),
 ):
@@ -121,9 +119,9 @@ def _back_project(
 @wp.kernel
 def _project(
     # in
-    first_voxel: int,
     matrix: Matrix,
     volume: wp.array(dtype=float),
+    first_voxel: int,
     # out
     rays_out: wp.array(dtype=float),
 ):
@@ -135,7 +133,7 @@ def _project(
 
 @wp.func
 def _level(matrix: Matrix, value: wp.int64, width: int, row: int, column: int):
-    """Level of a block's ray; its values begin at `value`."""
+    """Return the level of a block's ray. The block's values begin at `value`."""
     if matrix.profiles:
         return float(matrix.level[value + wp.int64(column)]) * float(matrix.level[value + wp.int64(width + row)])
     return float(matrix.level[value + wp.int64(row * width + column)])
@@ -143,7 +141,7 @@ def _level(matrix: Matrix, value: wp.int64, width: int, row: int, column: int):
 
 @wp.func
 def _values(matrix: Matrix, width: int, height: int):
-    """Values of a block."""
+    """Return the number of a block's values."""
     if matrix.profiles:
         return wp.int64(width + height)
     return wp.int64(width * height)
@@ -154,10 +152,11 @@ def _project_atomic(
     # in
     matrix: Matrix,
     volume: wp.array(dtype=float),
+    first_voxel: int,
     # out
     rays_out: wp.array(dtype=float),
 ):
-    voxel = wp.tid()
+    voxel = first_voxel + wp.tid()
     intensity = volume[voxel] * matrix.scale[voxel]
     if intensity == 0.0:
         return
@@ -175,9 +174,9 @@ def _project_atomic(
 @wp.kernel
 def _count_lit(
     # in
-    first_voxel: int,
     matrix: Matrix,
     share: wp.array(dtype=float),
+    first_voxel: int,
     # out
     count_out: wp.array(dtype=int),
 ):
@@ -196,48 +195,42 @@ def _count_lit(
 class Projector:
     """The linear map of one camera's weights on the running device: voxels to sensor pixels, and back.
 
-    Light goes from voxels to rays (`scatter`) and from rays to pixels, and the same way back (`gather`). On the way the
-    rays keep it, in memory of their own for every part of the voxels that a CPU launch takes: so no two threads write
-    one ray, and results do not depend on their number. A ray that voxels of two parts light lies in both.
+    Light goes from voxels to rays (`scatter`) and from rays to pixels; back from pixels to rays and from rays to voxels
+    (`gather`). Each part of the voxels that a CPU launch takes has memory of its own for its rays. So no two threads
+    write the same ray, and results do not depend on the number of threads. The light of a ray that voxels of two parts
+    light lies in both parts and is added up.
 
-    `project` and `back_project` may be called from several threads, which take turns. Whoever calls `scatter` and
-    `gather`, and counts on the light on the rays in between, does so inside `kept`.
+    `project` and `back_project` may be called from several threads, which take turns. A caller of `scatter` and
+    `gather` that needs the light on the rays in between calls them inside `reserved`.
 
-    Arrays in and out are float32, C-contiguous and flat; on the CPU they are used in place.
+    Arrays in and out are float32, C-contiguous and flat. On the CPU they are used in place.
     """
 
     def __init__(self, blocks: Blocks):
-        self._turn, self._kept = threading.RLock(), False
+        self._turn, self._reserved = threading.RLock(), False
         self.blocks = blocks
-        self._device = runtime.device()
+        self._on_cpu = runtime.device().kind == "cpu"
         self._matrix = Matrix()
-        self._matrix.first_block = self._put(blocks.first_block, int)
-        self._matrix.first_value = self._put(blocks.first_value, wp.int64)
-        self._matrix.ray = self._put(blocks.ray, int)
-        self._matrix.height = self._put(blocks.height, wp.uint8)
-        self._matrix.width = self._put(blocks.width, wp.uint8)
-        self._matrix.level = self._put(blocks.value, wp.uint8)
-        self._matrix.scale = self._put(blocks.scale, float)
+        for name in ("first_block", "first_value", "ray", "height", "width", "scale"):
+            setattr(self._matrix, name, to_device(getattr(blocks, name)))
+        self._matrix.level = to_device(blocks.value)
         self._matrix.stride = blocks.microimages.edge
         self._matrix.profiles = blocks.form == "profiles"
-        wp.load_module(sys.modules[__name__], device=self._device.warp)  # before threads use it
+        wp.load_module(_project.module, device=runtime.device().warp)  # before threads start
         self._spans = self._find_spans()
         self._places = np.cumsum([0] + [stop - start for start, stop in self._spans])
-        self.rays = self._put(np.empty(max(int(self._places[-1]), 1), np.float32), float)  # `scatter` writes it first
+        self.rays = to_device(np.empty(max(int(self._places[-1]), 1), np.float32))  # `scatter` writes it first
         """The light on the rays, part after part."""
-        self._parts = [  # each as if it began with the camera's first ray, where the blocks count from
+        self._parts = [  # each as if it began with the camera's first ray, from which the blocks count
             wp.array(ptr=self.rays.ptr + 4 * (int(place) - start), dtype=float, shape=(stop,), device=self.rays.device)
             for place, (start, stop) in zip(self._places, self._spans, strict=False)
         ]
         self.map = self._map_rays()
 
-    def _put(self, array, dtype):
-        return wp.array(array, dtype=dtype, device=self._device.warp, copy=False)
-
-    def _find_spans(self):
-        """First and last ray that each part of the voxels can touch."""
+    def _find_spans(self) -> list[tuple[int, int]]:
+        """Return the first ray that each part of the voxels can touch, and the end of its rays."""
         voxels, rays = len(self.blocks.scale), self.blocks.microimages
-        if self._device.kind == "cuda":
+        if not self._on_cpu:
             return [(0, rays.size)]
         edges = [self.blocks.first_block[voxels * part // runtime.CHUNKS] for part in range(runtime.CHUNKS + 1)]
         spans = []
@@ -246,117 +239,91 @@ class Projector:
                 spans.append((0, 0))
                 continue
             first, last, tall = self.blocks.ray[a:b].min(), self.blocks.ray[a:b].max(), self.blocks.height[a:b].max()
-            spans.append((int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + LANES, rays.size)))
+            spans.append((int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + BLOCK_WIDTH, rays.size)))
         return spans
 
-    def _map_rays(self):
-        """Map of the rays that voxels light to pixels."""
+    def _map_rays(self) -> RayMap:
+        """Return the map between pixels and the rays that voxels light."""
         self.scatter(np.ones(len(self.blocks.scale), np.float32))
         return RayMap(self.blocks.microimages, self.rays.numpy(), self._places, [start for start, _ in self._spans])
 
     @contextlib.contextmanager
-    def kept(self) -> Iterator[None]:
-        """Keep the light on the rays: other threads wait meanwhile.
+    def reserved(self) -> Iterator[None]:
+        """Reserve the rays for this thread. Other threads wait.
 
         Raises
         ------
         RuntimeError
-            If this thread is inside `kept` already: it would overwrite the light on the rays.
+            If this thread has reserved them already: it would overwrite the light on them.
         """
         with self._turn:
-            if self._kept:
+            if self._reserved:
                 raise RuntimeError(
                     "weights: these are in use by a reconstruction of the same thread, whose `progress` cannot project "
                     "with them. Do so before or after it, or build weights of its own."
                 )
-            self._kept = True
+            self._reserved = True
             try:
                 yield
             finally:
-                self._kept = False
+                self._reserved = False
 
     def scatter(self, volume: np.ndarray) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays."""
-        voxels = self._put(volume, float)
-        if self._device.kind == "cuda":
+        voxels = to_device(volume, float)
+        if not self._on_cpu:
             self.rays.zero_()
-            wp.launch(
-                _project_atomic,
-                dim=len(volume),
-                inputs=[self._matrix, voxels],
-                outputs=[self.rays],
-                device=self._device.warp,
-            )
+            launch(Call(_project_atomic, len(volume), [self._matrix, voxels], [self.rays]))
             return
         rays = self.rays.numpy()
 
-        def launch(part, first, last):
+        def scatter_part(part, first, last):
             rays[self._places[part] : self._places[part + 1]] = 0.0
-            wp.launch(
-                _project,
-                dim=last - first,
-                inputs=[first, self._matrix, voxels],
-                outputs=[self._parts[part]],
-                device="cpu",
-            )
+            inputs, outputs = [self._matrix, voxels, first], [self._parts[part]]
+            wp.launch(_project, dim=last - first, inputs=inputs, outputs=outputs, device="cpu")
 
-        runtime.run_chunks(len(volume), launch)
+        runtime.run_chunks(len(volume), scatter_part)
 
     def gather(self, out: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-        """Add the weighted sum of the light on each voxel's rays to `out`, shape (voxel,).
+        """Add the weighted sum of the light on each voxel's rays to `out`, shape (voxel,), and return it.
 
-        Voxels whose `active` is zero are left out. Returns `out`.
+        Voxels whose `active`, shape (voxel,), float32, is zero do not change.
         """
-        volume = self._put(out, float)
-        mask = self._put(np.ones_like(out) if active is None else active, float)
+        volume, device = to_device(out, float), runtime.device().warp
+        mask = to_device(np.ones_like(out) if active is None else active, float)
 
-        def launch(part, first, last):
-            wp.launch(
-                _back_project,
-                dim=last - first,
-                inputs=[first, self._matrix, self._parts[part], mask],
-                outputs=[volume],
-                device=self._device.warp,
-            )
+        def gather_part(part, first, last):
+            inputs = [self._matrix, self._parts[part], mask, first]
+            wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume], device=device)
 
-        runtime.run_chunks(len(out), launch)
-        if self._device.kind == "cuda":
+        runtime.run_chunks(len(out), gather_part)
+        if not self._on_cpu:
             out[:] = volume.numpy()
         return out
 
     def project(self, volume: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Write the image of `volume`, shape (voxel,), into `out`, shape (pixel,); returns `out`."""
-        with self.kept():
+        """Write the image of `volume`, shape (voxel,), into `out`, shape (pixel,), and return it."""
+        with self.reserved():
             self.scatter(volume)
             out.fill(0.0)  # pixels that no voxel lights
-            image = self._put(out, float)
+            image = to_device(out, float)
             self.map.collect(self.rays, image)
-        if self._device.kind == "cuda":
+        if not self._on_cpu:
             out[:] = image.numpy()
         return out
 
     def back_project(self, image: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
 
-        Returns `out`.
+        Return `out`.
         """
-        with self.kept():
-            self.map.spread(self._put(image, float), self.rays)
+        with self.reserved():
+            self.map.spread(to_device(image, float), self.rays)
             return self.gather(out)
 
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32."""
-        count = wp.zeros(len(self.blocks.scale), dtype=int, device=self._device.warp)
-        share = self._put(self.blocks.microimages.share, float)
-
-        def launch(_, first, last):
-            wp.launch(
-                _count_lit,
-                dim=last - first,
-                inputs=[first, self._matrix, share],
-                outputs=[count],
-                device=self._device.warp,
-            )
-
-        runtime.run_chunks(len(count), launch)
+        count = wp.zeros(len(self.blocks.scale), dtype=int, device=runtime.device().warp)
+        share = to_device(self.blocks.microimages.share, float)
+        launch(Call(_count_lit, len(count), [self._matrix, share], [count]))
         return count.numpy()

@@ -1,35 +1,31 @@
-"""Warp: SMART's steps on pixels and voxels, each in one sweep. Twin: ``reference.smart``."""
-
-import sys
+"""Warp: the steps of SMART (Eq. 5) on pixels and voxels, each in one sweep over arrays. Twin: ``reference.smart``."""
 
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.native import read_native
-from lfpiv_kernels.reconstruction.pixel_rays import RAYS, Rays
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.reconstruction.pixel_rays import PixelRays
 from lfpiv_kernels.reconstruction.projector import Projector
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+wp.set_module_options(native.options("update.h"))
 
-LEAST_RUNS, LEAST_VOXELS = 256, 16384
-"""Least work of a chunk: below, the launch takes longer."""
+FEWEST_RUNS, FEWEST_VOXELS = 256, 16384
+"""Smallest part of a launch: a smaller one takes less time than the launch itself."""
 LARGEST_LEAP = 50.0
 """Largest ratio of two iterates that momentum repeats, and the inverse of the smallest one."""
 SMALLEST = float(np.finfo(np.float32).tiny)
-"""Least light of an active voxel under momentum: below, float32 is slow, and a zero would never come back."""
+"""Least light of an active voxel under momentum: smaller float32 numbers are slow, and a zero would stay zero."""
 
 
-# P is the projection and I the image, both plus the floor. log(I / P) is 2 artanh(t) + exponent * log(2) with the
-# quotient brought to 0.7 ... 1.4 by a power of 2, t at most 0.172. Where that power is 1, t and the pixel's misfit
-# come from the difference I - P, whose digits the quotient would lose: near its minimum a misfit is made of these.
-_COMPARE = RAYS + read_native("update_compare.inc")
-
-
-@wp.func_native(_COMPARE)
+@wp.func_native("""
+    lfpiv::compare(
+        lfpiv::pixel_run(map, run), image.data, gain.data, floor, rays_out.data, squares_out.data, divergence_out.data
+    );
+""")
 def _compare_run(
     run: int,
-    map: Rays,
+    map: PixelRays,
     image: wp.array(dtype=float),
     gain: wp.array(dtype=float),
     floor: float,
@@ -42,14 +38,14 @@ def _compare_run(
 @wp.kernel
 def _compare(
     # in
-    first_run: int,
-    map: Rays,
+    map: PixelRays,
     image: wp.array(dtype=float),
     gain: wp.array(dtype=float),
     floor: float,
+    first_run: int,
     # out
     rays_out: wp.array(dtype=float),
-    squares_out: wp.array(dtype=wp.float64),
+    squares_out: wp.array(dtype=wp.float64),  # per run
     divergence_out: wp.array(dtype=wp.float64),
 ):
     _compare_run(first_run + wp.tid(), map, image, gain, floor, rays_out, squares_out, divergence_out)
@@ -58,9 +54,9 @@ def _compare(
 @wp.kernel
 def _update(
     # in
-    first_voxel: int,
     exponent: wp.array(dtype=float),
     step: wp.array(dtype=float),
+    first_voxel: int,
     # out
     volume_out: wp.array(dtype=float),
 ):
@@ -71,8 +67,8 @@ def _update(
 @wp.kernel
 def _extrapolate(
     # in
-    first_voxel: int,
     exponent: float,
+    first_voxel: int,
     # out
     volume_out: wp.array(dtype=float),
     last_out: wp.array(dtype=float),
@@ -87,16 +83,19 @@ def _extrapolate(
 
 
 class Comparison:
-    """One camera's image beside the projections of volumes: Eq. 5's logarithm of their ratio, and their misfit.
+    """One camera's image beside the projections of volumes.
 
-    Only pixels that voxels light count: what the others recorded, no volume can explain.
+    It gives the logarithm of their ratio, Eq. 5, and two sums of their misfit. Only pixels that voxels light count:
+    no volume can explain the light of other pixels.
 
     Parameters
     ----------
     projector : Projector
         The camera's weights.
-    image, gain : ndarray, shape (pixel,), float32
-        Counts >= 0, zero where the gain is; what a pixel records per unit of light.
+    image : ndarray, shape (pixel,), float32
+        Counts >= 0, zero where the gain is zero.
+    gain : ndarray, shape (pixel,), float32
+        What a pixel records per unit of light.
     floor : float
         Noise floor [counts].
     """
@@ -104,15 +103,12 @@ class Comparison:
     def __init__(self, projector: Projector, image: np.ndarray, gain: np.ndarray, floor: float):
         self.projector = projector
         self._floor = float(floor)
-        pixels, where = projector.map.pixel, runtime.device()
-        self._image, self._gain = (
-            wp.array(array[pixels], dtype=float, device=where.warp, copy=False) for array in (image, gain)
-        )
-        self._sums = [wp.zeros(projector.map.rays.runs, dtype=wp.float64, device=where.warp) for _ in range(2)]
-        wp.load_module(sys.modules[__name__], device=where.warp)
+        self._image, self._gain = (to_device(array[projector.map.pixel], float) for array in (image, gain))
+        device = runtime.device().warp
+        self._sums = [wp.zeros(projector.map.rays.runs, dtype=wp.float64, device=device) for _ in range(2)]
 
     def compare(self, volume: np.ndarray) -> tuple[float, float]:
-        """Project `volume`, shape (voxel,), and leave gain * log((image + floor) / (projection + floor)) on the rays.
+        """Project `volume`, shape (voxel,), and write gain * log((image + floor) / (projection + floor)) on the rays.
 
         Returns
         -------
@@ -121,56 +117,37 @@ class Comparison:
         float
             Sum of P log(P / I) - P + I with P the projection and I the image, both plus floor [counts].
         """
-        where, runs = runtime.device().warp, self.projector.map.rays.runs
         self.projector.scatter(volume)
-
-        def launch(_, first, last):
-            wp.launch(
-                _compare,
-                dim=last - first,
-                inputs=[first, self.projector.map.rays, self._image, self._gain, self._floor],
-                outputs=[self.projector.rays, *self._sums],
-                device=where,
-            )
-
-        runtime.run_chunks(runs, launch, chunks=_chunks(runs, LEAST_RUNS))
+        rays = self.projector.map.rays
+        inputs, outputs = [rays, self._image, self._gain, self._floor], [self.projector.rays, *self._sums]
+        launch(Call(_compare, rays.runs, inputs, outputs), parts=_parts(rays.runs, FEWEST_RUNS))
         squares, divergence = (float(sums.numpy().sum()) for sums in self._sums)
         return squares, divergence
 
 
-def update(volume, exponent, step):
-    """SMART's step volume *= exp(step * exponent), in place; float32, shape (voxel,); returns `volume`."""
-    _sweep(_update, [exponent, step], [volume])
+def update(volume: np.ndarray, exponent: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Multiply `volume` by exp(step * exponent) in place; float32, shape (voxel,). Return `volume`."""
+    _sweep(_update, [to_device(exponent, float), to_device(step, float)], [volume])
     return volume
 
 
-def extrapolate(volume, last, exponent):
-    """Overwrite `last` by volume * (volume / last)^exponent; both float32, shape (voxel,); returns `last`.
+def extrapolate(volume: np.ndarray, last: np.ndarray, exponent: float) -> np.ndarray:
+    """Overwrite `last` by volume * (volume / last)^exponent; both float32, shape (voxel,). Return `last`.
 
-    Zeros of `last` stay zero; the others, `volume`'s included, are kept above zero.
+    Zeros of `last` stay zero. Elsewhere `last` and `volume` become at least `SMALLEST`.
     """
     _sweep(_extrapolate, [float(exponent)], [volume, last])
     return last
 
 
-def _sweep(kernel, inputs, outputs):
-    """Launch a kernel on all voxels; arrays are used in place, or written back."""
-    where = runtime.device().warp
-
-    def put(value):
-        return value if isinstance(value, float) else wp.array(value, dtype=float, device=where, copy=False)
-
-    inputs, written = [put(value) for value in inputs], [put(value) for value in outputs]
-    wp.load_module(sys.modules[__name__], device=where)
-
-    def launch(_, first, last):
-        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=written, device=where)
-
-    runtime.run_chunks(len(outputs[0]), launch, chunks=_chunks(len(outputs[0]), LEAST_VOXELS))
-    if where != "cpu":
-        for host, array in zip(outputs, written, strict=True):
-            host[:] = array.numpy()
+def _sweep(kernel: wp.Kernel, inputs: list[object], arrays: list[np.ndarray]) -> None:
+    """Launch a kernel on all voxels; it changes `arrays`."""
+    outputs = [to_device(array, float) for array in arrays]
+    launch(Call(kernel, len(arrays[0]), inputs, outputs), parts=_parts(len(arrays[0]), FEWEST_VOXELS))
+    if runtime.device().kind != "cpu":
+        for array, output in zip(arrays, outputs, strict=True):
+            array[:] = output.numpy()
 
 
-def _chunks(size, least):
-    return min(runtime.CHUNKS, 1 + size // least)
+def _parts(size: int, fewest: int) -> int:
+    return min(runtime.CHUNKS, 1 + size // fewest)

@@ -1,6 +1,7 @@
-"""Taichi: plenoptic images by rays traced backward: every pixel collects what its rays see.
+"""Taichi: plenoptic images by rays traced backward: each pixel collects the light at the other ends of its rays.
 
-That is the open pupil in uniform light, or a calibration board; `render` sends rays forward from small sources.
+The rays end in uniform light (white images) or on a calibration board. ``render`` traces rays forward instead, from
+small sources.
 """
 
 import math
@@ -15,7 +16,7 @@ from lfpiv_kernels.rendering import real_optics
 from lfpiv_kernels.rendering.render import Matrix, Optics, RenderCamera
 
 SPREAD_RAYS = 4096
-"""Rays from which the blur of a pixel on a board seen through real optics is bounded."""
+"""Rays used to bound the blur of a pixel on a board behind real optics."""
 
 Board = ti.types.vector(7, ti.f32)
 """Plane z [mm], dots along x and y, spacing, dot radius [mm], light of a dot and between dots."""
@@ -24,7 +25,10 @@ Vector = ti.types.vector(3, ti.f32)
 
 @ti.func
 def _dot_distance(s, t, u, v, so, si, rotation, offset, board):
-    """Distance of the point a ray comes from to the nearest dot's centre, on the board [mm]; and the ray's slant."""
+    """Return the distance of a ray's end on the board to the nearest dot's centre [mm], the ray's slant and its depth.
+
+    It has nine parameters because they are numbers of one ray and of the camera, which Taichi inlines.
+    """
     start = ti.Vector([-s * so / si, -t * so / si, 0.0])
     slope = ti.Vector([u / so + s / si, v / so + t / si, 1.0])
     normal = ti.Vector([rotation[0, 2], rotation[1, 2], rotation[2, 2]])  # the world's z axis seen by the camera
@@ -37,7 +41,7 @@ def _dot_distance(s, t, u, v, so, si, rotation, offset, board):
 
 @ti.func
 def _to_nearest_dot(place, board):
-    """Distance of a point of the board to the nearest dot's centre [mm]."""
+    """Return the distance of a point of the board to the nearest dot's centre [mm]."""
     x = place[0] / board[3] + 0.5 * (board[1] - 1)
     y = place[1] / board[3] + 0.5 * (board[2] - 1)
     i = ti.min(ti.max(ti.round(x), 0.0), board[1] - 1)
@@ -47,7 +51,7 @@ def _to_nearest_dot(place, board):
 
 @ti.func
 def _real_distance(s, t, u, v, so, si, rotation, offset, board, plates: ti.template(), aberrations):
-    """`_dot_distance` through windows and aberrations: distance to the nearest dot's centre [mm]."""
+    """Return the same distance through windows and aberrations [mm]; parameters as in `_dot_distance`."""
     normal = ti.Vector([rotation[0, 2], rotation[1, 2], rotation[2, 2]])
     level = normal.dot(rotation @ (ti.Vector([0.0, 0.0, board[0]]) - offset))
     hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, normal, level)
@@ -57,25 +61,31 @@ def _real_distance(s, t, u, v, so, si, rotation, offset, board, plates: ti.templ
 @ti.kernel
 def _collect_pixels(
     # in
-    samples: ti.types.ndarray(dtype=ti.f32, ndim=2),  # place in the pixel (2) and in the lens's cell (2), -1/2 to 1/2
+    samples: ti.types.ndarray(
+        dtype=ti.f32, ndim=2
+    ),  # position in the pixel (2) and in the lens's cell (2), -1/2 to 1/2
     rotation: Matrix,  # world to camera
     optics: Optics,
     lattice: Lattice,
     lens_gain: ti.types.ndarray(dtype=ti.f32, ndim=2),
     first_i: ti.i32,
     first_j: ti.i32,
-    plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `raytrace.pack_plates`
+    plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.pack_plates`
     aberrations: real_optics.Aberrations,
     offset: Vector,
-    reach: ti.i32,  # lenses to each side whose light may reach a pixel
+    reach: ti.i32,  # lenses to each side whose light can reach a pixel
     board: Board,
-    widest: ti.f32,  # largest distance on the board between a pixel's middle ray and its others, not ideal [mm]
+    widest: ti.f32,  # see `_widest_spread`; used where not ideal [mm]
     has_board: ti.template(),  # whether the rays end on a board or in uniform light
     ideal: ti.template(),  # whether windows and aberrations are left out
     hexagonal: ti.template(),
     # out
     image_out: ti.types.ndarray(dtype=ti.f32, ndim=2),  # light relative to a fully lit pixel
 ):
+    """Collect the light of every pixel.
+
+    Taichi takes arrays and templates only as arguments of their own, hence their number.
+    """
     so, si, radius, scale, pixel = optics[0], optics[1], optics[2], optics[3], optics[4]
     rows, columns, pitch = optics[5], optics[6], optics[7]
     count = samples.shape[0]
@@ -94,7 +104,7 @@ def _collect_pixels(
             distance = ti.sqrt((x - middle[0] * (1 + scale)) ** 2 + (y - middle[1] * (1 + scale)) ** 2)
             on_array = i >= 0 and i < lens_gain.shape[0] and j >= 0 and j < lens_gain.shape[1]
             if on_array and distance < outer:
-                light, even = 1.0, True  # what the pixel's rays end on, where it is the same for all of them
+                light, even = 1.0, True  # the light where the pixel's rays end, and whether it is the same for all
                 if ti.static(has_board):
                     u, v = middle[0] - (x - middle[0]) / scale, middle[1] - (y - middle[1]) / scale
                     if ti.static(ideal):
@@ -138,7 +148,7 @@ def _collect_pixels(
 
 
 def _widest_spread(camera: RenderCamera, plane_mm: float, seed: int) -> float:
-    """Bound of the distance on the board between a pixel's middle ray and its others [mm], from rays at random."""
+    """Return a bound of the distance on the board between a pixel's middle ray and its others [mm]."""
     rng = np.random.default_rng(seed)
     radius, turn = np.sqrt(rng.random(SPREAD_RAYS)), rng.uniform(0, 2 * np.pi, SPREAD_RAYS)
     pupil = camera.pupil_radius_mm * radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -159,6 +169,7 @@ def _widest_spread(camera: RenderCamera, plane_mm: float, seed: int) -> float:
 
 
 def _collect(camera: RenderCamera, samples: int, seed: int, board: tuple | None) -> np.ndarray:
+    """Return the image of a board, or of uniform light if there is none."""
     runtime.device()
     bits = max(0, math.ceil(math.log2(samples)))
     table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(seed)).random_base2(bits)
@@ -183,14 +194,14 @@ def _collect(camera: RenderCamera, samples: int, seed: int, board: tuple | None)
 
 
 def render_white(camera: RenderCamera, *, samples: int, seed: int) -> np.ndarray:
-    """Image of uniform light: how much of each pixel the pupil's images cover.
+    """Return the image of uniform light: the fraction of each pixel that the pupil's images cover.
 
     Parameters
     ----------
     camera : RenderCamera
-        Camera to look through.
+        The camera.
     samples : int
-        Rays of a pixel that lies on the edge of a microimage; rounded up to a power of two.
+        Rays of a pixel on the edge of a microimage, rounded up to a power of two.
     seed : int
         Seed of the rays.
 
@@ -214,12 +225,14 @@ def render_board(
     samples: int,
     seed: int,
 ) -> np.ndarray:
-    """Image of an endless, evenly radiant board with a grid of round dots in the plane z = plane_mm, traced backward.
+    """Return the image of an endless, evenly radiant board with a grid of round dots in the plane z = plane_mm.
+
+    It has nine parameters because they describe the board one by one; all but two are given by name.
 
     Parameters
     ----------
     camera : RenderCamera
-        Camera to look through.
+        The camera.
     plane_mm : float
         The board's z [mm].
     dots : tuple of int
@@ -229,7 +242,7 @@ def render_board(
     dot_light, board_light : float
         Radiance of the dots and of the board between them.
     samples : int
-        Rays of a pixel; rounded up to a power of two.
+        Rays of a pixel, rounded up to a power of two.
     seed : int
         Seed of the rays.
 

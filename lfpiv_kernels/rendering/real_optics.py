@@ -1,23 +1,23 @@
 """Real optics in front of the microlens array: plane-parallel windows and third-order aberrations of the main lens.
 
-Everything happens in the camera's frame: main lens at z = object distance, focal plane at z = 0, pupil point (u, v).
+All coordinates are in the camera's frame: main lens at z = object distance, plane in focus at z = 0, pupil (u, v).
 
-*Windows.* Behind a plane-parallel plate of index n a ray keeps its direction and is displaced along the plate; from a
-medium of index n0 on the particles' side it is also bent. Let N be the unit normal towards the lens and T the part of
-the ray's direction in air along the plate, per unit of N: |T| is the tangent of the angle of incidence. By Snell's law
-the same ray advances by T / sqrt(q) per unit of N in an index n, with q = 1 + (n^2 - 1)(1 + |T|^2). So a point h below
-a plate of thickness t is seen, by this ray, at its *apparent place*
+*Windows.* A plane-parallel plate of index n displaces a ray along the plate and does not change its direction in air. A
+medium of index n0 on the particles' side bends the ray as well. Let N be the unit normal towards the lens, and T the
+component along the plate of the ray's direction in air, per unit of N: |T| is the tangent of the angle of incidence. By
+Snell's law the same ray advances by T / sqrt(q) per unit of N in an index n, with q = 1 + (n^2 - 1)(1 + |T|^2). So this
+ray sees a point h below a plate of thickness t at its *apparent place*
 
-    point - E T,    E = t (1 - 1/sqrt(q_plate)) + h (1 - 1/sqrt(q_medium)),
+    point - E T,    E = t (1 - 1/sqrt(q_plate)) + h (1 - 1/sqrt(q_medium)).
 
-from where the ray is straight. T depends on the apparent place in turn: a fixed point, which contracts by about
-E / (distance to the lens). It is iterated until it moves by less than a stated tolerance. From the sensor outwards T
-is known and nothing is iterated. This is Snell's law without approximation.
+From there the ray is straight. T depends on the apparent place, which is found by fixed-point iteration. The iteration
+contracts by about E / (distance to the lens). From the sensor outwards T is known and nothing is iterated. This is
+Snell's law without approximation.
 
 *Aberrations.* A ray that an ideal lens brings to (s, t) on the array lands at (s, t) plus the gradient of Seidel's wave
 aberration; see `aberration_mm`.
 
-NumPy functions work in float64 and are the reference; Taichi functions do the same in float32 inside the renderer.
+NumPy functions compute in float64 and are the reference. Taichi functions do the same in float32 inside the renderer.
 """
 
 import numpy as np
@@ -27,18 +27,17 @@ NO_PLATE = np.array([[0.0, 0, 1, 0, 0, 0, 0]])
 """A window that does nothing."""
 
 STEPS, TOLERANCE_MM = 200, 1e-12
-"""Iterations at most and the last one's largest move [mm], in float64."""
+"""Iterations at most, and the largest step at which they stop [mm], in float64."""
 STEPS_F32, TOLERANCE_F32_MM = 40, 2e-6
-"""The same in the kernels: 2e-6 mm is 1/2000 of a small pixel and 16 float32 steps of a coordinate of 2 mm. Measured
-against float64: 3e-7 mm rms behind a window, 7e-7 behind a tank, never above 2e-5."""
+"""The same in the kernels, in float32. 2e-6 mm is 1/2000 of a small pixel."""
 FIELD_STOP = 1.5
-"""Rays that an ideal lens brings further from the sensor's centre than this, over the field's radius, are stopped: out
-there the third-order polynomial would fold them back onto the sensor."""
+"""Largest distance from the sensor's centre at which an ideal ray passes, in radii of the field. Farther out the
+third-order polynomial would fold rays back onto the sensor."""
 STRONGEST = 0.5
-"""Largest change of an aberration over the change of the place on the array that is followed back: the iteration to the
-ideal place halves its error in each step or does better, and no two rays through one pupil point cross."""
+"""Largest change of an aberration per change of the position on the array. Up to it the iteration to the ideal position
+at least halves its error in each step, and no two rays through one pupil point cross."""
 STEEPEST = 0.05
-"""Least cosine between a ray in air and a window's normal: beyond 87 degrees of incidence hardly any light enters."""
+"""Least cosine between a ray in air and a window's normal: 87 degrees of incidence. Hardly any steeper light enters."""
 
 Aberrations = ti.types.vector(9, ti.f32)
 """Centre (s, t) [mm], 1 / pupil radius, 1 / field radius [1/mm], then spherical, coma, astigmatism, field curvature,
@@ -54,19 +53,19 @@ def pack_plates(
     *,
     object_distance_mm: float,
 ) -> np.ndarray:
-    """Pack windows for the functions below.
+    """Return windows in the form that the functions of this module take.
 
     Parameters
     ----------
     normals : ndarray, shape (window, 3)
         Normals in the camera's frame, of any length and either sense.
     points_mm : ndarray, shape (window, 3)
-        A point of each window's surface on the particles' side, in the camera's frame [mm].
+        A point of each window's surface on the particles' side [mm].
     thickness_mm, index, medium_index : ndarray, shape (window,)
         Thickness [mm], refractive index of the plate and of the medium on the particles' side. Only the first window,
         the one next to the particles, may have a medium other than air.
     object_distance_mm : float
-        The lens is here on the z axis [mm].
+        Position of the lens on the z axis [mm].
 
     Returns
     -------
@@ -83,34 +82,34 @@ def pack_plates(
 
 
 def _shortening(square_less_one, tangent_square):
-    """1 - 1/sqrt(q), without cancellation and exactly 0 in air."""
+    """Return 1 - 1/sqrt(q), without cancellation and exactly 0 in air."""
     extra = square_less_one * (1 + tangent_square)
     return extra / (1 + extra + np.sqrt(1 + extra))
 
 
 def apparent_points(points: np.ndarray, pupil: np.ndarray, object_distance_mm: float, plates: np.ndarray) -> np.ndarray:
-    """Where points seem to be, seen through windows from points of the pupil: exact Snell refraction.
+    """Return where points appear through windows from points of the pupil, by exact Snell refraction.
 
     Parameters
     ----------
     points : ndarray, shape (..., 3)
         Points in the camera's frame, on the far side of the windows [mm].
     pupil : ndarray, shape (..., 2)
-        Where each ray crosses the pupil (u, v) [mm].
+        Position (u, v) at which each ray crosses the pupil [mm].
     object_distance_mm : float
-        The pupil is here on the z axis [mm].
+        Position of the pupil on the z axis [mm].
     plates : ndarray, shape (window, 7)
         From `pack_plates`.
 
     Returns
     -------
     ndarray, shape (..., 3)
-        Points from which straight rays reach the pupil as the real rays do [mm], converged to `TOLERANCE_MM`.
+        Points from which straight rays reach the pupil like the real rays [mm], converged to `TOLERANCE_MM`.
 
     Raises
     ------
     ValueError
-        If a ray does not converge: the medium fills nearly the whole way and rays graze the window.
+        If a ray does not converge: it grazes a window and the medium fills nearly the whole way to the lens.
     """
     points, pupil = np.asarray(points, float), np.asarray(pupil, float)
     aim = np.concatenate([pupil, np.full((*pupil.shape[:-1], 1), float(object_distance_mm))], axis=-1)
@@ -133,7 +132,7 @@ def apparent_points(points: np.ndarray, pupil: np.ndarray, object_distance_mm: f
 
 
 def aberration_mm(array_mm: np.ndarray, pupil: np.ndarray, aberrations: np.ndarray) -> np.ndarray:
-    """Third-order transverse ray aberration on the array, the gradient of Seidel's wave aberration over the pupil.
+    """Return the third-order transverse ray aberration on the array: the gradient of Seidel's wave aberration.
 
     With p the pupil point over the pupil's radius and h the ideal landing point over the field's radius,
 
@@ -142,16 +141,16 @@ def aberration_mm(array_mm: np.ndarray, pupil: np.ndarray, aberrations: np.ndarr
     Parameters
     ----------
     array_mm : ndarray, shape (..., 2)
-        Where an ideal lens brings each ray (s, t) [mm].
+        Position (s, t) to which an ideal lens brings each ray [mm].
     pupil : ndarray, shape (..., 2)
-        Where each ray crosses the pupil (u, v) [mm].
+        Position (u, v) at which each ray crosses the pupil [mm].
     aberrations : ndarray, shape (9,)
-        As `Aberrations` lists them.
+        In the order of `Aberrations`.
 
     Returns
     -------
     ndarray, shape (..., 2)
-        To be added to `array_mm` [mm].
+        Displacement from `array_mm` [mm].
     """
     spherical, coma, astigmatism, curvature, distortion = aberrations[4:]
     p, h = np.asarray(pupil, float) * aberrations[2], (np.asarray(array_mm, float) - aberrations[:2]) * aberrations[3]
@@ -162,17 +161,18 @@ def aberration_mm(array_mm: np.ndarray, pupil: np.ndarray, aberrations: np.ndarr
 
 
 def steepest_aberration(aberrations: np.ndarray) -> float:
-    """Bound of the aberration's change over the change of the place on the array, inside `FIELD_STOP`.
+    """Return a bound of the aberration's change per change of the position on the array, inside `FIELD_STOP`.
 
     Parameters
     ----------
     aberrations : ndarray, shape (9,)
-        As `Aberrations` lists them.
+        In the order of `Aberrations`.
 
     Returns
     -------
     float
-        Largest spectral norm of the derivative over field and pupil; only below `STRONGEST` can rays be followed back.
+        Largest spectral norm of the derivative over field and pupil. Rays can be traced back where it is at most
+        `STRONGEST`.
     """
     changing, field, pupil = aberrations[5:], 1 / aberrations[3], 1 / aberrations[2]
     if not np.any(changing):
@@ -198,21 +198,21 @@ def object_lines(
     plates: np.ndarray,
     aberrations: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Follow rays from the microlens array back to the particles' side of the windows.
+    """Trace rays from the microlens array back to the particles' side of the windows.
 
     Parameters
     ----------
     array_mm, pupil : ndarray, shape (n, 2)
-        Where each ray meets the array (s, t) and the pupil (u, v) [mm].
+        Positions (s, t) and (u, v) at which each ray meets the array and the pupil [mm].
     object_distance_mm, image_distance_mm : float
         Main lens to the plane in focus and to the array [mm].
     plates, aberrations : ndarray
-        From `pack_plates`; as `Aberrations` lists them.
+        From `pack_plates`; in the order of `Aberrations`.
 
     Returns
     -------
     start, direction : ndarray, shape (n, 3)
-        A point of each ray and its direction, in the camera's frame.
+        A point of each ray and its direction.
     """
     array_mm, pupil = np.asarray(array_mm, float), np.asarray(pupil, float)
     ideal = array_mm
@@ -244,10 +244,10 @@ def shortening(square_less_one, tangent_square):
 
 @ti.func
 def apparent_shift(place, start, u, v, so, plates: ti.template()):
-    """Float32 twin of `apparent_points` for one ray: apparent place minus `place`, iterated from the guess `start`.
+    """Return the apparent place minus `place` for one ray, iterated from the guess `start`.
 
-    Every other step is lengthened by the ratio of the last two (Aitken), which leaves about that ratio squared of the
-    step. With the shift of a neighbouring ray as the guess, two steps do for a window, four or five for a tank.
+    Float32 twin of `apparent_points`. Every other step is lengthened by the ratio of the last two steps (Aitken). The
+    error left is about the square of that ratio times the step.
     """
     shift, last = start, ti.Vector([0.0, 0.0, 0.0])
     aim = ti.Vector([u, v, so]) - place
@@ -288,9 +288,10 @@ def aberration(s, t, u, v, lens):
 
 @ti.func
 def board_hit(s, t, u, v, so, si, plates: ti.template(), lens, normal, level):
-    """Where the plane normal . place = level meets the ray from the array at (s, t) through the pupil at (u, v).
+    """Return where the ray from (s, t) on the array through (u, v) on the pupil meets the plane normal . place = level.
 
-    Float32 twin of `object_lines`, cut with a plane of the camera's frame.
+    Float32 twin of `object_lines`. It has ten parameters because they are numbers of one ray, of the camera and of the
+    plane, which Taichi inlines.
     """
     ideal = ti.Vector([s, t])
     for _step in range(STEPS_F32):

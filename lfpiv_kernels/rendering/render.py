@@ -1,9 +1,9 @@
-"""Taichi: render raw plenoptic images by sending rays through the main lens and the microlens array (Eqs. 1-3 and 9).
+"""Taichi: raw plenoptic images of small bright sources, by rays through main lens and microlens array (Eqs. 1-3 and 9).
 
-Forward, from small bright sources, every ray adds its energy to the pixel it meets; `collect` goes the other way.
+Each ray adds its energy to the pixel that it meets. ``collect`` traces rays backward instead.
 
-Sums are kept in 64-bit integers of `FIXED` units per count, so an image does not depend on the order in which threads
-add: it is the same on every run and for any number of threads.
+Sums are 64-bit integers of `FIXED` units per count. So an image does not depend on the order in which threads add: it
+is the same in every run and for any number of threads.
 """
 
 import math
@@ -19,13 +19,13 @@ from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens, pack_
 from lfpiv_kernels.rendering import real_optics
 
 FIXED = 1 << 20
-"""Integer units per count: 20 bits below the count leave 43 bits above it."""
+"""Integer units per count: 20 bits below one count, 43 bits above."""
 
 RAYS_PER_TASK = 2048
-"""Rays one parallel task sends; cuts a few sources with many rays into enough tasks for all threads."""
+"""Rays of a parallel task, so few that a few sources with many rays make enough tasks for all threads."""
 
 SOURCES = ("ball", "gaussian", "disc")
-"""Shapes of a source: a ball or a disc of given radius, or a Gaussian blob of given standard deviation."""
+"""Shapes of a source: a ball or a disc of given radius, or a Gaussian of given standard deviation."""
 
 Optics = ti.types.vector(8, ti.f32)
 """Object distance, image distance, pupil radius [mm], f_m/s_i, pixel [mm], rows, columns, microlens pitch [mm]."""
@@ -34,14 +34,14 @@ Matrix = ti.types.matrix(3, 3, ti.f32)
 
 @dataclass(frozen=True, kw_only=True)
 class RenderCamera:
-    """One plenoptic camera as the renderer needs it; camera point = rotation @ (world point - offset)."""
+    """A plenoptic camera as the renderer takes it; camera point = rotation @ (world point - offset)."""
 
     object_distance_mm: float
     """Main lens to the plane in focus, s_o [mm]."""
     image_distance_mm: float
     """Main lens to the microlens array, s_i [mm]."""
     pupil_radius_mm: float
-    """Radius of the main lens pupil [mm]."""
+    """Radius of the main lens's pupil [mm]."""
     sensor_per_pupil: float
     """f_m / s_i, the scale of the pupil's image behind a microlens."""
     pixel_mm: float
@@ -51,30 +51,30 @@ class RenderCamera:
     rotation: np.ndarray
     """World to camera, shape (3, 3)."""
     offset_mm: np.ndarray
-    """World point on the camera's axis in focus, (x, y, z) [mm]."""
+    """World point (x, y, z) on the camera's axis in the plane in focus [mm]."""
     origin_mm: np.ndarray
     """Centre (s, t) of lens (0, 0) [mm]."""
     basis_mm: np.ndarray
     """Lattice vectors of the microlens array, shape (2, 2) [mm]."""
     hexagonal: bool
-    """Whether the lattice vectors are 60 degrees apart (a ray belongs to the nearest lens either way)."""
+    """Whether the lattice vectors are 60 degrees apart. A ray belongs to the nearest lens in any case."""
     lens_gain: np.ndarray
-    """Transmission of each lens, shape (i, j); no light passes outside the table."""
+    """Transmission of each lens, shape (i, j). No light passes lenses outside the table."""
     first_lens: tuple[int, int]
     """Lattice index (i, j) of ``lens_gain[0, 0]``."""
     plates: np.ndarray = field(default_factory=lambda: np.empty((0, 7)))
-    """Windows between the particles and the lens, the one next to the particles first: `raytrace.pack_plates`."""
+    """Windows between particles and lens, the one next to the particles first: `real_optics.pack_plates`."""
     aberrations: np.ndarray = field(default_factory=lambda: np.zeros(9))
-    """Third-order aberrations of the main lens: `raytrace.Aberrations`."""
+    """Third-order aberrations of the main lens: `real_optics.Aberrations`."""
 
     @property
     def ideal(self) -> bool:
-        """Whether rays are those of a thin lens: no windows, no aberrations."""
+        """Whether the camera is a thin lens without windows and aberrations."""
         return len(self.plates) == 0 and not np.any(self.aberrations[4:])
 
     @property
     def pitch_mm(self) -> float:
-        """Distance of neighbouring lenses, from the area of the lattice's cell [mm]."""
+        """Distance of neighbouring lenses [mm], from the area of the lattice's cell."""
         return math.sqrt(abs(np.linalg.det(self.basis_mm)) * (2 / math.sqrt(3) if self.hexagonal else 1))
 
     @property
@@ -83,7 +83,7 @@ class RenderCamera:
         return math.pi * (self.pupil_radius_mm * self.sensor_per_pupil / self.pixel_mm) ** 2
 
     def arguments(self) -> tuple:
-        """Give what both kernels take, in their order: rotation to aberrations."""
+        """Return the arguments of both kernels from `rotation` to `aberrations`."""
         scale = (self.object_distance_mm, self.image_distance_mm, self.pupil_radius_mm, self.sensor_per_pupil)
         return (
             Matrix(np.asarray(self.rotation, float).tolist()),
@@ -97,12 +97,12 @@ class RenderCamera:
 
 
 def ray_table(count: int, shape: str, seed: int) -> np.ndarray:
-    """Well-spread rays of a source: scrambled Sobol points mapped to the pupil's disc and to the source's shape.
+    """Return well-spread rays of a source: scrambled Sobol points mapped to the pupil's disc and to the source's shape.
 
     Parameters
     ----------
     count : int
-        Rays; rounded up to a power of two, where Sobol points are balanced.
+        Rays, rounded up to a power of two, because so many Sobol points are balanced.
     shape : {"ball", "gaussian", "disc"}
         Shape of the source.
     seed : int
@@ -111,7 +111,7 @@ def ray_table(count: int, shape: str, seed: int) -> np.ndarray:
     Returns
     -------
     ndarray, shape (ray, 5), float32
-        Place on the unit pupil (u, v) and in the unit source (x, y, z); a disc lies in its own x-y plane.
+        Position on the unit pupil (u, v) and in the unit source (x, y, z). A disc lies in its own x-y plane.
     """
     if shape not in SOURCES:
         raise ValueError(f"shape: expected one of {', '.join(SOURCES)}, got {shape!r}.")
@@ -131,7 +131,7 @@ def ray_table(count: int, shape: str, seed: int) -> np.ndarray:
             length = stats.chi.ppf(np.clip(points[:, 2], 1e-9, 1 - 1e-9), 3)
         height, across = length * direction, length * np.sqrt(1 - direction**2)
     table[:, 2], table[:, 3], table[:, 4] = across * np.cos(angle), across * np.sin(angle), height
-    # neighbours on the pupil light neighbouring pixels: sorted rays stay in the processor's cache
+    # neighbours on the pupil light neighbouring pixels: the pixels of sorted rays stay in the processor's cache
     order = np.lexsort((table[:, 0], np.floor(table[:, 1] * 8)))
     return table[order].astype(np.float32)
 
@@ -140,7 +140,7 @@ def ray_table(count: int, shape: str, seed: int) -> np.ndarray:
 def _trace_sources(
     # in
     centre: ti.types.ndarray(dtype=ti.f32, ndim=2),  # camera frame [mm], (source, 3)
-    spin: ti.types.ndarray(dtype=ti.f32, ndim=2),  # cos, sin turning the pupil points; cos, sin turning the source
+    spin: ti.types.ndarray(dtype=ti.f32, ndim=2),  # cosine, sine of the turns of pupil points and source
     extent: ti.types.ndarray(dtype=ti.f32, ndim=1),  # size of the unit source [mm], (source,)
     energy: ti.types.ndarray(dtype=ti.f32, ndim=1),  # of one ray [count], (source,)
     rays: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `ray_table`
@@ -150,7 +150,7 @@ def _trace_sources(
     lens_gain: ti.types.ndarray(dtype=ti.f32, ndim=2),
     first_i: ti.i32,
     first_j: ti.i32,
-    plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `raytrace.pack_plates`
+    plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.pack_plates`
     aberrations: real_optics.Aberrations,
     per_task: ti.i32,
     glass: ti.template(),  # whether there are windows
@@ -159,6 +159,10 @@ def _trace_sources(
     # out
     image_out: ti.types.ndarray(dtype=ti.i64, ndim=2),  # [1/FIXED count], added to
 ):
+    """Trace the rays of all sources.
+
+    Taichi takes arrays and templates only as arguments of their own, hence their number.
+    """
     so, si, radius, scale, pixel = optics[0], optics[1], optics[2], optics[3], optics[4]
     rows, columns = ti.cast(optics[5], ti.i32), ti.cast(optics[6], ti.i32)
     tasks = (rays.shape[0] + per_task - 1) // per_task
@@ -207,22 +211,22 @@ def render_sources(
     *,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Image of small bright sources.
+    """Return the image of small bright sources.
 
     Parameters
     ----------
     camera : RenderCamera
-        Camera to look through.
+        The camera.
     points_mm : ndarray, shape (source, 3)
         Centres (x, y, z) in the world [mm].
     counts : ndarray, shape (source,)
-        Light of each source that passes the pupil, summed over its pixels [count].
+        Light of each source through the pupil, summed over its pixels [count].
     extent_mm : float or ndarray, shape (source,)
-        Radius (ball, disc) or standard deviation (Gaussian) [mm]; a disc lies in the world's x-y plane.
+        Radius (ball, disc) or standard deviation (Gaussian) [mm]. A disc lies in the world's x-y plane.
     rays : ndarray, shape (ray, 5)
-        Rays of every source, from `ray_table`; each source turns them by its own random angles.
+        Rays of every source, from `ray_table`. Each source turns them by random angles.
     rng : Generator
-        Source of those angles.
+        Generator of the angles.
 
     Returns
     -------

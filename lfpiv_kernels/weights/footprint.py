@@ -1,203 +1,164 @@
 """Warp: area-integrated weights of voxels, written as 8-bit blocks of rays.
 
 The weight of a ray is the fraction of a voxel's light, uniform in the voxel and over the pupil, that reaches its pixel
-through its lens, Eq. 10, integrated in closed form instead of counted. Per voxel the mapping is a second-order
-polynomial of the pupil point, (s, t)(P) with P = (u, v); K = d(s, t)/dP. A pixel at X under the lens centred at c looks
-through the centre of its lens at P = -(X - c (1 + r)) / r, r = f_m/s_i (Eq. 9 solved for u). Then
+through its lens: Eq. 10, integrated in closed form instead of counted. A voxel's mapping is a second-order polynomial
+of the pupil point, (s, t)(P) with P = (u, v); K = d(s, t)/dP. A pixel at X under the lens centred at c looks through
+the centre of its lens at P = -(X - c (1 + r)) / r, r = f_m/s_i (Eq. 9 solved for u). Then
 
-- the ray's offset from the lens centre is g = (I - K)^-1 ((s, t)(P) - c): moving it by g moves the pupil point too;
+- the ray's offset from the lens centre is g = (I - K)^-1 ((s, t)(P) - c), because the pupil point moves with the ray;
 - the pixel's cell on the pupil has the area h^2 |det (I - K)^-1|, h the pixel's width on the pupil;
-- g is smeared by the voxel's three projected edges and by the pixel's cell: boxes, of which along each lattice axis the
-  widest stays a box and the others become one box of the same variance. The axes are taken as independent, which they
-  are where every edge lies along one of them: where a camera is upright to its array. The projection of a cube has no
-  covariance at any angle, but that is not enough: cut into parts, as below, it is integrated at any angle;
+- g is smeared by the voxel's three projected edges and by the pixel's cell. Each of these is a box. Along each lattice
+  axis the widest box stays, and the others become one box of the same variance;
 - the weight is amplitude x probability that the smeared g lies in the lens's cell. How much of the pixel lies inside
   the pupil is the ray's own share, see ``microimages``.
 
-Two forms of the same integral: "pixels" follows the slopes and the offset pixel by pixel; "profiles" takes them as
-linear and without cross terms under a lens, so that a square cell's weights are the product of a profile along the
-columns and one along the rows (rank 1), a third of the memory. Pixels may add up the footprints of parts of the voxel,
-cut along x, y, z: what is not independent within a part, its fourth-order moments, falls with the fourth power of its
-size. It takes time for every part, and no more memory. Blocks are at most LANES pixels wide, one vector load,
-and end where the weights round to zero or the pupil ends. The computation is C++ on vectors of lenses and of pixels
-(``raymodel``): Taichi's loops took four times as long. Twin: ``reference.footprint``; source: ``footprint_source``.
+The two axes are integrated as if they were independent. They are where every edge lies along one of them, that is where
+the camera is upright to its array. Elsewhere the voxel can be cut into parts along x, y, z, whose footprints are added.
+What is not independent within a part, its fourth-order moments, falls with the fourth power of the part's size. Parts
+take time and no memory.
+
+The integral has two forms. "pixels" follows the slopes and the offset pixel by pixel. "profiles" takes them as linear
+and without cross terms under a lens. Then the weights of a square cell are the product of a profile along the columns
+and one along the rows (rank 1), which takes a third of the memory. The loops are C++, see ``footprint.h``: they work on
+vectors of lenses and of pixels. Twin: ``reference.footprint``.
 """
 
 import math
-import sys
 
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.weights.footprint_source import FILL, MEASURE, MOST_PARTS, PACK
-from lfpiv_kernels.weights.ray_model import GEOMETRY_SIZE, Camera
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.weights.ray_model import GEOMETRY_SIZE
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=fast",  # fused multiply-add
-    }
-)
+wp.set_module_options(native.options("footprint.h", contract="fast"))
 
+TALLEST: int = native.constant("footprint.h", "TALLEST")
+"""Rows of a block at most."""
+MOST_PARTS: int = native.constant("footprint.h", "MOST_PARTS")
+"""Parts of a voxel at most."""
 FORMS = ("profiles", "pixels")
 """Rank-1 blocks, or one value per ray."""
-CHUNKS = 16
-"""Parts of a launch on the CPU: voxels differ in their work."""
+LAUNCH_PARTS = 16
+"""Parts of a launch on the CPU: more than usual, because the work differs from voxel to voxel."""
 SCRATCH_BYTES = 1 << 26
-"""Values that are computed before they are packed."""
+"""Values that are computed before they are packed [byte]."""
 
 
-def pack_camera(*, sensor_per_pupil, pixel_mm, sensor_shape, pupil_radius_mm, edge=0):
-    """Pack a camera's constants for the kernels of this module and of ``trace``."""
-    rows, columns = sensor_shape
-    return Camera(sensor_per_pupil, pixel_mm, columns / 2, rows / 2, pupil_radius_mm, columns, rows, edge)
+@wp.struct
+class Inputs:
+    """What the kernels read, the same for all voxels."""
+
+    model: wp.array(dtype=float)
+    """Ray models, (voxel, MODEL_SIZE), flat."""
+    geometry: wp.array(dtype=float)
+    """The camera's, (GEOMETRY_SIZE,)."""
+    lenses: wp.vec4i
+    """First i and j, lenses along i and j."""
+    corners: wp.array(dtype=int)
+    """First pixel (column, row) of each lens's block, (lens along j, lens along i, 2), flat."""
+    cuts: wp.vec3i
+    """Parts of a voxel along x, y, z."""
+    profiles: bool
 
 
-@wp.func_native(MEASURE)
-def _measure(
-    model: wp.array(dtype=float),
-    geometry: wp.array(dtype=float),
-    lenses: wp.vec4i,
-    corners: wp.array(dtype=int),
-    profiles: bool,
-    cuts: wp.vec3i,
-    voxel: int,
-    blocks_out: wp.array(dtype=int),
-    bytes_out: wp.array(dtype=int),
-): ...
+@wp.struct
+class Outline:
+    """Outline of a lens's cell, from ``lattice.cell_steps``."""
+
+    extent: wp.array(dtype=float)
+    """Half extents along a and b, (step, 2), flat."""
+    steps: int
+    square: bool
 
 
-@wp.func_native(FILL)
+@wp.struct
+class BlockArrays:
+    """Blocks of voxels on the device, and where each voxel's begin."""
+
+    first_block: wp.array(dtype=int)
+    first_value: wp.array(dtype=int)
+    ray: wp.array(dtype=int)
+    height: wp.array(dtype=wp.uint8)
+    width: wp.array(dtype=wp.uint8)
+    value: wp.array(dtype=wp.uint8)
+
+
+@wp.func_native("lfpiv::measure(lfpiv::weight_inputs(inputs), voxel, blocks_out.data, bytes_out.data);")
+def _measure(inputs: Inputs, voxel: int, blocks_out: wp.array(dtype=int), bytes_out: wp.array(dtype=int)): ...
+
+
+@wp.func_native("""
+    lfpiv::fill(
+        lfpiv::weight_inputs(inputs), {outline.extent.data, outline.steps, outline.square}, voxel,
+        lfpiv::block_arrays(blocks_out), scale_out.data, counts_out.data, bytes_out.data
+    );
+""")
 def _fill(
-    model: wp.array(dtype=float),
-    geometry: wp.array(dtype=float),
-    lenses: wp.vec4i,
-    corners: wp.array(dtype=int),
-    outline: wp.array(dtype=float),
-    steps: int,
-    square: bool,
-    profiles: bool,
-    cuts: wp.vec3i,
+    inputs: Inputs,
+    outline: Outline,
     voxel: int,
-    first_block: wp.array(dtype=int),
-    first_value: wp.array(dtype=int),
-    ray_out: wp.array(dtype=int),
-    height_out: wp.array(dtype=wp.uint8),
-    width_out: wp.array(dtype=wp.uint8),
-    value_out: wp.array(dtype=wp.uint8),
+    blocks_out: BlockArrays,
     scale_out: wp.array(dtype=float),
-    blocks_out: wp.array(dtype=int),
+    counts_out: wp.array(dtype=int),
     bytes_out: wp.array(dtype=int),
 ): ...
 
 
-@wp.func_native(PACK)
-def _pack(
-    from_block: int,
-    to_block: int,
-    blocks: int,
-    from_value: int,
-    to_value: int,
-    values: int,
-    ray: wp.array(dtype=int),
-    height: wp.array(dtype=wp.uint8),
-    width: wp.array(dtype=wp.uint8),
-    value: wp.array(dtype=wp.uint8),
-    ray_out: wp.array(dtype=int),
-    height_out: wp.array(dtype=wp.uint8),
-    width_out: wp.array(dtype=wp.uint8),
-    value_out: wp.array(dtype=wp.uint8),
-): ...
+@wp.func_native("lfpiv::pack(lfpiv::block_arrays(blocks), lfpiv::block_arrays(packed_out), voxel);")
+def _pack(blocks: BlockArrays, voxel: int, packed_out: BlockArrays): ...
 
 
 @wp.kernel
 def _measure_blocks(
     # in
+    inputs: Inputs,
     first_voxel: int,
-    model: wp.array(dtype=float),  # (voxel, MODEL_SIZE), flat
-    geometry: wp.array(dtype=float),
-    lenses: wp.vec4i,
-    corners: wp.array(dtype=int),  # (lens along j, lens along i, 2), flat
-    profiles: bool,
-    cuts: wp.vec3i,
     # out
-    blocks_out: wp.array(dtype=int),
+    blocks_out: wp.array(dtype=int),  # blocks and values that each voxel needs at most
     bytes_out: wp.array(dtype=int),
 ):
-    voxel = first_voxel + wp.tid()
-    _measure(model, geometry, lenses, corners, profiles, cuts, voxel, blocks_out, bytes_out)
+    _measure(inputs, first_voxel + wp.tid(), blocks_out, bytes_out)
 
 
 @wp.kernel
 def _fill_blocks(
     # in
+    inputs: Inputs,
+    outline: Outline,
     first_voxel: int,
-    model: wp.array(dtype=float),
-    geometry: wp.array(dtype=float),
-    lenses: wp.vec4i,
-    corners: wp.array(dtype=int),
-    outline: wp.array(dtype=float),  # of a lens's cell, (step, 2), flat
-    steps: int,
-    square: bool,
-    profiles: bool,
-    cuts: wp.vec3i,  # parts of a voxel along x, y, z
-    first_block: wp.array(dtype=int),  # room for each voxel's blocks and values, (voxel + 1,)
-    first_value: wp.array(dtype=int),
     # out
-    ray_out: wp.array(dtype=int),
-    height_out: wp.array(dtype=wp.uint8),
-    width_out: wp.array(dtype=wp.uint8),
-    value_out: wp.array(dtype=wp.uint8),
+    blocks_out: BlockArrays,
     scale_out: wp.array(dtype=float),
-    blocks_out: wp.array(dtype=int),  # blocks and values of each voxel
+    counts_out: wp.array(dtype=int),  # blocks and values of each voxel
     bytes_out: wp.array(dtype=int),
 ):
-    voxel = first_voxel + wp.tid()
-    _fill(
-        model, geometry, lenses, corners, outline, steps, square, profiles, cuts, voxel,
-        first_block, first_value, ray_out, height_out, width_out, value_out, scale_out, blocks_out, bytes_out,
-    )  # fmt: skip
+    _fill(inputs, outline, first_voxel + wp.tid(), blocks_out, scale_out, counts_out, bytes_out)
 
 
 @wp.kernel
 def _pack_blocks(
     # in
+    blocks: BlockArrays,
     first_voxel: int,
-    first_block: wp.array(dtype=int),
-    first_value: wp.array(dtype=int),
-    packed_block: wp.array(dtype=int),  # where each voxel's blocks and values go, (voxel + 1,)
-    packed_value: wp.array(dtype=int),
-    ray: wp.array(dtype=int),
-    height: wp.array(dtype=wp.uint8),
-    width: wp.array(dtype=wp.uint8),
-    value: wp.array(dtype=wp.uint8),
     # out
-    ray_out: wp.array(dtype=int),
-    height_out: wp.array(dtype=wp.uint8),
-    width_out: wp.array(dtype=wp.uint8),
-    value_out: wp.array(dtype=wp.uint8),
+    packed_out: BlockArrays,  # without gaps
 ):
-    voxel = first_voxel + wp.tid()
-    _pack(
-        first_block[voxel], packed_block[voxel], packed_block[voxel + 1] - packed_block[voxel],
-        first_value[voxel], packed_value[voxel], packed_value[voxel + 1] - packed_value[voxel],
-        ray, height, width, value, ray_out, height_out, width_out, value_out,
-    )  # fmt: skip
+    _pack(blocks, first_voxel + wp.tid(), packed_out)
 
 
 class Footprints:
-    """Computes the blocks of one camera's voxels, some at a time, in scratch memory that it keeps.
+    """Computes the blocks of one camera's voxels, some voxels at a time.
 
     Parameters
     ----------
     camera, lattice
-        From `pack_camera` and ``lattice.pack_lattice``.
+        From ``ray_model.pack_optics`` and ``lattice.pack_lattice``.
     cell_mm : float
         Half extent of a lens's cell along s and t [mm].
     microimages : Microimages
-        How the rays lie in memory.
+        Where the rays lie in memory.
     frame, outline
         The lens's cell, from ``lattice.cell_frame`` and ``lattice.cell_steps``.
     form : {"profiles", "pixels"}
@@ -222,24 +183,24 @@ class Footprints:
         )
         assert geometry.shape == (GEOMETRY_SIZE,)
         rows, columns = microimages.corner.shape[:2]
-        self._rays = [
-            self._put(geometry),
-            wp.vec4i(*microimages.first_lens, columns, rows),
-            self._put(microimages.corner.ravel()),
-        ]
-        self._cell = [self._put(np.ravel(outline)), len(outline), len(outline) == 1]
-        self._profiles = form == "profiles"
-        self._cuts = wp.vec3i(*cuts)
+        self._inputs = Inputs()
+        self._inputs.geometry = to_device(geometry)
+        self._inputs.lenses = wp.vec4i(*microimages.first_lens, columns, rows)
+        self._inputs.corners = to_device(microimages.corner.ravel())
+        self._inputs.cuts = wp.vec3i(*cuts)
+        self._inputs.profiles = form == "profiles"
+        self._outline = Outline()
+        self._outline.extent, self._outline.steps = to_device(np.ravel(outline)), len(outline)
+        self._outline.square = len(outline) == 1
         self._scratch: dict[str, wp.array] = {}
-        wp.load_module(sys.modules[__name__], device=self._device.warp)  # before threads use it
 
     def compute(self, model):
-        """Compute the blocks of voxels, some voxels at a time, which are kept until the next are asked for.
+        """Compute the blocks of voxels, some voxels at a time. `write` copies those computed last.
 
         Parameters
         ----------
         model : ndarray, shape (voxel, MODEL_SIZE), float32
-            Ray models, see ``raymodel.MODEL_SIZE``.
+            Ray models, see ``ray_model.MODEL_SIZE``.
 
         Yields
         ------
@@ -247,67 +208,69 @@ class Footprints:
             Blocks of the next voxels, and their bytes of values.
         """
         model = np.ascontiguousarray(model, np.float32)
-        room = [wp.empty(len(model), dtype=int, device=self._device.warp) for _ in range(2)]
-        self._launch(
-            _measure_blocks, len(model), [self._put(model.ravel()), *self._rays, self._profiles, self._cuts], room
-        )
-        blocks, values = (most.numpy() for most in room)
+        self._inputs.model = to_device(model.ravel())
+        most = self._counts_of(len(model))
+        self._launch(_measure_blocks, len(model), [self._inputs], most)
+        blocks, values = (count.numpy() for count in most)
         edges = np.flatnonzero(np.diff(np.cumsum(values, dtype=np.int64) // SCRATCH_BYTES)) + 1
         for first, last in zip([0, *edges], [*edges, len(model)], strict=True):
             yield self._fill(model[first:last], blocks[first:last], values[first:last])
 
     def _fill(self, model, most_blocks, most_values):
-        room = [_starts(most) for most in (most_blocks, most_values)]
-        self._room = [self._put(starts) for starts in room]
-        self._blocks = [
-            self._memory("ray", room[0][-1], int),
-            self._memory("height", room[0][-1], wp.uint8),
-            self._memory("width", room[0][-1], wp.uint8),
-            self._memory("value", room[1][-1], wp.uint8),
-        ]
-        self._scale = self._memory("scale", len(model), float)
-        counts = [wp.empty(len(model), dtype=int, device=self._device.warp) for _ in range(2)]
-        self._launch(
-            _fill_blocks,
-            len(model),
-            [self._put(model.ravel()), *self._rays, *self._cell, self._profiles, self._cuts, *self._room],
-            [*self._blocks, self._scale, *counts],
+        """Compute blocks of some voxels where there is room for as many as they can have."""
+        first_block, first_value = _starts(most_blocks), _starts(most_values)
+        self._blocks = _block_arrays(
+            first_block,
+            first_value,
+            self._memory("ray", first_block[-1], int),
+            *(self._memory(name, first_block[-1], wp.uint8) for name in ("height", "width")),
+            self._memory("value", first_value[-1], wp.uint8),
         )
+        self._scale = self._memory("scale", len(model), float)
+        self._inputs.model = to_device(model.ravel())
+        counts = self._counts_of(len(model))
+        self._launch(_fill_blocks, len(model), [self._inputs, self._outline], [self._blocks, self._scale, *counts])
         self._counts = [count.numpy() for count in counts]
         return self._counts
 
     def write(self, ray, height, width, value, scale):
-        """Copy the blocks computed last, without gaps, into arrays as long as they are.
+        """Copy the blocks computed last, without gaps, into arrays of their length.
 
         Parameters
         ----------
         ray, height, width, value, scale : ndarray
-            As in ``project.Blocks``, of these voxels alone.
+            As in ``projector.Blocks``, for these voxels only.
         """
-        packed = [self._put(_starts(count)) for count in self._counts]
-        arrays = [self._put(array) for array in (ray, height, width, value)]
-        self._launch(_pack_blocks, len(scale), [*self._room, *packed, *self._blocks], arrays)
+        arrays = [to_device(array) for array in (ray, height, width, value)]
+        packed = _block_arrays(*(_starts(count) for count in self._counts), *arrays)
+        self._launch(_pack_blocks, len(scale), [self._blocks], [packed])
         scale[:] = self._scale.numpy()[: len(scale)]
         if self._device.kind == "cuda":
             for array, filled in zip((ray, height, width, value), arrays, strict=True):
                 array[:] = filled.numpy()
 
-    def _put(self, array):
-        return wp.array(array, device=self._device.warp, copy=False)
+    def _counts_of(self, voxels):
+        """Return room for each voxel's number of blocks and of values."""
+        return [wp.empty(voxels, dtype=int, device=self._device.warp) for _ in range(2)]
 
     def _memory(self, name, size, dtype):
-        """Scratch memory of at least `size`, kept for the next voxels."""
+        """Return scratch memory of at least `size`, which is used again for the next voxels."""
         if name not in self._scratch or self._scratch[name].size < size:
             self._scratch[name] = wp.empty(int(size) + int(size) // 4, dtype=dtype, device=self._device.warp)
         return self._scratch[name]
 
     def _launch(self, kernel, size, inputs, outputs):
-        def launch(_, first, last):
-            wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=outputs, device=self._device.warp)
+        launch(Call(kernel, size, inputs, outputs), parts=LAUNCH_PARTS)
 
-        runtime.run_chunks(size, launch, chunks=CHUNKS)
+
+def _block_arrays(first_block, first_value, ray, height, width, value):
+    """Return blocks on the device; each voxel's begin at `first_block` and `first_value`."""
+    blocks = BlockArrays()
+    blocks.first_block, blocks.first_value = to_device(first_block), to_device(first_value)
+    blocks.ray, blocks.height, blocks.width, blocks.value = ray, height, width, value
+    return blocks
 
 
 def _starts(count):
-    """Where each voxel's part begins, and the end of the last, shape (voxel + 1,), int32."""
+    """Return where each voxel's part begins, and the end of the last, shape (voxel + 1,), int32."""
     return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]).astype(np.int32)

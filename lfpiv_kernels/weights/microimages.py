@@ -1,33 +1,29 @@
-"""Warp: the light of a sensor's pixels as rays, block by block of microimages; ``raymap`` maps the two to each other.
+"""Warp: the pixels of a sensor as rays of its lenses, microimage by microimage.
 
-The layout is C++: NumPy took ten times as long. Twin of the shares: ``lfpiv.lightfield.decoder.disc_fraction``.
+A pixel under two microimages has a ray for each. A ray has a share: the fraction of the pixel's cell inside the pupil.
+The loops are C++, see ``microimages.h``. Twin of the shares: ``lfpiv.lightfield.decoder.disc_fraction``.
 """
 
-import sys
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.native import read_native
-from lfpiv_kernels.weights.footprint_source import LAYER_FALL, LAYERS, SIDE_LAYERS
-from lfpiv_kernels.weights.ray_model import LANES
+from lfpiv_kernels import native
+from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
-wp.set_module_options(
-    {
-        "enable_backward": False,
-        "max_unroll": 0,
-        "cpu_compiler_flags": wp.config.cpu_compiler_flags + " -ffp-contract=off",  # rounds as NumPy does
-    }
-)
+wp.set_module_options(native.options("microimages.h", contract="off"))  # rounds as NumPy does
+
+LAYERS: int = native.constant("microimages.h", "LAYERS")
+"""Versions of each microimage."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Microimages:
-    """How the rays of a camera's lenses lie in memory: blocks of edge x edge pixels, row by row.
+    """Where the rays of a camera's lenses lie in memory: blocks of edge x edge pixels, row by row.
 
-    Every row of lenses comes in layers, of which each holds a block per lens, see ``footprint_source.LAYERS``.
+    Every row of lenses has `LAYERS` layers. Each layer holds a block per lens.
     """
 
     first_lens: tuple[int, int]
@@ -37,7 +33,7 @@ class Microimages:
     edge: int
     """Pixels along each side of a block."""
     pixel: np.ndarray
-    """Sensor pixel of each ray, row by row; -1 outside the sensor. Shape (ray,), int32, some rays more than blocks."""
+    """Sensor pixel of each ray, shape (ray,), int32: -1 outside the sensor. Some rays more than the blocks have."""
     share: np.ndarray
     """Fraction of the pixel's cell inside the pupil, shape (ray,), float32."""
     sensor_shape: tuple[int, int]
@@ -49,53 +45,43 @@ class Microimages:
         return len(self.pixel)
 
 
-_LAY_OUT = (
-    f"const int LAYERS = {LAYERS}, SIDE_LAYERS = {SIDE_LAYERS}; const double LAYER_FALL = {LAYER_FALL};"
-    + read_native("microimages_lay_out.inc")
-)
+@wp.struct
+class Layout:
+    """The lenses and the sensor, see ``MicroimageLayout`` in ``microimages.h``."""
+
+    centre: wp.array(dtype=wp.float64)
+    corner: wp.array(dtype=int)
+    lenses: int
+    edge: int
+    columns: int
+    rows: int
+    radius: float
+    curvature: float
 
 
-@wp.func_native(_LAY_OUT)
-def _lay_out_lens(
-    lens: int,
-    centre: wp.array(dtype=wp.float64),
-    corner: wp.array(dtype=int),
-    lenses: int,
-    edge: int,
-    columns: int,
-    rows: int,
-    radius: float,
-    curvature: float,
-    pixel_out: wp.array(dtype=int),
-    share_out: wp.array(dtype=float),
-): ...
+@wp.func_native("""
+    lfpiv::write_lens_rays(lfpiv::microimage_layout(layout), lens, pixel_out.data, share_out.data);
+""")
+def _write_rays(layout: Layout, lens: int, pixel_out: wp.array(dtype=int), share_out: wp.array(dtype=float)): ...
 
 
 @wp.kernel
-def _lay_out(
+def _write_lens_rays(
     # in
+    layout: Layout,
     first_lens: int,
-    centre: wp.array(dtype=wp.float64),  # (lens, 2), flat
-    corner: wp.array(dtype=int),
-    lenses: int,  # in a row
-    edge: int,
-    columns: int,
-    rows: int,
-    radius: float,  # [pixel]
-    curvature: float,  # how far the edge's mean curvature moves it [pixel]
     # out
     pixel_out: wp.array(dtype=int),
     share_out: wp.array(dtype=float),
 ):
-    lens = first_lens + wp.tid()
-    _lay_out_lens(lens, centre, corner, lenses, edge, columns, rows, radius, curvature, pixel_out, share_out)
+    _write_rays(layout, first_lens + wp.tid(), pixel_out, share_out)
 
 
-def lay_out(first_lens, centre, radius, edge, sensor_shape):
-    """Lay a sensor's pixels out as the rays of its lenses.
+def lens_rays(first_lens, centre, radius, edge, sensor_shape):
+    """Return a sensor's pixels as the rays of its lenses.
 
-    A pixel at a microimage's edge shows the part of its cell inside the pupil, whose middle lies inwards of its own: so
-    a lens has more versions of its block, with shares for weights that fall or rise outwards.
+    Of a pixel at a microimage's edge, only a part lies inside the pupil. The middle of that part lies inwards of the
+    pixel's middle. So each lens has several layers of its block, whose shares suit weights that fall or rise outwards.
 
     Parameters
     ----------
@@ -114,23 +100,17 @@ def lay_out(first_lens, centre, radius, edge, sensor_shape):
     -------
     Microimages
     """
-    runtime.device()
-    wp.load_module(sys.modules[__name__], device="cpu")  # before threads use it
     corner = np.floor(centre - radius).astype(np.int32)
     count = LAYERS * centre[..., 0].size * edge**2
-    pixel, share = np.empty(count + LANES, np.int32), np.empty(count + LANES, np.float32)
+    pixel, share = np.empty(count + BLOCK_WIDTH, np.int32), np.empty(count + BLOCK_WIDTH, np.float32)
     pixel[count:], share[count:] = -1, 0.0
-    rows, columns = sensor_shape
-    inputs = [
-        *(wp.array(np.ravel(array), device="cpu", copy=False) for array in (centre, corner)),
-        *(centre.shape[1], edge, columns, rows, radius, 1 / (24 * max(radius, 1.0))),
-    ]
-    outputs = [wp.array(array, device="cpu", copy=False) for array in (pixel, share)]
-
-    def launch(_, first, last):
-        wp.launch(_lay_out, dim=last - first, inputs=[first, *inputs], outputs=outputs, device="cpu")
-
-    runtime.run_chunks(corner[..., 0].size, launch)
+    layout = Layout()
+    layout.centre, layout.corner = (to_device(np.ravel(array), device="cpu") for array in (centre, corner))
+    layout.lenses, layout.edge, layout.radius = centre.shape[1], edge, radius
+    layout.rows, layout.columns = sensor_shape
+    layout.curvature = 1 / (24 * max(radius, 1.0))  # how far the edge's mean curvature moves it within a pixel
+    outputs = [to_device(array, device="cpu") for array in (pixel, share)]
+    launch(Call(_write_lens_rays, corner[..., 0].size, [layout], outputs), device="cpu")
     return Microimages(
-        first_lens=first_lens, corner=corner, edge=edge, pixel=pixel, share=share, sensor_shape=(rows, columns)
+        first_lens=first_lens, corner=corner, edge=edge, pixel=pixel, share=share, sensor_shape=tuple(sensor_shape)
     )

@@ -249,6 +249,7 @@ def label_sub_lens(scene, dots):
     return (dots.array_mm - lattice.centres_mm(lattice.nearest(dots.array_mm))) / lattice.pitch_mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_labels_follow_the_true_rays(name):
     scene = SCENES[name]
@@ -276,6 +277,7 @@ def test_labels_follow_the_true_rays(name):
     assert abs(dots.response_share - share) < SHARE_ERROR
 
 
+@pytest.mark.slow
 def test_gaussian_fits_are_biased_to_lens_centres_and_the_integral_is_not():
     """Gaussian fits have the errors that were measured on other renderings."""
     scene = replace(SCENES["hexagonal, steep"], layout="square")
@@ -292,6 +294,7 @@ def test_gaussian_fits_are_biased_to_lens_centres_and_the_integral_is_not():
     assert mean["lens_integral"] < mean["gaussian"] / 4
 
 
+@pytest.mark.slow
 def test_dots_outside_the_field_are_missing_and_overlapping_ones_are_not_biased():
     """Planes far from focus: the light of neighbouring dots overlaps on the sensor, and the board leaves the field."""
     scene = replace(SCENES["square, rolled camera, wrong angle"], planes_mm=(-4.5, 0.0, 4.5), missing=(), false_mm=())
@@ -504,6 +507,7 @@ def test_bad_boards_are_refused():
         measure_board(empty, decoder, scene.board, nominal_angle_deg=20, estimator="centroid")
 
 
+@pytest.mark.slow
 @pytest.mark.sample_data
 @pytest.mark.parametrize("number", [0, 1])
 def test_labels_of_the_sample_experiment(sample_data, number):

@@ -131,6 +131,7 @@ def test_a_wrongly_named_dot_is_left_out(rig):
     assert (agreeing_dots(dots, departure, 0.1) == ~wrong).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", ["planes", "angle"])
 def test_a_board_that_no_such_camera_can_see_is_refused(rig, mistake):
     experiment, _, _ = rig
@@ -161,6 +162,7 @@ def spoiled(experiment, folder, images):
     return lfpiv.open_experiment(folder / experiment.path.name)
 
 
+@pytest.mark.slow
 def test_planes_without_dots_are_named_and_left_out(rig, tmp_path, caplog):
     experiment, spec, _ = rig
     rng = np.random.default_rng(0)
@@ -179,6 +181,7 @@ def some_planes(experiment, *planes_mm):
     return dataclasses.replace(experiment, board=experiment.board.model_copy(update={"planes_mm": planes_mm}))
 
 
+@pytest.mark.slow
 def test_saturated_dots_are_left_out_with_a_dark_image_too(rig, tmp_path):
     """Dots are five times too bright. A subtracted dark image makes the saturated pixels differ."""
     experiment, spec, _ = rig
@@ -197,6 +200,7 @@ def test_saturated_dots_are_left_out_with_a_dark_image_too(rig, tmp_path):
     assert any(warning.code is Code.BOARD_SATURATED for warning in camera.warnings)
 
 
+@pytest.mark.slow
 def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(rig, tmp_path):
     experiment, spec, _ = rig
     copy = experiment.board_image("only", 2).astype(np.uint16)
@@ -335,6 +339,7 @@ def test_wrong_arguments_are_named(rig, tmp_path):
         lfpiv.load_calibration(tmp_path / "damaged.h5")
 
 
+@pytest.mark.slow
 @pytest.mark.sample_data
 def test_the_sample_experiment_reaches_the_projects_figures(sample_data, tmp_path, device):
     """Compare the mapping of the sample data with the true rays, and the vectors with the true flow."""

@@ -5,22 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.ndimage
-import warp as wp
 from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, uniform
 
 from lfpiv_kernels import runtime
 from lfpiv_kernels.correlation import (
-    blocks,
     box_sum,
     correlate,
     deform,
     neighbours,
-    peaks,
     plan,
-    planes,
-    spectra,
     transforms,
-    windows,
 )
 
 pytestmark = pytest.mark.usefixtures("device")
@@ -139,18 +133,6 @@ def test_spectra_of_blocks_and_surroundings_give_their_correlation(edge, search)
     taps, near = (row[: half + 1] + 1j * np.pad(row[half + 1 :], 1) for row in rows)
     found = np.fft.irfft(taps.conj() * near, spectrum.size[0])[np.arange(-search, search + 1)]
     np.testing.assert_allclose(found, np.correlate(around, block, "valid"), atol=TOLERANCE_SUM)
-
-
-@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
-@pytest.mark.parametrize(
-    "module",
-    [blocks, box_sum, deform, neighbours, peaks, planes, spectra, windows],
-    ids=lambda module: module.__name__.rpartition(".")[2],
-)
-def test_correlation_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):
-    (compiled,) = wp.compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
-    entries = compiled.read_text().count(".visible .entry")
-    assert entries == len(wp.get_module(module.__name__).kernels)
 
 
 @pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])

@@ -5,6 +5,7 @@ import pkgutil
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 import warp as wp
@@ -13,6 +14,7 @@ import lfpiv_kernels
 from lfpiv_kernels import native, runtime
 
 HEADERS = sorted(native.FOLDER.glob("*.h"))
+CHECKOUT = Path(__file__).resolve().parents[2] / "lfpiv_kernels" / "native"  # the format's file is not installed
 
 
 def warp_modules() -> list[str]:
@@ -44,7 +46,7 @@ def changed_options():
 
 
 @pytest.mark.skipif(shutil.which("clang-format") is None, reason="clang-format is not installed")
-@pytest.mark.parametrize("header", HEADERS, ids=lambda path: path.name)
+@pytest.mark.parametrize("header", sorted(CHECKOUT.glob("*.h")), ids=lambda path: path.name)
 def test_headers_are_formatted(header):
     done = subprocess.run(["clang-format", "--dry-run", "--Werror", header], stderr=subprocess.PIPE, text=True)
     assert done.returncode == 0, done.stderr
@@ -59,6 +61,7 @@ def build_dependencies(module):
     return wp.get_module(module).options["extra_build_options"].extra_build_dependencies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", warp_modules())
 def test_compiler_has_no_warnings(module, changed_options, capfd, tmp_path):
     """Those that Warp's own compiler gives by default, anywhere, and all others in the headers."""
@@ -93,3 +96,12 @@ def test_constants_are_read_from_headers():
     assert native.constant("projector.h", "BLOCK_WIDTH") == 8
     with pytest.raises(ValueError, match=r"projector.h: expected 'constexpr int NO_SUCH = <number>;'"):
         native.constant("projector.h", "NO_SUCH")
+
+
+@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
+@pytest.mark.parametrize("module", warp_modules())
+def test_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):
+    runtime.device()
+    (compiled,) = wp.compile_aot_module(importlib.import_module(module), arch=80, module_dir=tmp_path, use_ptx=True)
+    entries = compiled.read_text().count(".visible .entry")
+    assert entries == len(wp.get_module(module).kernels)

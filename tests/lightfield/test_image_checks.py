@@ -211,6 +211,7 @@ def test_a_white_image_of_another_place_is_refused(small_run, tmp_path):
         calibrate_first(file)
 
 
+@pytest.mark.slow
 def test_a_saturated_white_image_and_pictures_on_their_side_are_named(small_run, tmp_path):
     file = small_run.images(tmp_path / "data")
     spoil(file, "white/*.tif", lambda image: np.minimum(image * 4.0, 4095))
@@ -221,6 +222,7 @@ def test_a_saturated_white_image_and_pictures_on_their_side_are_named(small_run,
     assert "white image's bright pixels are saturated" in saturated and "turned by 90 degrees" in turned
 
 
+@pytest.mark.slow
 def test_wrong_spacing_and_size_of_the_dots_show(small_run, tmp_path, caplog):
     """The magnification and the apparent diameter show them; the calibration holds both warnings at any log level."""
     file = small_run.images(tmp_path / "data")

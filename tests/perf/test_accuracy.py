@@ -67,6 +67,7 @@ def figures(tiny):
     return json.loads((tiny / "reproduce.json").read_text())
 
 
+@pytest.mark.slow
 def test_ray_tracing_fails_through_real_optics_and_the_network_does_not(figures):
     case = figures["optics"]
     for errors in case["mapping_error_pitch"].values():
@@ -79,6 +80,7 @@ def test_ray_tracing_fails_through_real_optics_and_the_network_does_not(figures)
     assert list(case["pairs"]) == ["window"]
 
 
+@pytest.mark.slow
 def test_more_cameras_see_depth(figures):
     runs = {run["cameras"]: run for run in figures["cameras"]["runs"]}
     assert set(runs) == {"truth", "one", "two", "three"}
@@ -87,6 +89,7 @@ def test_more_cameras_see_depth(figures):
     assert runs["one"]["elongation"] > runs["two"]["elongation"]
 
 
+@pytest.mark.slow
 def test_noise_costs_quality(figures):
     bright, dim = figures["sweeps"]["noise"]
     assert bright["snr"] > dim["snr"] > 0 and bright["electrons"] == pytest.approx(dim["electrons"] * 300 / DIM)
@@ -95,6 +98,7 @@ def test_noise_costs_quality(figures):
     assert figures["sweeps"]["seeding"][0]["q"] == pytest.approx(bright["q"], abs=ROUNDING)  # one run, shown twice
 
 
+@pytest.mark.slow
 def test_choices_are_held_against_the_defaults(figures):
     case = figures["choices"]
     default, made = case["default"], case["choices"]
@@ -116,6 +120,7 @@ def test_only_what_changes_the_volumes_is_reconstructed():
     assert all(choice.like is None or choice.like in every for choice in every.values())
 
 
+@pytest.mark.slow
 def test_cases_share_their_runs_and_the_page_tells_them_apart(tiny, figures):
     runs = {path.stem for path in (tiny / "work" / "bench" / "runs").glob("*.npz")}
     assert runs >= {f"{name}_{PPM:g}_ppm_300_counts" for name in ("one", "two", "three")}

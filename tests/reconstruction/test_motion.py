@@ -277,6 +277,7 @@ def test_volumes_that_do_not_say_leave_the_vectors_as_they_are(reconstructed, ca
     assert np.isnan(motion.unshared_quality(single, both)["uncertainty"]).all()
 
 
+@pytest.mark.slow
 def test_a_run_tells_which_pairs_followed_the_motion(small_run, tmp_path, monkeypatch):
     calls = []
 

@@ -90,6 +90,7 @@ def test_a_hot_pixel_raises_no_floor_and_no_particle_is_cut(weights, per_voxel):
     assert default == pytest.approx([NOISE] * 2, rel=2 * TOLERANCE_FLOOR)  # negative counts of the noise
 
 
+@pytest.mark.slow
 def test_a_camera_s_brightness_is_part_of_its_gain(weights):
     """Brightness and floor scale with it: the same as a camera of which the white image says so, in its own counts."""
     images = recorded(weights, particles(weights.grid, 2), 2)

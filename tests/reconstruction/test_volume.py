@@ -443,6 +443,7 @@ def small_volume():
     return rig, lfpiv.build_weights(rig, grid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sigma_voxel", "ppm", "counts"),
     [(0.7, 0.2, 200.0), (0.7, 1.0, 200.0), (0.7, 0.5, 8.0), (1.0, 0.5, 200.0), (0.0, 0.2, 200.0), (0.0, 1.0, 8.0)],

@@ -11,7 +11,7 @@ from support import report_run
 
 from lfpiv.report import markup
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 LAPTOP, PHONE = (1366, 768), (390, 844)
 PATIENCE_S = 90
@@ -60,6 +60,16 @@ for (const element of document.body.querySelectorAll('main *')) {
 return found;
 """
 
+CONTROLS = """
+return [...document.querySelectorAll('a[href], button, input, select, summary, [tabindex]')]
+  .filter((element) => element.checkVisibility()).map((element) => element.id || element.tagName);
+"""
+"""Names of all controls on the page, in the order of the document."""
+FOCUSED = """
+const element = document.activeElement;
+return [element.id || element.tagName, getComputedStyle(element).outlineStyle];
+"""
+
 
 class Tab:
     """The report in one tab."""
@@ -95,10 +105,12 @@ class Tab:
         self.wait("document.getElementById('space').dataset.drawn")
 
     def keys(self, *keys):
+        """Press keys, one after the other: names of selenium's `Keys`, or characters."""
         from selenium.webdriver import ActionChains
+        from selenium.webdriver.common.keys import Keys
 
         for key in keys:
-            ActionChains(self.browser, duration=0).send_keys(key).perform()
+            ActionChains(self.browser, duration=0).send_keys(getattr(Keys, key, key)).perform()
 
     def of(self, name):
         return self.js("return document.getElementById(arguments[0]).textContent", name)
@@ -128,8 +140,6 @@ def tab(browser, reported):
 
 
 def test_the_slider_moves_through_all_depths(tab):
-    from selenium.webdriver.common.keys import Keys
-
     tab.open()
     tab.wait("document.getElementById('slices').classList.contains('ready')")
     tab.js(
@@ -151,7 +161,7 @@ def test_the_slider_moves_through_all_depths(tab):
         )
         assert row[3:6] == means
         pictures.add(tab.js("return document.getElementById('slice-canvas').toDataURL()"))
-        tab.keys(Keys.ARROW_RIGHT)
+        tab.keys("ARROW_RIGHT")
     assert len(pictures) == truth.sizes["z"]
     tab.choose("slice-axis", "y")
     assert (
@@ -169,12 +179,10 @@ def test_the_slider_moves_through_all_depths(tab):
 
 
 def test_a_vector_can_be_read_by_keys(tab):
-    from selenium.webdriver.common.keys import Keys
-
     tab.open()
     tab.wait("document.getElementById('slices').classList.contains('ready')")
     tab.js("document.getElementById('slice-canvas').focus()")
-    tab.keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_UP)  # the first one goes to the middle
+    tab.keys("ARROW_RIGHT", "ARROW_RIGHT", "ARROW_UP")  # the first one goes to the middle
     vector = report_run.field(0).isel(z=2, y=4, x=4)
     speed = float(np.sqrt(sum(float(vector[name]) ** 2 for name in "uvw")))
     said = tab.of("slice-reading")
@@ -189,12 +197,11 @@ def test_a_vector_can_be_read_by_keys(tab):
 def test_numbers_read_as_in_the_tables(tab):
     tab.open()
     values = [0, 2443.2, -0.012345, 1.5e-7, 123456789.0, 999.6, 0.00009996, 1e6, -3.0]
-    assert tab.js("return arguments[0].map((value) => short(value))", values) == [*map(markup.significant, values)]
+    shown = tab.js("return arguments[0].map((value) => significant(value))", values)
+    assert shown == [*map(markup.significant, values)]
 
 
 def test_the_view_in_space_draws_turns_and_fits_every_page(tab):
-    from selenium.webdriver.common.keys import Keys
-
     tab.open(PHONE)
     tab.draw_space()
     assert tab.js("return document.querySelectorAll('#space-scene canvas').length") >= 1 and not tab.shown(
@@ -220,7 +227,7 @@ def test_the_view_in_space_draws_turns_and_fits_every_page(tab):
     eye = "return JSON.stringify(document.getElementById('space-scene')._fullLayout.scene.camera.eye)"
     before = json.loads(tab.js(eye))
     tab.js("document.getElementById('space-scene').focus()")
-    tab.keys(Keys.ARROW_LEFT, "+")
+    tab.keys("ARROW_LEFT", "+")
     after = json.loads(tab.js(eye))
     assert np.linalg.norm(list(after.values())) == pytest.approx(np.linalg.norm(list(before.values())) / 1.12)
     assert np.arctan2(after["y"], after["x"]) == pytest.approx(np.arctan2(before["y"], before["x"]) - 0.12)
@@ -237,7 +244,7 @@ def test_the_view_in_space_draws_turns_and_fits_every_page(tab):
     start = tab.js(level)
     assert start == pytest.approx(report_run.OMEGA, rel=1e-3)  # half of the vorticity, which is the same everywhere
     tab.js("document.getElementById('space-level').focus()")
-    tab.keys(Keys.ARROW_RIGHT)
+    tab.keys("ARROW_RIGHT")
     tab.wait(f"document.getElementById('space-scene').data.some((trace) => trace.isomin > {start})")
     for label in ("pair 2", "fluctuation", "mean of"):
         tab.choose("space-field", label)
@@ -246,26 +253,62 @@ def test_the_view_in_space_draws_turns_and_fits_every_page(tab):
     assert not tab.errors()
 
 
-def test_every_control_is_reached_by_the_tab_key_and_shows_it(tab):
-    from selenium.webdriver.common.keys import Keys
+def walk(tab):
+    """Press Tab from the first to the last element of the page; return [name, outline style] of each focused element.
 
+    The walk starts at a focused element in front of the page: all browsers continue from the focus. Without a focus
+    they differ: Chromium 150 continues from the element that `scrollIntoView` showed last.
+    """
+    tab.js(
+        """for (const [id, place, index] of [['walk-start', 'prepend', -1], ['walk-end', 'append', 0]]) {
+          const end = Object.assign(document.createElement('span'), { id, tabIndex: index });
+          document.body[place](end);
+        }
+        document.getElementById('walk-start').focus();"""
+    )
+    focused, most = [], 2 * len(tab.js(CONTROLS))
+    while not focused or focused[-1][0] != "walk-end":
+        assert len(focused) < most, f"the Tab key does not come to the end of the page: {focused}"
+        tab.keys("TAB")
+        focused.append(tab.js(FOCUSED))
+    tab.js("for (const id of ['walk-start', 'walk-end']) document.getElementById(id).remove()")
+    return focused[:-1]
+
+
+def open_for_keys(tab):
     tab.open()
     tab.wait("document.getElementById('slices').classList.contains('ready')")
     tab.draw_space()
-    tab.js("window.scrollTo(0, 0); document.activeElement.blur()")
-    seen, script = [], "const e = document.activeElement; return [e.id || e.tagName, getComputedStyle(e).outlineStyle]"
-    for _ in range(70):
-        tab.keys(Keys.TAB)
-        name, outline = tab.js(script)
-        if name == "BODY":
-            break
-        assert outline != "none", f"{name} does not show that it has the focus"
-        seen.append(name)
-    wanted = [
-        *("A", "SUMMARY", "slice-field", "slice-colour", "slice-axis", "slice-slider", "slice-canvas"),
+
+
+def test_every_control_is_reached_by_the_tab_key_and_shows_it(tab):
+    open_for_keys(tab)
+    controls = tab.js(CONTROLS)
+    named = [
+        *("slice-field", "slice-colour", "slice-axis", "slice-slider", "slice-canvas"),
         *("space-field", "space-quantity", "space-level", "space-arrows", "space-scene"),
     ]
-    assert [name for name in dict.fromkeys(seen) if name in wanted] == wanted
+    assert [name for name in controls if name in named] == named and {"A", "SUMMARY"} <= set(controls)
+    focused = walk(tab)
+    assert [name for name, _ in focused] == controls
+    assert [name for name, outline in focused if outline == "none"] == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "unreached", "invisible"),
+    [
+        ("document.getElementById('slice-axis').tabIndex = -1", ["slice-axis"], []),
+        ("document.getElementById('space-scene').style.outline = 'none'", [], ["space-scene"]),
+    ],
+    ids=["skipped", "without outline"],
+)
+def test_the_walk_by_the_tab_key_finds_faults(tab, fault, unreached, invisible):
+    open_for_keys(tab)
+    tab.js(fault)
+    focused = walk(tab)
+    names = [name for name, _ in focused]
+    assert [name for name in tab.js(CONTROLS) if name not in names] == unreached
+    assert [name for name, outline in focused if outline == "none"] == invisible
 
 
 @pytest.mark.parametrize(

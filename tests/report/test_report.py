@@ -9,13 +9,14 @@ import json
 import math
 import re
 
+import h5py
 import numpy as np
 import pytest
 from scipy import ndimage
 from support import report_run
 
 import lfpiv
-from lfpiv.report import calibration, fields, flow_panels, markup, overview, vectors, volumes
+from lfpiv.report import calibration, markup, overview, vectors, volumes
 from lfpiv.report import pairs as pairs_section
 from lfpiv.report.dot_map import dot_map
 from lfpiv.report.fields import (
@@ -32,6 +33,7 @@ from lfpiv.report.fields import (
 from lfpiv.report.lens_map import lens_map
 from lfpiv.report.light_sheet import find_sheet
 from lfpiv.report.pairs import MOST_ROWS, group
+from lfpiv.report.summary import CameraFigures, Summary
 from lfpiv.results import netcdf
 
 PLOTLY_BYTES, PAGE_BYTES, CAMERA_BYTES, VECTOR_BYTES = 2.4e6, 1.5e6, 0.7e6, 24
@@ -90,6 +92,10 @@ def text(reported):
     return reported.page.read_text("utf-8")
 
 
+def figures(summary):
+    return Summary.model_validate(summary)
+
+
 def unpacked(text, name):
     data = re.search(rf'id="{name}">([^<]*)</script>', text)[1]
     return gzip.decompress(base64.b64decode(data))
@@ -129,11 +135,11 @@ def test_failed_pairs_come_first_among_the_warnings_and_long_lists_end(reported,
         < text.index('"run"')
     )
     failed = [{"pair": pair, "reason": "no light"} for pair in range(2000)]
-    section = overview.warnings(reported.summary | {"failed": failed})
+    section = overview.warnings(figures(reported.summary | {"failed": failed}))
     assert section.index("Pair 0 failed: no light") < section.index("<details>")
     assert section.count("failed: no light") == overview.WARNINGS_MOST
     assert f"{2001 - overview.WARNINGS_MOST:,} more are in summary.json" in section
-    assert overview.warnings(reported.summary | {"failed": [], "warnings": []}) == ""
+    assert overview.warnings(figures(reported.summary | {"failed": [], "warnings": []})) == ""
 
 
 def test_fields_are_stored_to_a_65000th_of_their_range(text):
@@ -149,7 +155,7 @@ def test_fields_are_stored_to_a_65000th_of_their_range(text):
         expected = {name: truth[name].values for name in "uvw"}
         expected["vorticity"] = np.full(truth["u"].shape, 2 * report_run.OMEGA * (1 + 0.1 * number))
         for name, values in expected.items():
-            stored = np.frombuffer(block, "<i2", values.size, entry["values"][name]["at"])
+            stored = np.frombuffer(block, "<i2", values.size, entry["values"][name]["offset"])
             scale = entry["values"][name]["scale"]
             assert (stored != NO_NUMBER).all()
             np.testing.assert_allclose(
@@ -178,20 +184,33 @@ def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, mon
     files = {pair: reported.vectors[pair % 2] for pair in range(pairs)}
     items = [reported.summary["pairs"][pair % 3] | {"pair": pair} for pair in range(pairs)]
     noted = {"pairs": items, "warnings": ["few valid vectors"] * pairs, "reused": [f"pair {k}" for k in range(pairs)]}
-    sections = {}
-    for name, summary, paths in (
+    opened, sections = [], {}
+
+    class CountedFile(h5py.File):
+        def __init__(self, name, *arguments, **options):
+            opened.append(name)
+            super().__init__(name, *arguments, **options)
+
+    monkeypatch.setattr(h5py, "File", CountedFile)
+    for name, content, paths in (
         ("few", reported.summary, reported.vectors),
         ("many", reported.summary | noted, files),
     ):
-        read = []
-        with monkeypatch.context() as patch:
-            for module, function in ((netcdf, "_read"), (fields, "_read_velocity")):
-                original = getattr(module, function)
-                patch.setattr(module, function, lambda *parts, o=original, r=read: r.append(parts) or o(*parts))
-            plain = overview.warnings(summary) + overview.timings(summary) + overview.head(reported.experiment, summary)
-            sections[name] = vectors.section(paths) + volumes.section(summary, paths) + pairs_section.section(summary)
-            sections[name] += plain
-        assert len(read) <= MOST_READ + MOST_SHOWN + 2  # the first once more, and its volumes
+        opened.clear()
+        summary = figures(content)
+        sections[name] = "".join(
+            [
+                overview.warnings(summary),
+                overview.timings(summary),
+                overview.head(reported.experiment, summary),
+                vectors.section(paths),
+                volumes.section(summary.pairs, paths),
+                pairs_section.section(summary.pairs, summary.failed),
+            ]
+        )
+        assert (
+            min(len(paths), MOST_READ) <= len(opened) <= MOST_READ + MOST_SHOWN + 2
+        )  # its volumes, the first once more
     assert len(sections["many"]) - len(sections["few"]) < 0.2 * PAGE_BYTES
     assert f"holds 6 of {pairs:,} pairs" in sections["many"]
     assert f"those of {MOST_READ} evenly chosen pairs" in sections["many"]
@@ -211,7 +230,8 @@ def test_large_fields_are_thinned_out():
 
 
 def test_pairs_are_put_together_without_loss(reported):
-    items = [reported.summary["pairs"][0] | {"pair": 2 * pair, "valid_fraction": pair / 1000} for pair in range(1001)]
+    first = figures(reported.summary).pairs[0]
+    items = [first.model_copy(update={"number": 2 * pair, "valid_fraction": pair / 1000}) for pair in range(1001)]
     groups = group(items)
     assert len(groups.pairs) <= MOST_ROWS and groups.pairs.sum() == 1001
     assert (groups.first[1:] > groups.last[:-1]).all() and groups.first[0] == 0 and groups.last[-1] == 2000
@@ -251,14 +271,12 @@ def test_a_dot_in_the_wrong_place_shows_where_it_is(reported):
 def test_arrows_have_the_scale_that_is_stated(monkeypatch):
     """The longest arrow drawn is as long as the scale in the title says of its speed; a field at rest has no scale."""
     paths, titles = [], []
-    draw, style = flow_panels.arrows, flow_panels.style
-    monkeypatch.setattr(flow_panels, "arrows", lambda *parts: paths.append(draw(*parts)) or paths[-1])
-    monkeypatch.setattr(
-        flow_panels, "style", lambda axes, **names: titles.append(names["title"]) or style(axes, **names)
-    )
+    draw, style = vectors.arrows, vectors.style
+    monkeypatch.setattr(vectors, "arrows", lambda *parts: paths.append(draw(*parts)) or paths[-1])
+    monkeypatch.setattr(vectors, "style", lambda axes, **names: titles.append(names["title"]) or style(axes, **names))
     moving = report_run.field(0)
     moving["valid"][:] = True
-    assert len(flow_panels.slices(moving)) == 5
+    assert len(vectors.slices(moving)) == 5
     length, speed = map(float, re.search(r"an arrow of (\S+) mm is (\S+) m/s", titles[0]).groups())
     shafts = paths[0].vertices.reshape(-1, 5, 2)
     longest = np.linalg.norm(shafts[:, 1] - shafts[:, 0], axis=1).max()
@@ -266,8 +284,8 @@ def test_arrows_have_the_scale_that_is_stated(monkeypatch):
     assert longest / fastest == pytest.approx(length / speed, rel=0.05)  # the title rounds to two digits
     still = moving.assign({name: 0 * moving[name] for name in "uvw"})
     titles.clear()
-    assert flow_panels.slices(still, most=1) and "m/s" not in titles[0]
-    assert [flow_panels.round_below(value) for value in (0.0, 0.0199, 1.0, 7e3, np.nan)] == [0, 0.01, 1, 5000, 0]
+    assert vectors.slices(still, most=1) and "m/s" not in titles[0]
+    assert [vectors.round_below(value) for value in (0.0, 0.0199, 1.0, 7e3, np.nan)] == [0, 0.01, 1, 5000, 0]
 
 
 def test_the_brightness_outside_the_light_sheet_tells_the_level_of_ghosts(reported, text):
@@ -278,7 +296,7 @@ def test_the_brightness_outside_the_light_sheet_tells_the_level_of_ghosts(report
     assert abs(1 / float(ratio) - report_run.EDGE_LEVEL) < GRAIN * report_run.EDGE_LEVEL
     stored = netcdf.read_reconstruction(reported.vectors[0])
     older = stored.drop_vars("profile_z")  # as the schema before had it
-    figure = volumes._quality_figure(0, older, {})
+    figure = volumes.quality_figure(0, older, {})
     assert "an earlier version" in figure and "<svg" not in figure
 
 
@@ -330,8 +348,8 @@ def test_a_report_before_any_pair_is_finished(reported, tmp_path, monkeypatch):
 
 def test_ray_tracing_at_nominal_angles_is_reported_without_dots(reported):
     traced = lfpiv.thin_lens(reported.experiment)
-    summary = {"calibration": {name: camera.report.to_json() for name, camera in traced.cameras.items()}}
-    page = Page(calibration.section(reported.experiment, traced, summary))
+    cameras = {name: CameraFigures.model_validate(camera.report.to_json()) for name, camera in traced.cameras.items()}
+    page = Page(calibration.section(reported.experiment, traced, cameras))
     assert "Microlens array of left" in page.text["figcaption"] and "eld-out" not in page.text["figcaption"]
 
 

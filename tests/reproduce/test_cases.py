@@ -148,12 +148,14 @@ def test_planar_piv_measures_the_sheet():
         assert np.abs(np.nanmean(part, axis=(0, 1))).max() < PLANAR_PX
 
 
+@pytest.mark.slow
 def test_a_missing_openpiv_is_named(monkeypatch, rig, tmp_path):
     monkeypatch.setitem(sys.modules, "openpiv", None)
     with pytest.raises(InputError, match=r"OpenPIV.*piv2d"):
         lsi.compute(rig, lsi.SIZES["small"], tmp_path, seed=0, progress=quiet)
 
 
+@pytest.mark.slow
 def test_dense_labels_lie_on_the_same_rays(rig):
     camera = rig.calibration.cameras["camera1"]
     points, pupil, array, dot = table3.dense_labels(camera.dots, 50, camera.optics.pupil_radius_mm)
@@ -189,6 +191,7 @@ def test_profiles_of_exact_fields_are_exact(scale):
     assert lsi.relative_error(np.array([1.0, np.nan]), np.array([2.0, 1.0])) == pytest.approx(0.5, abs=ROUNDING)
 
 
+@pytest.mark.slow
 def test_table1_on_a_tiny_rig(rig, tmp_path):
     sizes = table1.Sizes(layers=(1, 2), samples=400, epochs=4, descent_epochs=4, shallow_epochs=12)
     result = table1.compute(rig, sizes, tmp_path, seed=0, progress=quiet)
@@ -205,6 +208,7 @@ def test_table1_on_a_tiny_rig(rig, tmp_path):
     assert kept == {path: path.read_bytes() for path in (tmp_path / "networks").glob("*.json")}
 
 
+@pytest.mark.slow
 def test_table3_on_a_tiny_rig(rig, monkeypatch):
     monkeypatch.setitem(table3.VOLUME_MM, "small", (0.8, 0.8, 0.4))
     result = table3.compute(rig, "small", seed=0, progress=quiet)
@@ -213,6 +217,7 @@ def test_table3_on_a_tiny_rig(rig, monkeypatch):
     assert all(row["goal"] is None for row in result["comparison"])  # goals are for the paper's size only
 
 
+@pytest.mark.slow
 def test_fig19_on_a_tiny_rig(rig, tmp_path):
     result = fig19.compute(rig, (1, 2, 3), tmp_path, seed=0, progress=quiet)
     assert result["dots_found"] == result["dots_expected"] == 75

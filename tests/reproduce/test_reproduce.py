@@ -174,6 +174,7 @@ SSIM_TINY = 0.97  # the goal; a calibration from 27 dots is cruder than the pape
 COUNT_L2 = 0.025  # footprint against counts: 0.02 is the goal, four counts have a noise of 0.007
 
 
+@pytest.mark.slow
 def test_weights_agree_with_ray_tracing_and_with_counted_rays(figures):
     case = figures["fig10"]
     assert case["ssim"] >= SSIM_TINY
@@ -184,6 +185,7 @@ def test_weights_agree_with_ray_tracing_and_with_counted_rays(figures):
         assert 0 < camera["count_noise_l2"] < camera["paper_sampling_against_count_l2"]
 
 
+@pytest.mark.slow
 def test_network_and_ray_tracing_reconstruct_alike(figures):
     case = figures["fig12"]
     runs = {(run["particles"], run["mapping"], run["ppm"]): run for run in case["runs"]}
@@ -210,6 +212,7 @@ def test_network_and_ray_tracing_reconstruct_alike(figures):
     )  # points do not fit the truth's blobs
 
 
+@pytest.mark.slow
 def test_vectors_are_those_of_the_flow(figures):
     case = figures["fig14"]
     error, peak = case["error_mean_voxel"], case["flow"]["peak_mm"] / rigs.VOXEL_MM
@@ -232,6 +235,7 @@ def test_the_angle_error_at_a_contrast_lies_between_those_computed():
     assert text.count("at 3.5 degrees") == 3 and "contrast of 2 is not found: 1.10" in text
 
 
+@pytest.mark.slow
 def test_equal_angle_errors_stretch_the_volume_and_roll_tears_it(tiny):
     rig = rigs.numerical_rig(tiny / "work" / "rig", "small", 5, lambda step, fraction: None)
     rng = np.random.default_rng(3)
@@ -254,6 +258,7 @@ def test_equal_angle_errors_stretch_the_volume_and_roll_tears_it(tiny):
     assert np.abs(np.abs(torn) - np.abs(expected)).max() < 0.1 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 def test_every_figure_is_drawn_and_shown(tiny, figures):
     for key in ("fig10", "fig12", "fig14"):
         for figure in figures[key]["figures"]:

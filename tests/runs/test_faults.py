@@ -76,6 +76,7 @@ def no_report(monkeypatch):
     monkeypatch.setattr("lfpiv.report.write_report", lambda *arguments: None)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path, no_report):
     """Kill -9 with two workers at work: they die too, nothing is half-written, and one process does the rest."""
     out = small_run.calibrated(tmp_path / "out")
@@ -94,6 +95,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path, no
     assert len(summary["pairs"]) == PAIRS and summary["failed"] == []
 
 
+@pytest.mark.slow
 def test_a_killed_worker_costs_nothing_and_a_bad_pair_only_itself(small_run, tmp_path):
     """One of two workers dies by kill -9, one image is damaged: the other pairs are done, status 3, as documented."""
     experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
@@ -138,6 +140,7 @@ def cluster(tmp_path):
             process.wait()
 
 
+@pytest.mark.slow
 def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_run, tmp_path, cluster):
     """Kill -9 the run, then in the next run a worker; let the scheduler hang for a while: the same numbers."""
     address, scheduler, start_worker = cluster
@@ -161,6 +164,7 @@ def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_ru
     assert worker.poll() is None and scheduler.poll() is None, "the cluster is not ours to end"
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_ends_the_run_with_one_message(small_run, tmp_path, cluster, no_report):
     """Kill -9: status 1, all files whole, and the same command goes on, here without the cluster."""
     address, scheduler, start_worker = cluster
@@ -192,6 +196,7 @@ kill -- "-$1"
 """
 
 
+@pytest.mark.slow
 def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
     """The documented script and dask-jobqueue, processes for jobs: one job is cancelled, one pair cannot be done."""
     (tmp_path / "bin").mkdir()
@@ -227,6 +232,7 @@ def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
     assert same_vectors(reference, out) == PAIRS - 1 and whole(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "options"), [(signal.SIGINT, ["--workers", "2"]), (signal.SIGTERM, [])])
 def test_an_interrupted_run_ends_cleanly_and_says_how_to_go_on(small_run, tmp_path, number, options):
     out = small_run.calibrated(tmp_path / "out")
@@ -250,6 +256,7 @@ def mounts():
     return shutil.which("unshare") and subprocess.run(command, capture_output=True).returncode == 0
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_nothing_half_written(small_run, tmp_path):
     """The second pair's vectors do not fit: one clear message, status 1, every file whole."""
     out = small_run.calibrated(tmp_path / "out")
@@ -330,6 +337,7 @@ def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatc
     assert not finished(out) and whole(out)
 
 
+@pytest.mark.slow
 def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(small_run, tmp_path, capfd, no_report):
     """Each status tells of its own invocation; results of other images than there are now are put aside."""
     experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
@@ -365,6 +373,7 @@ def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(sm
     assert same_vectors(small_run.out, out) == PAIRS and not list(out.rglob("*.outdated"))
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_does_not_end_at_the_first_damaged_pair(small_run, tmp_path, capfd, no_report):
     """Stopped after pair 0; pair 1 is damaged, and its volumes are not needed where its images are gone."""
     experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")

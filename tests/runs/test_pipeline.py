@@ -208,6 +208,7 @@ def test_images_are_told_apart_by_their_whole_path(small_run, tmp_path):
     assert stamp(exchanged).changes(made) == ["particles.frames"]
 
 
+@pytest.mark.slow
 def test_figures_come_from_the_files_without_reading_them(finished, monkeypatch):
     """What is left of a run are its files: the summary is rebuilt from their heads alone."""
     experiment, out, _ = finished

@@ -256,6 +256,7 @@ def test_a_worker_uses_the_cores_that_its_job_was_given(monkeypatch, granted, ex
     assert dispatch._granted_cores() == expected
 
 
+@pytest.mark.slow
 def test_what_workers_are_forked_from_is_whole_and_has_started_nothing():
     """A device or a thread of Python would not survive the fork; a module that cannot be read would be passed over."""
     script = "import threading, lfpiv.runs.worker_preload; from lfpiv_kernels import runtime"

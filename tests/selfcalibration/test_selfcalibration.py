@@ -158,6 +158,7 @@ def test_cameras_that_stood_still_agree(small_run):
     assert not any("apart" in text for text in small_run.summary["warnings"])
 
 
+@pytest.mark.slow
 def test_run_tells_that_a_camera_moved_and_corrects_it_where_asked(small_run, knocked, tmp_path):
     out = small_run.calibrated(tmp_path / "out")
     summary = pipeline.run(knocked, out, pairs=(0, 1))
@@ -195,6 +196,7 @@ def small_grid(file):
     return lfpiv.open_experiment(file).grid
 
 
+@pytest.mark.slow
 def test_library_call_recovers_a_known_movement(small_run):
     experiment = lfpiv.open_experiment(small_run.experiment)
     calibration = lfpiv.load_calibration(small_run.out / "calibration.h5")
@@ -225,6 +227,7 @@ def test_what_cannot_be_told_is_refused(small_run, knocked, tmp_path):
         lfpiv.self_calibrate(calibration, experiment.grid, [noise])
 
 
+@pytest.mark.slow
 def test_cameras_of_different_instants_are_named(small_run, tmp_path):
     file = small_run.images(tmp_path / "data")
     images = sorted((file.parent / "particles" / "right").iterdir())

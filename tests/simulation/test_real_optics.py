@@ -335,6 +335,7 @@ def test_only_the_window_next_to_the_particles_has_a_medium():
         rig("glass", window=(GLASS, WATER))
 
 
+@pytest.mark.slow
 def test_the_network_learns_what_the_thin_lens_cannot(device, tmp_path):
     """A camera at its nominal position, behind a window and with aberrations: only the network maps it."""
     lens = "[aberrations]\ncoma_pitch = 0.27\ndistortion_percent = 1.0\ncentre_mm = [-2.3, 0.0]\n"

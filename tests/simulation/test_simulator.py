@@ -241,6 +241,7 @@ LEVEL_ERROR = 1.0  # count; the model's own ray noise, 4 %, squared lowers the f
 SAMPLE_NOISE = 12.0  # count: variance per count of the sample's images, most of it the noise of its own few rays
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_reproduces_the_sample_data(device, sample_data, number):
     """White, board and particle images equal those of an independent ray tracer with the same specification."""

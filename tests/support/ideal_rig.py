@@ -1,4 +1,4 @@
-"""An ideal thin-lens camera written straight from section 1 of the conventions, for tests of weights and volumes."""
+"""An ideal thin-lens camera, written from section 1 of the conventions, for tests of weights and volumes."""
 
 from dataclasses import dataclass, field
 
@@ -39,7 +39,7 @@ def lattice(layout="square", roll_deg=0.0, origin_mm=(0.031, -0.022), pitch_mm=0
 
 @dataclass
 class IdealCamera:
-    """What `build_weights` asks of a camera; `coma` adds second-order terms of the pupil point [mm at its edge]."""
+    """Camera for `build_weights`. `coma` adds second-order terms of the pupil position [mm at the pupil's edge]."""
 
     name: str
     pose: np.ndarray
@@ -70,7 +70,7 @@ class IdealCamera:
 
 @dataclass
 class IdealRig:
-    """What `build_weights` asks of a calibration."""
+    """Calibration for `build_weights`."""
 
     cameras: dict
 

@@ -1,4 +1,4 @@
-"""A finished run to report on: calibrated on simulated boards; vectors, volumes and summary by formula."""
+"""Make a finished run to report on: calibrated on simulated boards; vectors, volumes and summary by formula."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,24 +15,24 @@ from lfpiv.simulation.simulator import simulate
 from lfpiv.velocity.cross_correlation import Verdict
 
 NAME = """Ring <b>&"1'</b>"""
-"""Name of the experiment: all that HTML would read as its own."""
+"""Name of the experiment, with all characters that have a meaning in HTML."""
 EVIL = '</script><img src=x onerror="alert(1)"> & "more"'
-"""Text of a warning and of a failure."""
+"""Text of a warning and of a failure, which would run a script if it were not escaped."""
 
 OMEGA, STRETCH = 40.0, 25.0
-"""Rotation about z [rad/s] and du/dx-like growth of w along z [1/s]: the vorticity is 2 OMEGA everywhere."""
+"""Rotation about z [rad/s] and gradient of w along z [1/s]; the vorticity is 2 OMEGA everywhere."""
 DT_S, VOXEL_MM = 1e-3, 0.1
 PAIRS = 3
-"""The last one has not a single valid vector."""
+"""Number of pairs. The last one has no valid vector."""
 SHEET_MM = 0.3
-"""Half the thickness of the light sheet in the volumes."""
+"""Half the thickness of the light sheet in the volumes [mm]."""
 EDGE_LEVEL = 0.2
-"""Brightness of the volumes outside the light sheet over that inside."""
+"""Brightness of the volumes outside the light sheet, relative to inside."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What `write_report` takes."""
+    """The arguments of `write_report`, and the report."""
 
     experiment: Experiment
     calibration: Calibration
@@ -42,7 +42,7 @@ class Run:
     """The report."""
 
     def write(self, path: Path, **changed) -> str:
-        """Write the report, with some arguments changed; return its text."""
+        """Write the report with some arguments changed; return its text."""
         parts = {name: getattr(self, name) for name in ("experiment", "calibration", "summary", "vectors")} | changed
         lfpiv.write_report(**parts, path=path)
         return path.read_text("utf-8")
@@ -58,7 +58,7 @@ def make_run(folder: Path) -> Run:
         particles={"count": 4, "pairs": PAIRS, "sigma_mm": 0.05},
         displacement_mm=(0.05, 0.0, 0.0),
         dt_s=DT_S,
-        network={"hidden": (6,), "epochs": 20},
+        network={"hidden": (6,), "epochs": 20, "estimator": "gaussian"},
     )
     experiment = lfpiv.open_experiment(simulate(scene, folder / "data"))
     calibration = lfpiv.calibrate(experiment)
@@ -73,7 +73,7 @@ def make_run(folder: Path) -> Run:
 
 
 def field(pair: int, shape: tuple[int, int, int] = (5, 6, 7)) -> xr.Dataset:
-    """Rotation about z that grows by a tenth from pair to pair, with a stretch along z; some vectors replaced."""
+    """Return a rotation about z that grows by a tenth per pair, with a stretch along z; some vectors are invalid."""
     axes = {name: 0.2 * (np.arange(n) - (n - 1) / 2) for name, n in zip("zyx", shape, strict=True)}
     z, y, x = np.meshgrid(*axes.values(), indexing="ij")
     factor = 1 + 0.1 * pair
@@ -97,7 +97,7 @@ def field(pair: int, shape: tuple[int, int, int] = (5, 6, 7)) -> xr.Dataset:
 
 
 def reconstruction() -> xr.Dataset:
-    """Volumes of a light sheet that ends inside them."""
+    """Return condensed volumes of a light sheet that ends inside them."""
     axes = {name: VOXEL_MM * (np.arange(n) - (n - 1) / 2) for name, n in (("z", 14), ("y", 12), ("x", 14))}
     sheet = np.where(np.abs(axes["z"]) < SHEET_MM, 1.0, EDGE_LEVEL)[:, None, None]
     grain = np.random.default_rng(0).random((14, 12, 14))
@@ -111,7 +111,7 @@ def reconstruction() -> xr.Dataset:
 
 
 def make_summary(experiment: Experiment, calibration: Calibration, vectors: dict[int, Path]) -> dict:
-    """The content of summary.json."""
+    """Return the content of summary.json."""
     pairs = []
     for pair in vectors:
         found = field(min(pair, PAIRS - 1))

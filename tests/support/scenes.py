@@ -1,4 +1,4 @@
-"""Small rigs for tests: the optics of the published experiment on sensors of a few hundred pixels."""
+"""Build scenes of small rigs: the optics of the published experiment on sensors of a few hundred pixels."""
 
 from lfpiv.simulation.scene import Scene
 
@@ -12,13 +12,13 @@ OPTICS = {
 
 
 def camera(name, angle_deg, pixels, *, pixel_um=8.0, **more):
-    """One camera's table for a scene; `pixels` are (columns, rows)."""
+    """Return the table of a camera of a scene; `pixels` are (columns, rows)."""
     sensor = {"pixel_um": pixel_um, "sensor_width_px": pixels[0], "sensor_height_px": pixels[1]}
     return OPTICS | sensor | {"name": name, "nominal_angle_deg": angle_deg} | more
 
 
 def scene(name, cameras, *, planes_mm, spacing_mm=0.5, size_mm=(2.0, 2.0, 1.2), particles, displacement_mm, **more):
-    """Scene of a board of 5 x 5 dots, a volume of voxels of 0.1 mm, and a uniform flow, unless `more` has another."""
+    """Return a scene: a board of 5 x 5 dots, voxels of 0.1 mm, and a uniform flow unless `more` has another."""
     return Scene.model_validate(
         {
             "name": name,

@@ -1,4 +1,4 @@
-"""A small simulated experiment that everything runs on in seconds once it is calibrated."""
+"""Simulate and run a small experiment, which tests copy and run again in seconds."""
 
 import shutil
 import signal
@@ -16,39 +16,39 @@ from lfpiv.simulation.simulator import simulate
 
 PAIRS = 4
 DISPLACEMENT_VOXEL = (0.8, -0.6, 0.4)
-"""Uniform flow along x, y, z: off whole voxels on every axis."""
+"""Uniform displacement along x, y, z [voxel], no whole number on any axis."""
 
 TRUE_ANGLE_DEG = -0.5
-"""Turn of each camera from where it is said to be."""
+"""Difference between the true and the stated yaw of each camera [degree]."""
 
 
 @dataclass(frozen=True)
 class SmallRun:
-    """A finished run that kept its volumes; nobody may change it."""
+    """A finished run with its volumes. Tests work on copies, never on its files."""
 
     experiment: Path
     out: Path
     summary: dict
 
     def images(self, folder: Path) -> Path:
-        """Copy of the experiment with its images, times of change included; return its file."""
+        """Copy the experiment with its images and their modification times; return the experiment file."""
         shutil.copytree(self.experiment.parent, folder)
         return folder / self.experiment.name
 
     def results(self, folder: Path) -> Path:
-        """Copy of everything that the run wrote."""
+        """Copy everything that the run wrote; return the folder."""
         shutil.copytree(self.out, folder)
         return folder
 
     def calibrated(self, folder: Path) -> Path:
-        """Return a new output folder that holds the calibration and nothing else."""
+        """Create an output folder that holds only the calibration; return it."""
         folder.mkdir()
         shutil.copy2(self.out / "calibration.h5", folder)
         return folder
 
 
 def small_scene(**moved):
-    """Scene of two cameras; `moved` has more keys of a camera by its name."""
+    """Return a scene of two cameras. `moved` maps a camera to keys that are changed."""
     cameras = [
         scenes.camera(
             name,
@@ -78,9 +78,9 @@ def make_small_run(folder: Path, device: str) -> SmallRun:
 
 
 def start(*arguments, **options) -> subprocess.Popen:
-    """Start the command line as a process of its own; its standard error is a pipe of text.
+    """Start the command line in a process whose standard error is a pipe of text.
 
-    A shell's background jobs ignore interrupts, and so would what they start.
+    The handler of SIGINT is reset, because background jobs of a shell, and their children, ignore interrupts.
     """
     command = [sys.executable, "-m", "lfpiv", *map(str, arguments)]
     options["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -88,7 +88,7 @@ def start(*arguments, **options) -> subprocess.Popen:
 
 
 def damage(path: Path) -> None:
-    """Spoil the pixels of an image in the middle; its header and its length stay."""
+    """Overwrite pixels in the middle of an image file, without changing its header and length."""
     content = bytearray(path.read_bytes())
     middle = len(content) // 2
     content[middle : middle + 64] = bytes(64)
@@ -96,7 +96,7 @@ def damage(path: Path) -> None:
 
 
 def same_vectors(first: Path, second: Path) -> int:
-    """Compare every array of all vectors in two folders, byte by byte; return how many pairs there are."""
+    """Assert that all arrays of the vectors in two folders are equal; return the number of pairs."""
     names = sorted(path.name for path in (first / "vectors").iterdir())
     assert names == sorted(path.name for path in (second / "vectors").iterdir())
     for name in names:

@@ -1,4 +1,4 @@
-"""Vector datasets of known content, in memory and as the files of a run."""
+"""Make vector datasets of known content, in memory and as the files of a run."""
 
 import numpy as np
 import xarray as xr
@@ -11,7 +11,7 @@ VOXEL_MM = 0.1
 
 
 def axes(shape=SHAPE, spacing_mm=(0.6, 0.5, 0.4), first_mm=(-1.0, 2.0, 0.3)):
-    """Uneven spacings along z, y, x: a swapped axis shows."""
+    """Return coordinates with different spacings along z, y, x, so that a swapped axis shows."""
     return {
         name: (name, first + step * np.arange(n), {"units": "mm"})
         for name, n, step, first in zip("zyx", shape, spacing_mm, first_mm, strict=True)
@@ -19,7 +19,7 @@ def axes(shape=SHAPE, spacing_mm=(0.6, 0.5, 0.4), first_mm=(-1.0, 2.0, 0.3)):
 
 
 def from_flow(flow, places=None):
-    """u, v, w [m/s] of `flow(x, y, z)`, a function of metres that returns the three components."""
+    """Return u, v, w [m/s] of `flow(x, y, z)`, a function of metres that returns the three components."""
     places = axes() if places is None else places
     z, y, x = np.meshgrid(*(1e-3 * places[name][1] for name in "zyx"), indexing="ij")
     parts = [np.broadcast_to(part, x.shape).astype(float) for part in flow(x, y, z)]
@@ -29,7 +29,7 @@ def from_flow(flow, places=None):
 
 
 def random_vectors(seed, shape=SHAPE):
-    """A dataset in the form of `correlate`: everything random, velocities that follow from the displacements."""
+    """Return random vectors in the form of `correlate`, with velocities that follow from the displacements."""
     rng = np.random.default_rng(seed)
     variables = {}
     for name, unit in netcdf.VECTOR_UNITS.items():
@@ -45,7 +45,7 @@ def random_vectors(seed, shape=SHAPE):
 
 
 def write_run(folder, numbers, *, shape=SHAPE, **attributes):
-    """Write vectors of pairs, each with its number as seed; return what was written."""
+    """Write random vectors of pairs, each with its number as seed; return them."""
     written = {number: random_vectors(number, shape) for number in numbers}
     for number, vectors in written.items():
         stamp = {"pair": number, "smart": {"iterations": 20}, "experiment": "test", **attributes}

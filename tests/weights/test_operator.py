@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import warp as wp
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
@@ -20,12 +19,11 @@ from lfpiv.weights.counting import CountedVoxels, add_entries, count_voxels
 from lfpiv.weights.operator import compare_with_count, estimate_memory
 from lfpiv.weights.ray_fit import NEAR_PITCH, grid_models, ray_models
 from lfpiv.weights.stored_grid import StoredGrid
-from lfpiv_kernels import reference, runtime
+from lfpiv_kernels import native, reference, runtime
 from lfpiv_kernels.rays import count as trace
 from lfpiv_kernels.rays.lattice import cell_frame, cell_rectangles, pack_lattice
-from lfpiv_kernels.reconstruction import projector as project
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
-from lfpiv_kernels.weights import footprint, footprint_source
+from lfpiv_kernels.weights import footprint, microimages
 from lfpiv_kernels.weights import ray_model as raymodel
 
 VOXEL_MM = 0.1
@@ -128,6 +126,7 @@ def test_footprint_kernel_equals_its_twin(name, form):
     assert np.linalg.norm(image - twin) <= TOLERANCE_EDGE * np.linalg.norm(twin)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "cuts"), [("any angle", (2, 1, 1)), ("hexagonal 15", (1, 1, 2))])
 def test_footprints_of_parts_equal_the_twins_of_smaller_voxels(name, cuts):
     coarse = replace(RIGS[name].optics, pixel_mm=0.011, sensor_shape=(200, 240))  # the twin takes its time
@@ -194,10 +193,10 @@ def test_rays_lie_where_their_lenses_put_them(layout, f_number):
     seen = (column >= 0) & (column < 130) & (row >= 0) & (row < 90)
     offset = np.stack(np.broadcast_arrays(column, row), -1) + 0.5 - centre[..., None, None, :]
     inside = np.where(seen, disc_fraction(offset.astype(np.float32), radius)[0], 0.0)
-    shape = (len(centre), footprint_source.LAYERS, *inside.shape[1:])
+    shape = (len(centre), microimages.LAYERS, *inside.shape[1:])
     pixel, share = (array[: np.prod(shape)].reshape(shape) for array in (rays.pixel, rays.share))
-    for layer in range(footprint_source.LAYERS):
-        fall = footprint_source.LAYER_FALL * (layer - footprint_source.SIDE_LAYERS)
+    for layer in range(microimages.LAYERS):
+        fall = native.constant("microimages.h", "LAYER_FALL") * (layer - microimages.LAYERS // 2)
         np.testing.assert_array_equal(pixel[:, layer], np.where(seen, 130 * row + column, -1))
         np.testing.assert_allclose(share[:, layer], inside * (1 + fall * (1 - inside) / 2), atol=TOLERANCE_SHARE)
     assert (rays.pixel[np.prod(shape) :] == -1).all() and not rays.share[np.prod(shape) :].any()
@@ -238,7 +237,7 @@ def test_microimages_may_be_higher_than_a_block(form):
         IdealRig({"fine": IdealCamera("fine", rotation(0, 3, 2), optics=fine)}), grid, form=form
     )
     blocks = weights.projector("fine").blocks
-    assert blocks.height.max() == footprint_source.TALLEST and blocks.microimages.edge > footprint_source.TALLEST
+    assert blocks.height.max() == footprint.TALLEST and blocks.microimages.edge > footprint.TALLEST
     rays, _ = blocks.entries(0)
     assert len(np.unique(rays)) == len(rays)  # blocks do not overlap
     assert weights.image("fine", (0, 0, 0)).sum() == pytest.approx(1.0, rel=0.01)
@@ -258,15 +257,6 @@ def test_blocks_do_not_depend_on_how_the_voxels_are_cut(form, monkeypatch):
         assert getattr(cut, name).tobytes() == getattr(whole, name).tobytes(), name
 
 
-@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
-@pytest.mark.parametrize("module", [footprint, project], ids=lambda module: module.__name__.rpartition(".")[2])
-def test_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):
-    runtime.device()
-    (compiled,) = wp.compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
-    entries = compiled.read_text().count(".visible .entry")
-    assert entries == len(wp.get_module(module.__name__).kernels)
-
-
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
 def test_count_kernel_equals_its_twin(layout):
     runtime.device()
@@ -284,7 +274,7 @@ def test_count_kernel_equals_its_twin(layout):
         shift,
         window,
         corner,
-        footprint.pack_camera(
+        raymodel.pack_optics(
             sensor_per_pupil=setup.sensor_per_pupil,
             pixel_mm=setup.pixel_mm,
             sensor_shape=setup.sensor_shape,
@@ -434,6 +424,7 @@ def test_memory_estimate_holds_before_building():
     assert estimate_memory(rig, huge) > estimate  # and nothing of that size was allocated
 
 
+@pytest.mark.slow
 def test_form_follows_the_optics_and_the_limit_is_kept():
     grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
     cameras = {"straight": RIGS["misaligned"], "bent": IdealCamera("bent", rotation(-45), coma=0.02)}
@@ -458,6 +449,7 @@ def test_a_voxel_is_cut_only_along_edges_that_matter():
         assert "".join(axis for axis, parts in zip("xyz", cuts, strict=True) if parts > 1) == cut, pose
 
 
+@pytest.mark.slow
 def test_profiles_stay_where_pixels_are_hardly_nearer_and_a_warning_says_why():
     grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
     rig = IdealRig({"spherical": Spherical("spherical", rotation(45)), "rolled": RIGS["rolled 40"]})

@@ -1,6 +1,7 @@
 "use strict";
-// Data of the page: vector fields, packed by lfpiv/report/fields.py.
+// Decode the vector fields of the page, which lfpiv/report/fields.py encodes.
 
+/** Stored integer that means not-a-number. */
 const NO_NUMBER = -32768;
 const QUANTITIES = {
   u: { label: "u", unit: "m/s", signed: true },
@@ -10,10 +11,12 @@ const QUANTITIES = {
   vorticity: { label: "vorticity", unit: "1/s", signed: false },
   q: { label: "Q", unit: "1/s²", signed: true },
 };
+/** Velocity component along each axis. */
 const COMPONENT = { x: "u", y: "v", z: "w" };
-const AXES = ["z", "y", "x"]; // order in memory
+/** Axes in the order of the stored values. */
+const AXES = ["z", "y", "x"];
 
-/** Bytes behind a script element that holds gzipped base64. */
+/** Return the bytes that a script element holds as gzipped base64. */
 async function unpack(id) {
   const text = atob(document.getElementById(id).textContent);
   const bytes = new Uint8Array(text.length);
@@ -22,7 +25,7 @@ async function unpack(id) {
   return new Response(stream).arrayBuffer();
 }
 
-/** One vector field: a pair, the mean over pairs, or their fluctuation. */
+/** A vector field: that of a pair, the mean over pairs, or their fluctuation. */
 class Field {
   constructor(entry, block) {
     this.label = entry.label;
@@ -36,11 +39,12 @@ class Field {
     this.cache = {};
   }
 
+  /** Return the names of the quantities that the field has. */
   quantities() {
     return Object.keys(QUANTITIES).filter((name) => name === "speed" || name in this.entry.values);
   }
 
-  /** Name of a quantity with its unit. */
+  /** Return the label of a quantity with its unit. */
   title(name) {
     const { label, unit } = QUANTITIES[name];
     if (this.isVector) return `${label} [${unit}]`;
@@ -51,15 +55,15 @@ class Field {
     return this.isVector && QUANTITIES[name].signed;
   }
 
-  /** All values of a quantity, order (z, y, x). */
+  /** Return all values of a quantity, in the order (z, y, x). */
   values(name) {
-    if (!(name in this.cache)) this.cache[name] = name === "speed" ? this.speed() : this.read(name);
+    if (!(name in this.cache)) this.cache[name] = name === "speed" ? this.speed() : this.decode(name);
     return this.cache[name];
   }
 
-  read(name) {
-    const { at, scale } = this.entry.values[name];
-    const stored = new Int16Array(this.block, at, this.size);
+  decode(name) {
+    const { offset, scale } = this.entry.values[name];
+    const stored = new Int16Array(this.block, offset, this.size);
     return Float32Array.from(stored, (value) => (value === NO_NUMBER ? NaN : value * scale));
   }
 
@@ -68,42 +72,43 @@ class Field {
     return u.map((value, i) => Math.hypot(value, v[i], w[i]));
   }
 
+  /** Return the index of the value at (z, y, x) = (k, j, i). */
   index(k, j, i) {
     return (k * this.shape[1] + j) * this.shape[2] + i;
   }
 
-  /** Valid and known. */
-  isGood(at) {
-    return this.valid[at] !== 0 && Number.isFinite(this.values("speed")[at]);
+  /** Return whether a vector is valid and finite. */
+  isValid(index) {
+    return this.valid[index] !== 0 && Number.isFinite(this.values("speed")[index]);
   }
 
-  /** Value that a share of the valid ones do not exceed in magnitude. */
-  top(name, share) {
-    const key = `${name} top ${share}`;
+  /** Return the quantile (0 to 1) of the magnitude of a quantity over the valid vectors; 0 without any. */
+  magnitudeQuantile(name, quantile) {
+    const key = `${name} quantile ${quantile}`;
     if (!(key in this.cache)) {
       const values = this.values(name);
-      const known = values.map(Math.abs).filter((value, at) => this.isGood(at) && Number.isFinite(value)).sort();
-      this.cache[key] = known.length ? known[Math.round((known.length - 1) * share)] : 0;
+      const known = values.map(Math.abs).filter((value, index) => this.isValid(index) && Number.isFinite(value)).sort();
+      this.cache[key] = known.length ? known[Math.round((known.length - 1) * quantile)] : 0;
     }
     return this.cache[key];
   }
 
-  /** Distance of neighbouring vectors along an axis [mm]; that of another axis where there is one layer only. */
+  /** Return the spacing of the vectors along an axis [mm]; that of another axis where it has a single layer. */
   spacing(name) {
-    const apart = (axis) => (axis.length > 1 ? (axis[axis.length - 1] - axis[0]) / (axis.length - 1) : NaN);
-    const known = [this.axis[name], ...Object.values(this.axis)].map(apart).filter(Number.isFinite);
+    const spacing = (axis) => (axis.length > 1 ? (axis[axis.length - 1] - axis[0]) / (axis.length - 1) : NaN);
+    const known = [this.axis[name], ...Object.values(this.axis)].map(spacing).filter(Number.isFinite);
     return known.length ? known[0] : 1;
   }
 
-  /** Figures of the valid vectors at one place along an axis. */
-  summary(normal, place) {
+  /** Return counts, mean velocity, rms and largest speed of the valid vectors of a slice. */
+  sliceStatistics(normal, layer) {
     const sums = { count: 0, good: 0, u: 0, v: 0, w: 0, square: 0, largest: 0 };
-    this.forSlice(normal, place, (at) => {
+    this.forSlice(normal, layer, (index) => {
       sums.count += 1;
-      if (!this.isGood(at)) return;
-      const speed = this.values("speed")[at];
+      if (!this.isValid(index)) return;
+      const speed = this.values("speed")[index];
       sums.good += 1;
-      for (const name of ["u", "v", "w"]) sums[name] += this.values(name)[at];
+      for (const name of ["u", "v", "w"]) sums[name] += this.values(name)[index];
       sums.square += speed * speed;
       sums.largest = Math.max(sums.largest, speed);
     });
@@ -114,24 +119,24 @@ class Field {
     };
   }
 
-  /** Call with (index, column, row) of every vector of a slice. */
-  forSlice(normal, place, visit) {
-    const [across, up] = inSlice(normal);
+  /** Call `visit(index, column, row)` for every vector of a slice. */
+  forSlice(normal, layer, visit) {
+    const [across, up] = sliceAxes(normal);
     for (let row = 0; row < this.axis[up].length; row += 1) {
       for (let column = 0; column < this.axis[across].length; column += 1) {
-        const at = { [normal]: place, [across]: column, [up]: row };
-        visit(this.index(at.z, at.y, at.x), column, row);
+        const position = { [normal]: layer, [across]: column, [up]: row };
+        visit(this.index(position.z, position.y, position.x), column, row);
       }
     }
   }
 }
 
-/** Axes of a slice, across and up. */
-function inSlice(normal) {
+/** Return the horizontal and the vertical axis of a slice. */
+function sliceAxes(normal) {
   return { z: ["x", "y"], y: ["x", "z"], x: ["y", "z"] }[normal];
 }
 
-/** Colour at a share from 0 to 1 of a colour map given by stops #rrggbb. */
+/** Interpolate a colour map, given by stops #rrggbb, at a share from 0 to 1. */
 function colourAt(stops, share) {
   const place = Math.min(Math.max(share, 0), 1) * (stops.length - 1);
   const low = Math.min(Math.floor(place), stops.length - 2);
@@ -140,8 +145,8 @@ function colourAt(stops, share) {
   return `rgb(${mix.join(",")})`;
 }
 
-/** Number with so many significant digits, as the tables have it. */
-function short(value, digits = 3) {
+/** Format a number with significant digits, as `markup.significant` does for the tables. */
+function significant(value, digits = 3) {
   if (!Number.isFinite(value)) return "–";
   const rounded = Number(value.toPrecision(digits));
   const size = Math.abs(rounded);
@@ -150,12 +155,13 @@ function short(value, digits = 3) {
   return text.replace(/-/g, "−");
 }
 
-/** Number with so many decimals. */
+/** Format a number with decimals. */
 function fixed(value, decimals) {
   return Number.isFinite(value) ? value.toFixed(decimals).replace("-", "−") : "–";
 }
 
-function fill(select, entries) {
+/** Set the options of a select element, and keep its value if it is still among them. */
+function fillOptions(select, entries) {
   const before = select.value;
   select.replaceChildren(...entries.map(([value, text]) => new Option(text, value)));
   if (entries.some(([value]) => String(value) === before)) select.value = before;

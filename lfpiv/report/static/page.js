@@ -1,7 +1,7 @@
 "use strict";
-// Start of the page's views. Where one cannot run, its still picture stays.
+// Start the interactive views. Where one cannot run, its still picture stays.
 
-/** Tables wider than their frame can be scrolled by keys. */
+/** Make tables that are larger than their frame scrollable by keys. */
 function markScrollers() {
   for (const frame of document.querySelectorAll(".scroll")) {
     const moves = frame.scrollWidth > frame.clientWidth || frame.scrollHeight > frame.clientHeight;

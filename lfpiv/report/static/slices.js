@@ -1,100 +1,100 @@
 "use strict";
-// Slices of a vector field on a canvas, moved by a slider.
+// Draw slices of a vector field on a canvas; a slider selects the layer.
 
 class SliceView {
   constructor(fields, colours) {
     this.fields = fields;
     this.colours = colours;
-    this.probe = null;
-    this.part = Object.fromEntries(
+    this.selected = null;
+    this.elements = Object.fromEntries(
       ["field", "colour", "axis", "slider", "place", "canvas", "reading"].map((name) => [
         name, document.getElementById(`slice-${name}`),
       ]),
     );
-    fill(this.part.field, fields.map((field, number) => [number, field.label]));
-    this.part.field.addEventListener("change", () => this.takeField());
-    this.part.axis.addEventListener("change", () => this.takeAxis());
-    this.part.colour.addEventListener("change", () => this.draw());
-    this.part.slider.addEventListener("input", () => this.draw());
-    const canvas = this.part.canvas;
-    canvas.addEventListener("pointermove", (event) => this.point(event));
-    canvas.addEventListener("pointerleave", () => this.setProbe(null));
-    canvas.addEventListener("keydown", (event) => this.moveProbe(event));
-    canvas.addEventListener("blur", () => this.setProbe(null));
+    fillOptions(this.elements.field, fields.map((field, number) => [number, field.label]));
+    this.elements.field.addEventListener("change", () => this.selectField());
+    this.elements.axis.addEventListener("change", () => this.selectAxis());
+    this.elements.colour.addEventListener("change", () => this.draw());
+    this.elements.slider.addEventListener("input", () => this.draw());
+    const canvas = this.elements.canvas;
+    canvas.addEventListener("pointermove", (event) => this.selectPointed(event));
+    canvas.addEventListener("pointerleave", () => this.select(null));
+    canvas.addEventListener("keydown", (event) => this.moveSelection(event));
+    canvas.addEventListener("blur", () => this.select(null));
     new ResizeObserver(() => this.draw()).observe(canvas.parentElement);
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
-    this.takeField();
+    this.selectField();
   }
 
-  get field() { return this.fields[Number(this.part.field.value)]; }
-  get normal() { return this.part.axis.value; }
-  get place() { return Number(this.part.slider.value); }
+  get field() { return this.fields[Number(this.elements.field.value)]; }
+  get normal() { return this.elements.axis.value; }
+  get layer() { return Number(this.elements.slider.value); }
 
-  takeField() {
+  selectField() {
     const names = this.field.quantities();
-    const first = this.part.colour.options.length === 0;
-    fill(this.part.colour, names.map((name) => [name, this.field.title(name)]));
-    if (first) this.part.colour.value = "w";
-    this.takeAxis();
+    const first = this.elements.colour.options.length === 0;
+    fillOptions(this.elements.colour, names.map((name) => [name, this.field.title(name)]));
+    if (first) this.elements.colour.value = "w";
+    this.selectAxis();
     this.writeTable();
   }
 
-  takeAxis() {
-    const slider = this.part.slider;
+  selectAxis() {
+    const slider = this.elements.slider;
     const last = this.field.axis[this.normal].length - 1;
     if (this.shownAxis !== this.normal || Number(slider.max) !== last) {
       slider.max = last;
       slider.value = Math.floor((last + 1) / 2);
       this.shownAxis = this.normal;
     }
-    this.probe = null;
+    this.selected = null;
     this.draw();
   }
 
-  /** Where things go on the canvas, in CSS pixels. */
+  /** Return positions and sizes on the canvas [CSS pixel]. */
   layout() {
-    const [across, up] = inSlice(this.normal);
+    const [across, up] = sliceAxes(this.normal);
     const edges = [across, up].map((name) => {
       const axis = this.field.axis[name];
       const half = this.field.spacing(name) / 2;
       return [axis[0] - half, axis[axis.length - 1] + half];
     });
     const span = edges.map(([low, high]) => high - low);
-    const whole = this.part.canvas.parentElement.clientWidth;
+    const outerWidth = this.elements.canvas.parentElement.clientWidth;
     const margin = { left: 54, right: 14, top: 26, bottom: 92 };
     const most = Math.max(0.62 * window.innerHeight, 220);
-    const scale = Math.min((whole - margin.left - margin.right) / span[0], most / span[1]);
+    const scale = Math.min((outerWidth - margin.left - margin.right) / span[0], most / span[1]);
     const [width, height] = span.map((value) => value * scale);
-    const left = margin.left + Math.max((whole - margin.left - margin.right - width) / 2, 0);
+    const left = margin.left + Math.max((outerWidth - margin.left - margin.right - width) / 2, 0);
     const total = height + margin.top + margin.bottom;
-    return { across, up, edges, scale, whole, width, height, left, top: margin.top, total };
+    return { across, up, edges, scale, outerWidth, width, height, left, top: margin.top, total };
   }
 
   draw() {
-    const { canvas } = this.part;
-    const at = this.layout();
-    if (!(at.whole > 0)) return;
-    const dense = window.devicePixelRatio || 1;
-    canvas.width = Math.round(at.whole * dense);
-    canvas.height = Math.round(at.total * dense);
-    canvas.style.height = `${at.total}px`;
-    const pen = canvas.getContext("2d");
-    pen.scale(dense, dense);
+    const { canvas } = this.elements;
+    const box = this.layout();
+    if (!(box.outerWidth > 0)) return;
+    const pixelRatio = window.devicePixelRatio || 1;
+    canvas.width = Math.round(box.outerWidth * pixelRatio);
+    canvas.height = Math.round(box.total * pixelRatio);
+    canvas.style.height = `${box.total}px`;
+    const context = canvas.getContext("2d");
+    context.scale(pixelRatio, pixelRatio);
     this.ink = getComputedStyle(canvas).color;
-    pen.font = "12px system-ui, sans-serif";
-    this.drawCells(pen, at);
-    if (this.field.isVector) this.drawArrows(pen, at);
-    this.drawFrame(pen, at);
-    this.drawBar(pen, at);
-    if (this.probe) this.drawProbe(pen, at);
-    this.at = at;
-    this.say();
+    context.font = "12px system-ui, sans-serif";
+    this.drawCells(context, box);
+    if (this.field.isVector) this.drawArrows(context, box);
+    this.drawFrame(context, box);
+    this.drawBar(context, box);
+    if (this.selected) this.drawSelected(context, box);
+    this.box = box;
+    this.describe();
   }
 
-  /** Colour map of the chosen quantity: its stops and what a value's share of it is. */
+  /** Return the colour map of the chosen quantity: its stops and ends, and a value's share of it. */
   scale() {
-    const name = this.part.colour.value;
-    const limit = this.field.top(name, 0.99) || 1;
+    const name = this.elements.colour.value;
+    const limit = this.field.magnitudeQuantile(name, 0.99) || 1;
     const signed = this.field.isSigned(name);
     return {
       stops: signed ? this.colours.signed : this.colours.positive,
@@ -104,180 +104,182 @@ class SliceView {
     };
   }
 
-  drawCells(pen, at) {
-    const values = this.field.values(this.part.colour.value);
+  drawCells(context, box) {
+    const values = this.field.values(this.elements.colour.value);
     const scale = this.scale();
-    const cell = [at.across, at.up].map((name) => this.field.spacing(name) * at.scale);
-    this.field.forSlice(this.normal, this.place, (index, column, row) => {
+    const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
+    this.field.forSlice(this.normal, this.layer, (index, column, row) => {
       if (!Number.isFinite(values[index])) return;
-      pen.fillStyle = colourAt(scale.stops, scale.share(values[index]));
-      const x = at.left + column * cell[0];
-      const y = at.top + at.height - (row + 1) * cell[1];
-      pen.fillRect(Math.floor(x), Math.floor(y), Math.ceil(cell[0]) + 1, Math.ceil(cell[1]) + 1);
+      context.fillStyle = colourAt(scale.stops, scale.share(values[index]));
+      const x = box.left + column * cell[0];
+      const y = box.top + box.height - (row + 1) * cell[1];
+      context.fillRect(Math.floor(x), Math.floor(y), Math.ceil(cell[0]) + 1, Math.ceil(cell[1]) + 1);
     });
-    pen.clearRect(at.left + at.width, 0, at.whole, at.total); // what cells reach beyond the frame
-    pen.clearRect(0, at.top + at.height, at.whole, at.total);
+    context.clearRect(box.left + box.width, 0, box.outerWidth, box.total); // parts of cells beyond the frame
+    context.clearRect(0, box.top + box.height, box.outerWidth, box.total);
   }
 
-  drawArrows(pen, at) {
-    const cell = [at.across, at.up].map((name) => this.field.spacing(name) * at.scale);
+  drawArrows(context, box) {
+    const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
     const step = Math.max(Math.ceil(13 / Math.min(...cell)), 1);
-    const names = [at.across, at.up].map((axis) => COMPONENT[axis]);
-    const longest = Math.max(...names.map((name) => this.field.top(name, 0.99)));
+    const names = [box.across, box.up].map((axis) => COMPONENT[axis]);
+    const longest = Math.max(...names.map((name) => this.field.magnitudeQuantile(name, 0.99)));
     if (!(longest > 0)) return;
     const scale = (1.3 * step * Math.min(...cell)) / longest;
     const [u, v] = names.map((name) => this.field.values(name));
     const head = 0.35 * step * Math.min(...cell);
-    this.field.forSlice(this.normal, this.place, (index, column, row) => {
+    this.field.forSlice(this.normal, this.layer, (index, column, row) => {
       const offset = Math.floor(step / 2);
       if (column % step !== offset || row % step !== offset) return;
-      const from = this.centre(at, column, row);
-      arrow(pen, from, [u[index] * scale, -v[index] * scale], head, this.field.isGood(index) ? "#101418" : "#8b9198");
+      const from = this.centre(box, column, row);
+      const colour = this.field.isValid(index) ? "#101418" : "#8b9198";
+      arrow(context, from, [u[index] * scale, -v[index] * scale], head, colour);
     });
     const speed = roundBelow(longest);
-    const from = [at.left, at.top - 12];
-    arrow(pen, from, [speed * scale, 0], head, this.ink);
-    pen.fillStyle = this.ink;
-    pen.textAlign = "left";
-    pen.textBaseline = "middle";
-    pen.fillText(`${short(speed)} m/s (${names.join(", ")})`, at.left + speed * scale + 8, at.top - 12);
+    const from = [box.left, box.top - 12];
+    arrow(context, from, [speed * scale, 0], head, this.ink);
+    context.fillStyle = this.ink;
+    context.textAlign = "left";
+    context.textBaseline = "middle";
+    context.fillText(`${significant(speed)} m/s (${names.join(", ")})`, box.left + speed * scale + 8, box.top - 12);
   }
 
-  centre(at, column, row) {
-    const cell = [at.across, at.up].map((name) => this.field.spacing(name) * at.scale);
-    return [at.left + (column + 0.5) * cell[0], at.top + at.height - (row + 0.5) * cell[1]];
+  centre(box, column, row) {
+    const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
+    return [box.left + (column + 0.5) * cell[0], box.top + box.height - (row + 0.5) * cell[1]];
   }
 
-  drawFrame(pen, at) {
-    pen.strokeStyle = this.ink;
-    pen.fillStyle = this.ink;
-    pen.lineWidth = 1;
-    pen.strokeRect(at.left, at.top, at.width, at.height);
-    const axisTicks = (axis, length) => ticks(...at.edges[axis], Math.max(Math.min(Math.floor(length / 55), 8), 2));
-    pen.textAlign = "center";
-    pen.textBaseline = "top";
-    for (const value of axisTicks(0, at.width)) {
-      const x = at.left + (value - at.edges[0][0]) * at.scale;
-      line(pen, [x, at.top + at.height], [x, at.top + at.height + 4]);
-      pen.fillText(short(value, 6), x, at.top + at.height + 6);
+  drawFrame(context, box) {
+    context.strokeStyle = this.ink;
+    context.fillStyle = this.ink;
+    context.lineWidth = 1;
+    context.strokeRect(box.left, box.top, box.width, box.height);
+    const axisTicks = (axis, length) => ticks(...box.edges[axis], Math.max(Math.min(Math.floor(length / 55), 8), 2));
+    context.textAlign = "center";
+    context.textBaseline = "top";
+    for (const value of axisTicks(0, box.width)) {
+      const x = box.left + (value - box.edges[0][0]) * box.scale;
+      line(context, [x, box.top + box.height], [x, box.top + box.height + 4]);
+      context.fillText(significant(value, 6), x, box.top + box.height + 6);
     }
-    pen.fillText(`${at.across} [mm]`, at.left + at.width / 2, at.top + at.height + 22);
-    pen.textAlign = "right";
-    pen.textBaseline = "middle";
-    for (const value of axisTicks(1, at.height)) {
-      const y = at.top + at.height - (value - at.edges[1][0]) * at.scale;
-      line(pen, [at.left - 4, y], [at.left, y]);
-      pen.fillText(short(value, 6), at.left - 6, y);
+    context.fillText(`${box.across} [mm]`, box.left + box.width / 2, box.top + box.height + 22);
+    context.textAlign = "right";
+    context.textBaseline = "middle";
+    for (const value of axisTicks(1, box.height)) {
+      const y = box.top + box.height - (value - box.edges[1][0]) * box.scale;
+      line(context, [box.left - 4, y], [box.left, y]);
+      context.fillText(significant(value, 6), box.left - 6, y);
     }
-    pen.save();
-    pen.translate(at.left - 44, at.top + at.height / 2);
-    pen.rotate(-Math.PI / 2);
-    pen.textAlign = "center";
-    pen.fillText(`${at.up} [mm]`, 0, 0);
-    pen.restore();
+    context.save();
+    context.translate(box.left - 44, box.top + box.height / 2);
+    context.rotate(-Math.PI / 2);
+    context.textAlign = "center";
+    context.fillText(`${box.up} [mm]`, 0, 0);
+    context.restore();
   }
 
-  drawBar(pen, at) {
+  drawBar(context, box) {
     const scale = this.scale();
-    const width = Math.min(at.whole - 40, 320);
-    const left = Math.min(Math.max(at.left + at.width / 2 - width / 2, 20), at.whole - width - 20);
-    const top = at.top + at.height + 44;
+    const width = Math.min(box.outerWidth - 40, 320);
+    const left = Math.min(Math.max(box.left + box.width / 2 - width / 2, 20), box.outerWidth - width - 20);
+    const top = box.top + box.height + 44;
     const steps = 160;
     for (let k = 0; k < steps; k += 1) {
-      pen.fillStyle = colourAt(scale.stops, (k + 0.5) / steps);
-      pen.fillRect(left + (k * width) / steps, top, width / steps + 0.6, 10);
+      context.fillStyle = colourAt(scale.stops, (k + 0.5) / steps);
+      context.fillRect(left + (k * width) / steps, top, width / steps + 0.6, 10);
     }
-    pen.strokeStyle = this.ink;
-    pen.strokeRect(left, top, width, 10);
-    pen.fillStyle = this.ink;
-    pen.textAlign = "center";
-    pen.textBaseline = "top";
+    context.strokeStyle = this.ink;
+    context.strokeRect(left, top, width, 10);
+    context.fillStyle = this.ink;
+    context.textAlign = "center";
+    context.textBaseline = "top";
     for (const value of ticks(scale.low, scale.high, 4)) {
       const x = left + ((value - scale.low) / (scale.high - scale.low)) * width;
-      line(pen, [x, top + 10], [x, top + 13]);
-      pen.fillText(short(value, 6), x, top + 14);
+      line(context, [x, top + 10], [x, top + 13]);
+      context.fillText(significant(value, 6), x, top + 14);
     }
-    pen.fillText(this.field.title(this.part.colour.value), left + width / 2, top + 30);
+    context.fillText(this.field.title(this.elements.colour.value), left + width / 2, top + 30);
   }
 
-  drawProbe(pen, at) {
-    const cell = [at.across, at.up].map((name) => this.field.spacing(name) * at.scale);
-    const [x, y] = this.centre(at, ...this.probe);
-    pen.lineWidth = 3;
-    pen.strokeStyle = "#ffffff";
-    pen.strokeRect(x - cell[0] / 2, y - cell[1] / 2, cell[0], cell[1]);
-    pen.lineWidth = 1.5;
-    pen.strokeStyle = "#000000";
-    pen.strokeRect(x - cell[0] / 2, y - cell[1] / 2, cell[0], cell[1]);
+  drawSelected(context, box) {
+    const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
+    const [x, y] = this.centre(box, ...this.selected);
+    context.lineWidth = 3;
+    context.strokeStyle = "#ffffff";
+    context.strokeRect(x - cell[0] / 2, y - cell[1] / 2, cell[0], cell[1]);
+    context.lineWidth = 1.5;
+    context.strokeStyle = "#000000";
+    context.strokeRect(x - cell[0] / 2, y - cell[1] / 2, cell[0], cell[1]);
   }
 
-  point(event) {
-    const box = this.part.canvas.getBoundingClientRect();
-    const { at, field } = this;
-    const column = Math.floor((event.clientX - box.left - at.left) / (field.spacing(at.across) * at.scale));
-    const row = Math.floor((at.top + at.height - event.clientY + box.top) / (field.spacing(at.up) * at.scale));
-    const inside = column >= 0 && row >= 0 && column < field.axis[at.across].length && row < field.axis[at.up].length;
-    this.setProbe(inside ? [column, row] : null);
+  selectPointed(event) {
+    const canvas = this.elements.canvas.getBoundingClientRect();
+    const { box, field } = this;
+    const column = Math.floor((event.clientX - canvas.left - box.left) / (field.spacing(box.across) * box.scale));
+    const row = Math.floor((box.top + box.height - event.clientY + canvas.top) / (field.spacing(box.up) * box.scale));
+    const inside = column >= 0 && row >= 0 && column < field.axis[box.across].length && row < field.axis[box.up].length;
+    this.select(inside ? [column, row] : null);
   }
 
-  moveProbe(event) {
+  moveSelection(event) {
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (!step) return;
     event.preventDefault();
-    const [across, up] = inSlice(this.normal);
+    const [across, up] = sliceAxes(this.normal);
     const count = [this.field.axis[across].length, this.field.axis[up].length];
-    const from = this.probe || count.map((n) => Math.floor(n / 2));
-    const moved = this.probe ? from.map((value, k) => Math.min(Math.max(value + step[k], 0), count[k] - 1)) : from;
-    this.setProbe(moved);
+    const from = this.selected || count.map((n) => Math.floor(n / 2));
+    const moved = this.selected ? from.map((value, k) => Math.min(Math.max(value + step[k], 0), count[k] - 1)) : from;
+    this.select(moved);
   }
 
-  setProbe(probe) {
-    if (String(probe) === String(this.probe)) return;
-    this.probe = probe;
+  /** Select the vector at [column, row], or none. */
+  select(vector) {
+    if (String(vector) === String(this.selected)) return;
+    this.selected = vector;
     this.draw();
   }
 
-  /** Put the slice, or the vector pointed at, into words. */
-  say() {
+  /** Describe the slice, or the selected vector, in words. */
+  describe() {
     const { field, normal } = this;
-    const where = `${normal} = ${fixed(field.axis[normal][this.place], 3)} mm`;
-    this.part.place.textContent = where;
-    this.part.slider.setAttribute("aria-valuetext", where);
-    this.part.canvas.setAttribute("aria-label", `${field.label}, slice at ${where}`);
-    this.part.reading.textContent = this.probe ? this.vectorInWords() : this.sliceInWords(where);
+    const where = `${normal} = ${fixed(field.axis[normal][this.layer], 3)} mm`;
+    this.elements.place.textContent = where;
+    this.elements.slider.setAttribute("aria-valuetext", where);
+    this.elements.canvas.setAttribute("aria-label", `${field.label}, slice at ${where}`);
+    this.elements.reading.textContent = this.selected ? this.describeVector() : this.describeSlice(where);
   }
 
-  sliceInWords(where) {
-    const sums = this.field.summary(this.normal, this.place);
+  describeSlice(where) {
+    const statistics = this.field.sliceStatistics(this.normal, this.layer);
     const mark = this.field.isVector ? "" : "′";
-    const parts = ["u", "v", "w"].map((name) => `${name}${mark} ${short(sums[name])}`).join(", ");
-    return `${where}: ${sums.good} of ${sums.count} vectors valid; mean ${parts} m/s; rms ${short(sums.rms)}, `
-      + `largest ${short(sums.largest)} m/s.`;
+    const parts = ["u", "v", "w"].map((name) => `${name}${mark} ${significant(statistics[name])}`).join(", ");
+    return `${where}: ${statistics.good} of ${statistics.count} vectors valid; mean ${parts} m/s; `
+      + `rms ${significant(statistics.rms)}, largest ${significant(statistics.largest)} m/s.`;
   }
 
-  vectorInWords() {
+  describeVector() {
     const { field } = this;
-    const [across, up] = inSlice(this.normal);
-    const at = { [this.normal]: this.place, [across]: this.probe[0], [up]: this.probe[1] };
-    const index = field.index(at.z, at.y, at.x);
-    const where = ["x", "y", "z"].map((name) => fixed(field.axis[name][at[name]], 3)).join(", ");
+    const [across, up] = sliceAxes(this.normal);
+    const position = { [this.normal]: this.layer, [across]: this.selected[0], [up]: this.selected[1] };
+    const index = field.index(position.z, position.y, position.x);
+    const where = ["x", "y", "z"].map((name) => fixed(field.axis[name][position[name]], 3)).join(", ");
     const values = field.quantities().map((name) => {
       const [label, unit] = field.title(name).split(" [");
-      return `${label} ${short(field.values(name)[index])} ${unit.slice(0, -1)}`;
+      return `${label} ${significant(field.values(name)[index])} ${unit.slice(0, -1)}`;
     });
-    const doubt = field.isVector ? "replaced after validation" : "valid in too few pairs";
-    return `(x, y, z) = (${where}) mm: ${values.join(", ")}; ${field.valid[index] ? "valid" : doubt}.`;
+    const replaced = field.isVector ? "replaced after validation" : "valid in too few pairs";
+    return `(x, y, z) = (${where}) mm: ${values.join(", ")}; ${field.valid[index] ? "valid" : replaced}.`;
   }
 
-  /** The table by depth of the chosen field. */
+  /** Write the table by depth of the chosen field. */
   writeTable() {
     document.getElementById("depth-field").textContent = this.field.label;
     const rows = this.field.axis.z.map((depth, k) => {
-      const sums = this.field.summary("z", k);
+      const statistics = this.field.sliceStatistics("z", k);
       const row = document.createElement("tr");
       const cells = [
-        String(sums.count), `${((100 * sums.good) / sums.count).toFixed(1)} %`,
-        ...["u", "v", "w", "rms", "largest"].map((name) => short(sums[name])),
+        String(statistics.count), `${((100 * statistics.good) / statistics.count).toFixed(1)} %`,
+        ...["u", "v", "w", "rms", "largest"].map((name) => significant(statistics[name])),
       ];
       const head = document.createElement("th");
       head.scope = "row";
@@ -289,34 +291,35 @@ class SliceView {
   }
 }
 
-function arrow(pen, from, step, head, colour) {
+/** Draw an arrow with its tail at `from`; arrows shorter than half a pixel are left out. */
+function arrow(context, from, step, head, colour) {
   const length = Math.hypot(...step);
   if (!(length > 0.5)) return;
   const along = step.map((value) => value / length);
   const tip = [from[0] + step[0], from[1] + step[1]];
   const barb = Math.min(head, length / 2.5, 9);
-  pen.strokeStyle = colour;
-  pen.lineWidth = 1.2;
-  line(pen, from, tip);
+  context.strokeStyle = colour;
+  context.lineWidth = 1.2;
+  line(context, from, tip);
   for (const side of [0.45, -0.45]) {
-    line(pen, tip, [tip[0] - barb * (along[0] + side * along[1]), tip[1] - barb * (along[1] - side * along[0])]);
+    line(context, tip, [tip[0] - barb * (along[0] + side * along[1]), tip[1] - barb * (along[1] - side * along[0])]);
   }
 }
 
-function line(pen, from, to) {
-  pen.beginPath();
-  pen.moveTo(...from);
-  pen.lineTo(...to);
-  pen.stroke();
+function line(context, from, to) {
+  context.beginPath();
+  context.moveTo(...from);
+  context.lineTo(...to);
+  context.stroke();
 }
 
-/** Largest of 1, 2, 5, 10, ... times a power of ten up to a value. */
+/** Return the largest 1, 2 or 5 times a power of ten that does not exceed a value. */
 function roundBelow(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   return [5, 2, 1].find((step) => step * power <= value * (1 + 1e-9)) * power;
 }
 
-/** Round values between two ends, about so many. */
+/** Return about `count` round values between two ends. */
 function ticks(low, high, count) {
   const rough = (high - low) / count;
   const power = 10 ** Math.floor(Math.log10(rough));

@@ -1,0 +1,124 @@
+"""Figures of ``summary.json`` that the report shows, validated once when the report is written.
+
+Keys that the report does not show are ignored. Keys with a default are missing in runs that did not compute them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Figures(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class CameraFigures(_Figures):
+    """Figures of a camera's calibration; None where the calibration has no such figure."""
+
+    sigma_nor_test: float | None = None
+    dots_found: int | None = None
+    dots_expected: int | None = None
+    labels: int | None = None
+    lens_array_rms_px: float | None = None
+    lens_array_pitch_px: float | None = None
+    lens_array_rotation_deg: float | None = None
+    magnification: float | None = None
+    turn_from_nominal_deg: float | None = None
+    network_correction_pitch: float | None = None
+    epochs: int | None = None
+    training_s: float | None = None
+
+
+class Movement(_Figures):
+    """Correction of a camera by self-calibration."""
+
+    shift_mm: tuple[float, float, float]
+    rotation_deg: tuple[float, float, float]
+
+
+class SelfCalibration(_Figures):
+    """Disparity between the cameras before and after self-calibration, and the corrections."""
+
+    pairs: tuple[int, ...]
+    disparity_before_voxel: float
+    disparity_voxel: float
+    movements: dict[str, Movement]
+
+
+class WeightFigures(_Figures):
+    """Method, memory and checks of the weights; empty where no weights were built."""
+
+    method: str = ""
+    memory_mib: float = 0.0
+    form: dict[str, str] = {}
+    count_check_l2: tuple[float, ...] = ()
+    disparity_pair: int | None = None
+    disparity_voxel: float | None = None
+    self_calibration: SelfCalibration | None = None
+
+
+class Spread(_Figures):
+    """Mean and standard deviation of a velocity component over the valid vectors [m/s]; None without valid vectors."""
+
+    mean: float | None
+    sd: float | None
+
+
+class MotionFigures(_Figures):
+    """Outcome of the motion passes of a pair."""
+
+    followed: bool = False
+
+
+class PairFigures(_Figures):
+    """Figures of a finished pair.
+
+    ``residual`` and ``stop`` have the frames as keys; ``structure``, ``camera_gain`` and ``light_outside`` have frames
+    and cameras.
+    """
+
+    number: int = Field(alias="pair")
+    valid_fraction: float
+    verdict: str
+    velocity_m_per_s: dict[str, Spread]
+    uncertainty_voxel: float | None
+    peak_ratio: float | None
+    motion: MotionFigures = MotionFigures()
+    residual: dict[str, tuple[float, ...]] = {}
+    stop: dict[str, str] = {}
+    structure: dict[str, dict[str, float]] = {}
+    camera_gain: dict[str, dict[str, float]] = {}
+    light_outside: dict[str, dict[str, float]] = {}
+
+
+class Failure(_Figures):
+    """A pair without result, and the reason."""
+
+    pair: int
+    reason: str
+
+
+class DeviceFigures(_Figures):
+    """Device of the kernels."""
+
+    kind: str
+    threads: int
+
+
+class Summary(_Figures):
+    """Content of ``summary.json`` as far as the report shows it."""
+
+    device: DeviceFigures
+    versions: dict[str, str]
+    settings: dict[str, dict[str, Any]]
+    timings_s: dict[str, float | None]
+    peak_memory_mib: float | None
+    calibration: dict[str, CameraFigures]
+    weights: WeightFigures = WeightFigures()
+    pairs: tuple[PairFigures, ...]
+    failed: tuple[Failure, ...] = ()
+    valid_fraction: float | None
+    warnings: tuple[str, ...]
+    reused: tuple[str, ...]

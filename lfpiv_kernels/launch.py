@@ -1,0 +1,74 @@
+"""Launches of Warp kernels: each cut into parts that run side by side on the CPU's threads, whole on CUDA."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import runtime
+
+
+@dataclass(frozen=True)
+class Call:
+    """A kernel to launch over `size` threads.
+
+    A launch covers a part of the threads. The kernel's last inputs, which `launch` adds, are the number of the scratch
+    memory that the launch may use (-1 on CUDA, where each thread has its own) if `scratch`, and its first thread.
+    """
+
+    kernel: wp.Kernel
+    size: int
+    inputs: Sequence[object]
+    outputs: Sequence[object]
+    scratch: bool = False
+    inner: tuple[int, ...] = ()
+    """Further axes of the threads. Only the first axis, `size`, is cut into parts."""
+
+
+def launch(*calls: Call, parts: int | None = None, device: str | None = None) -> None:
+    """Launch kernels that do not depend on each other, and wait until all are done.
+
+    Parameters
+    ----------
+    *calls : Call
+        The kernels. On the CPU their parts must write disjoint memory.
+    parts : int, optional
+        Parts into which each call is cut on the CPU. Default: enough for all threads.
+    device : str, optional
+        Warp's name of the device. Default: the running device.
+    """
+    where = runtime.device()
+    device = device or where.warp
+    for call in calls:
+        wp.load_module(call.kernel.module, device=device)  # before threads start: compilation is not thread-safe
+    on_cpu = where.kind == "cpu"
+    if not on_cpu:
+        parts = 1
+    elif parts is None:
+        parts = min(runtime.CHUNKS // len(calls), 2 * where.threads)  # each launch costs Python time
+    free = list(range(runtime.CHUNKS)) if on_cpu else [-1]  # a stack: memory used last is still in the caches
+
+    def run(_: int, begin: int, end: int) -> None:
+        for index in range(begin, end):
+            call, part = calls[index // parts], index % parts
+            first, last = (call.size * k // parts for k in (part, part + 1))
+            if first == last:
+                continue
+            inputs = [*call.inputs, first]
+            if call.scratch:
+                slot = free.pop()
+                inputs = [*call.inputs, slot, first]
+            dim = (last - first, *call.inner)
+            wp.launch(call.kernel, dim=dim, inputs=inputs, outputs=call.outputs, device=device)
+            if call.scratch:
+                free.append(slot)
+
+    runtime.run_chunks(len(calls) * parts, run, chunks=len(calls) * parts)
+
+
+def to_device(values: np.ndarray, dtype: type | None = None, device: str | None = None) -> wp.array:
+    """Return an array on a device, by default the running one; on the CPU a view of the same memory."""
+    device = device or runtime.device().warp
+    kind = {} if dtype is None else {"dtype": dtype}
+    return wp.array(values, device=device, copy=device != "cpu", **kind)

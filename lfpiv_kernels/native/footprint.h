@@ -1,0 +1,368 @@
+// The area-integrated weights of a voxel as 8-bit blocks of rays: how much room they need, and the blocks themselves.
+#ifndef LFPIV_FOOTPRINT_H
+#define LFPIV_FOOTPRINT_H
+
+#include "lens_group.h"
+
+namespace lfpiv {
+
+/// Rows of a block at most.
+constexpr int TALLEST = 64;
+/// Parts of a voxel at most.
+constexpr int MOST_PARTS = 64;
+/// Steps of a cell's outline at most.
+constexpr int MOST_STEPS = 8;
+
+/// Count the blocks and the bytes of values that a voxel needs at most.
+LFPIV_INLINE void measure(const WeightInputs& in, int index, int* blocks_out, int* bytes_out) {
+    const Voxel voxel(in, index);
+    ReachedLenses reached(voxel);
+    int blocks = 0, bytes = 0;
+    for (int n = 0; n < reached.count; n += WIDTH) {
+        Lenses lenses;
+        PixelBox box;
+        reached.take(lenses);
+        const M lit = reached.pixel_box(reached.count - n, lenses, box);
+        if (!any(lit)) continue;
+        const V tiles = floor((box.last_column - box.first_column + (float)BLOCK_WIDTH) / (float)BLOCK_WIDTH);
+        const V rows = box.last_row - box.first_row + 1.0f, none = V{};
+        const V parts = floor((rows + (float)(TALLEST - 1)) / (float)TALLEST);
+        const V values = in.profiles ? tiles * (rows + parts * (float)BLOCK_WIDTH) : tiles * rows * (float)BLOCK_WIDTH;
+        const V lit_blocks = lit ? tiles * parts : none, lit_values = lit ? values : none;
+        for (int k = 0; k < WIDTH; ++k) {
+            blocks += (int)lane(lit_blocks, k);
+            bytes += (int)lane(lit_values, k);
+        }
+    }
+    blocks_out[index] = blocks;
+    bytes_out[index] = bytes + 2 * BLOCK_WIDTH;  // a vector may be stored past the last value
+}
+
+#if defined(__CUDA_ARCH__)
+
+/// Return 8 bytes as one word, the first one lowest.
+LFPIV_INLINE uint64_t load_word(const unsigned char* from) {
+    uint64_t word = 0;
+    for (int k = 0; k < 8; ++k) word |= (uint64_t)from[k] << (8 * k);
+    return word;
+}
+/// Write a word as 8 bytes.
+LFPIV_INLINE void store_word(unsigned char* to, uint64_t word) {
+    for (int k = 0; k < 8; ++k) to[k] = (unsigned char)(word >> (8 * k));
+}
+/// Return the number of the lowest bit that is set.
+LFPIV_INLINE int lowest_bit(uint64_t word) { return __ffsll(word) - 1; }
+/// Return the number of the highest bit that is set.
+LFPIV_INLINE int highest_bit(uint64_t word) { return 63 - __clzll(word); }
+
+#else
+
+LFPIV_INLINE uint64_t load_word(const unsigned char* from) {
+    uint64_t word;
+    __builtin_memcpy(&word, from, 8);
+    return word;
+}
+LFPIV_INLINE void store_word(unsigned char* to, uint64_t word) { __builtin_memcpy(to, &word, 8); }
+LFPIV_INLINE int lowest_bit(uint64_t word) { return __builtin_ctzll(word); }
+LFPIV_INLINE int highest_bit(uint64_t word) { return 63 - __builtin_clzll(word); }
+
+#endif
+
+/// Return a word whose first `count` bytes are set.
+LFPIV_INLINE uint64_t bytes_below(int count) { return count >= 8 ? ~(uint64_t)0 : ((uint64_t)1 << (8 * count)) - 1; }
+
+/// Where the blocks of a voxel are written.
+struct BlockWriter {
+    int* ray_out;
+    unsigned char* height_out;
+    unsigned char* width_out;
+    int block, last_block;     // the next block, and the end of the room
+    unsigned char* value;      // the next value
+    const unsigned char* end;  // of the room for values
+    int stride;                // rays from one row of a microimage to the next
+
+    /// Finish a block whose values are written.
+    LFPIV_INLINE void finish(int ray, int row, int column, int height, int width) {
+        ray_out[block] = ray + row * stride + column;
+        width_out[block] = (unsigned char)width;
+        height_out[block] = (unsigned char)height;
+        ++block;
+    }
+};
+
+/// Columns and rows of pixels in a vector.
+constexpr int ACROSS = WIDTH < 8 ? WIDTH : 8, DOWN = WIDTH < 8 ? 1 : WIDTH / 8;
+
+/// Return k / divisor % modulus for lane k.
+LFPIV_INLINE V lane_numbers(int divisor, int modulus) {
+    V numbers;
+    for (int k = 0; k < WIDTH; ++k) set_lane(numbers, k, (float)(k / divisor % modulus));
+    return numbers;
+}
+
+/// Outline of a lens's cell: half extents along a and b of rectangles on top of each other; one for a square cell.
+struct Outline {
+    const float* extent;
+    int steps;
+    bool square;
+};
+
+/// Steps of the cell's outline, and offsets of the voxel's parts, under one lens.
+struct CellParts {
+    Smear<float> step_a[MOST_STEPS], step_b[MOST_STEPS];
+    float part_a[MOST_PARTS], part_b[MOST_PARTS];
+
+    LFPIV_INLINE CellParts(const LensValues& values, const Voxel& voxel, const Outline& outline, int lens) {
+        for (int q = 0; !outline.square && q < outline.steps; ++q) {
+            const float width = 2.0f * outline.extent[2 * q], height = 2.0f * outline.extent[2 * q + 1];
+            const Smear<float> a = values.one(values.smear_a, lens), b = values.one(values.smear_b, lens);
+            step_a[q] = smear_of(width, in_memory(values.wide_a, lens), a.narrow, a.bend);
+            step_b[q] = smear_of(height, in_memory(values.wide_b, lens), b.narrow, b.bend);
+        }
+        part_a[0] = part_b[0] = 0.0f;
+        if (voxel.parts == 1) return;
+        float e[6];
+        for (int n = 0; n < 6; ++n) e[n] = in_memory(values.edge[n], lens);
+        for (int part = 0; part < voxel.parts; ++part) {
+            part_a[part] = middle_of_part(voxel.in.cuts, part, e[0], e[1], e[2]);
+            part_b[part] = middle_of_part(voxel.in.cuts, part, e[3], e[4], e[5]);
+        }
+    }
+};
+
+/// The pixels under one lens of a group in one tile.
+struct LensTile {
+    const LensValues& values;
+    const Voxel& voxel;
+    const Bend& bend;
+    const Outline& outline;
+    const CellParts& cell;
+    const int lens;          // lane of the group
+    const float column0;     // of the tile, in the box
+    const uint64_t columns;  // a byte for each column of the tile
+    const int ray;           // of the tile's first pixel in the box's first row
+    const float to_a;
+    const Smear<float> smear_a, smear_b;
+
+    LFPIV_INLINE LensTile(const LensValues& values, const Voxel& voxel, const Bend& bend, const Outline& outline,
+                          const CellParts& cell, int lens, int tile, int ray)
+        : values(values),
+          voxel(voxel),
+          bend(bend),
+          outline(outline),
+          cell(cell),
+          lens(lens),
+          column0((float)(tile * BLOCK_WIDTH)),
+          columns(bytes_below((int)in_memory(values.columns, lens) - tile * BLOCK_WIDTH)),
+          ray(ray),
+          to_a(in_memory(values.to_a, lens)),
+          smear_a(values.one(values.smear_a, lens)),
+          smear_b(values.one(values.smear_b, lens)) {}
+
+    /// Return the lens's part of a value.
+    LFPIV_INLINE float of(const V& x) const { return in_memory(x, lens); }
+
+    /// Return the profile along the columns, a byte each.
+    LFPIV_INLINE uint64_t profile_across() const {
+        unsigned char level[WIDTH < 8 ? 8 : WIDTH];
+        for (int x = 0; x < 8; x += ACROSS) {
+            const V from = lane_numbers(1, 8) + (column0 + (float)x - of(values.column));
+            const V y = smeared(of(values.a) - from * of(values.step_a), smear_a) * to_a + 0.5f;
+            store_bytes(level + x, min(y, splat(LEVELS)));
+        }
+        return load_word(level) & columns;
+    }
+
+    /// Write the block of rows from `first` on as two profiles. Nothing is written where all weights round to zero.
+    LFPIV_INLINE void write_profiles(uint64_t across, int first, int height, BlockWriter& out) const {
+        unsigned char level[TALLEST + 16];
+        const float to_b = of(values.to_b);
+        int top = -1, bottom = -1;
+        for (int y = 0; y < height; y += WIDTH) {
+            const V from = lane_numbers(1, WIDTH) + ((float)(first + y) - of(values.row));
+            const V z = smeared(of(values.b) - from * of(values.step_b), smear_b) * to_b + 0.5f;
+            store_bytes(level + y, min(z, splat(LEVELS)));
+        }
+        for (int y = 0; y < height; y += 8) {
+            const uint64_t word = load_word(level + y) & bytes_below(height - y);
+            if (!word) continue;
+            bottom = y + highest_bit(word) / 8;
+            if (top < 0) top = y + lowest_bit(word) / 8;
+        }
+        if (top < 0) return;
+        const int left = lowest_bit(across) / 8, wide = highest_bit(across) / 8 - left + 1;
+        store_word(out.value, across >> (8 * left));
+        out.value += wide;
+        for (int y = top; y <= bottom; y += 8) store_word(out.value + y - top, load_word(level + y));
+        out.value += bottom - top + 1;
+        out.finish(ray, first + top, left, bottom - top + 1, wide);
+    }
+
+    /// Return the probability, times the widest smears, that rays at (a, b) lie in the lens's cell.
+    LFPIV_INLINE V inside_cell(V a, V b) const {
+        const int parts = voxel.parts;
+        if (outline.square && parts == 1) return smeared(a, smear_a) * smeared(b, smear_b);
+        V inside = {};
+        for (int part = 0; outline.square && part < parts; ++part)
+            inside += smeared(a - cell.part_a[part], smear_a) * smeared(b - cell.part_b[part], smear_b);
+        for (int part = 0; !outline.square && part < parts; ++part) {
+            V lower = {};
+            for (int q = 0; q < outline.steps; ++q) {
+                const V higher = smeared(b - cell.part_b[part], cell.step_b[q]);
+                inside += smeared(a - cell.part_a[part], cell.step_a[q]) * (higher - lower);
+                lower = higher;
+            }
+        }
+        return inside;
+    }
+
+    /// Write the levels of all pixels of `height` rows, 8 to a row.
+    LFPIV_INLINE void write_levels(int first, int height, unsigned char* out) const {
+        const V lane_column = lane_numbers(1, 8), lane_row = lane_numbers(8, WIDTH), none = {};
+        const V *slope = values.slope, *matrix = values.matrix;
+        for (int c = 0; c < 8; c += ACROSS) {
+            const V x = lane_column + (column0 + (float)c - of(values.column));
+            const V s_x = of(values.s) + x * (of(slope[0]) + x * bend.s_xx);
+            const V t_x = of(values.t) + x * (of(slope[2]) + x * bend.t_xx);
+            const V s_y = of(slope[1]) + x * bend.s_xy, t_y = of(slope[3]) + x * bend.t_xy;
+            const V n0 = of(matrix[0]) + x * bend.along_column[0], n1 = of(matrix[1]) + x * bend.along_column[1];
+            const V n2 = of(matrix[2]) + x * bend.along_column[2], n3 = of(matrix[3]) + x * bend.along_column[3];
+            for (int row = 0; row < height; row += DOWN) {
+                const V y = lane_row + ((float)(first + row) - of(values.row));
+                const V ds = s_x + y * (s_y + y * bend.s_yy), dt = t_x + y * (t_y + y * bend.t_yy);
+                const V k0 = n0 + y * bend.along_row[0], k1 = n1 + y * bend.along_row[1];
+                const V k2 = n2 + y * bend.along_row[2], k3 = n3 + y * bend.along_row[3];
+                const V inverse = 1.0f / (k0 * k3 - k1 * k2);
+                const V a = (k3 * ds - k1 * dt) * inverse, b = (k0 * dt - k2 * ds) * inverse;
+                const V level = abs(inverse) * inside_cell(a, b) * to_a + 0.5f;
+                store_bytes(out + 8 * row + c, min(max(level, none), splat(LEVELS)));
+            }
+        }
+    }
+
+    /// Write the block of rows from `first` on, a value per pixel. Nothing is written where all weights round to zero.
+    LFPIV_INLINE void write_pixels(int first, int height, BlockWriter& out) const {
+        write_levels(first, height, out.value);
+        uint64_t all = 0, lit_rows = 0;
+        for (int row = 0; row < height; ++row) {
+            const uint64_t word = load_word(out.value + 8 * row) & columns;
+            all |= word;
+            lit_rows |= (uint64_t)(word != 0) << row;
+        }
+        if (!all) return;
+        const int top = lowest_bit(lit_rows), bottom = highest_bit(lit_rows);
+        const int left = lowest_bit(all) / 8, wide = highest_bit(all) / 8 - left + 1;
+        const unsigned char* from = out.value;
+        for (int row = top; row <= bottom; ++row, out.value += wide)
+            store_word(out.value, (load_word(from + 8 * row) & columns) >> (8 * left));
+        out.finish(ray, first + top, left, bottom - top + 1, wide);
+    }
+
+    /// Write the blocks of rows `low` to `last`.
+    LFPIV_INLINE void write(int low, int last, BlockWriter& out) const {
+        const bool profiles = voxel.in.profiles;
+        const uint64_t across = profiles ? profile_across() : 1;
+        if (!across) return;
+        for (int first = low; first <= last; first += TALLEST) {
+            const int height = min(last, first + TALLEST - 1) - first + 1;
+            // rounding may differ from that of `measure`: never write past what it counted
+            const int needed = (profiles ? 8 + height : 8 * height) + BLOCK_WIDTH;
+            if (out.block >= out.last_block || out.value + needed > out.end) break;
+            if (profiles)
+                write_profiles(across, first, height, out);
+            else
+                write_pixels(first, height, out);
+        }
+    }
+};
+
+/// Return the ray of the first pixel of a lens's box, in one layer of the microimages.
+LFPIV_INLINE int first_ray(const WeightInputs& in, const Lenses& lenses, const LensValues& values, int lens,
+                           int layer) {
+    const int edge = (int)in.geometry->edge;
+    const int lens_row = (lenses.index[2 * lens + 1] - in.first_j) * LAYERS + layer + SIDE_LAYERS;
+    const int block = lens_row * in.lenses_i + lenses.index[2 * lens] - in.first_i;
+    const int row = (int)in_memory(values.first_row, lens) - lenses.corner[2 * lens + 1];
+    const int column = (int)in_memory(values.first_column, lens) - lenses.corner[2 * lens];
+    return block * edge * edge + row * edge + column;
+}
+
+/// Write the blocks of the pixels under one group of lenses.
+LFPIV_INLINE void fill_group(const LensGroup& group, const Top& top, const Bend& bend, const Outline& outline, M lit,
+                             BlockWriter& out) {
+    const Voxel& voxel = group.voxel;
+    const LensValues values(group, top, bend, lit);
+    for (int tile = 0;; ++tile) {
+        const float column0 = (float)(tile * BLOCK_WIDTH);
+        const M here = values.columns > column0;
+        if (!any(here)) break;
+        const Tile rows(group, here, column0);
+        for (unsigned live = rows.lit(); live; live &= live - 1) {
+            const int lens = lowest_bit(live), layer = (int)in_memory(rows.layer, lens);
+            const int ray = first_ray(voxel.in, group.lenses, values, lens, layer) + tile * BLOCK_WIDTH;
+            const CellParts cell(values, voxel, outline, lens);
+            const LensTile pixels(values, voxel, bend, outline, cell, lens, tile, ray);
+            pixels.write((int)in_memory(rows.low, lens), (int)in_memory(rows.high, lens), out);
+        }
+    }
+}
+
+/// Device arrays of blocks, and where each voxel's blocks and values begin, shape (voxel + 1,).
+struct BlockArrays {
+    const int* first_block;
+    const int* first_value;
+    int* ray;
+    unsigned char* height;
+    unsigned char* width;
+    unsigned char* value;
+};
+
+/// Return the arrays from Warp's struct.
+template <class Blocks>
+LFPIV_INLINE BlockArrays block_arrays(const Blocks& blocks) {
+    return {blocks.first_block.data, blocks.first_value.data, blocks.ray.data,
+            blocks.height.data,      blocks.width.data,       blocks.value.data};
+}
+
+/// Compute the blocks of a voxel where there is room for them, without gaps from block to block.
+LFPIV_INLINE void fill(const WeightInputs& in, const Outline& outline, int index, const BlockArrays& room,
+                       float* scale_out, int* blocks_out, int* bytes_out) {
+    const Voxel voxel(in, index);
+    ReachedLenses reached(voxel);
+    const Top top(voxel);
+    const Bend bend(voxel);
+    scale_out[index] = reached.count > 0 ? top.scale(voxel) : 0.0f;
+    const int first_block = room.first_block[index], last_block = room.first_block[index + 1];
+    unsigned char* const first_value = room.value + room.first_value[index];
+    unsigned char* const end = room.value + room.first_value[index + 1];
+    BlockWriter out = {room.ray,   room.height, room.width, first_block,
+                       last_block, first_value, end,        (int)in.geometry->edge};
+    for (int n = 0; n < reached.count; n += WIDTH) {
+        Lenses lenses;
+        PixelBox box;
+        reached.take(lenses);
+        const M lit = reached.pixel_box(reached.count - n, lenses, box);
+        if (any(lit)) fill_group(LensGroup(voxel, lenses, box), top, bend, outline, lit, out);
+    }
+    blocks_out[index] = out.block - first_block;
+    bytes_out[index] = (int)(out.value - first_value);
+}
+
+/// Copy the blocks of a voxel to where they lie without gaps.
+LFPIV_INLINE void pack(const BlockArrays& from, const BlockArrays& to, int voxel) {
+    const int from_block = from.first_block[voxel], to_block = to.first_block[voxel];
+    const int blocks = to.first_block[voxel + 1] - to_block;
+    for (int k = 0; k < blocks; ++k) {
+        to.ray[to_block + k] = from.ray[from_block + k];
+        to.height[to_block + k] = from.height[from_block + k];
+        to.width[to_block + k] = from.width[from_block + k];
+    }
+    const unsigned char* value = from.value + from.first_value[voxel];
+    unsigned char* out = to.value + to.first_value[voxel];
+    const int values = to.first_value[voxel + 1] - to.first_value[voxel];
+    for (int k = 0; k < values; ++k) out[k] = value[k];
+}
+
+}  // namespace lfpiv
+
+#endif

@@ -1,0 +1,54 @@
+"""Launches of Warp kernels in parts."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from lfpiv_kernels.launch import Call, launch, to_device
+
+
+@wp.kernel
+def _count_visits(
+    # in
+    weight: int,
+    first: int,
+    # out
+    count_out: wp.array(dtype=int),
+):
+    index = first + wp.tid()
+    count_out[index] = count_out[index] + weight
+
+
+@wp.kernel
+def _note_slot(
+    # in
+    slot: int,
+    first: int,
+    # out
+    slot_out: wp.array(dtype=int),
+):
+    slot_out[first + wp.tid()] = slot
+
+
+@pytest.mark.parametrize("parts", [None, 1, 7, 16])
+@pytest.mark.parametrize("size", [0, 1, 5, 1000])
+def test_parts_cover_every_thread_once(device, size, parts):
+    counts = [np.zeros(size, np.int32) for _ in range(2)]
+    arrays = [to_device(count) for count in counts]
+    launch(*(Call(_count_visits, size, [n + 1], [array]) for n, array in enumerate(arrays)), parts=parts)
+    for n, array in enumerate(arrays):
+        assert (array.numpy() == n + 1).all()
+
+
+def test_parts_that_run_side_by_side_have_scratch_memory_of_their_own(device):
+    slots = to_device(np.full(1000, -2, np.int32))
+    launch(Call(_note_slot, 1000, [], [slots], scratch=True))
+    found = slots.numpy()
+    assert (found == -1).all() if device.kind == "cuda" else (found.min() >= 0 and found.max() < 8)
+
+
+def test_arrays_on_the_cpu_are_views():
+    values = np.arange(4, dtype=np.float32)
+    array = to_device(values, device="cpu")
+    values[2] = 7.0
+    assert array.numpy()[2] == 7.0
