@@ -1,4 +1,8 @@
-"""Benchmark cases as data, and the operations they name: how to prepare one, what it does, what a right result is."""
+"""Benchmark cases: each names an operation, its settings and a scale.
+
+The function of an operation prepares its inputs and returns a `Work`: the timed call, the check of its result, and the
+same work by other software.
+"""
 
 from __future__ import annotations
 
@@ -25,19 +29,19 @@ SCALES = {
     "medium": {"voxels": 64, "sensor": (1360, 1880), "rays": 20_000_000, "volume": (70, 140, 140), "samples": 40_000},
     "paper": {"voxels": 100, "sensor": (2048, 2800), "rays": 40_000_000, "volume": (100, 100, 100), "samples": 197_570},
 }
-"""Cubic grid of 0.1 mm voxels, sensor (rows, columns), rays through the mapping, particle volumes of the correlation
-(z, y, x), training samples. "paper": the published case, 3e9 weights."""
+"""Edge of the cubic grid of 0.1 mm voxels, sensor (rows, columns), rays through the mapping, particle volumes of the
+correlation (z, y, x), training samples. "paper": the published case, 3e9 weights."""
 
 PEER_VOXELS = 32
 """Largest volume edge whose weights are also written as an explicit sparse matrix."""
 NEAR = 2e-4
-"""Error of the single-precision mapping [microlens pitch]."""
+"""Largest error of the single-precision mapping [microlens pitch]."""
 FOOTPRINT = 0.025
-"""Mean relative L2 difference of footprint from counted weights: the goal of 0.02, and the noise of the count."""
+"""Largest mean relative L2 difference of footprint from counted weights: the goal of 0.02 and the count's noise."""
 ADJOINT = 1e-5
-"""Float32 sums of positive terms, added in vector lanes and eight chunks."""
+"""Largest relative difference of the two products, sums of positive float32 terms in vector lanes and eight chunks."""
 PEER_F32, PEER_SMART = 1e-5, 1e-3
-"""Relative difference from an explicit float32 matrix: of a pass, and of ten iterations, which amplify it."""
+"""Largest relative difference from an explicit float32 matrix, of one pass and of ten iterations."""
 BIAS_VOXEL = {8: 0.02, 16: 0.01}
 """Largest bias of the displacement by window edge: the project's goals [voxel]."""
 SHIFT = np.array([0.7, -0.4, 0.3])
@@ -54,32 +58,32 @@ class WrongResult(Exception):
 
 @dataclass
 class Work:
-    """A case ready to run: one sample of it is one call of `run`."""
+    """A prepared case. One sample is one call of `run`."""
 
     run: Callable[[], object]
     check: Callable[[object], dict[str, float]]  # raises WrongResult, or returns figures of quality
     amounts: dict[str, float]  # units of work in one run
-    read_bytes: float = 0  # memory that a run cannot help streaming: its hardware limit is this over the bandwidth,
+    read_bytes: float = 0  # memory that a run must stream at least: its hardware limit is this over the bandwidth,
     flops: float = 0  # or this over the floating-point rate, whichever takes longer
     peers: dict[str, Callable[[], object]] = field(default_factory=dict)  # the same work by other software
     peer_check: Callable[[object], dict[str, float]] | None = None  # default: check
-    peer_share: float = 1.0  # of the work that a peer's run does
+    peer_share: float = 1.0  # part of the work that a run of a peer does
 
 
 def prepare(name: str) -> Work:
-    """Set a case up: everything that is not timed."""
+    """Prepare a case. This is not timed."""
     maker, settings, scale = CASES[name]
     return maker(SCALES[scale], **settings)
 
 
 def require(good: bool, message: str) -> None:
-    """Raise `WrongResult` unless the result is right."""
+    """Raise `WrongResult` with a message unless the result is right."""
     if not good:
         raise WrongResult(message)
 
 
 def relative(found, expected, limit: float) -> dict[str, float]:
-    """Relative L2 difference of two arrays, which must stay below the limit."""
+    """Return the relative L2 difference of two arrays. Require it to be below the limit."""
     difference = float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
     require(difference < limit, f"a relative difference of {difference:.1e}")
     return {"difference": difference}
@@ -176,7 +180,7 @@ def _smart(scale, iterations, form="profiles") -> Work:
     truth = 1e4 * particles(weights.grid.shape)
     images = weights(truth)
     first = np.full(weights.grid.shape, float(truth.mean()), np.float32)
-    plain = {"accelerate": False, "floor_share": 0.0}  # what the peer does; momentum costs the same per iteration
+    plain = {"accelerate": False, "floor_share": 0.0}  # as the peer; momentum costs the same per iteration
     require(bool((weights.column_sum > 0).all()), "a voxel is seen by no camera")  # all voxels active
 
     def check(volume):
@@ -209,7 +213,7 @@ def _smart(scale, iterations, form="profiles") -> Work:
 
 
 def _correlate(scale, window, search=None) -> Work:
-    """The bare kernel; without `search` what a user calls: one pass with its own range, validation and a dataset."""
+    """Prepare the kernel, or without `search` the public function with one pass, its own range and validation."""
     first, second = particles(scale["volume"]), particles(scale["volume"], SHIFT)
     cube = (window,) * 3
 
@@ -222,7 +226,7 @@ def _correlate(scale, window, search=None) -> Work:
 
     def bias(displacement):
         vectors = displacement.reshape(-1, 3)
-        found = vectors[np.linalg.norm(vectors - SHIFT, axis=1) < 1]  # spurious vectors are another matter
+        found = vectors[np.linalg.norm(vectors - SHIFT, axis=1) < 1]  # without spurious vectors
         require(len(found) > 0.8 * len(vectors), f"only {len(found)} of {len(vectors)} vectors are right")
         return {"bias_voxel": float(np.abs(found.mean(0) - SHIFT).max()), "right": len(found) / len(vectors)}
 
@@ -334,11 +338,11 @@ def _train(scale, epochs) -> Work:
         return matrix.reshape(-1, 162)
 
     def evaluations(fit):
-        work.peer_share = fit.njev / epochs / 0.7  # it takes all samples, ours trains on 70 % and looks at 15 % more
+        work.peer_share = fit.njev / epochs / 0.7  # it uses all samples, ours 70 %
         return {"peer_epochs": fit.njev}
 
     def peer():
-        with threadpool_limits(limits=1, user_api="blas"):  # as ours; its spinning threads only burn time here
+        with threadpool_limits(limits=1, user_api="blas"):  # as ours
             return optimize.least_squares(residual, first, jacobian, method="trf", x_scale="jac", max_nfev=epochs)
 
     work = Work(run, check, {"epochs": epochs, "samples": epochs * count}, flops=epochs * 0.7 * count * 2 * 162**2)

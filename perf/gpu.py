@@ -1,9 +1,10 @@
-"""Everything to be checked on a machine with a GPU, in one command: the tests and the benchmarks on CUDA.
+"""Run the tests and the benchmarks on a machine with a GPU.
 
     python perf/gpu.py [--out FOLDER] [--paper]
 
-Writes FOLDER/tests.txt, FOLDER/perf.jsonl and FOLDER/limits.json (the bandwidth of the GPU's memory), and prints
-a table of the cases against these limits. Exit status 1 where a test fails or a result is wrong, 2 without a GPU.
+Writes FOLDER/tests.txt, FOLDER/perf.jsonl and FOLDER/limits.json (the bandwidth of the GPU's memory), and prints a
+table that compares the cases with this limit. The exit status is 1 if a test fails or a result is wrong, 2 without a
+GPU.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = 1 << 28
-"""Floats copied to measure the bandwidth of the GPU's memory: 1 GiB read and as much written."""
+"""Number of floats copied to measure the bandwidth of the GPU's memory: 1 GiB read and 1 GiB written."""
 REPEATS = 10
 
 
 def limits() -> dict[str, float | str]:
-    """Name of the GPU, and its copy bandwidth [byte/s], read and write counted."""
+    """Return the name of the GPU and its copy bandwidth, reads plus writes [byte/s]."""
     import warp as wp
 
     first, second = (wp.zeros(COPIED, dtype=float, device="cuda:0") for _ in range(2))
@@ -41,7 +42,7 @@ def limits() -> dict[str, float | str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("gpu"), help="folder of the results; made where it is missing")
+    parser.add_argument("--out", type=Path, default=Path("gpu"), help="folder of the results; made if it is missing")
     parser.add_argument("--paper", action="store_true", help="the published size too")
     given = parser.parse_args()
     from lfpiv_kernels import runtime

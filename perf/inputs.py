@@ -1,7 +1,7 @@
-"""What the cases work on: a rig, its grid and particles, and its weights as the explicit matrices of the peers.
+"""Inputs of the cases: a rig, its grid and particles, and its weights as explicit matrices for the peers.
 
-The rig is two cameras of Table 2 at +-45 degrees, each a thin lens with a small network on top, as a calibration gives
-them; the sensor is just large enough for the volume.
+The rig has two cameras of Table 2 at +-45 degrees. Each maps by a thin lens and a small network, as after a
+calibration. The sensor is just large enough for the volume.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from lfpiv.calibration.cameras import CalibratedCamera, Calibration
+from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.geometry.grid import Grid
@@ -25,7 +25,7 @@ class _Camera(CalibratedCamera):
 
 
 def rig(sensor: tuple[int, int], bent_mm: float = 0.0) -> Calibration:
-    """Two calibrated cameras; `bent_mm` scales the network's part, of which about a third is of second order."""
+    """Make two calibrated cameras. `bent_mm` scales the network's output. About a third of it is of second order."""
     optics = Optics(
         focal_length_mm=100.0, magnification=-1.0, f_number=4.0, microlens_pitch_mm=0.1, pixel_mm=0.0055,
         microlens_focal_length_mm=0.8, sensor_shape=sensor,
@@ -58,12 +58,12 @@ def grid(scale: dict) -> Grid:
 
 
 def nonzeros(weights) -> int:
-    """Weights above zero."""
+    """Count the weights above zero."""
     return sum(int(weights.projector(name).count_lit().sum(dtype=np.int64)) for name in weights.cameras)
 
 
 def explicit(weights) -> dict[str, tuple[sparse.csr_array, sparse.csr_array]]:
-    """Each camera's weights as explicit matrices, (voxel, pixel) and (pixel, voxel): SciPy's fastest, both by rows."""
+    """Return each camera's weights as matrices (voxel, pixel) and (pixel, voxel), by rows: SciPy's fastest form."""
     matrices = {}
     for name in weights.cameras:
         blocks = weights.projector(name).blocks
@@ -74,7 +74,7 @@ def explicit(weights) -> dict[str, tuple[sparse.csr_array, sparse.csr_array]]:
 
 
 def _rows_of(blocks, first: int, last: int) -> sparse.csr_array:
-    """Rows of the explicit matrix (voxel, pixel) of some voxels."""
+    """Return the rows (voxel, pixel) of some voxels."""
     rays, profiles = blocks.microimages, blocks.form == "profiles"
     part = slice(blocks.first_block[first], blocks.first_block[last])
     height, width = blocks.height[part].astype(np.int64), blocks.width[part].astype(np.int64)
@@ -97,7 +97,7 @@ def _rows_of(blocks, first: int, last: int) -> sparse.csr_array:
 
 
 def particles(shape: tuple[int, int, int], shift=0.0, seed: int = 0) -> np.ndarray:
-    """Gaussian particles of 0.7 voxel standard deviation, 0.012 per voxel, moved by `shift`."""
+    """Draw Gaussian particles of 0.7 voxel standard deviation, 0.012 per voxel, moved by `shift`."""
     rng = np.random.default_rng(seed)
     at = rng.random((int(0.012 * np.prod(shape)), 3)) * shape + shift
     stencil = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)

@@ -3,8 +3,8 @@
     python perf/run.py [--case NAME ...] [--small | --all] [--paper] [--device auto]
     python perf/run.py --against COMMIT [--case NAME ...]
 
-Each case runs in a process of its own, so that peak memory is its own. Times are 10th percentiles after a warm-up, CPU
-time of all threads beside wall time. A case with a wrong result prints why and no time, and the exit status is 1.
+Each case runs in its own process, so that its peak memory is measured. Times are 10th percentiles after a warm-up: wall
+time, and CPU time of all threads. A case with a wrong result prints the reason and no time, and the exit status is 1.
 """
 
 from __future__ import annotations
@@ -23,30 +23,29 @@ from pathlib import Path
 
 import numpy as np
 
-os.environ.update(
-    ENABLE_TAICHI_HEADER_PRINT="0", TQDM_DISABLE="1"
-)  # before the first import of Taichi: standard output is for JSON
+# before the first import of Taichi: standard output is for JSON
+os.environ.update(ENABLE_TAICHI_HEADER_PRINT="0", TQDM_DISABLE="1")
 ROOT = Path(__file__).resolve().parents[1]
 PERCENTILE = 10
 SECONDS, FEWEST, MOST, ENOUGH = 4.0, 3, 30, 20.0
-"""Time spent on a case's samples, and how many there are at least and at most; a run that takes longer than
-`ENOUGH` is timed once, without a warm-up [s]."""
+"""Time for the samples of a case [s], their least and largest number, and the time [s] above which a run is measured
+once, without a warm-up."""
 TURNS, SHARE = 8, 0.5
-"""Turns at least of a peer and us, and how long ours runs in each, as a part of the peer's time."""
+"""Least number of turns of a peer, and our time in each turn as a part of the peer's."""
 ROUNDS, BLOCKS, LEAST_BAND = 30, 5, 0.03
-"""Samples per side of a comparison, the blocks they are cut into, and the narrowest band of a verdict."""
+"""Samples per side of a comparison, blocks of these samples, and least band of ratios without a difference."""
 COMPARED = ("mapping", "count", "footprint", "project", "back_project", "smart", "correlate_8", "deform", "train")
 
 
 def sample(run) -> tuple[object, float, float]:
-    """Result, wall time and CPU time of one run [s]."""
+    """Return the result, the wall time and the CPU time of one run [s]."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = run()
     return result, time.perf_counter() - wall, time.process_time() - cpu
 
 
 def low(run) -> tuple[object, float, float, int]:
-    """Result of the warm-up; low percentiles of wall and CPU time [s] of the samples after it, and their number."""
+    """Return the result of a warm-up, low percentiles of wall and CPU time of the samples [s], and their number."""
     result, first, cpu = sample(run)
     times = [(first, cpu)] if first > ENOUGH else []
     while first <= ENOUGH and len(times) < MOST:
@@ -57,11 +56,11 @@ def low(run) -> tuple[object, float, float, int]:
 
 
 def interleaved(run, peer) -> tuple[object, np.ndarray, list[float]]:
-    """Result of a peer's first run; low percentiles of the peer's and our times [s], and the range of their ratio.
+    """Return the result of a peer, low percentiles of the peer's and our times [s], and the range of their ratio.
 
-    The machine's speed drifts by a third within minutes, so both take turns: after each run of the peer ours runs for
-    `SHARE` of its time. Shape (peer and ours, wall and CPU); the range is from the 10th to the 90th percentile of the
-    ratio of wall times, turn by turn.
+    The machine's speed drifts by a third within minutes, so both take turns: after each run of the peer, ours runs for
+    `SHARE` of its time. The times have the shape (peer and ours, wall and CPU). The range is the 10th to the 90th
+    percentile of the ratio of wall times per turn.
     """
     result, first, cpu = sample(peer)
     theirs, ours, ratios = [(first, cpu)] if first > ENOUGH else [], [], []
@@ -79,7 +78,7 @@ def interleaved(run, peer) -> tuple[object, np.ndarray, list[float]]:
 
 
 def _for_seconds(run, seconds: float) -> list[tuple[float, float]]:
-    """Wall and CPU times of runs until they took so long altogether, `MOST` at most."""
+    """Return wall and CPU times of runs that take this long in total, `MOST` runs at most."""
     times: list[tuple[float, float]] = []
     while len(times) < MOST and sum(wall for wall, _ in times) < seconds:
         times.append(sample(run)[1:])
@@ -87,7 +86,7 @@ def _for_seconds(run, seconds: float) -> list[tuple[float, float]]:
 
 
 def limits() -> dict[str, float]:
-    """What the machine gives on all its cores now: streaming reads [byte/s], float32 matrix products [flop/s]."""
+    """Measure the machine on all cores: streaming reads [byte/s] and float32 matrix products [flop/s]."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parts, matrix = [np.ones(1 << 24, np.uint64) for _ in range(cores)], np.ones((2048, 2048), np.float32)
     with ThreadPoolExecutor(cores) as pool:
@@ -97,7 +96,7 @@ def limits() -> dict[str, float]:
 
 
 def measure(name: str) -> bool:
-    """Print the metrics of one case; false if its result is wrong."""
+    """Print the metrics of one case. Return whether its result is right."""
     import cases
 
     from lfpiv.runs.memory import peak_mib
@@ -144,7 +143,7 @@ def measure(name: str) -> bool:
 
 
 def serve(name: str) -> None:
-    """Prepare a case and time one run per line read: what `compare` talks to."""
+    """Prepare a case and time one run per line of standard input, for `compare`."""
     import cases
 
     import lfpiv
@@ -157,10 +156,10 @@ def serve(name: str) -> None:
 
 
 def compare(name: str, base: Path, device: str) -> None:
-    """Print the ratio of this checkout to another, from interleaved samples of three processes: theirs, ours, theirs.
+    """Print the ratio of this checkout's time to another's, from interleaved samples of processes theirs, ours, theirs.
 
-    Each checkout runs its own ``perf/cases.py``, so that modules may have moved. The band inside which a ratio means
-    nothing is the difference between the two processes of one checkout, block by block.
+    Each checkout runs its own ``perf/cases.py``, because modules may have moved. The largest difference between the two
+    processes of one checkout, block by block, is the band of ratios without a difference.
     """
     with contextlib.ExitStack() as stack:
         sides = []
@@ -192,7 +191,7 @@ def compare(name: str, base: Path, device: str) -> None:
 
 
 def machine() -> dict:
-    """Return what figures depend on."""
+    """Return the facts about the machine and the checkout that the figures depend on."""
     model = platform.processor()
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text().splitlines()

@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lfpiv.calibration.board.board import BoardDots
+from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
@@ -184,13 +184,15 @@ def load_calibration(path: str | Path) -> Calibration:
             if version != SCHEMA_VERSION:
                 raise InputError(
                     f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {version}; "
-                    "calibrate anew."
+                    "calibrate again."
                 )
             return Calibration({name: _read_camera(file[f"camera/{name}"], name) for name in file.attrs["cameras"]})
     except (OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: expected a calibration file, could not read it ({error}); calibrate anew.") from None
+        raise InputError(
+            f"{path}: expected a calibration file, could not read it ({error}); calibrate again."
+        ) from None
 
 
 def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:

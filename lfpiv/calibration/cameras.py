@@ -10,14 +10,16 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lfpiv.calibration import checks
-from lfpiv.calibration.board.board import BoardDots, DotBoard, Planes, agreeing_dots, measure_board
-from lfpiv.calibration.camera import CalibratedCamera, Calibration, load_calibration
+from lfpiv.calibration.board.board import agreeing_dots, measure_board
+from lfpiv.calibration.board.dots import BoardDots, DotBoard
+from lfpiv.calibration.board.planes import Planes
+from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
 from lfpiv.calibration.quality import CalibrationQuality, LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens, thin_lens_model
@@ -28,20 +30,16 @@ from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.geometry.optics import LensLattice
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.lens_array import find_lens_array
+from lfpiv.progress import StepProgress, part_of
 from lfpiv.warn import collected
-
-__all__ = ["CalibratedCamera", "Calibration", "calibrate", "load_calibration", "thin_lens"]
 
 log = logging.getLogger(__name__)
 
 MODEL_ERROR_PITCH = 0.002
 """Error that all labels of a dot share, beside their standard errors [microlens pitch]."""
 
-Progress = Callable[[float], None]
-"""Called with the finished fraction."""
 
-
-def calibrate(experiment: Experiment, progress: Progress | None = None) -> Calibration:
+def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> Calibration:
     """Calibrate every camera of an experiment from its white and board images (section 3.1 of the paper).
 
     The mapping does not depend on the nominal camera angles. They only help to number the board's dots.
@@ -62,15 +60,11 @@ def calibrate(experiment: Experiment, progress: Progress | None = None) -> Calib
     InputError
         If a white image shows no microlens array or the board's dots cannot be found. Names camera and file.
     """
-    cameras = {}
+    cameras, count = {}, len(experiment.cameras)
+    whole = progress or (lambda fraction: None)
     for number, setup in enumerate(experiment.cameras):
-
-        def step(fraction: float, number: int = number) -> None:
-            if progress is not None:
-                progress((number + fraction) / len(experiment.cameras))
-
         with collected() as warnings:
-            camera = _calibrate_camera(experiment, setup, step)
+            camera = _calibrate_camera(experiment, setup, part_of(whole, number / count, (number + 1) / count))
         named = (replace(warning, subject=setup.name) for warning in warnings)
         cameras[setup.name] = replace(camera, warnings=tuple(named))
     return Calibration(cameras)
@@ -141,7 +135,7 @@ class _Mapping:
     """Difference from the stated pose and magnification."""
 
 
-def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: Progress) -> CalibratedCamera:
+def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> CalibratedCamera:
     sensor = _decode(experiment, setup)
     step(0.15)
     dots = _measure_dots(experiment, setup, sensor.decoder, step)
@@ -190,8 +184,9 @@ def _decode(experiment: Experiment, setup: CameraSetup) -> _Sensor:
     return _Sensor(lattice=lattice, decoder=decoder, quality=quality)
 
 
-def _measure_dots(experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, step: Progress) -> BoardDots:
-    """Check the board images and measure the dots in them."""
+def _measure_dots(
+    experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, step: StepProgress
+) -> BoardDots:
     board, dark = experiment.board, experiment.dark(setup.name)
     images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
     checks.check_light(experiment, setup, decoder, images, dark)
@@ -202,12 +197,7 @@ def _measure_dots(experiment: Experiment, setup: CameraSetup, decoder: LightFiel
             dots = measure_board(
                 images,
                 decoder,
-                DotBoard(
-                    dots=board.dots,
-                    spacing_mm=board.spacing_mm,
-                    diameter_mm=board.dot_diameter_mm,
-                    planes_mm=tuple(board.planes_mm),
-                ),
+                DotBoard.from_settings(board),
                 nominal_angle_deg=setup.nominal_angle_deg,
                 estimator=experiment.network.estimator,
                 dark=dark,
@@ -215,7 +205,7 @@ def _measure_dots(experiment: Experiment, setup: CameraSetup, decoder: LightFiel
         except np.linalg.LinAlgError:
             raise InputError(
                 "expected images of the board's dots, found blobs that no camera sees as a board. Check that these are "
-                "board images and what [board] says."
+                "board images, and check the numbers in [board]."
             ) from None
     checks.check_planes(experiment, setup, dots)
     return dots
@@ -254,7 +244,6 @@ def _fit_mapping(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pi
 
 
 def _disagreeing_per_plane(dots: BoardDots, agreeing: np.ndarray, dots_per_plane: int) -> np.ndarray:
-    """Count the dots of each plane that disagree with their neighbours."""
     return np.bincount(np.unique(dots.dot[~agreeing]) // dots_per_plane, minlength=len(dots.found))
 
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lfpiv.calibration.board.board import BoardDots, few_pixels
+from lfpiv.calibration.board.board import few_pixels
+from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel, thin_lens_model

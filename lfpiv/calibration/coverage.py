@@ -44,7 +44,7 @@ def require_seen(path: Path, calibration: Calibration, grid: Grid) -> None:
         if share == 0:
             raise InputError(
                 f"{path}: volume: expected a volume in the view of every camera, found one around "
-                f"{grid.centre_text()} of which camera {camera.name!r} sees nothing by its calibration. Check "
+                f"{grid.centre_text()} that camera {camera.name!r}, as calibrated, does not see. Check "
                 "volume.centre_mm and size_mm against the board's extent."
             )
     for warning in sight_warnings(calibration, grid):
@@ -142,7 +142,7 @@ def outside_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
         box = ", ".join(f"{name} {a:g} to {b:g}" for name, a, b in zip("xyz", low, high, strict=True))
         advice = "shrink the volume or use a larger board or more planes"
         if camera.baseline is None:
-            advice += ', or set network.baseline = "thin_lens": a network alone extrapolates badly'
+            advice += ', or set network.baseline = "thin_lens": a network without a thin lens extrapolates badly'
         figures = {"share": 1 - inside, "region": box, "distance_mm": distance, "advice": advice}
         warnings.append(Warning(code=Code.OUTSIDE_CALIBRATION, subject=camera.name, figures=figures))
     return warnings

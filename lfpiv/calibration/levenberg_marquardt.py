@@ -53,6 +53,18 @@ class TrainingStop(enum.Enum):
     EPOCH_LIMIT = "epoch limit reached while the validation error still fell: raise network.epochs"
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingRules:
+    """Rules that end a training."""
+
+    epochs: int = 200
+    """Largest number of epochs."""
+    patience: int = 15
+    """Epochs without a fall of the validation error after which training stops."""
+    tolerance: float = 1e-3
+    """Relative fall of the validation error that counts."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Samples:
     """Scaled samples of a trainer."""
@@ -79,15 +91,11 @@ class Fit:
     """Reason why training ended."""
 
 
-def levenberg_marquardt(
-    layers: list[np.ndarray],
-    training: Samples,
-    validation: Samples,
-    *,
-    epochs: int,
-    patience: int,
-    tolerance: float,
-) -> Fit:
+Trainer = Callable[[list[np.ndarray], Samples, Samples, TrainingRules], Fit]
+"""Train first layers on scaled samples: ``trainer(layers, training, validation, rules)``."""
+
+
+def levenberg_marquardt(layers: list[np.ndarray], training: Samples, validation: Samples, rules: TrainingRules) -> Fit:
     """Train by Levenberg-Marquardt with geodesic acceleration and early stopping.
 
     D is the largest diagonal of J^T J so far (Marquardt's scaling).
@@ -98,26 +106,22 @@ def levenberg_marquardt(
         First layers.
     training, validation : Samples
         Scaled samples. The validation part decides when to stop and which epoch is returned.
-    epochs : int
-        Largest number of accepted steps.
-    patience : int
-        Epochs without a fall of the validation error by `tolerance` after which training stops.
-    tolerance : float
-        Relative fall of the validation error that counts.
+    rules : TrainingRules
+        Rules that end the training. An epoch is an accepted step.
 
     Returns
     -------
     Fit
         Holds the layers of the epoch with the lowest validation error.
     """
-    unpack = _unpacker(layers)
-    theta = np.concatenate([layer.ravel() for layer in layers])
+    unpack = unpacker(layers)
+    theta = flattened(layers)
     gram, gradient, squares = normal_equations(layers, training)
     training_rms, validation_rms = [math.sqrt(squares / training.outputs.size)], [_rms_error(layers, validation)]
     best, best_theta, mark, mark_epoch = validation_rms[0], theta, validation_rms[0], 0
     damping, growth, scale = FIRST_DAMPING, 2.0, np.zeros(theta.size)
     stop = TrainingStop.EPOCH_LIMIT
-    while len(training_rms) <= epochs:
+    while len(training_rms) <= rules.epochs:
         scale = np.maximum(scale, gram.diagonal())
         scale = np.maximum(scale, LEAST_SCALE * scale.max())
         while damping < LAST_DAMPING:
@@ -140,15 +144,20 @@ def levenberg_marquardt(
         validation_rms.append(_rms_error(unpack(theta), validation))
         if validation_rms[-1] < best:
             best, best_theta = validation_rms[-1], theta
-        if best < mark * (1 - tolerance):
+        if best < mark * (1 - rules.tolerance):
             mark, mark_epoch = best, len(training_rms) - 1
-        elif len(training_rms) - 1 - mark_epoch >= patience:
+        elif len(training_rms) - 1 - mark_epoch >= rules.patience:
             stop = TrainingStop.VALIDATION
             break
     return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 
 
-def _unpacker(layers: Sequence[np.ndarray]) -> Callable[[np.ndarray], list[np.ndarray]]:
+def flattened(layers: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the parameters of all layers as one vector."""
+    return np.concatenate([layer.ravel() for layer in layers])
+
+
+def unpacker(layers: Sequence[np.ndarray]) -> Callable[[np.ndarray], list[np.ndarray]]:
     """Return the function that cuts one vector of parameters into layers of these shapes."""
     shapes, edges = [layer.shape for layer in layers], np.cumsum([layer.size for layer in layers])[:-1]
 
@@ -211,8 +220,6 @@ def _sum_over_blocks(terms_of: Callable[[int, int], Terms], count: int, rows: in
 
 
 def _sum_of_squares(layers: Sequence[np.ndarray], samples: Samples) -> float:
-    """Return the weighted sum of squared residuals."""
-
     def squares(first: int, last: int) -> Terms:
         part = slice(first, last)
         residual = samples.weights[part] * (samples.outputs[part] - forward(layers, samples.inputs[part])[-1])

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv.geometry.optics import Optics
+from lfpiv.lightfield.decoder import NORMAL_MAD
 
 FIT_SAMPLES = 20_000
 """Largest number of labels in a fit, evenly drawn from all labels."""
@@ -40,8 +41,6 @@ LEAST_DEPTH = 1e-4
 """Smallest extent of the dots relative to their largest extent."""
 TRIMMING = 4.0
 """Residual above which the linear start leaves out a label [median residuals]."""
-MAD_TO_STD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,8 +149,8 @@ def fit_thin_lens(
 
     Linear least squares of s, t = a + A (x, y, z) + (k + b (x, y, z)) (u, v) start the fit: the rows of A are the
     camera's axes times the magnification, and b is its optical axis times s_i / s_o^2. A robust fit of pose, image
-    distance, focal length, pupil scale and optical axis follows. Mislabelled dots have next to no weight in it, and the
-    data sheet decides only what the labels leave open.
+    distance, focal length, pupil scale and optical axis follows. Mislabelled dots have next to no weight in it. The
+    data sheet decides only parameters that the labels do not determine.
 
     Parameters
     ----------
@@ -217,7 +216,7 @@ def _robust_minimum(residual_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarr
     parameters, damping = np.zeros(PRIOR.size), FIRST_DAMPING
     residual = residual_of(parameters)
     for _ in range(ITERATIONS):
-        sigma = max(MAD_TO_STD * float(np.median(np.abs(residual))), SMALLEST_STD_MM)
+        sigma = max(NORMAL_MAD * float(np.median(np.abs(residual))), SMALLEST_STD_MM)
         weight = 1 / (1 + (residual / (OUTLIER * sigma)) ** 2) ** 2
         steps = STEP * np.eye(PRIOR.size)
         jacobian = np.stack([(residual_of(parameters + step) - residual) / STEP for step in steps], axis=1)

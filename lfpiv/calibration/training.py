@@ -12,14 +12,21 @@ References
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv.calibration.levenberg_marquardt import Fit, Samples, TrainingStop, levenberg_marquardt, normal_equations
+from lfpiv.calibration.levenberg_marquardt import (
+    Samples,
+    Trainer,
+    TrainingRules,
+    TrainingStop,
+    levenberg_marquardt,
+    normal_equations,
+)
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.virtual_samples import VirtualSampler
 
@@ -28,25 +35,19 @@ FIRST_RIDGE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingSettings:
+class TrainingSettings(TrainingRules):
     """Size of a network and rules of its training."""
 
     hidden: tuple[int, ...] = (20,)
     """Nodes of each hidden layer."""
-    trainer: Callable[..., Fit] = levenberg_marquardt
-    """``trainer(layers, training, validation, epochs=, patience=, tolerance=) -> Fit``."""
-    epochs: int = 200
-    """Largest number of epochs."""
-    patience: int = 15
-    """Epochs without a fall of the validation error after which training stops."""
-    tolerance: float = 1e-3
-    """Relative fall of the validation error that counts."""
+    trainer: Trainer = levenberg_marquardt
+    """Method of the training."""
     split: tuple[float, float, float] = (0.70, 0.15, 0.15)
     """Shares of the training, validation and test parts."""
     shrink: bool = False
     """Multiply the network by the factor from 0 to 1 that fits the validation part best.
 
-    For a network that corrects a baseline, such as a fitted thin lens: one that learned only noise vanishes.
+    For a network that corrects a baseline, such as a fitted thin lens. A correction that fits only noise becomes 0.
     """
     seed: int = 0
     """Seed of the split and the first weights. Equal seeds give equal networks."""
@@ -153,9 +154,7 @@ def train(
             first_layers((inputs.shape[1], *settings.hidden, outputs.shape[1]), training, rng),
             training,
             validation,
-            epochs=settings.epochs,
-            patience=settings.patience,
-            tolerance=settings.tolerance,
+            settings,
         )
     network, shrinkage = scaling.network(fit.layers), 1.0
     if settings.shrink:

@@ -123,7 +123,6 @@ def _powers(points: np.ndarray, dots: int) -> list[tuple[int, ...]]:
 
 
 def _places_between(labelled: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw random points on lines between two random labels."""
     first, second = rng.integers(len(labelled), size=(2, len(labelled) // 2))
     part = rng.random((len(first), 1))
     places: np.ndarray = part * labelled[first] + (1 - part) * labelled[second]

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 LAYOUTS = ("square", "hexagonal")
+NEIGHBOURS = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
+"""Lattice steps to the eight neighbours of a node, shape (8, 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +87,12 @@ def spread_over_pupil(radius_mm: float) -> np.ndarray:
         angle = (np.arange(6 * ring) + 0.5 * (ring % 2)) * np.pi / (3 * ring)
         rings.append(ring / 3 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     return radius_mm * np.concatenate(rings)
+
+
+def random_on_pupil(radius_mm: float, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw points evenly over the pupil, shape (count, 2) [mm]."""
+    radius, angle = radius_mm * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def float_pair(values: ArrayLike) -> tuple[float, float]:

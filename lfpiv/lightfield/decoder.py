@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from lfpiv.errors import InputError
-from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.geometry.optics import NEIGHBOURS, LensLattice, Optics
 
 CORE_COVERAGE = 0.99
 """Least coverage of a pixel that lies inside a microimage."""
@@ -229,7 +229,7 @@ def _assign_lenses(optics: Optics, lattice: LensLattice) -> tuple[np.ndarray, np
     rows, columns = optics.sensor_shape
     widening = 1 + optics.sensor_per_pupil
     inverse = np.linalg.inv(np.asarray(lattice.basis_mm))
-    inscribed = _neighbour_distances(lattice).min() / 2
+    inscribed = np.linalg.norm(_neighbours(lattice), axis=1).min() / 2
     lens_index = np.empty((rows, columns, 2), np.int16)
     offset = np.empty((rows, columns, 2), np.float32)
     column = np.arange(columns)
@@ -247,15 +247,9 @@ def _assign_lenses(optics: Optics, lattice: LensLattice) -> tuple[np.ndarray, np
 
 def _neighbours(lattice: LensLattice) -> np.ndarray:
     """Return the vectors from a lens to its neighbours [mm], shape (n, 2)."""
-    steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    vectors: np.ndarray = np.asarray(steps, float) @ np.asarray(lattice.basis_mm)
+    vectors = NEIGHBOURS @ np.asarray(lattice.basis_mm)
     near: np.ndarray = vectors[np.hypot(*vectors.T) < 1.6 * lattice.pitch_mm]  # no far corners
     return near
-
-
-def _neighbour_distances(lattice: LensLattice) -> np.ndarray:
-    distances: np.ndarray = np.linalg.norm(_neighbours(lattice), axis=1)
-    return distances
 
 
 def _cover(optics: Optics, lattice: LensLattice, offset_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

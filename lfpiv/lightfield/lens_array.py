@@ -173,9 +173,6 @@ def find_lens_array(
     return array
 
 
-# Input ---------------------------------------------------------------------------------------------------------------
-
-
 def _checked_image(white: np.ndarray, dark: np.ndarray | None) -> np.ndarray:
     """Check white and dark image, and return their difference as float32."""
     white = _checked_frame("white", white)
@@ -225,9 +222,6 @@ def _checked_pitch(nominal_pitch_px: float | None, shape: tuple[int, int]) -> fl
             "Check pitch and pixel size."
         )
     return nominal
-
-
-# Centres and lattice -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,9 +35,6 @@ DISC_RADII = np.arange(0.2, 0.81, 0.02)
 """Radii of microimages tried [pitch]. Four of the largest overlap in the middle between their lenses."""
 
 
-# Lattice vectors from the autocorrelation ----------------------------------------------------------------------------
-
-
 def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndarray:
     """Return the lattice vectors, rows (column, row) [pixel], in the order of `LensArray.basis_px`.
 
@@ -78,7 +75,6 @@ def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndar
 
 
 def _middle(image: np.ndarray) -> np.ndarray:
-    """Return the middle part of an image."""
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape]
     return image[start[0] : start[0] + TILE_PX, start[1] : start[1] + TILE_PX]
 
@@ -224,9 +220,6 @@ def indices_inside(origin: np.ndarray, basis: np.ndarray, low: ArrayLike, high: 
     node = origin + index @ basis
     inside: np.ndarray = index[((node >= low) & (node < high)).all(1)]
     return inside
-
-
-# Phase from the symmetry of the mean cell ----------------------------------------------------------------------------
 
 
 def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from lfpiv.geometry.optics import NEIGHBOURS
 from lfpiv.lightfield.lens_basis import indices_inside
 
 BLUR_PX = 0.9
@@ -224,7 +225,7 @@ def _neighbours_light(microimage: np.ndarray, column: np.ndarray, row: np.ndarra
     """
     core = np.hypot(column, row) < CORE_PITCHES * np.hypot(*basis[0])
     light = np.where(core, 0, np.maximum(microimage - microimage[core].max(), 0))
-    offsets = np.array([i * basis[0] + j * basis[1] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)])
+    offsets = NEIGHBOURS @ basis
     distance = (column - offsets[:, 0, None, None]) ** 2 + (row - offsets[:, 1, None, None]) ** 2
     weighted: np.ndarray = light * offsets[distance.argmin(0)].transpose(2, 0, 1)
     return weighted

@@ -47,9 +47,8 @@ def microimage_centres(optics: Optics, lattice: LensLattice, margin_px: float) -
         np.asarray(lattice.basis_mm)
     )
     first, last = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
-    index = np.stack(
-        np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(first, last, strict=True))), axis=-1
-    )  # (j, i, 2)
+    along = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
+    index = np.stack(np.meshgrid(*along), axis=-1)  # (j, i, 2)
     return first, lattice.centres_mm(index) * widening + half
 
 

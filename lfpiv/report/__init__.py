@@ -22,7 +22,7 @@ from lfpiv.report import vectors as vector_section
 from lfpiv.report.summary import Summary
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.cameras import Calibration
+    from lfpiv.calibration.camera import Calibration
 
 __all__ = ["write_report"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv.calibration.board.board import BoardDots
+from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.geometry.optics import Optics
 

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from lfpiv.reproduce.study import SCALES, Progress, Study, compute
+from lfpiv.progress import Progress
+from lfpiv.reproduce.study import SCALES, Study, compute
 
 __all__ = ["CASES", "PAPER", "SCALES", "reproduce"]
 
@@ -35,11 +36,11 @@ def reproduce(
     cases : sequence of str
         Keys of `CASES`, or "all".
     out : path
-        Folder for the results. Finished cases of the same scale and seed are kept, and finished parts of others.
+        Folder for the results. Finished cases and parts of the same scale and seed are not computed again.
     scale : {"small", "paper"}
-        "paper": the paper's own sizes, hours; "small": smaller volumes and fewer densities.
+        "paper": the sizes of the paper, which take hours. "small": smaller volumes and fewer densities.
     seed : int
-        Every random draw derives from it.
+        Seed of all random numbers.
     progress : callable, optional
         Called with (step, finished fraction).
     finished : callable, optional
@@ -48,12 +49,12 @@ def reproduce(
     Returns
     -------
     dict
-        The content of ``reproduce.json``: of these cases, and of those the folder already holds.
+        The content of ``reproduce.json``: these cases, and those that the folder already holds.
 
     Raises
     ------
     InputError
-        If a case, the scale or the seed is unknown or out of range, or the folder cannot be written or is of another
-        scale or seed.
+        If a case, the scale or the seed is unknown or out of range, or the folder cannot be written or holds
+        results of another scale or seed.
     """
     return compute(PAPER, cases, out, scale, seed=seed, progress=progress, finished=finished)

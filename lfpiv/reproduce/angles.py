@@ -1,4 +1,4 @@
-"""Errors of vectors where direct ray tracing is given wrong camera angles: Fig. 14 of the paper for more errors."""
+"""Errors of vectors from direct ray tracing with wrong camera angles: Fig. 14 of the paper with more errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LABELS = {
     "rolled": "cameras rolled against each other",
 }
 SIZES_DEG = (0, *rigs.ANGLE_ERRORS_DEG)
-"""Errors of the angles [degree]; 0 means right angles."""
+"""Errors of the angles [degree]; 0: exact angles."""
 Errors = Mapping[str, Sequence[float]]
 """Mean errors [voxel] by kind of the angles' error, one for each of `SIZES_DEG`."""
 
@@ -29,10 +29,10 @@ def by_kind(errors: Mapping[str, float]) -> Errors:
 
 
 def stretch(size_deg: float) -> np.ndarray:
-    """Factors (x, y, z) by which overestimated separation angles stretch the volume.
+    """Return the factors (x, y, z) by which overestimated separation angles stretch the volume.
 
-    Two cameras see x cos(a) -+ z sin(a). With a + d in place of a the same rays meet at x cos(a) / cos(a + d) and
-    z sin(a) / sin(a + d): the volume is stretched along x and shortened along z, and stays sharp.
+    Two cameras see x cos(a) -+ z sin(a). With a + d instead of a the same rays meet at x cos(a) / cos(a + d) and
+    z sin(a) / sin(a + d). The volume is longer along x, shorter along z, and as sharp.
     """
     angle = np.radians(rigs.ANGLES_DEG[0])
     wrong = angle + np.radians(size_deg)
@@ -40,9 +40,9 @@ def stretch(size_deg: float) -> np.ndarray:
 
 
 def reached(errors: Sequence[float], contrast: float) -> float | None:
-    """Error of the angles [degree] at which the mean error is `contrast` times that of the right ones, or None.
+    """Return the angles' error [degree] at which the mean error is `contrast` times that of exact angles, or None.
 
-    Between the sizes that were computed the mean error is taken as linear.
+    The mean error is interpolated linearly between the computed sizes.
     """
     ratio = np.array(errors) / errors[0]
     above = np.flatnonzero(ratio >= contrast)
@@ -59,8 +59,8 @@ def describe(errors: Errors, stretch_voxel: float, contrast: float, goal: float,
         "DRT off by 1 degree: both separation angles overestimated, +46 and -46 degrees (Eqs. 11 and 12). Two cameras "
         "that are off by the same angle agree on where their rays meet, in a volume stretched by "
         f"{factors[0]:.1f} % along x and shortened by {-factors[2]:.1f} % along z: particles lie in wrong places, at "
-        "the edges by more than at the centre, but they stay sharp. In the analytic flow this alone is an error of "
-        f"{stretch_voxel:.3f} voxel. "
+        "the edges by more than at the centre, but they stay sharp. In the analytic flow the stretch gives an error "
+        f"of {stretch_voxel:.3f} voxel. "
     )
     if contrast < goal:
         text += f"The paper's contrast of 2 is not found: {contrast:.2f}. The stretch is too small an error for it. "
@@ -75,8 +75,8 @@ def describe(errors: Errors, stretch_voxel: float, contrast: float, goal: float,
 def table(errors: Errors, ppm: float) -> dict[str, Any]:
     """Return a table of mean errors, one row per size."""
     return {
-        "caption": f"Mean error [voxel] against the true particles' correlation at {ppm} ppm where direct ray tracing "
-        "is given wrong angles. Rolled: half of it each.",
+        "caption": f"Mean error [voxel] against the true particles' correlation at {ppm} ppm by direct ray tracing "
+        "with wrong angles. Rolled: half the error for each camera.",
         "columns": ["error [degree]", *LABELS.values()],
         "rows": [[size, *row] for size, *row in zip(SIZES_DEG, *(errors[kind] for kind in LABELS), strict=True)],
     }

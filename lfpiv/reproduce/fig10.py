@@ -12,9 +12,9 @@ import numpy as np
 from lfpiv import metrics
 from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.geometry.grid import Grid
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots
 from lfpiv.reproduce.rigs import VOXEL_MM, numerical_rig
-from lfpiv.reproduce.study import Progress
 from lfpiv.weights.counting import count_voxels
 from lfpiv.weights.operator import COUNT_SAMPLES_ONE
 
@@ -34,9 +34,9 @@ CAPTION = (
 )
 NOTES = (
     "The paper does not state its SSIM settings. Over the whole sensor nearly all pixels are dark in both images and "
-    "SSIM is close to 1 whatever the weights, so the goal is compared with the lit pixels alone.",
-    "The cameras of this rig are ideal and stand at exactly 45 degrees: DRT knows the truth here, and a count through "
-    "DRT's mapping is a count through the true optics.",
+    "SSIM is close to 1 for any weights, so the goal applies to the lit pixels only.",
+    "The cameras of this rig are ideal and stand at exactly 45 degrees. So DRT is exact, and a count through DRT's "
+    "mapping is a count through the true optics.",
 )
 
 
@@ -89,7 +89,6 @@ def _figures(ours: np.ndarray, traced: np.ndarray, network: Count, drt: Count) -
 
 
 def _result(cameras: Mapping[str, Mapping[str, float]], counts: int) -> dict[str, Any]:
-    """Put the figures of all cameras into the form of the page."""
 
     def worst(key: str, choose: Callable[[Iterable[float]], float] = max) -> float:
         return choose(figures[key] for figures in cameras.values())
@@ -132,13 +131,12 @@ def _result(cameras: Mapping[str, Mapping[str, float]], counts: int) -> dict[str
             *NOTES,
             f"Converged count: mean of {counts} independent counts, each of 512 points in the voxel and one ray per "
             f"0.05 degree; from their scatter its noise is {100 * worst('count_noise_l2'):.2f} %. One such count is "
-            "the paper's sampling. Comparing two of them shows what sampling noise alone does to SSIM.",
+            "the paper's sampling. Comparing two of them shows the effect of sampling noise on SSIM.",
         ],
     )
 
 
 def _count(camera: CalibratedCamera, counts: int, seed: list[int], shape: tuple[int, int]) -> Count:
-    """Count the rays of the voxel on a camera's sensor several times."""
     images = _counted_images(camera, counts, seed, shape)
     first = next(images)
     total, squares = first.copy(), first**2

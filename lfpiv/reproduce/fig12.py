@@ -12,9 +12,9 @@ import numpy as np
 from lfpiv import metrics
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.metrics.particles import PEAK_SHARE
+from lfpiv.progress import Progress
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import page, plots, rigs, store
-from lfpiv.reproduce.study import Progress
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.weights.operator import Weights
 
@@ -30,7 +30,7 @@ GOAL_Q = 0.80
 POINTS_PPM = {"small": (0.1, 0.5, 1.0), "paper": PPM["paper"]}
 """Seeding at which points are reconstructed too, by the network."""
 TRUTH_PPM = 0.5
-"""Seeding at which SMART also starts from the true particles, to see whether the images distinguish ghosts at all."""
+"""Seeding at which SMART also starts from the true particles, to test whether the images distinguish ghosts."""
 DARK_SHARE = 1e-3
 """First guess of that run in voxels without a particle, as a share of the brightest voxel."""
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -68,16 +68,16 @@ FIGURES = (
 TABLES = {
     f"Gaussian particles, sigma {rigs.BLOB_VOXEL} voxel": MAPPINGS,
     f"The same with the paper's SMART: {VARIANTS['paper']['iterations']} iterations, no momentum": ("paper",),
-    "The same without a sieve, in voxels of any brightness: what is missing is what the particles' size, which the "
-    "images tell, is worth": ("no_sieve",),
+    "The same without a sieve, in voxels of any brightness: the difference is the value of the particles' size, which "
+    "the images show": ("no_sieve",),
     "Point particles, Q against the same blobs": ("points",),
 }
 """Caption of each table, and the groups of runs in it."""
 NOTES = (
     f"A peak counts as a particle above {PEAK_SHARE:g} of the median brightness found at the true particles; the paper "
     "does not state its threshold, on which R_acc and R_g depend.",
-    "Points are far smaller than a voxel: pixels of a voxel's footprint that a point leaves dark hold its brightness "
-    "down, and their Q is compared with blobs that they are not.",
+    "Points are far smaller than a voxel. A point leaves some pixels of its voxel's footprint dark, which lowers its "
+    "brightness. The Q of points is measured against blobs.",
 )
 
 
@@ -121,7 +121,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
             step = _part(progress, "reconstruction", done, len(jobs))
             return _judge(built[job.mapping], images, positions, smart, job.kind == "from_truth", step)
 
-        figures = store.kept_arrays(
+        figures = store.cached_arrays(
             work / f"{job.kind}_{job.mapping}_{job.ppm:.2f}.npz",
             {**settings, "ppm": job.ppm, "kind": job.kind, **VARIANTS[job.kind]},
             compute,
@@ -142,7 +142,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 
 
 def _jobs(scale: str) -> list[Job]:
-    """Return all volumes of a scale, those with the same weights side by side."""
+    """Return all volumes of a scale, sorted by their weights."""
     jobs = [Job(mapping, ppm, "blobs") for mapping in MAPPINGS for ppm in PPM[scale]]
     jobs += [Job("network", ppm, kind) for ppm in PPM[scale] for kind in ("paper", "no_sieve")]
     jobs += [Job("network", TRUTH_PPM, "from_truth")]
@@ -151,7 +151,7 @@ def _jobs(scale: str) -> list[Job]:
 
 
 def _stream(ppm: float, seed: int) -> list[int]:
-    """Seed of the random numbers of one seeding."""
+    """Return the seed of the random numbers of one seeding."""
     return [seed, 12, round(1000 * ppm)]
 
 
@@ -160,7 +160,6 @@ def _positions(size: tuple[float, float, float], ppm: float, seed: int) -> np.nd
 
 
 def _result(groups: Mapping[str, Sequence[Mapping[str, Any]]], setup: Mapping[str, Any]) -> dict[str, Any]:
-    """Put the runs, grouped by mapping or kind, into the form of the page."""
     q_mean = {mapping: _mean(groups[mapping]) for mapping in MAPPINGS}
     accuracy, ghost_ratio, q_as_correlated = (
         {mapping: _mean(groups[mapping], key) for mapping in MAPPINGS}
@@ -210,7 +209,6 @@ def _judge(
     from_truth: bool,
     step: Callable[[float], None],
 ) -> dict[str, Any]:
-    """Reconstruct a volume and compare it with its particles."""
     truth, first = rigs.truth(positions_mm, weights.grid), None
     if from_truth:  # dark voxels are not quite dark: ghosts may grow
         light = sum(float(image.sum(dtype=np.float64)) for image in images.values()) / len(images)
@@ -268,8 +266,8 @@ def _verdict(
         f"Mean Q of the network is {q_mean:.3f}, {min(r['q'] for r in rows):.2f} to {max(r['q'] for r in rows):.2f}, "
         f"goal {GOAL_Q:g}. Without a sieve, at {ours['ppm']:g} ppm, Q is {ours['q']:.2f} with an image residual of "
         f"{ours['residual']:.4f}; the same iterations started from the true particles end at Q {from_truth['q']:.2f} "
-        f"with {from_truth['residual']:.4f}. The nearer these residuals, the less the images of two views can tell "
-        "ghosts from particles, whatever the weights: DRT with the true geometry gives the same Q."
+        f"with {from_truth['residual']:.4f}. The nearer these residuals, the less can the images of two cameras "
+        "distinguish ghosts from particles, with any weights: DRT with the true geometry gives the same Q."
     )
 
 
@@ -295,7 +293,6 @@ def _draw_curves(blobs: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -
 def _draw_scatter(
     found: Mapping[str, np.ndarray], true_mm: np.ndarray, size_mm: tuple[float, float, float], path: Path
 ) -> None:
-    """Draw the volumes' particles in space, and a slice of them."""
     drawn = plots.figure(11, 7.2)
     drawn.set_layout_engine("constrained", w_pad=0.15, h_pad=0.05)
     half = np.array(size_mm) / 2

@@ -16,9 +16,9 @@ from lfpiv import metrics
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import AXES
 from lfpiv.metrics.vector_fields import BELOW_VOXEL
+from lfpiv.progress import Progress
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import angles, page, plots, rigs, store
-from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.flows import Ring
 from lfpiv.velocity import derived
 from lfpiv.velocity.cross_correlation import correlate
@@ -31,7 +31,7 @@ SIZE_MM = {"small": (7.0, 7.0, 3.5), "paper": (14.0, 14.0, 7.0)}
 PPM = {"small": (0.1, 0.5, 1.0), "paper": tuple(round(0.1 * n, 1) for n in range(1, 11))}
 MAPPINGS = ("network", "drt", "drt_plus_1deg")
 TURNED = tuple(name for name in rigs.TURNED_DEG if name not in MAPPINGS)
-"""Other errors of the angles, at `SHOWN_PPM` alone."""
+"""Other errors of the angles, computed at `SHOWN_PPM` only."""
 SHOWN_PPM = 0.5
 """Seeding of Figs. 13 and 14(b)."""
 ISO_VORTICITY = 0.12
@@ -41,7 +41,7 @@ SCHEDULES: dict[str, tuple[int, ...]] = {"default": DEFAULT_WINDOWS, "8": (24, 1
 PAPER_MEAN = {"network": 0.35, "drt": 0.36, "drt_plus_1deg": 0.71}
 PAPER_BELOW = {"network": 0.756, "drt": None, "drt_plus_1deg": 0.643}
 WIDTHS = {"truth": 1.2, "network": 4.0, "drt": 1.2, "drt_plus_1deg": 1.2}
-"""Widths of lines [point]. The network's line is wide, so that it shows beneath DRT's."""
+"""Widths of lines [point]. The network's line is wide, so that it is visible below DRT's."""
 GOAL_MEAN, GOAL_BELOW, GOAL_CONTRAST = 0.30, 0.80, 1.5
 
 FIGURES = (
@@ -53,7 +53,7 @@ FIGURES = (
     ),
     (
         "fig14_angles.png",
-        "Mean error against the correlation of the true particles where direct ray tracing is given wrong angles, at "
+        "Mean error against the correlation of the true particles of direct ray tracing with wrong angles, at "
         f"{SHOWN_PPM} ppm with this software's windows; the paper shows 1 degree of the first kind.",
     ),
     (
@@ -74,7 +74,7 @@ Fields = dict[str, np.ndarray]
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
-    """Reconstruct, correlate and judge; see `lfpiv.reproduce.study` for the arguments."""
+    """Measure the flow by all mappings; see `lfpiv.reproduce.study` for the arguments."""
     rig = rigs.numerical_rig(work.parent / "rig", scale, seed, progress)
     size, ppms = SIZE_MM[scale], PPM[scale]
     grid, flow = rigs.volume_grid(size), rigs.ring(size)
@@ -123,9 +123,9 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
                 return {**correlated(volumes), "q": np.array(quality)}
 
             path = work / f"vectors_{mapping}_{ppm:.2f}.npz"
-            fields[mapping, ppm] = store.kept_arrays(path, {**settings, "ppm": ppm, "mapping": mapping}, compute)
+            fields[mapping, ppm] = store.cached_arrays(path, {**settings, "ppm": ppm, "mapping": mapping}, compute)
             done += 1
-    for path in work.glob("images_*.npz"):  # large, and no longer needed: all vectors are there
+    for path in work.glob("images_*.npz"):  # large, and not needed once all vectors are computed
         path.unlink()
     setup = {
         "size_mm": size,
@@ -139,14 +139,14 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 def _images(
     rig: rigs.Rig, work: Path, settings: Mapping[str, Any], ppm: float, frame: int, positions: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Images of a frame, rendered once for all mappings."""
+    """Render a frame once for all mappings."""
 
     def compute() -> dict[str, np.ndarray]:
         drawn = rigs.particle_images(rig, positions, [settings["seed"], 14, round(1000 * ppm), frame])
         return {name: image.astype(np.uint16) for name, image in drawn.items()}
 
-    kept = {key: settings[key] for key in ("scale", "seed", "size_mm")}
-    images = store.kept_arrays(work / f"images_{ppm:.2f}_{'ab'[frame]}.npz", kept, compute)
+    rendered = {key: settings[key] for key in ("scale", "seed", "size_mm")}
+    images = store.cached_arrays(work / f"images_{ppm:.2f}_{'ab'[frame]}.npz", rendered, compute)
     return {name: image.astype(np.float32) for name, image in images.items()}
 
 
@@ -158,7 +158,7 @@ def _pack(vectors: xr.Dataset, name: str) -> dict[str, np.ndarray]:
 
 
 def _analytic(packed: Fields, name: str, flow: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Mean of the flow over the windows of a vector field [voxel], shape (z, y, x, 3)."""
+    """Return the mean of the flow over the windows of a vector field [voxel], shape (z, y, x, 3)."""
     edge = SCHEDULES[name][-1] * rigs.VOXEL_MM
     return rigs.true_field(flow, [packed[f"{name}_{axis}"] for axis in "zyx"], edge) / rigs.VOXEL_MM
 
@@ -170,7 +170,6 @@ def _result(
     setup: Mapping[str, Any],
     work: Path,
 ) -> dict[str, Any]:
-    """Judge all vectors, draw them, and put the figures into the form of the page."""
     judged = Judged([row for key, packed in fields.items() for row in _rows(key, packed, fields, flow)], ppms)
     _draw_errors(judged.runs, fields, ppms, work / "fig14.png")
     _draw_vorticity({m: fields[m, SHOWN_PPM] for m in ("truth", *MAPPINGS)}, work / "fig13.png")
@@ -264,7 +263,6 @@ def _rows(
 
 
 def _comparison(judged: Judged) -> list[dict[str, Any]]:
-    """Put ours beside the paper's."""
     mean, mean_8 = judged.means("error_voxel"), judged.means("error_voxel", "8")
     exact = judged.means("error_analytic_voxel", mappings=("truth", *MAPPINGS))
     rows = [
@@ -292,7 +290,7 @@ def _comparison(judged: Judged) -> list[dict[str, Any]]:
 
 
 def _stretch_error(packed: Fields, flow: Ring) -> float:
-    """Mean error of the flow where separation angles are 1 degree too large and nothing else goes wrong [voxel]."""
+    """Return the mean error of the flow from separation angles that are 1 degree too large [voxel]."""
     factors = angles.stretch(1.0)
     exact = _analytic(packed, "default", flow)
     seen = _analytic(packed, "default", lambda points: flow(points / factors) * factors)
@@ -355,7 +353,6 @@ def _draw_errors(
 
 
 def _draw_vorticity(panels: Mapping[str, Fields], path: Path) -> None:
-    """Draw the iso-surfaces of Fig. 13."""
     drawn = plots.figure(11, 8.4)
     drawn.set_layout_engine("constrained", w_pad=0.2, h_pad=0.2)
     drawings = []

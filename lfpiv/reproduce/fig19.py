@@ -14,10 +14,10 @@ from scipy import ndimage
 from lfpiv import metrics
 from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.grid import Grid
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots, store
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.rigs import Rig, reconstruct_images
-from lfpiv.reproduce.study import Progress
 
 TITLE = "Figs. 18 and 19: board dots reconstructed at every plane"
 
@@ -34,7 +34,7 @@ MARGIN_MM = 0.3
 OFF_CENTRE_VOXEL = 0.4
 """Volumes are placed at random by up to this much along each axis, so that dots lie anywhere in a voxel."""
 OFF_CENTRE_DEPTH_MM = 0.3
-"""The same along depth [mm]. The middle of a volume must not give away the depth of its dots."""
+"""The same along depth [mm]. The middle of a volume must not show the depth of its dots."""
 GATE = 0.3
 """Largest distance along x and y of a dot from its place on the board, and half width of the window of its centroid
 [spacing]."""
@@ -54,7 +54,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 
 
 def compute(rig: Rig, planes: Sequence[int], work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
-    """Reconstruct some planes of a rig's board; each finished one is kept in `work`."""
+    """Reconstruct some planes of a rig's board, except those that `work` holds already."""
     board = rig.experiment.board
     found = []
     for done, plane in enumerate(planes):
@@ -63,12 +63,12 @@ def compute(rig: Rig, planes: Sequence[int], work: Path, *, seed: int, progress:
         def reconstruct(plane: int = plane) -> dict[str, np.ndarray]:
             return {"positions_mm": reconstruct_plane(rig, plane, seed=seed)}
 
-        kept = store.kept_arrays(
+        arrays = store.cached_arrays(
             work / "planes" / f"plane_{plane:02d}.npz",
             {"seed": seed, "iterations": ITERATIONS, "board": board.model_dump(mode="json")},
             reconstruct,
         )
-        found.append(kept["positions_mm"])
+        found.append(arrays["positions_mm"])
     progress("planes", 1.0)
     positions, planes_mm = np.array(found), [board.planes_mm[plane] for plane in planes]
     error = metrics.dot_error(positions, board.spacing_mm, planes_mm)
@@ -78,7 +78,7 @@ def compute(rig: Rig, planes: Sequence[int], work: Path, *, seed: int, progress:
 
 
 def _true_positions(rig: Rig, planes_mm: Sequence[float]) -> np.ndarray:
-    """Places of the dots on the board (plane, row, column, 3) [mm]."""
+    """Return the places of the dots on the board (plane, row, column, 3) [mm]."""
     board = rig.experiment.board
     columns, rows = ((np.arange(n) - (n - 1) / 2) * board.spacing_mm for n in board.dots)
     z, y, x = np.meshgrid(planes_mm, rows, columns, indexing="ij")
@@ -86,7 +86,7 @@ def _true_positions(rig: Rig, planes_mm: Sequence[float]) -> np.ndarray:
 
 
 def _result(positions: np.ndarray, planes_mm: Sequence[float], error: metrics.DotError, rig: Rig) -> dict[str, Any]:
-    """Put the errors into the form of the page; `positions` of shape (plane, row, column, 3) [mm]."""
+    """Return the result of the page. `positions` has the shape (plane, row, column, 3) [mm]."""
     board = rig.experiment.board
     expected = positions.shape[0] * positions.shape[1] * positions.shape[2]
     rms = np.sqrt(np.nanmean((positions - _true_positions(rig, planes_mm)) ** 2, axis=(0, 1, 2)))
@@ -121,11 +121,11 @@ def _result(positions: np.ndarray, planes_mm: Sequence[float], error: metrics.Do
         ],
         notes=[
             f"Each plane's images are reconstructed by {ITERATIONS} SMART iterations in a volume of "
-            f"{VOXEL_SHARE * board.dot_diameter_mm:g} mm voxels, 2 x {DEPTH_MM:g} mm deep, around where the stage "
-            f"stood to within {OFF_CENTRE_DEPTH_MM:g} mm. A dot is the brightest light within {GATE:g} spacings of its "
+            f"{VOXEL_SHARE * board.dot_diameter_mm:g} mm voxels, 2 x {DEPTH_MM:g} mm deep, around the stage's depth "
+            f"to within {OFF_CENTRE_DEPTH_MM:g} mm. A dot is the brightest light within {GATE:g} spacings of its "
             "place on the board along x and y, at any depth; its position is the centroid of the light around it.",
-            "The same images served the calibration, as in the paper: the figures tell how well mapping, weights and "
-            "SMART fit together, with the noise of these images.",
+            "The calibration uses the same images, as in the paper. So the figures show how well mapping, weights and "
+            "SMART agree, with the noise of these images.",
             "The voxels are smaller than the dots. In the paper's voxels of 0.1 mm most of the light goes to ghosts, "
             "the crossings of the two cameras' rays between the dots.",
             "The paper states a spacing of 0.5 mm in section 5.1 and of 1 mm below Eq. 18; here it is "
@@ -135,7 +135,7 @@ def _result(positions: np.ndarray, planes_mm: Sequence[float], error: metrics.Do
 
 
 def reconstruct_plane(rig: Rig, plane: int, *, seed: int) -> np.ndarray:
-    """Reconstruct the board at one plane and find its dots: positions (row, column, 3) [mm], NaN where none is."""
+    """Reconstruct the board at one plane and find its dots: positions (row, column, 3) [mm], NaN for missing dots."""
     board = rig.experiment.board
     voxel = VOXEL_SHARE * board.dot_diameter_mm
     rng = np.random.default_rng([seed, 19, plane])

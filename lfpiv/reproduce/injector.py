@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from lfpiv.progress import Progress
 from lfpiv.reproduce.rigs import OPTICS, VOXEL_MM, Rig, calibrated_rig
 from lfpiv.simulation.scene import Scene
 
@@ -36,10 +36,10 @@ MISALIGNMENTS = (
 
 
 def experimental_scene(scale: str, seed: int) -> Scene:
-    """Table 2's experimental column: 4.54 um pixels, two cameras at 20 degrees to either side, a board of 0.5 mm.
+    """Return Table 2's experimental column: 4.54 um pixels and two cameras at 20 degrees to either side.
 
-    The cameras stand a little off the plan, and their images have shot and read-out noise. A board of 7 x 7 dots 0.5 mm
-    apart stands at every millimetre from -6 to 6 mm.
+    The cameras deviate from their nominal poses, and their images have shot and read-out noise. A board of 7 x 7 dots
+    0.5 mm apart is recorded at every millimetre from -6 to 6 mm.
     """
     rows, columns = SENSOR_PX[scale]
     cameras = [
@@ -63,7 +63,7 @@ def experimental_scene(scale: str, seed: int) -> Scene:
             "dt_s": 1.0,
             "camera": cameras,
             "board": {"dots": (7, 7), "spacing_mm": 0.5, "dot_diameter_mm": 0.1, "planes_mm": PLANES_MM},
-            # the data set's own particles only complete it: the cases render their own
+            # required by the scene, not used: each case renders its own particles
             "volume": {"size_mm": (3.0, 3.0, 12.0), "voxel_mm": VOXEL_MM},
             "particles": {"count": 8},
             "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
@@ -71,6 +71,6 @@ def experimental_scene(scale: str, seed: int) -> Scene:
     )
 
 
-def experimental_rig(folder: Path, scale: str, seed: int, progress: Callable[[str, float], None]) -> Rig:
-    """Simulate the boards of `experimental_scene` and calibrate from them; kept in `folder` and taken from there."""
+def experimental_rig(folder: Path, scale: str, seed: int, progress: Progress) -> Rig:
+    """Return the calibrated rig of `experimental_scene`, see `calibrated_rig`."""
     return calibrated_rig(experimental_scene(scale, seed), folder, progress)

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.lsi_twin import (
@@ -30,7 +31,6 @@ from lfpiv.reproduce.lsi_twin import (
 )
 from lfpiv.reproduce.planar_piv import require_openpiv
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, true_field
-from lfpiv.reproduce.study import Progress
 
 TITLE = "Figs. 20 to 22: low-swirl injector, light-field PIV against planar PIV"
 
@@ -78,7 +78,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 
 
 def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
-    """Record and measure on a calibrated rig; every finished pair is kept in `work`."""
+    """Record and measure on a calibrated rig, except the pairs that `work` holds already."""
     require_openpiv()
     twin = Twin(sizes, seed)
     planar = planar_mean(twin, work, progress)
@@ -88,15 +88,14 @@ def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress
 
 
 def sample_profiles(twin: Twin, volume: LightField, planar: Sequence[Sheet]) -> dict[str, np.ndarray]:
-    """Mean in-plane velocity along y at x/D = 0.2 in every plane [m/s], shape (plane, y, 2).
+    """Return mean in-plane velocities along y at x/D = 0.2 in every plane [m/s], shape (plane, y, 2).
 
     Returns
     -------
     dict of ndarray
-        ``y_mm`` (y,); ``light_field``, ``planar``; ``recorded``: the true flow at these points, mean of the instants
-        that the light field recorded; ``mean``: that of all instants; ``windows``: the true flow of the recorded
-        instants, averaged over the light field's windows; ``mean_windows``: the mean flow over them;
-        ``planar_windows``: planar PIV averaged over them in its plane.
+        ``y_mm``, shape (y,). ``light_field`` and ``planar``: measured. ``recorded``: true flow, mean of the instants
+        that the light field recorded. ``mean``: true mean flow. ``windows``, ``mean_windows`` and ``planar_windows``:
+        ``recorded``, ``mean`` and ``planar`` averaged over the light field's windows.
     """
     y_mm = volume["axes_mm"][1]
     half = np.array(window_mm(twin)[:2]) / 2
@@ -126,10 +125,9 @@ def sample_profiles(twin: Twin, volume: LightField, planar: Sequence[Sheet]) -> 
 
 
 def _along(twin: Twin, axes_mm: list[np.ndarray], field: np.ndarray) -> np.ndarray:
-    """Field (z, y, x, ...) along the profiles, shape (plane, y, ...): linear in x, a cubic spline along depth.
+    """Interpolate a field (z, y, x, ...) to the profiles, linear in x, by a cubic spline in z, shape (plane, y, ...).
 
-    A plane may lie midway between two layers of windows. Their mean, which linear interpolation gives, is that of a
-    window 1.5 times as deep.
+    Linear interpolation midway between two layers of windows would average over 1.5 times their depth.
     """
     z_mm, _, x_mm = axes_mm
     line = RegularGridInterpolator((x_mm,), np.moveaxis(field, 2, 0))([[twin.profile_x_mm]])[0]
@@ -139,7 +137,7 @@ def _along(twin: Twin, axes_mm: list[np.ndarray], field: np.ndarray) -> np.ndarr
 
 
 def relative_error(values: np.ndarray, reference: np.ndarray) -> float:
-    """Mean distance of values from a reference over the reference's mean magnitude; NaN are left out."""
+    """Return the mean distance of values from a reference over the reference's mean magnitude. Ignore NaN."""
     good = np.isfinite(values) & np.isfinite(reference)
     return float(np.abs(values - reference)[good].mean() / np.abs(reference)[good].mean())
 
@@ -158,17 +156,17 @@ def error_by_pairs(twin: Twin, volume: LightField, reference: np.ndarray) -> ByP
     Parameters
     ----------
     twin : Twin
-        Where the profiles are.
+        The flow and the places of the profiles.
     volume : LightField
         From `light_field_mean`.
     reference : ndarray, shape (plane, y, 2)
-        What the errors are relative to: its mean magnitude [m/s].
+        Velocities whose mean magnitude the errors are relative to [m/s].
 
     Returns
     -------
     ByPairs
-        ``pairs``; for each ``error``, the mean distance of the average of the first pairs, for (u, v); ``chance``, the
-        error without bias that the scatter between pairs leads to, sqrt(2 / pi) of the standard error.
+        ``pairs``: numbers of pairs. ``error``: mean distance of the average of so many pairs, for (u, v). ``chance``:
+        error expected from the scatter between pairs without bias, sqrt(2 / pi) of the standard error.
     """
     scale = 1 / 1000 / twin.dt_s / np.abs(reference).mean(axis=(0, 1))
     each = np.moveaxis(volume["departures_mm"][..., :2], 0, -2)
@@ -196,11 +194,11 @@ COMPARED = {
         "windows",
         "light field against the same averaged over its windows: the measurement",
     ),
-    "smoothing": ("windows", "recorded", "that average against the truth at points: what the windows smooth away"),
+    "smoothing": ("windows", "recorded", "that average against the truth at points: smoothing by the windows"),
     "smoothing_mean": (
         "mean_windows",
         "mean",
-        "the same of the mean flow, without turbulence: what stays with any number",
+        "the same of the mean flow, without turbulence: smoothing at any number of pairs",
     ),
     "mean_flow": ("light_field", "mean", "light field against the mean flow"),
     "planar_truth": ("planar", "mean", "planar PIV against the truth"),
@@ -215,7 +213,6 @@ Errors = Mapping[str, Mapping[str, float]]
 def _result(
     twin: Twin, volume: LightField, planar: Sequence[Sheet], profiles: Mapping[str, np.ndarray], work: Path
 ) -> dict[str, Any]:
-    """Compare and draw the profiles, and put the figures into the form of the page."""
     errors = _errors(profiles, same_instants=twin.sizes.same_instants)
     off = volume["displacement_mm"] - volume["truth_mm"]
     voxel = [float(np.nanmean(np.abs(off[..., axis]))) / VOXEL_MM for axis in range(3)]
@@ -249,7 +246,7 @@ def _result(
 
 
 def _errors(profiles: Mapping[str, np.ndarray], *, same_instants: bool) -> dict[str, dict[str, float]]:
-    """Compare the profiles of `COMPARED`; planar PIV of the same instants with their flow, not with the mean flow."""
+    """Compare the profiles of `COMPARED`, and planar PIV of the same instants with the flow of these instants."""
     pairs = {key: (first, second) for key, (first, second, _) in COMPARED.items()}
     if same_instants:
         pairs["planar_truth"] = ("planar", "recorded")
@@ -263,7 +260,6 @@ def _errors(profiles: Mapping[str, np.ndarray], *, same_instants: bool) -> dict[
 
 
 def _comparison(name: str, errors: Mapping[str, float], paper: float) -> list[dict[str, Any]]:
-    """Put the errors of one velocity component beside the paper's."""
     return [
         page.compare(f"{name}, light field against planar PIV", errors["planar"], paper=paper, at_most=0.05),
         page.compare(
@@ -279,13 +275,13 @@ def _tables(errors: Errors, by_pairs: ByPairs) -> list[dict[str, Any]]:
     rows = zip(by_pairs["pairs"], by_pairs["error"], by_pairs["chance"], strict=True)
     return [
         {
-            "caption": "Relative errors of the profiles: mean difference over mean magnitude, all depths together",
+            "caption": "Relative errors of the profiles: mean difference over mean magnitude, all depths",
             "columns": ["", *(NAMES[name] for name in "uv")],
             "rows": [[what, *(errors[n][key] for n in "uv")] for key, (_, _, what) in COMPARED.items()],
         },
         {
-            "caption": "Light field against the truth in its windows by the number of pairs averaged; by chance: what "
-            "the scatter from pair to pair would leave if there were no bias",
+            "caption": "Light field against the truth in its windows by the number of pairs averaged; by chance: "
+            "expected from the scatter between pairs without bias",
             "columns": ["pairs", "u", "u by chance", "v", "v by chance"],
             "rows": [[count, error[0], chance[0], error[1], chance[1]] for count, error, chance in rows],
         },
@@ -293,7 +289,7 @@ def _tables(errors: Errors, by_pairs: ByPairs) -> list[dict[str, Any]]:
 
 
 def _notes(twin: Twin, valid: float, voxel: Sequence[float]) -> list[str]:
-    """Say what was recorded and how it was measured; `voxel` holds the mean errors along x, y, z."""
+    """Describe recording and measurement. `voxel` holds the mean errors along x, y, z."""
     sizes = twin.sizes
     instants = "the same instants" if sizes.same_instants else "other instants"
     return [
@@ -306,36 +302,35 @@ def _notes(twin: Twin, valid: float, voxel: Sequence[float]) -> list[str]:
         f"Mean error of the averaged vectors over the volume, against the true flow in their windows: "
         f"{voxel[0]:.3f}, {voxel[1]:.3f} and {voxel[2]:.3f} voxel along x, y and z; {100 * valid:.0f} % of the "
         "vectors valid.",
-        "The relative error divides by the mean magnitude of the reference over the profiles: u is small, so that "
-        "the same error in voxels weighs more there.",
+        "The relative error divides by the mean magnitude of the reference over the profiles. u is small, so the same "
+        "error in voxels is a larger relative error.",
     ]
 
 
 def _about_scale(twin: Twin, errors: Errors) -> list[str]:
-    """Say what the small scale leaves out."""
+    """Describe what the small scale leaves out."""
     if not twin.sizes.same_instants:
         return []
     return [
         f"Cut at this scale: a volume of {' x '.join(f'{s:g}' for s in twin.sizes.volume_mm)} mm around the profiles "
-        f"instead of 13 x 10 x 12 mm, {twin.sizes.pairs} pairs instead of 150 (planar: 600); both see the same "
-        "instants, since so few would differ by their turbulence alone, by "
+        f"instead of 13 x 10 x 12 mm, {twin.sizes.pairs} pairs instead of 150 (planar: 600). Both record the "
+        "same instants, because the turbulence of so few other instants would differ by "
         f"{100 * errors['u']['sampling']:.1f} % of u and {100 * errors['v']['sampling']:.1f} % of v."
     ]
 
 
 def _about_errors(twin: Twin, errors: Errors, by_pairs: ByPairs) -> str:
-    """Say how much of the error is smoothing, chance and bias."""
+    """Describe the parts of smoothing, chance and bias in the error."""
     edge = " x ".join(f"{edge:g}" for edge in window_mm(twin))
     parts = []
     for number, name in enumerate("uv"):
         error, chance = by_pairs["error"][-1][number], by_pairs["chance"][-1][number]
         parts.append(
             f"of {name}'s {100 * errors[name]['truth']:.1f} % against the true flow at points, "
-            f"{100 * errors[name]['smoothing']:.1f} % are there before anything is measured, because the windows of "
-            f"{edge} mm smooth the flow ({100 * errors[name]['smoothing_mean']:.1f} % in the mean flow, which stay; "
-            "the rest is turbulence finer than the windows, which more pairs average out); against the flow in these "
-            f"windows {100 * error:.1f} % are left, where the scatter of {by_pairs['pairs'][-1]} pairs alone would "
-            f"leave {100 * chance:.1f} %"
+            f"{100 * errors[name]['smoothing']:.1f} % are smoothing by the windows of {edge} mm "
+            f"({100 * errors[name]['smoothing_mean']:.1f} % in the mean flow; the rest is turbulence finer than the "
+            f"windows, which more pairs average out); against the flow in these windows {100 * error:.1f} % are left, "
+            f"and {100 * chance:.1f} % are expected from the scatter of {by_pairs['pairs'][-1]} pairs"
         )
     alike = (
         "Planar PIV sees the same instants, so the turbulence left in so few of them cancels between the two."
@@ -344,9 +339,9 @@ def _about_errors(twin: Twin, errors: Errors, by_pairs: ByPairs) -> str:
         "difference."
     )
     return (
-        f"Where the error comes from: {'; '.join(parts)}. {alike} The goal is held against the vectors as both methods "
-        "give them, as in the paper; planar PIV resolves 0.4 mm, so the fairer comparison averages it over the light "
-        f"field's windows first: {100 * errors['u']['planar_windows']:.1f} % and "
+        f"Where the error comes from: {'; '.join(parts)}. {alike} The goal applies to the vectors of both methods, as "
+        "in the paper. Planar PIV resolves 0.4 mm, so a fairer comparison first averages it over the light field's "
+        f"windows: {100 * errors['u']['planar_windows']:.1f} % and "
         f"{100 * errors['v']['planar_windows']:.1f} %."
     )
 

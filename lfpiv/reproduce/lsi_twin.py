@@ -13,10 +13,10 @@ import xarray as xr
 from lfpiv.calibration.coverage import warn_outside
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import Grid
+from lfpiv.progress import Progress
 from lfpiv.reproduce import store
 from lfpiv.reproduce.planar_piv import SheetCamera, correlate_frames, sheet_images
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, reconstruct_images, recorded_images, true_field, volume_grid
-from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.flows import SwirlingJet
 from lfpiv.simulation.scene import Noise
 from lfpiv.simulation.simulator import LEAST_INTENSITY
@@ -33,15 +33,15 @@ SWIRL_NUMBER = 0.55
 DEPTHS_D = (-0.45, -0.30, -0.15)
 """Depths of the planes, z/D."""
 PROFILE_D = 0.2
-"""Where the profiles are taken, x/D."""
+"""Place of the profiles, x/D."""
 CENTRE_HEIGHT_MM = 0.35 * DIAMETER_MM + 5.0
 """Middle of the volume above the outlet: its lower edge is 0.35 D downstream, its height 10 mm."""
 BULK_VOXEL = 2.5
-"""Displacement at the bulk velocity between the frames [voxel]; sets the time between them."""
+"""Displacement at the bulk velocity between the frames [voxel]. It gives the time between the frames."""
 PLANAR_SHARE = 0.4
-"""The same for planar PIV, relative to it: 7 pixels, a quarter of its windows."""
+"""Displacement of planar PIV relative to it: 7 pixels, a quarter of its windows."""
 TURBULENCE_SHARE, TURBULENCE_SCALE_MM = 0.1, 3.0
-"""Turbulence: rms of a component over the bulk velocity, and integral scale; the perforated plate's holes are 2 mm."""
+"""Turbulence: rms of a component over the bulk velocity, and integral scale. The perforated plate has 2 mm holes."""
 PARTICLES_PER_MICROLENS = 0.5
 """Seeding. The paper does not state it."""
 PARTICLE_RADIUS_MM = 2.5e-3
@@ -49,13 +49,13 @@ PARTICLE_RADIUS_MM = 2.5e-3
 PARTICLE_RAYS = 32_768
 """Rays per particle."""
 LIT = 1.05
-"""Edges of the lit region over the volume's: the slits' edges are no sharper."""
+"""Edges of the lit region over those of the volume. The edges of the slits are not sharper."""
 ITERATIONS = 10
 """SMART iterations, as in the paper."""
 WINDOWS = (32, 16, 16)
 """Windows of the passes [voxel]; the last one is the paper's, with half overlap."""
 PLANAR_MARGIN_MM = 1.0
-"""Planar PIV reads the sensor this far beyond the light-field volume, at "small"."""
+"""Width of planar PIV's field beyond the light-field volume at "small"."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,14 +65,14 @@ class Sizes:
     volume_mm: tuple[float, float, float]
     """Size (x, y, z) of the reconstructed volume."""
     centre_x_mm: float
-    """Its middle from the injector's axis."""
+    """Distance of its middle from the injector's axis along x."""
     pairs: int
     planar_pairs: int
     """Pairs of planar PIV at each depth."""
     same_instants: bool
     """Whether planar PIV records the same instants as the light field. The paper recorded others."""
     field_mm: tuple[tuple[float, float], tuple[float, float]] | None
-    """Corners of planar PIV's field from axis and outlet; None: the volume's and a margin."""
+    """Corners of planar PIV's field relative to axis and outlet. None: those of the volume with a margin."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Twin:
 
     @property
     def profile_x_mm(self) -> float:
-        """Where x/D is that of the profiles."""
+        """Position x of the profiles."""
         return PROFILE_D * DIAMETER_MM + self.outlet_mm[0]
 
     @property
@@ -122,7 +122,7 @@ class Twin:
         return SwirlingJet(bulk_mm=self.bulk_mm, swirl_number=SWIRL_NUMBER, centre_mm=self.outlet_mm)
 
     def instant(self, number: int, *, planar: bool = False) -> TurbulentFlow:
-        """Displacement of one instant, mean and turbulence; for planar PIV too, where it sees the same ones."""
+        """Return the displacement of one instant: mean and turbulence. Planar PIV may see other instants."""
         stream = 8 if planar and not self.sizes.same_instants else 7
         turbulence = Turbulence(rms_mm=TURBULENCE_SHARE * self.bulk_mm, integral_scale_mm=TURBULENCE_SCALE_MM)
         return TurbulentFlow(self.mean, turbulence.realisation(seed=(self.seed, stream, number)))
@@ -136,7 +136,7 @@ class LightField(TypedDict):
     displacement_mm: np.ndarray
     """Mean displacement, shape (z, y, x, 3)."""
     truth_mm: np.ndarray
-    """The true one over the windows, shape (z, y, x, 3)."""
+    """True mean displacement over the windows, shape (z, y, x, 3)."""
     departures_mm: np.ndarray
     """Measured minus true displacement of each pair, shape (pair, z, y, x, 3); NaN where not valid."""
     valid: float
@@ -155,7 +155,7 @@ class Sheet(TypedDict):
 
 
 def particle_frames(rig: Rig, twin: Twin, pair: int) -> list[dict[str, np.ndarray]]:
-    """Both frames of a pair as the cameras record them: camera -> image (rows, columns), 12 bits with noise."""
+    """Record both frames of a pair: camera -> image (rows, columns), 12 bits with noise."""
     size = LIT * np.array(twin.sizes.volume_mm)
     rng = np.random.default_rng([twin.seed, 21, pair])
     count = round(PARTICLES_PER_MICROLENS * size[0] * size[1] / VOXEL_MM**2)
@@ -179,7 +179,7 @@ def particle_frames(rig: Rig, twin: Twin, pair: int) -> list[dict[str, np.ndarra
 
 
 def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Progress) -> LightField:
-    """Mean vectors of all pairs, the true ones over their windows, each pair's departure from these, and the axes."""
+    """Measure all pairs and average their vectors."""
     grid = volume_grid(twin.sizes.volume_mm)
     weights: Weights | None = None
     total: tuple[np.ndarray, ...] = ()
@@ -189,7 +189,7 @@ def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Progress) -> Li
 
         def measure(pair: int = pair) -> dict[str, np.ndarray]:
             nonlocal weights
-            if weights is None:  # built once, when the first pair is not finished
+            if weights is None:  # built once, when the first pair is measured
                 warn_outside(rig.calibration, grid)
                 weights = rig.weights(grid, "network")
             volumes = [
@@ -198,7 +198,7 @@ def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Progress) -> Li
             ]
             return _measure(volumes, twin, grid, pair)
 
-        found = store.kept_arrays(work / "light_field" / f"pair_{pair:04d}.npz", twin.settings, measure)
+        found = store.cached_arrays(work / "light_field" / f"pair_{pair:04d}.npz", twin.settings, measure)
         usable = np.where(found["valid"][..., None], found["displacement_mm"], np.nan)
         terms = np.nan_to_num(usable), np.isfinite(usable[..., 0]).astype(int), found["truth_mm"]
         total = tuple(a + b for a, b in zip(total, terms, strict=True)) if total else terms
@@ -214,7 +214,7 @@ def light_field_mean(rig: Rig, twin: Twin, work: Path, progress: Progress) -> Li
 
 
 def window_mm(twin: Twin) -> tuple[float, float, float]:
-    """Edges (x, y, z) of the light field's last windows [mm]."""
+    """Return the edges (x, y, z) of the light field's last windows [mm]."""
     x, y, z = (min(WINDOWS[-1] * VOXEL_MM, edge) for edge in twin.sizes.volume_mm)
     return x, y, z
 
@@ -232,7 +232,7 @@ def _measure(volumes: Sequence[xr.DataArray], twin: Twin, grid: Grid, pair: int)
 
 
 def planar_mean(twin: Twin, work: Path, progress: Progress) -> list[Sheet]:
-    """Mean vectors of planar PIV at each depth, displacement over the light field's time between frames."""
+    """Measure all pairs of planar PIV and average their vectors at each depth."""
     sizes, (x, y, _) = twin.sizes, twin.outlet_mm
     if sizes.field_mm is None:
         half_x, half_y = (edge / 2 + PLANAR_MARGIN_MM for edge in sizes.volume_mm[:2])
@@ -260,7 +260,7 @@ def planar_mean(twin: Twin, work: Path, progress: Progress) -> list[Sheet]:
                 return vars(correlate_frames(*frames, camera, field))
 
             name = f"z_{depth:+.1f}_pair_{pair:04d}.npz"
-            found = store.kept_arrays(work / "planar" / name, twin.settings, measure)
+            found = store.cached_arrays(work / "planar" / name, twin.settings, measure)
             good = np.isfinite(found["displacement_mm"][..., 0])
             terms = np.nan_to_num(found["displacement_mm"]), good.astype(int)
             total = tuple(a + b for a, b in zip(total, terms, strict=True)) if total else terms

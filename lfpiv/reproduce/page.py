@@ -28,9 +28,9 @@ def compare(
     at_least: float | None = None,
     unit: str = "",
 ) -> dict[str, Any]:
-    """One row of ours beside the paper's: what, the figures, the goal and whether it is reached.
+    """Return one row that compares our figure with the paper's and with a goal.
 
-    Without `at_most` and `at_least` there is no goal, and ``reached`` is null.
+    Without `at_most` and `at_least` there is no goal, and ``reached`` is None.
     """
     goals, met = [], True
     if at_most is not None:
@@ -56,7 +56,7 @@ def result(
     Parameters
     ----------
     figures_of_merit : mapping
-        What ``reproduce.json`` promises under the case's key, such as ``{"ssim": 0.98}``.
+        Content of ``reproduce.json`` under the case's key, such as ``{"ssim": 0.98}``.
     comparison : sequence of mapping
         Rows made by `compare`.
     figures : sequence of (str, str)
@@ -64,7 +64,7 @@ def result(
     tables : sequence of mapping
         Each with ``caption``, ``columns`` (list of str) and ``rows`` (list of lists: str, number or null).
     notes : sequence of str
-        Plain sentences: how it was done, what falls short and why.
+        Sentences about the method and its limits.
     """
     taken = [key for key in figures_of_merit if key in (*SHOWN, "title", "time")]
     if taken:
@@ -93,9 +93,9 @@ def write(out: Path, settings: Mapping[str, Any], title: str, about: str, keys: 
     out : Path
         Folder of the reproduction; finished cases are ``work/<key>/result.json``.
     settings : mapping
-        Scale, seed and version the cases were computed with; results of others are left out.
+        Scale, seed and version of the run. Cases with other settings are left out.
     title, about : str
-        Heading of the page, and what it is about.
+        Heading and subject of the page.
     keys : sequence of str
         Keys of all cases, in the page's order.
     """
@@ -118,8 +118,6 @@ def write(out: Path, settings: Mapping[str, Any], title: str, about: str, keys: 
 
 ROUNDING = 1e-12
 """Magnitude below which a number is shown as 0."""
-
-# -- the page ----------------------------------------------------------------------------------------------------------
 
 STYLE = """
 :root { --ink: #1d2329; --dim: #5c6670; --line: #d9dee3; --paper: #fff; --good: #1f7a4d; --bad: #b3431e; }
@@ -164,8 +162,8 @@ TERMS = {
     "R_acc, R_g": "Part of the true particles that is found; particles found for each true one (Eqs. 13 and 14).",
     "error of vectors": "Mean length of the difference from the true displacement, in voxels, all vectors; along x, y, "
     "z its mean absolute components. z is the depth axis between the cameras.",
-    "took": "Of the run that finished the case; what an earlier, interrupted one had done is not in it.",
-    "goal": "What this software set out to reach; where there is none, there is only the figure.",
+    "took": "Time of the run that finished the case. Time of earlier, interrupted runs is not included.",
+    "goal": "Aim of this software. Some figures have none.",
 }
 """Explanations of the words on the page."""
 
@@ -179,8 +177,8 @@ def _page(out: Path, content: Mapping[str, Any], title: str, about: str, keys: S
         f"<h1>{html.escape(title)}</h1>",
         f"<p>{html.escape(about)}, computed by lfpiv "
         f"{html.escape(str(content['version']))} on simulated images: scale <b>{content['scale']}</b>, seed "
-        f"{content['seed']}. {sum(judged)} of {len(judged)} goals reached. Images are simulated, cameras calibrated "
-        "from them, volumes reconstructed and measured; the truth is known to the simulator alone. "
+        f"{content['seed']}. {sum(judged)} of {len(judged)} goals reached. Cameras are calibrated from simulated "
+        "images, volumes are reconstructed and measured. Only the simulator knows the truth. "
         "<a href='reproduce.json'>reproduce.json</a> holds all figures.</p>",
     ]
     if missing:

@@ -28,16 +28,16 @@ class SheetCamera:
     magnification: float = 0.33
     pixel_mm: float = 4.45e-3
     particle_px: float = 0.625
-    """Standard deviation of a particle's image [pixel]: 2.5 pixels across at 1/e^2, slightly out of focus as usual
-    against peak locking (diffraction alone would give 0.2)."""
+    """Standard deviation of a particle's image [pixel]: 2.5 pixels across at 1/e^2, slightly out of focus to avoid peak
+    locking. Diffraction would give 0.2."""
     sheet_mm: float = 0.5
-    """Half thickness of the Gaussian sheet at 1/e^2 of its intensity; the paper tells none [mm]."""
+    """Half thickness of the Gaussian sheet at 1/e^2 of its intensity [mm]. The paper does not state it."""
     particles_per_px: float = 8 / 32**2
     """Particles within the sheet's thickness per pixel: eight in each window of 32 x 32."""
     peak_counts: float = 1500.0
-    """Light of a particle in the middle of the sheet on one pixel, were it all there [count]."""
+    """All light of a particle in the middle of the sheet, summed over its pixels [count]."""
     axis_mm: tuple[float, float] = (0.0, 0.0)
-    """Where the camera's axis meets the sheet (x, y) [mm]."""
+    """Point (x, y) where the camera's axis meets the sheet [mm]."""
 
     @property
     def pixel_in_sheet_mm(self) -> float:
@@ -61,7 +61,7 @@ class PlanarVectors:
 
 
 def require_openpiv() -> None:
-    """Raise InputError where OpenPIV is not installed."""
+    """Raise InputError if OpenPIV is not installed."""
     try:
         import openpiv.windef  # noqa: F401
     except ImportError as error:
@@ -107,7 +107,7 @@ def sheet_images(
     columns, rows = (round(n) for n in (high - low) / pixel)
     margin = 32 * pixel  # particles that move into the field
     size = np.array([*(high - low + 2 * margin), 6 * camera.sheet_mm])
-    # as many as an evenly lit sheet of the same thickness holds
+    # the number of particles in an evenly lit sheet of the same thickness
     count = round(camera.particles_per_px * size[0] * size[1] / pixel**2 * size[2] / (2 * camera.sheet_mm))
     middle = np.array([*(low + high) / 2, plane_mm])
     position = middle + rng.uniform(-0.5, 0.5, (count, 3)) * size
@@ -129,7 +129,7 @@ def sheet_images(
 
 
 def _draw(column: np.ndarray, row: np.ndarray, light: np.ndarray, sigma: float, shape: tuple[int, int]) -> np.ndarray:
-    """Sum of Gaussians integrated over pixels; pixel (i, j) spans i to i + 1 along rows, j to j + 1 along columns."""
+    """Draw Gaussians integrated over pixels. Pixel (i, j) spans rows i to i + 1 and columns j to j + 1."""
     reach = int(np.ceil(4 * sigma)) + 1
     image = np.zeros((shape[0] + 2 * reach, shape[1] + 2 * reach))
     inside = (column > 0) & (column < shape[1]) & (row > 0) & (row < shape[0])
@@ -153,13 +153,13 @@ def correlate_frames(
     camera: SheetCamera,
     field_mm: tuple[tuple[float, float], tuple[float, float]],
 ) -> PlanarVectors:
-    """Correlate a pair by OpenPIV: windows of 64, 32 and 32 pixels, the last two with deformation, overlap a half."""
+    """Correlate a pair by OpenPIV in windows of 64, 32 and 32 pixels, half overlapping, the last two deformed."""
     from openpiv import windef
     from openpiv.settings import PIVSettings
 
     settings = PIVSettings()
     settings.windowsizes, settings.overlap, settings.num_iterations = (64, 32, 32), (32, 16, 16), 3
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints what its validation finds
+    with contextlib.redirect_stdout(io.StringIO()):  # its validation prints
         x, y, u, v, flags = windef.simple_multipass(first.astype(np.float32), second.astype(np.float32), settings)
     pixel = camera.pixel_in_sheet_mm
     # OpenPIV gives v upwards, vectors from the top row down, and their rows in reverse

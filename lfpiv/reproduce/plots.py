@@ -1,4 +1,4 @@
-"""Style of the figures: one type size, one set of colours, files written whole or not at all."""
+"""Style of the figures: type size, colours, axes and files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NAMES = {
 
 
 def figure(width: float, height: float) -> Figure:
-    """Make an empty figure [inch] that draws without a display and shares no state with the caller's pyplot."""
+    """Make an empty figure of a size [inch] that needs no display and no pyplot."""
     with matplotlib.rc_context({"font.size": 9}):
         drawn = Figure(figsize=(width, height), layout="constrained", facecolor="white")
         FigureCanvasAgg(drawn)
@@ -44,7 +44,7 @@ def figure(width: float, height: float) -> Figure:
 
 
 def plain(axes: Axes) -> None:
-    """Leave two spines and a faint grid."""
+    """Reduce axes to two spines and a faint grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#e6e9ec", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -78,7 +78,7 @@ def draw_slice(axes: Axes, volume: xr.DataArray, voxels: int, title: str) -> Non
 
 
 def save(drawn: Figure, path: Path) -> None:
-    """Write a figure as PNG by rename."""
+    """Write a figure as PNG, whole or not at all."""
     buffer = io.BytesIO()
     drawn.savefig(buffer, format="png", dpi=DPI)
     files.write_bytes(buffer.getvalue(), path)

@@ -1,4 +1,7 @@
-"""Simulated rigs that several cases share, the paper's (Table 2) first. Each is calibrated once and records images."""
+"""Simulate and calibrate the rig of the paper's numerical study (Table 2), and record particle images with it.
+
+Several cases share the rig, so it is calibrated once and stored.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,15 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lfpiv import files, metrics
-from lfpiv.calibration.board.board import BoardDots
-from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration, thin_lens
+from lfpiv.calibration.board.dots import BoardDots
+from lfpiv.calibration.camera import Calibration, load_calibration
+from lfpiv.calibration.cameras import calibrate, thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.experiment import Experiment, open_experiment
 from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.optics import random_on_pupil
+from lfpiv.progress import Progress, StepProgress
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.simulation.flows import Ring, window_mean
 from lfpiv.simulation.scene import Scene, true_mapping
@@ -68,6 +74,12 @@ PARTICLE_COUNTS = 400.0
 """Level of a pixel lit by one particle in focus [count]: at 1 ppm the brightest pixels stay below full scale."""
 PARTICLE_RAYS = 32_768
 """Rays per particle. It lights some 1,500 pixels, so a pixel receives about 20 rays."""
+UNUSED_TABLES = {
+    "volume": {"size_mm": (1.0, 1.0, 1.0), "voxel_mm": VOXEL_MM},
+    "particles": {"count": 8, "sigma_mm": BLOB_VOXEL * VOXEL_MM},
+    "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
+}
+"""Tables that a scene requires. The cases do not use them, because each renders its own particles."""
 DT_S = 1e-4
 """Time between the frames [s]; the figures are in voxels and do not depend on it."""
 RADIUS, CORE, PEAK = 0.25, 1 / 7, 0.3 / 14
@@ -93,19 +105,19 @@ class Rig:
     calibration: Calibration
 
     def labels(self, name: str) -> BoardDots:
-        """Labels that a camera was calibrated with."""
+        """Return the labels that a camera was calibrated with."""
         dots = self.calibration.cameras[name].dots
         if dots is None:
             raise ValueError(f"{name}: expected a camera calibrated from a board, got one without dots.")
         return dots
 
-    def weights(self, grid: Grid, mapping: str, progress: Callable[[float], None] | None = None) -> Weights:
-        """Weights of a grid by "network", or by direct ray tracing with a key of `TURNED_DEG`."""
+    def weights(self, grid: Grid, mapping: str, progress: StepProgress | None = None) -> Weights:
+        """Build the weights of a grid by "network", or by direct ray tracing with a key of `TURNED_DEG`."""
         calibration = self.calibration if mapping == "network" else self.ray_tracing(mapping)
         return build_weights(calibration, grid, progress=progress)
 
     def ray_tracing(self, mapping: str) -> Calibration:
-        """Thin lenses at the nominal angles, turned by the errors of `TURNED_DEG`."""
+        """Return thin lenses at the nominal angles, turned by the errors of `TURNED_DEG`."""
         cameras = {}
         for number, (name, camera) in enumerate(self._nominal.cameras.items()):
             yaw, roll = TURNED_DEG[mapping][number]
@@ -117,15 +129,14 @@ class Rig:
 
     @cached_property
     def _nominal(self) -> Calibration:
-        """Thin lenses behind the microlens arrays that the white images show."""
         return thin_lens(self.experiment)
 
 
 def numerical_scene(scale: str, seed: int) -> Scene:
-    """Table 2's numerical column: two ideal cameras at 45 degrees and a board of 7 x 7 dots.
+    """Return Table 2's numerical column: two ideal cameras at 45 degrees and a board of 7 x 7 dots.
 
-    Images have no noise but that of rounding to 12 bits, as in the paper: a sensor's quality does not enter the
-    comparison. "small" has the same optics on a smaller sensor and fewer planes of the board.
+    The images are rounded to 12 bits and have no other noise, as in the paper. "small" has the same optics on a smaller
+    sensor and fewer planes of the board.
     """
     cameras = [
         {
@@ -149,23 +160,20 @@ def numerical_scene(scale: str, seed: int) -> Scene:
                 "dot_diameter_mm": 0.1,
                 "planes_mm": tuple(float(z) for z in DEPTHS_MM[scale]),
             },
-            # the data set's own particles only complete it: each case renders its own
-            "volume": {"size_mm": (1.0, 1.0, 1.0), "voxel_mm": VOXEL_MM},
-            "particles": {"count": 8, "sigma_mm": BLOB_VOXEL * VOXEL_MM},
-            "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
+            **UNUSED_TABLES,
             "quality": {"pixel_rays": WHITE_RAYS},
             "noise": {"background": 0.0, "read_noise": 0.0, "full_well_e": 0.0},
         }
     )
 
 
-def numerical_rig(folder: Path, scale: str, seed: int, progress: Callable[[str, float], None]) -> Rig:
-    """Simulate the board of `numerical_scene` and calibrate from it; keep both in `folder`."""
+def numerical_rig(folder: Path, scale: str, seed: int, progress: Progress) -> Rig:
+    """Return the calibrated rig of `numerical_scene`, see `calibrated_rig`."""
     return calibrated_rig(numerical_scene(scale, seed), folder, progress)
 
 
-def calibrated_rig(scene: Scene, folder: Path, progress: Callable[[str, float], None]) -> Rig:
-    """Simulate the board of a scene and calibrate from it; keep both in `folder` while the scene stays the same."""
+def calibrated_rig(scene: Scene, folder: Path, progress: Progress) -> Rig:
+    """Simulate the board of a scene and calibrate from it, unless `folder` holds both for the same scene."""
     runtime.device()
     path, marker = folder / "experiment" / "experiment.toml", folder / "scene.json"
     content = files.plain(scene.model_dump(mode="json"))
@@ -186,7 +194,7 @@ def calibrated_rig(scene: Scene, folder: Path, progress: Callable[[str, float], 
 
 
 def volume_grid(size_mm: tuple[float, float, float]) -> Grid:
-    """Grid of the paper's voxels around the origin, size (x, y, z) [mm]."""
+    """Return a grid of the paper's voxels around the origin, size (x, y, z) [mm]."""
     return Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=size_mm, voxel_mm=VOXEL_MM)
 
 
@@ -205,7 +213,7 @@ def random_particles(size_mm: tuple[float, float, float], ppm: float, seed: list
 def particle_images(
     rig: Rig, positions_mm: np.ndarray, seed: list[int], *, blob_voxel: float = BLOB_VOXEL
 ) -> dict[str, np.ndarray]:
-    """Images of equally bright particles, rounded to 12 bits: camera -> (rows, columns), float32 [count]."""
+    """Render equally bright particles, rounded to 12 bits: camera -> (rows, columns), float32 [count]."""
     rays = render.ray_table(PARTICLE_RAYS, "gaussian", seed[0])
     images = {}
     for number, camera in enumerate(rig.scene.camera):
@@ -231,7 +239,7 @@ def recorded_images(
     frame: int,
     cameras: Sequence[str] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Images as the cameras store them, with blur, noise and 12 bits: camera -> (rows, columns), float32 [count].
+    """Record particles with blur, noise and 12 bits: camera -> (rows, columns), float32 [count].
 
     Parameters
     ----------
@@ -240,13 +248,13 @@ def recorded_images(
     positions_mm : ndarray, shape (n, 3)
         Particles (x, y, z) [mm].
     counts : ndarray, shape (n,)
-        Level of a pixel lit by one particle only, in focus [count].
+        Level of a pixel lit by one particle in focus [count].
     rays : ndarray
         From `render.ray_table`.
     size_mm : float
-        Radius or standard deviation of the particles, as `rays` has it [mm].
+        Radius or standard deviation of the particles, by the kind of `rays` [mm].
     seed : list of int
-        Seed of the noise, together with the camera's and the frame's number.
+        Seed of the noise. The numbers of camera and frame are added to it.
     frame : int
         Number of the frame.
     cameras : sequence of str, optional
@@ -276,15 +284,15 @@ def reconstruct_images(
     Parameters
     ----------
     weights : Weights
-        The operator; its cameras' decoders give each image's background level and noise.
+        The operator. Its cameras' decoders measure each image's background level and noise.
     images : mapping of str to ndarray
-        Camera name -> raw image, shape (rows, columns) [count]; those of other cameras are ignored.
+        Camera name -> raw image, shape (rows, columns) [count]; other cameras are ignored.
     smart : Smart
         SMART's settings.
     floor : float, optional
-        Noise floor [count] in place of each image's own.
+        Noise floor of all images [count]. Default: measured in each image.
     first : ndarray, shape (z, y, x), optional
-        First guess in place of SMART's own.
+        First guess. Default: SMART's own.
     """
     light, noise = {}, {}
     for name, camera in weights.cameras.items():
@@ -294,16 +302,16 @@ def reconstruct_images(
 
 
 def truth(positions_mm: np.ndarray, grid: Grid) -> xr.DataArray:
-    """Draw the blobs on the voxels."""
+    """Return the particles as blobs on the voxels."""
     return metrics.truth_volume(positions_mm, None, grid, BLOB_VOXEL)
 
 
 def true_field(
     flow: Callable[[np.ndarray], np.ndarray], axes_mm: Sequence[ArrayLike], edge_mm: float | tuple[float, float, float]
 ) -> np.ndarray:
-    """Mean displacement of a flow over windows centred on axes (z, y, x) [mm], shape (z, y, x, 3) [mm].
+    """Return the mean displacement of a flow over windows centred on axes (z, y, x) [mm], shape (z, y, x, 3) [mm].
 
-    `edge_mm` is the windows' edge, or their edges (x, y, z).
+    `edge_mm` is the edge of the windows, or their edges (x, y, z).
     """
     z, y, x = np.meshgrid(*axes_mm, indexing="ij")
     centres = np.stack([x, y, z], axis=-1)
@@ -311,14 +319,14 @@ def true_field(
 
 
 def mapping_errors_pitch(rig: Rig, grid: Grid, seed: int) -> dict[str, float]:
-    """Mean distance between mapped and true rays over a volume [microlens pitch], each camera."""
+    """Return the mean distance of mapped from true rays over a volume by camera [microlens pitch]."""
     return {name: float(error.mean()) for name, error in ray_errors_pitch(rig, rig.calibration, grid, seed).items()}
 
 
 def ray_errors_pitch(rig: Rig, calibration: Calibration, grid: Grid, seed: int) -> dict[str, np.ndarray]:
-    """Distances of a calibration's rays from the true ones [microlens pitch], shape (ray,), each of its cameras.
+    """Return the distances of a calibration's rays from the true ones by camera [microlens pitch], shape (ray,).
 
-    The rays start anywhere in a volume and go anywhere through the pupil.
+    The rays start at random points of a volume and cross the pupil at random points.
     """
     rng = np.random.default_rng([seed, 77])
     low = np.array(grid.first_centre_mm[::-1])
@@ -328,9 +336,7 @@ def ray_errors_pitch(rig: Rig, calibration: Calibration, grid: Grid, seed: int) 
     for camera in rig.scene.camera:
         if camera.name not in calibration.cameras:
             continue
-        radius = camera.optics.pupil_radius_mm * np.sqrt(rng.random(len(points)))
-        angle = 2 * np.pi * rng.random(len(points))
-        pupil = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        pupil = random_on_pupil(camera.optics.pupil_radius_mm, len(points), rng)
         miss = calibration.cameras[camera.name].map(points, pupil) - true_mapping(camera)(points, pupil)
         errors[camera.name] = np.linalg.norm(miss, axis=1) / camera.microlens_pitch_mm
     return errors

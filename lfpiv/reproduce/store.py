@@ -1,4 +1,4 @@
-"""Keep finished parts of a study on disk, so that none is computed twice. Files are written whole or not at all."""
+"""Store finished parts of a study on disk, so that none is computed twice. Files are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def open_folder(out: Path, settings: Mapping[str, Any]) -> None:
         )
 
 
-def kept(path: Path, settings: Mapping[str, Any], compute: Callable[[], Any]) -> Any:
-    """Return the JSON-able value of `compute`, from its file where the file has the same settings.
+def cached(path: Path, settings: Mapping[str, Any], compute: Callable[[], Any]) -> Any:
+    """Return the JSON-able value of `compute`, from its file if that has the same settings.
 
     Parameters
     ----------
     path : Path
-        JSON file to keep it in.
+        JSON file of the value.
     settings : mapping
-        What the value depends on, JSON-able.
+        Everything that the value depends on, JSON-able.
     compute : callable
-        Called where there is no file, or one of other settings.
+        Called if there is no file, or one with other settings.
     """
     settings = files.plain(settings)
     if path.exists():
@@ -62,10 +62,10 @@ def kept(path: Path, settings: Mapping[str, Any], compute: Callable[[], Any]) ->
     return value
 
 
-def kept_arrays(
+def cached_arrays(
     path: Path, settings: Mapping[str, Any], compute: Callable[[], Mapping[str, ArrayLike]]
 ) -> dict[str, np.ndarray]:
-    """Return the named arrays of `compute`, from the .npz file where they were computed with the same settings."""
+    """Return the named arrays of `compute`, from their .npz file if that has the same settings."""
     text = json.dumps(files.plain(settings), sort_keys=True)
     if path.exists():
         with np.load(path, allow_pickle=False) as data:

@@ -9,8 +9,8 @@ A case is a module. It provides
     number that every random draw derives from, ``progress`` a callable taking (step, finished fraction). It returns a
     JSON-able dict made by `page.result`.
 
-The result of each case is kept as ``work/<key>/result.json`` and taken from there on a rerun. A long case keeps its own
-steps with `store.kept` (JSON) and `store.kept_arrays` (arrays).
+The result of each case is stored as ``work/<key>/result.json``, and a rerun reads it from there. A long case stores its
+steps as well, by `store.cached` (JSON) and `store.cached_arrays`.
 """
 
 from __future__ import annotations
@@ -25,14 +25,13 @@ from types import ModuleType
 from typing import Any
 
 from lfpiv.errors import InputError
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, store
 from lfpiv.version import __version__
 
 log = logging.getLogger(__name__)
 
 SCALES = ("small", "paper")
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +41,7 @@ class Study:
     title: str
     """Heading of the page."""
     about: str
-    """What the cases are about, first part of a sentence on the page."""
+    """Subject of the cases, first part of a sentence on the page."""
     modules: Mapping[str, str]
     """Key of each case -> full name of its module, in the page's order. A module is imported when its case is run."""
 
@@ -72,9 +71,9 @@ def compute(
         work.mkdir(parents=True, exist_ok=True)
         known = (work / "result.json").exists()
         case = importlib.import_module(study.modules[key])
-        result = store.kept(work / "result.json", settings, _timed(case, key, scale, work, seed, report))
+        result = store.cached(work / "result.json", settings, _timed(case, key, scale, work, seed, report))
         if known:
-            log.info("%s: finished before, kept", key)
+            log.info("%s: finished before, not computed again", key)
         page.write(out, settings, study.title, study.about, list(study.modules))
         if finished is not None:
             finished(key, result)
@@ -96,7 +95,7 @@ def _timed(
 
 
 def _checked_cases(study: Study, cases: Sequence[str]) -> list[str]:
-    """Return the keys asked for, each once, in the order of the page."""
+    """Return the requested keys, each once, in the order of the page."""
     wanted = [cases] if isinstance(cases, str) else list(cases)
     unknown = [key for key in wanted if key not in (*study.modules, "all")]
     if unknown or not wanted:

@@ -1,32 +1,34 @@
-"""Table 1: error of the mapping by trainer and number of hidden layers, beside the shallow networks used here."""
+"""Table 1: error of the mapping by trainer and number of hidden layers, and the error of shallow networks."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lfpiv.calibration.board.board import BoardDots, DotBoard, measure_board
+from lfpiv.calibration.board.board import measure_board
+from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.cameras import MODEL_ERROR_PITCH
-from lfpiv.calibration.levenberg_marquardt import levenberg_marquardt
+from lfpiv.calibration.levenberg_marquardt import Trainer, levenberg_marquardt
 from lfpiv.calibration.network import sigma_nor
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
 from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.calibration.virtual_samples import sampler_between_dots
+from lfpiv.geometry.optics import random_on_pupil
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots, store
 from lfpiv.reproduce.rigs import Rig, numerical_rig
-from lfpiv.reproduce.study import Progress
 from lfpiv.reproduce.trainers import bayesian_regularisation, gradient_descent
 from lfpiv.simulation.scene import true_mapping
 
 TITLE = "Table 1: error of the mapping by trainer and depth of the network"
 
-TRAINERS = {"LM": levenberg_marquardt, "BR": bayesian_regularisation, "GDM": gradient_descent}
+TRAINERS: dict[str, Trainer] = {"LM": levenberg_marquardt, "BR": bayesian_regularisation, "GDM": gradient_descent}
 NAMES = {
     "LM": "Levenberg-Marquardt",
     "BR": "Bayesian regularisation",
@@ -42,13 +44,13 @@ PAPER = {
 PAPER["LM"][30], PAPER["BR"][30], PAPER["GDM"][30] = (0.063, 0.065), (0.066, 0.066), (0.090, 0.091)
 PAPER_BEST = 0.038
 SHALLOW = ((20,), (10, 10))
-"""Hidden layers of the networks that this software prefers."""
+"""Hidden layers of the shallow networks. The first is this software's default."""
 ESTIMATORS = ("lens_integral", "gaussian")
 """Estimators of the dots: the default, and the Gaussian fits of the paper."""
 MUCH_WORSE = 1.2
 """Ratio to the paper's error above which a deep network counts as worse than in the paper."""
 TRUE_RAYS = 20_000
-"""Number of rays compared with the true ones."""
+"""Number of rays compared with true rays."""
 PROBE_SEED = 11
 """Number of the random stream of those rays."""
 
@@ -67,17 +69,35 @@ class Sizes:
     samples: int | None
     """Labels drawn for each deep network; None takes all."""
     epochs: int
-    """Of LM and BR, at most."""
+    """Largest number of epochs of LM and BR."""
     descent_epochs: int
-    """Of GDM, at most: an epoch of it costs a thirtieth."""
+    """The same of GDM, whose epoch takes a thirtieth of the time."""
     shallow_epochs: int = 300
-    """Of the shallow networks, at most."""
+    """The same of the shallow networks."""
 
 
 SIZES = {
     "small": Sizes(layers=(5, 15, 30), samples=2500, epochs=40, descent_epochs=300),
     "paper": Sizes(layers=(5, 10, 15, 20, 25, 30), samples=None, epochs=1000, descent_epochs=1000),
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Training of one network."""
+
+    hidden: tuple[int, ...]
+    """Nodes of each hidden layer."""
+    trainer: str = "LM"
+    """Key of `TRAINERS`."""
+    baseline: str = "none"
+    """"thin_lens" or "none"."""
+    epochs: int
+    """Largest number of epochs."""
+    samples: int | None = None
+    """Labels drawn. None takes all."""
+    seed: int
+    """Seed of the drawn labels, the training and the compared rays."""
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
@@ -87,7 +107,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 
 
 def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
-    """Train all networks on a rig's labels; each finished one is kept in `work`."""
+    """Train all networks on a rig's labels, except those that `work` holds already."""
     cameras = list(rig.calibration.cameras)
     labels = {name: {"lens_integral": rig.labels(name), "gaussian": _gaussian_labels(rig, name)} for name in cameras}
 
@@ -98,88 +118,57 @@ def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress
         progress(f"{trainer}, {layers} hidden layers", float(cost[done - 1] / cost[-1]) if done else 0.0)
         epochs = sizes.descent_epochs if trainer == "GDM" else sizes.epochs
         settings = {"seed": seed, "samples": sizes.samples, "epochs": epochs}
-        deep[trainer][layers].append(
-            store.kept(
-                work / "networks" / f"{trainer}_{layers:02d}_{name}.json",
-                settings,
-                partial(
-                    fit,
-                    rig,
-                    name,
-                    labels[name]["lens_integral"],
-                    hidden=(NODES,) * layers,
-                    trainer=trainer,
-                    epochs=epochs,
-                    samples=sizes.samples,
-                    seed=seed,
-                ),
-            )
-        )
+        recipe = Recipe(hidden=(NODES,) * layers, trainer=trainer, epochs=epochs, samples=sizes.samples, seed=seed)
+        path = work / "networks" / f"{trainer}_{layers:02d}_{name}.json"
+        fitted = store.cached(path, settings, partial(fit, rig, name, labels[name]["lens_integral"], recipe))
+        deep[trainer][layers].append(fitted)
     shallow = []
-    for estimator in ESTIMATORS:
-        for baseline in ("none", "thin_lens"):
-            for hidden in SHALLOW:
-                fits = [
-                    fit(
-                        rig,
-                        name,
-                        labels[name][estimator],
-                        hidden=hidden,
-                        baseline=baseline,
-                        epochs=sizes.shallow_epochs,
-                        seed=seed,
-                    )
-                    for name in cameras
-                ]
-                shallow.append({"estimator": estimator, "baseline": baseline, "hidden": hidden, "cameras": fits})
+    for estimator, baseline, hidden in itertools.product(ESTIMATORS, ("none", "thin_lens"), SHALLOW):
+        recipe = Recipe(hidden=hidden, baseline=baseline, epochs=sizes.shallow_epochs, seed=seed)
+        fits = [fit(rig, name, labels[name][estimator], recipe) for name in cameras]
+        shallow.append({"estimator": estimator, "baseline": baseline, "hidden": hidden, "cameras": fits})
     progress("networks", 1.0)
     _draw(deep, shallow, work / "table1.png")
     return _result(deep, shallow, labels, sizes)
 
 
-def fit(
-    rig: Rig,
-    name: str,
-    dots: BoardDots,
-    *,
-    hidden: tuple[int, ...],
-    trainer: str = "LM",
-    baseline: str = "none",
-    epochs: int,
-    samples: int | None = None,
-    seed: int,
-) -> dict[str, Any]:
-    """Train one network on the labels of one camera: errors on held-out dots and against the true rays [pitch].
+def fit(rig: Rig, name: str, dots: BoardDots, recipe: Recipe) -> Fit:
+    """Train one network on the labels of one camera. Return errors on held-out dots and against true rays [pitch].
 
-    Whole dots are held out, so the test part holds none that training saw. Where the thin lens is the baseline, labels
-    are weighted by their standard errors and a polynomial gives virtual samples between the dots, as in
-    `lfpiv.calibrate`. The paper's network has equal weights and no virtual samples.
+    Whole dots are held out, so training sees no ray of a test dot. With the thin lens as baseline, labels are weighted
+    by their standard errors and a polynomial gives virtual samples between the dots, as in `lfpiv.calibrate`. The
+    paper's network has equal weights and no virtual samples.
     """
     camera = next(camera for camera in rig.scene.camera if camera.name == name)
     pitch = rig.calibration.cameras[name].lattice.pitch_mm
     chosen = np.arange(len(dots.dot))
-    if samples is not None and samples < len(chosen):
-        chosen = np.sort(np.random.default_rng([seed, 13]).permutation(chosen)[:samples])
+    if recipe.samples is not None and recipe.samples < len(chosen):
+        chosen = np.sort(np.random.default_rng([recipe.seed, 13]).permutation(chosen)[: recipe.samples])
     points, pupil, array = dots.points_mm[chosen], dots.pupil_mm[chosen], dots.array_mm[chosen]
     lens, target, std, sampler = None, array, None, None
-    if baseline == "thin_lens":
+    if recipe.baseline == "thin_lens":
         lens = fit_thin_lens(points, pupil, array, camera.optics)
         target, std = array - lens(points, pupil), np.hypot(dots.std_mm[chosen], MODEL_ERROR_PITCH * pitch)
-        sampler = sampler_between_dots(points, pupil, target, std, pitch_mm=pitch, seed=seed)
+        sampler = sampler_between_dots(points, pupil, target, std, pitch_mm=pitch, seed=recipe.seed)
     training = train(
         np.hstack([points, pupil]),
         target,
-        TrainingSettings(hidden=hidden, trainer=TRAINERS[trainer], epochs=epochs, shrink=lens is not None, seed=seed),
+        TrainingSettings(
+            hidden=recipe.hidden,
+            trainer=TRAINERS[recipe.trainer],
+            epochs=recipe.epochs,
+            shrink=lens is not None,
+            seed=recipe.seed,
+        ),
         groups=dots.dot[chosen],
         std=std,
         virtual_samples=sampler,
         unit=pitch,
     )
     low, high = dots.points_mm.min(0), dots.points_mm.max(0)
-    rng = np.random.default_rng([seed, PROBE_SEED])
+    rng = np.random.default_rng([recipe.seed, PROBE_SEED])
     probe = low + rng.random((TRUE_RAYS, 3)) * (high - low)
-    radius, angle = camera.optics.pupil_radius_mm * np.sqrt(rng.random(TRUE_RAYS)), 2 * np.pi * rng.random(TRUE_RAYS)
-    rays = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    rays = random_on_pupil(camera.optics.pupil_radius_mm, TRUE_RAYS, rng)
     mapped = training.network(np.hstack([probe, rays])) + (0.0 if lens is None else lens(probe, rays))
     return {
         "sigma_nor": training.sigma_nor,
@@ -192,19 +181,11 @@ def fit(
 
 
 def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
-    """Label the board with the paper's estimator."""
     experiment, camera = rig.experiment, rig.calibration.cameras[name]
-    board = experiment.board
-    planes = range(len(board.planes_mm))
     return measure_board(
-        [experiment.board_image(name, plane) for plane in planes],
+        [experiment.board_image(name, plane) for plane in range(len(experiment.board.planes_mm))],
         camera.decoder,
-        DotBoard(
-            dots=board.dots,
-            spacing_mm=board.spacing_mm,
-            diameter_mm=board.dot_diameter_mm,
-            planes_mm=board.planes_mm,
-        ),
+        DotBoard.from_settings(experiment.board),
         nominal_angle_deg=experiment.camera(name).nominal_angle_deg,
         estimator="gaussian",
         dark=experiment.dark(name),
@@ -253,7 +234,6 @@ class Best:
 def _result(
     deep: Deep, shallow: Sequence[Fit], labels: Mapping[str, Mapping[str, BoardDots]], sizes: Sizes
 ) -> dict[str, Any]:
-    """Put the networks into the form of the page."""
     best = Best.of(deep, shallow)
     return page.result(
         {
@@ -282,7 +262,6 @@ def _result(
 
 
 def _comparison(best: Best) -> list[dict[str, Any]]:
-    """Put ours beside the paper's."""
     name, unit = _describe(best.shallow), "pitch"
     overall = min(best.deep, best.shallow_sigma_nor)
     from_truth = max(_both(best.shallow["cameras"], "true_ray_error"))
@@ -338,7 +317,7 @@ def _tables(deep: Deep, shallow: Sequence[Fit], cameras: Sequence[str]) -> list[
 
 
 def _notes(deep: Deep, best: Best) -> list[str]:
-    """Say how it was done, and which deep networks do worse than the paper states."""
+    """Describe the method, and name the deep networks that do worse than in the paper."""
     labels_error, network_error = (max(_both(best.paper_like["cameras"], k)) for k in ("sigma_nor", "true_ray_error"))
     worse = [
         f"{trainer} with {layers} layers ({max(_both(fits)):.2g}, the paper {max(PAPER[trainer][layers]):.2g})"
@@ -349,22 +328,23 @@ def _notes(deep: Deep, best: Best) -> list[str]:
     notes = [
         "The paper's mapping of two cameras is two mappings that share no input but the point: here each camera has "
         "its own network, five inputs and two outputs. Hidden nodes are tanh: a logistic sigmoid with other weights.",
-        "sigma_nor (Eq. 8) is taken on whole dots that training never saw (70/15/15); the paper splits labels at "
-        "random, so that every dot of its test part was also trained on. The true-ray error is the distance to the "
-        f"simulator's own rays, {TRUE_RAYS} of them at random in the board's volume: no experiment can know it.",
+        "sigma_nor (Eq. 8) is measured on whole dots that training does not see (70/15/15). The paper splits labels at "
+        "random, so its training sees every test dot as well. The true-ray error is the distance to the simulator's "
+        f"rays, {TRUE_RAYS} of them at random in the board's volume. An experiment cannot measure it.",
         "Labels are fits of a dot integrated over microlenses and pixels. The Gaussian fits of the paper are off by a "
         f"twentieth of a pitch, and then sigma_nor ({labels_error:.3f}) shows the labels' error and not the network's "
         f"({network_error:.3f} from the true rays).",
-        "GDM steps on batches of 64 samples and lowers its rate where it stalls: on all samples at once, one step an "
-        "epoch, deep networks stay where they began.",
+        "GDM uses batches of 64 samples and lowers its rate where it stalls. With one step per epoch, on all samples, "
+        "deep networks hardly change.",
     ]
     if worse:
         notes.append(
-            f"Worse than the paper says: {'; '.join(worse)}. Deep chains of ten-node layers pass on little of what "
-            "varies: first-order methods hardly move their first layers, second-order ones need many epochs."
+            f"Worse than in the paper: {'; '.join(worse)}. Many layers of ten nodes in a row "
+            "have small gradients. First-order methods hardly change the first layers, second-order methods need many "
+            "epochs."
         )
     else:
-        notes.append("No deep network does worse than the paper says.")
+        notes.append("No deep network does worse than in the paper.")
     if best.shallow_sigma_nor < best.deep:
         notes.append(
             f"The best shallow network ({_describe(best.shallow)}) does better than any deep one, in seconds: the "
@@ -374,7 +354,7 @@ def _notes(deep: Deep, best: Best) -> list[str]:
 
 
 def _cut_notes(labels: Mapping[str, Mapping[str, BoardDots]], sizes: Sizes) -> list[str]:
-    """Say what a small scale leaves out."""
+    """Describe what a small scale leaves out."""
     left_out = [layers for layers in PAPER["LM"] if layers not in sizes.layers]
     if sizes.samples is None and not left_out:
         return []
@@ -390,13 +370,13 @@ def _cut_notes(labels: Mapping[str, Mapping[str, BoardDots]], sizes: Sizes) -> l
 
 def _describe(entry: Fit) -> str:
     nodes = " + ".join(map(str, entry["hidden"]))
-    base = "on a fitted thin lens" if entry["baseline"] == "thin_lens" else "alone"
+    base = "on a fitted thin lens" if entry["baseline"] == "thin_lens" else "without a thin lens"
     return f"{nodes} nodes {base}, {'Gaussian dots' if entry['estimator'] == 'gaussian' else 'integrated dots'}"
 
 
 def _parameters(hidden: Sequence[int]) -> list[int]:
     sizes = (5, *hidden, 2)
-    return [(a + 1) * b for a, b in pairwise(sizes)]
+    return [(a + 1) * b for a, b in itertools.pairwise(sizes)]
 
 
 def _draw(deep: Deep, shallow: Sequence[Fit], path: Path) -> None:

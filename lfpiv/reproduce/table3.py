@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.calibration.board.board import BoardDots
+from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.camera import Calibration
 from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.geometry.grid import Grid
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page
 from lfpiv.reproduce.rigs import Rig, numerical_rig, volume_grid
-from lfpiv.reproduce.study import Progress
 from lfpiv.weights.operator import build_weights, compare_with_count
 from lfpiv_kernels import runtime
 
@@ -27,10 +27,10 @@ PAPER_TRAINING_MIN, PAPER_WEIGHTS_MIN, PAPER_DRT_MIN = 15, 115, 118
 PARTS = (0.70, 0.15, 0.15)
 """Training, validation and test."""
 EPOCHS = {"small": 300, "paper": 1000}
-"""Epochs at most; training stops earlier where the validation error no longer falls."""
+"""Largest number of epochs. Training stops earlier when the validation error no longer falls."""
 VOLUME_MM = {"small": (4.0, 4.0, 4.0), "paper": (10.0, 10.0, 10.0)}
-VIEWS = {"small": 37, "paper": 192}
-"""Rays of each dot: 192 are the paper's 197,570 samples over 21 planes of 49 dots."""
+DOT_RAYS = {"small": 37, "paper": 192}
+"""Rays of each dot. 192 rays of 21 planes of 49 dots are the paper's 197,570 samples."""
 PUPIL_PART = 0.92
 """Rays of the dots lie within this part of the pupil's radius, as the labels do."""
 MATCH_TRAINING_S, MATCH_WEIGHTS_S = 60.0, 30.0
@@ -61,7 +61,7 @@ def compute(rig: Rig, scale: str, *, seed: int, progress: Progress) -> dict[str,
 def _time_training(rig: Rig, name: str, scale: str, seed: int) -> dict[str, Any]:
     """Train one camera's network on the paper's number of samples."""
     camera = rig.calibration.cameras[name]
-    points, pupil, array, dot = dense_labels(rig.labels(name), VIEWS[scale], camera.optics.pupil_radius_mm)
+    points, pupil, array, dot = dense_labels(rig.labels(name), DOT_RAYS[scale], camera.optics.pupil_radius_mm)
     cpu = time.process_time()
     training = train(
         np.hstack([points, pupil]),
@@ -98,7 +98,6 @@ def _time_weights(calibration: Calibration, grid: Grid) -> dict[str, float]:
 def _result(
     trained: Mapping[str, Mapping[str, Any]], built: Mapping[str, Mapping[str, float]], grid: Grid, scale: str
 ) -> dict[str, Any]:
-    """Put the times into the form of the page."""
     device, at_paper = runtime.device(), scale == "paper"
     training_s = sum(camera["wall_s"] for camera in trained.values())
     weights_s, drt_s = built["network"]["wall_s"], built["drt"]["wall_s"]
@@ -141,10 +140,10 @@ def _result(
         ],
         tables=[_table(trained, built, samples, voxels)],
         notes=[
-            "Times are wall times of this run on this machine, whatever else it did; CPU time is that of all threads.",
+            "Times are wall times of this run, with the machine's other load. CPU time is the sum over all threads.",
             *([] if at_paper else [small]),
-            f"Each dot gives {VIEWS[scale]} rays, evaluated from its fitted rays over the pupil; training stops by "
-            "itself where the error of the validation dots no longer falls.",
+            f"Each dot gives {DOT_RAYS[scale]} rays, evaluated from its fitted rays over the pupil; training stops "
+            "when the error of the validation dots no longer falls.",
         ],
     )
 
@@ -152,7 +151,6 @@ def _result(
 def _table(
     trained: Mapping[str, Mapping[str, Any]], built: Mapping[str, Mapping[str, float]], samples: int, voxels: str
 ) -> dict[str, Any]:
-    """Put ours beside the paper's."""
     device = runtime.device()
     training_s = sum(camera["wall_s"] for camera in trained.values())
     return {
@@ -183,17 +181,17 @@ def _cpu(trained: Mapping[str, Mapping[str, Any]], built: Mapping[str, Mapping[s
     return f"{sum(camera['cpu_s'] for camera in trained.values()):.1f}, {built['network']['cpu_s']:.1f}"
 
 
-def dense_labels(dots: BoardDots, views: int, pupil_radius_mm: float) -> tuple[np.ndarray, ...]:
-    """Rays of every dot at `views` points of the pupil, from a quadratic through the dot's own labels.
+def dense_labels(dots: BoardDots, rays: int, pupil_radius_mm: float) -> tuple[np.ndarray, ...]:
+    """Sample rays of every dot at `rays` points of the pupil, from a quadratic fit to the dot's labels.
 
     Returns
     -------
     tuple of ndarray
         Points (n, 3), pupil points (n, 2), array positions (n, 2) [mm], and each ray's dot (n,).
     """
-    number = np.arange(views) + 0.5
-    radius, angle = np.sqrt(number / views), np.pi * (1 + np.sqrt(5)) * number  # sunflower: evenly over the disc
-    asked = PUPIL_PART * np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    number = np.arange(rays) + 0.5
+    radius, angle = np.sqrt(number / rays), np.pi * (1 + np.sqrt(5)) * number  # sunflower: evenly over the disc
+    wanted = PUPIL_PART * np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
     def terms(pupil: np.ndarray) -> np.ndarray:
         u, v = pupil.T
@@ -202,11 +200,11 @@ def dense_labels(dots: BoardDots, views: int, pupil_radius_mm: float) -> tuple[n
     points, array, names = [], [], []
     for name in np.unique(dots.dot):
         mine = dots.dot == name
-        if mine.sum() < 2 * terms(asked).shape[1]:
+        if mine.sum() < 2 * terms(wanted).shape[1]:
             continue
         fitted = np.linalg.lstsq(terms(dots.pupil_mm[mine] / pupil_radius_mm), dots.array_mm[mine], rcond=None)[0]
-        points.append(np.broadcast_to(dots.points_mm[mine][0], (views, 3)))
-        array.append(terms(asked) @ fitted)
-        names.append(np.full(views, name))
-    pupil = np.tile(pupil_radius_mm * asked, (len(points), 1))
+        points.append(np.broadcast_to(dots.points_mm[mine][0], (rays, 3)))
+        array.append(terms(wanted) @ fitted)
+        names.append(np.full(rays, name))
+    pupil = np.tile(pupil_radius_mm * wanted, (len(points), 1))
     return np.concatenate(points), pupil, np.concatenate(array), np.concatenate(names)

@@ -13,12 +13,21 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack
 
-from lfpiv.calibration.levenberg_marquardt import Fit, Samples, TrainingStop, forward, normal_equations
+from lfpiv.calibration.levenberg_marquardt import (
+    Fit,
+    Samples,
+    TrainingRules,
+    TrainingStop,
+    flattened,
+    forward,
+    normal_equations,
+    unpacker,
+)
 
 FIRST_DAMPING, LEAST_DAMPING, LAST_DAMPING = 5e-3, 1e-20, 1e10
 """Damping of the first step, smallest damping, and damping at which training stops: the customary values for [1]_."""
@@ -35,13 +44,7 @@ LONGEST_GRADIENT = 1.0
 
 
 def bayesian_regularisation(
-    layers: list[np.ndarray],
-    training: Samples,
-    validation: Samples,
-    *,
-    epochs: int,
-    patience: int,
-    tolerance: float,
+    layers: list[np.ndarray], training: Samples, validation: Samples, rules: TrainingRules
 ) -> Fit:
     """Train by Levenberg-Marquardt on beta E_D + alpha E_W, alpha and beta estimated from the data ([1]_, [2]_).
 
@@ -55,19 +58,18 @@ def bayesian_regularisation(
         First weights, each (inputs + 1, nodes) with the bias in the last row.
     training, validation : Samples
         Scaled samples.
-    epochs : int
-        Accepted steps at most.
-    patience, tolerance
-        Training stops when the training error has fallen by less than the fraction `tolerance` in `patience` epochs.
+    rules : TrainingRules
+        An epoch is an accepted step. Training stops when the training error has fallen by less than the fraction
+        `tolerance` in `patience` epochs.
     """
-    pack, unpack = _packing(layers)
-    theta = pack(layers)
+    unpack = unpacker(layers)
+    theta = flattened(layers)
     values = training.outputs.size
     gram, gradient, squares = normal_equations(layers, training)
     training_rms, validation_rms = [np.sqrt(squares / values)], [_rms(layers, validation)]
     gamma, damping, stop = float(theta.size), FIRST_DAMPING, TrainingStop.EPOCH_LIMIT
     alpha, beta = _hyperparameters(min(gamma, 0.9 * values), values, squares, theta)
-    while len(training_rms) <= epochs:
+    while len(training_rms) <= rules.epochs:
         objective = beta * squares + alpha * (theta @ theta)
         while damping < LAST_DAMPING:
             factor = _factor(beta * gram, alpha + damping)
@@ -91,21 +93,14 @@ def bayesian_regularisation(
         alpha, beta = _hyperparameters(gamma, values, squares, theta)
         training_rms.append(np.sqrt(squares / values))
         validation_rms.append(_rms(unpack(theta), validation))
-        if len(training_rms) > patience and training_rms[-1] > (1 - tolerance) * training_rms[-1 - patience]:
+        patience = rules.patience
+        if len(training_rms) > patience and training_rms[-1] > (1 - rules.tolerance) * training_rms[-1 - patience]:
             stop = TrainingStop.MINIMUM
             break
     return Fit(layers=unpack(theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 
 
-def gradient_descent(
-    layers: list[np.ndarray],
-    training: Samples,
-    validation: Samples,
-    *,
-    epochs: int,
-    patience: int,
-    tolerance: float,
-) -> Fit:
+def gradient_descent(layers: list[np.ndarray], training: Samples, validation: Samples, rules: TrainingRules) -> Fit:
     """Train by gradient descent with momentum ([3]_) on small batches of samples in random order.
 
     With the gradient of all samples, one step per epoch, deep networks hardly train in a thousand epochs. Batches give
@@ -114,25 +109,23 @@ def gradient_descent(
     Parameters
     ----------
     layers, training, validation : as for `lfpiv.calibration.levenberg_marquardt.levenberg_marquardt`
-        The epoch with the lowest validation error is kept.
-    epochs : int
-        Passes over the samples at most.
-    patience, tolerance
-        Not used: descent ends by its epochs, or when the rate has fallen to `LAST_RATE`.
+        The result is the epoch with the lowest validation error.
+    rules : TrainingRules
+        Only the number of epochs is used. Training also stops when the rate has fallen to `LAST_RATE`.
     """
-    pack, unpack = _packing(layers)
-    theta = best_theta = pack(layers)
+    unpack = unpacker(layers)
+    theta = best_theta = flattened(layers)
     step, rate, stalled = np.zeros_like(theta), FIRST_RATE, 0
     training_rms, validation_rms = [_rms(layers, training)], [_rms(layers, validation)]
     best, stop = validation_rms[0], TrainingStop.EPOCH_LIMIT
     rng = np.random.default_rng(len(training.inputs))
-    for _ in range(epochs):
+    for _ in range(rules.epochs):
         order = rng.permutation(len(training.inputs))
         for batch in np.array_split(order, max(1, len(order) // BATCH)):
             part = Samples(
                 inputs=training.inputs[batch], outputs=training.outputs[batch], weights=training.weights[batch]
             )
-            gradient = pack(_gradient(unpack(theta), part))
+            gradient = flattened(_gradient(unpack(theta), part))
             gradient *= min(1.0, LONGEST_GRADIENT / max(float(np.linalg.norm(gradient)), 1e-300))
             step = MOMENTUM * step - rate * gradient
             theta = theta + step
@@ -150,29 +143,13 @@ def gradient_descent(
     return Fit(layers=unpack(best_theta), training_rms=training_rms, validation_rms=validation_rms, stop=stop)
 
 
-def _packing(
-    layers: Sequence[np.ndarray],
-) -> tuple[Callable[[Sequence[np.ndarray]], np.ndarray], Callable[[np.ndarray], list[np.ndarray]]]:
-    """Functions from layers to one vector and back."""
-    shapes = [layer.shape for layer in layers]
-    edges = np.cumsum([layer.size for layer in layers])[:-1]
-
-    def pack(parts: Sequence[np.ndarray]) -> np.ndarray:
-        return np.concatenate([part.ravel() for part in parts])
-
-    def unpack(vector: np.ndarray) -> list[np.ndarray]:
-        return [part.reshape(shape) for part, shape in zip(np.split(vector, edges), shapes, strict=True)]
-
-    return pack, unpack
-
-
 def _hyperparameters(gamma: float, values: int, squares: float, theta: np.ndarray) -> tuple[float, float]:
     """Return alpha and beta of [2]_ for gamma determined parameters."""
     return gamma / float(2 * theta @ theta), (values - gamma) / (2 * squares)
 
 
 def _factor(matrix: np.ndarray, shift: float) -> tuple[np.ndarray, bool] | None:
-    """Cholesky factor of matrix + shift I, or None where rounding leaves it indefinite."""
+    """Return the Cholesky factor of matrix + shift I, or None where rounding leaves it indefinite."""
     try:
         factor, lower = cho_factor(matrix + shift * np.eye(len(matrix)), overwrite_a=True, check_finite=False)
     except LinAlgError:
@@ -195,7 +172,7 @@ def _rms(layers: Sequence[np.ndarray], samples: Samples) -> float:
 
 
 def _gradient(layers: Sequence[np.ndarray], samples: Samples) -> list[np.ndarray]:
-    """Gradient of the mean squared error by the layers, by backpropagation."""
+    """Return the gradient of the mean squared error by the layers, by backpropagation."""
     outputs = forward(layers, samples.inputs)
     residual = _residual(outputs[-1], samples)
     delta = -2 / residual.size * samples.weights * residual

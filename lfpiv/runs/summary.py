@@ -17,6 +17,7 @@ import numpy as np
 from lfpiv import files, version
 from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
 from lfpiv.runs.invocation import Calibrated, Invocation
 from lfpiv.runs.pair_figures import PairFigures
@@ -212,9 +213,7 @@ def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
         return None
     rng = np.random.default_rng(0)
     points = np.stack([rng.choice(grid.axis_mm(axis), CORRECTION_RAYS) for axis in (2, 1, 0)], axis=1)
-    radius = camera.optics.pupil_radius_mm * np.sqrt(rng.random(CORRECTION_RAYS))
-    angle = 2 * np.pi * rng.random(CORRECTION_RAYS)
-    pupil = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    pupil = random_on_pupil(camera.optics.pupil_radius_mm, CORRECTION_RAYS, rng)
     correction = camera.network(np.hstack([points, pupil]))
     return float(np.sqrt((correction**2).sum(1).mean()) / camera.lattice.pitch_mm)
 

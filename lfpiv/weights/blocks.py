@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv.errors import InputError
 from lfpiv.lightfield.microimage_layout import microimage_edge
+from lfpiv.progress import StepProgress
 from lfpiv.weights.ray_fit import grid_models, ray_models
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.rays.lattice import Lattice, cell_frame, cell_steps, pack_lattice
@@ -116,7 +117,7 @@ def footprint_blocks(
     stored: StoredGrid,
     camera: CalibratedCamera,
     form: str,
-    progress: Callable[[float], None],
+    progress: StepProgress,
     allow: Callable[[int], None],
     cuts: Cuts = WHOLE,
 ) -> Blocks:

@@ -118,7 +118,7 @@ def form_errors(counted: CountedVoxels, form: str, cuts: Cuts = WHOLE) -> list[f
 
 
 def profiles_serve(errors: Sequence[float]) -> bool:
-    """Whether profiles are near enough to counted rays; true if the camera sees no voxel."""
+    """Return whether profiles are near enough to counted rays. True if the camera sees no voxel."""
     return not errors or bool(np.mean(errors) <= PROFILES_MEAN and max(errors) <= PROFILES_WORST)
 
 
@@ -142,7 +142,7 @@ def choose_cuts(stored: StoredGrid, camera: CalibratedCamera) -> Cuts:
 
 
 def _difference(blocks: Blocks, others: Blocks, voxel: int) -> float:
-    """Relative L2 difference of one voxel's weights on the sensor."""
+    """Return the relative L2 difference of one voxel's weights on the sensor."""
     pixels, weights = [], []
     for part, sign in ((blocks, -1), (others, 1)):
         ray, weight = part.entries(voxel)
@@ -157,7 +157,7 @@ def _difference(blocks: Blocks, others: Blocks, voxel: int) -> float:
 def warn_of_errors(counted: CountedVoxels, form: str, errors: Sequence[float], *, requested: bool) -> None:
     """Warn if no voxel could be compared, or if the weights' error exceeds the aim; name the likely cause.
 
-    `requested` says that the user requested the form, so that no counted rays chose it.
+    `requested` is true if the user chose the form, and false if counted rays did.
     """
     camera = counted.camera
     if not errors:
@@ -178,7 +178,7 @@ def warn_of_errors(counted: CountedVoxels, form: str, errors: Sequence[float], *
 
 
 def _bent(camera: CalibratedCamera, centres_mm: np.ndarray) -> float:
-    """Largest departure of rays from a polynomial of second order in the pupil point [microlens pitch]."""
+    """Return the largest departure of rays from a polynomial of second order in the pupil point [microlens pitch]."""
     third, second = (fit_rays(camera, centres_mm, degree=degree) for degree in (3, 2))
     third[..., : second.shape[-1]] -= second
     angle = np.arange(0, 2 * np.pi, np.pi / 8)
@@ -188,6 +188,6 @@ def _bent(camera: CalibratedCamera, centres_mm: np.ndarray) -> float:
 
 
 def _wide(camera: CalibratedCamera, counted: CountedVoxels) -> float:
-    """Longest projected edge of a counted voxel on the microlens array [microlens pitch]."""
+    """Return the longest projected edge of a counted voxel on the microlens array [microlens pitch]."""
     edges = ray_models(camera, counted.centres_mm, counted.stored.grid.voxel_mm)[:, 12:18].reshape(-1, 2)
     return float(np.hypot(*edges.T).max() / camera.lattice.pitch_mm)

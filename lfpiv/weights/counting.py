@@ -121,9 +121,6 @@ def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
     np.add.at(image.ravel(), blocks.microimages.pixel[ray[lit]], weight[lit] * share[lit])
 
 
-# -- a few voxels, to compare integrated weights with
-
-
 class CountedVoxels:
     """A few random voxels that a camera sees, counted twice with independent rays.
 
@@ -220,9 +217,6 @@ def _window(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np
     return out
 
 
-# -- all voxels of a grid
-
-
 def count_blocks(stored: StoredGrid, camera: CalibratedCamera) -> Blocks:
     """Count the rays of every voxel of a grid and pack the counts into blocks. Warn that this takes long."""
     rays, size = plain(camera.optics.sensor_shape), stored.grid.size
@@ -254,7 +248,7 @@ def _pack_windows(
 ) -> tuple[np.ndarray, ...]:
     """Pack windows of weights, shape (voxel, rows, columns), into blocks of one column of tiles each.
 
-    Returns the number of blocks and of rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
+    Return the number of blocks and of rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
     """
     row = corner[:, 1, None] + np.arange(windows.shape[1])
     column = corner[:, 0, None] + np.arange(windows.shape[2])

@@ -1,6 +1,6 @@
 """Light that each camera records of an evenly lit volume: the basis for comparing the brightness of cameras.
 
-Only pixels count whose light comes from voxels that all cameras see: they show the same particles in every camera.
+Only pixels count that are lit by voxels that all cameras see. They show the same particles in every camera.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LEAST_SHARED = 0.25
 
 @dataclass(frozen=True)
 class EvenLight:
-    """What one camera records of a volume with one unit of light per voxel."""
+    """Record of one camera of a volume with one unit of light per voxel."""
 
     light: float
     """Sum over the pixels that count."""

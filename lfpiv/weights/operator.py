@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ import numpy as np
 from lfpiv.calibration.coverage import SEEN_SHARE, warn_seen_by_one
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
+from lfpiv.progress import StepProgress, part_of
 from lfpiv.weights.blocks import (
     BLOCK_BYTES,
     CHUNK_VOXELS,
@@ -63,7 +64,7 @@ class Weights:
     cameras : mapping of str to CalibratedCamera
         The cameras.
     projectors : mapping of str to Projector
-        Weights of each camera. Of cameras that are not in it every voxel is counted when they are first needed.
+        Weights of each camera. The weights of other cameras are counted when first needed.
     method : {"footprint", "count"}
         How the weights were made.
     choices : mapping of str to Choice, optional
@@ -96,8 +97,6 @@ class Weights:
     def of_camera(self, name: str) -> Weights:
         """Return the weights of one of the cameras. They share memory with these."""
         return Weights(self.stored, {name: self.cameras[name]}, {name: self.projector(name)}, self.method)
-
-    # -- the operator ----------------------------------------------------------------------------------------------
 
     def __call__(self, volume: np.ndarray, out: Images | None = None) -> Images:
         """Project a volume: image[pixel] = sum over voxels of weight * volume (Eq. 4).
@@ -132,7 +131,7 @@ class Weights:
 
     @property
     def T(self) -> Adjoint:
-        """The adjoint operator: ``weights.T(images)`` sums weight * image over each voxel's pixels."""
+        """Adjoint operator: ``weights.T(images)`` sums weight * image over each voxel's pixels."""
         return Adjoint(self)
 
     def image(self, camera: str, voxel: tuple[int, int, int]) -> np.ndarray:
@@ -148,6 +147,11 @@ class Weights:
         Returns
         -------
         ndarray, shape (rows, columns), float32
+
+        Raises
+        ------
+        ValueError
+            If the camera is unknown or the voxel lies outside the grid.
         """
         if camera not in self.cameras:
             raise ValueError(f"camera: expected one of {', '.join(self.cameras)}, got {camera!r}.")
@@ -170,8 +174,6 @@ class Weights:
         if name not in self._projectors:
             self._projectors[name] = Projector(count_blocks(self.stored, self.cameras[name]))
         return self._projectors[name]
-
-    # -- properties of the weights -----------------------------------------------------------------------------------
 
     @property
     def grid(self) -> Grid:
@@ -230,7 +232,7 @@ class Weights:
 
     @cached_property
     def even_light(self) -> dict[str, EvenLight]:
-        """Camera name -> what it records of an evenly lit volume. Empty if the cameras share too little of it."""
+        """Camera name -> its record of an evenly lit volume. Empty if the cameras share too little of it."""
         projectors = {name: self.projector(name) for name in self.cameras}
         gains = {name: self.gain(name) for name in self.cameras}
         return project_even_light(projectors, gains, self.camera_sums)
@@ -260,7 +262,7 @@ class Weights:
         return sum(projector.blocks.nbytes for projector in self._projectors.values())
 
     def counted(self, name: str) -> CountedVoxels:
-        """Return a few voxels of a camera, counted when first asked for."""
+        """Return a few voxels of a camera, counted when first needed."""
         if name not in self._counted:
             self._counted[name] = CountedVoxels(self.stored, self.cameras[name])
         return self._counted[name]
@@ -312,7 +314,7 @@ def build_weights(
     *,
     form: str = "auto",
     limit_bytes: float = math.inf,
-    progress: Callable[[float], None] | None = None,
+    progress: StepProgress | None = None,
 ) -> Weights:
     """Build the weights of every voxel of a grid on every pixel of every camera (Eq. 10).
 
@@ -341,8 +343,9 @@ def build_weights(
     Raises
     ------
     ValueError
-        If `method` or `form` is unknown, profiles are requested for a hexagonal microlens layout, or the weights do not
-        fit into `limit_bytes`: before they are stored.
+        If `method` or `form` is unknown, or profiles are requested for a hexagonal microlens layout.
+    InputError
+        If the weights would not fit into `limit_bytes`. Raised before they are computed.
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}.")
@@ -357,12 +360,8 @@ def build_weights(
         return Weights(stored, cameras, {}, method)
     runtime.device()
     projectors, choices, counted = dict[str, Projector](), dict[str, Choice](), dict[str, CountedVoxels]()
+    whole = progress or (lambda fraction: None)
     for number, (name, camera) in enumerate(cameras.items()):
-
-        def step(fraction: float, number: int = number) -> None:
-            if progress is not None:
-                progress((number + fraction) / len(cameras))
-
         if form == "auto" and camera.lattice.layout == "square":
             counted[name] = CountedVoxels(stored, camera)
             choices[name] = choose_form(counted[name])
@@ -370,6 +369,7 @@ def build_weights(
             choices[name] = choose_uncounted(stored, camera, form)
         chosen, used = choices[name], sum(projector.blocks.nbytes for projector in projectors.values())
         allow = memory_check(name, grid, chosen, limit_bytes - used)
+        step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
         projectors[name] = Projector(footprint_blocks(stored, camera, chosen.form, step, allow, chosen.cuts))
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)
     text = "weights of %d voxels on %d cameras: %.0f MiB"
@@ -396,7 +396,7 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     """Compare stored weights with counted rays in a few random voxels of every camera.
 
-    Warns of weights whose error exceeds the aim, unless `choose_form` did so before.
+    Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
 
     Returns
     -------

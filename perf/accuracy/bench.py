@@ -1,6 +1,6 @@
-"""A bench beyond the paper's rigs: three misaligned, noisy cameras, and pairs of a ring vortex measured by any of them.
+"""A simulated bench of three misaligned, noisy cameras, and pairs of a ring vortex measured by some of them.
 
-The cases `cameras`, `sweeps` and `choices` share one calibration of it, and every run that two of them need.
+The cases `cameras`, `sweeps` and `choices` share its calibration and their common runs.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lfpiv import metrics
-from lfpiv.calibration.camera import CalibratedCamera
-from lfpiv.calibration.cameras import Calibration, calibrate, load_calibration
+from lfpiv.calibration.camera import CalibratedCamera, Calibration, load_calibration
+from lfpiv.calibration.cameras import calibrate
 from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import AXES
+from lfpiv.progress import Progress
 from lfpiv.reproduce import rigs, store
-from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import FULL_SCALE, render_camera
 from lfpiv.velocity.cross_correlation import correlate
@@ -33,19 +33,19 @@ SIZE_MM = {"small": (4.8, 4.8, 2.4), "paper": (10.0, 10.0, 5.0)}
 DOTS = {"small": (6, 6), "paper": (11, 11)}
 PLANES_MM = {"small": (-1.5, -0.75, 0.0, 0.75, 1.5), "paper": tuple(range(-3, 4))}
 SENSOR_PX = {"small": (980, 1060), "paper": (1980, 2200)}
-"""Rows and columns: what sees the volume and the board at 45 degrees."""
+"""Rows and columns. They cover the volume and the board at 45 degrees."""
 MISALIGNED = {
     "left": {"nominal_angle_deg": 45.0, "true_yaw_deg": 44.3, "true_pitch_deg": 0.4, "true_roll_deg": -0.3},
     "middle": {"nominal_angle_deg": 0.0, "true_yaw_deg": 0.8, "true_pitch_deg": -0.3, "true_roll_deg": 0.2},
     "right": {"nominal_angle_deg": -45.0, "true_yaw_deg": -45.7, "true_pitch_deg": 0.2, "true_roll_deg": 0.4},
 }
-"""The cameras, and how they truly stand, which nobody measures."""
+"""Nominal and true poses of the cameras. The calibration does not know the true ones."""
 SHARED: dict[str, dict[str, Any]] = {}
-"""Tables that all scenes share; the others are the simulator's own."""
+"""Tables that all scenes share. The other tables have the simulator's defaults."""
 ONE, TWO, THREE = ("middle",), ("left", "right"), ("left", "middle", "right")
-"""Cameras of a measurement. The one that works alone looks along z, so that its depth is the volume's."""
+"""Cameras of a measurement. A single camera looks along z, so that its depth axis is the volume's."""
 PARTICLE_RAYS = 16_384
-"""Rays per particle: a pixel of the some 1,500 that it lights receives about ten, evenly spread ones."""
+"""Rays per particle. It lights some 1,500 pixels, so a pixel receives about ten evenly spread rays."""
 ABOUT_STANDARD_ERROR = "Windows overlap by a half along three axes, so an eighth of the vectors counts as independent."
 
 
@@ -56,7 +56,7 @@ class Pair:
     ppm: float = 0.5
     """Seeding, particles per microlens of the volume's x-y face."""
     counts: float = 300.0
-    """Level of a pixel lit by one particle alone, in focus [count]."""
+    """Level of a pixel lit by one particle in focus [count]."""
     blob_voxel: float = rigs.BLOB_VOXEL
     """Standard deviation of the Gaussian particles [voxel]; 0 for points."""
 
@@ -65,15 +65,15 @@ DEFAULT = Pair()
 
 
 COLUMNS = ("error", "±", "x", "y", "z", "valid", "Q", "Q, zero mean", "R_acc", "R_g", "ghosts")
-"""Heads of the figures that tables show of a pair: `Judged.cells`."""
+"""Heads of the columns of `Judged.cells`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """What one pair's measurement is worth."""
+    """Quality of one pair's measurement."""
 
     error: metrics.DisplacementError
-    """Of the vectors, all of them, against the flow's mean over their windows [voxel]."""
+    """Error of all vectors against the flow's mean over their windows [voxel]."""
     length: np.ndarray
     """Length of each vector's error [voxel], shape (z, y, x)."""
     valid: float
@@ -81,20 +81,20 @@ class Judged:
     q: float
     """Q against blobs, mean of the two frames."""
     q_zero_mean: float
-    """The same with the mean subtracted, to which the haze of a dense volume adds nothing."""
+    """Q with the means subtracted, which ignores the haze of a dense volume."""
     accuracy: float
     """R_acc (Eq. 13), mean of the two frames."""
     ghost_ratio: float
-    """R_g (Eq. 14), likewise."""
+    """R_g (Eq. 14), mean of the two frames."""
     ghosts: float
-    """Peaks that are no particle, for each true one, likewise."""
+    """Peaks that are no particle per true particle, mean of the two frames."""
     elongation: float
-    """Of the particles along depth, likewise."""
+    """Elongation of the particles along depth, mean of the two frames."""
     iterations: float
-    """SMART iterations, likewise."""
+    """SMART iterations, mean of the two frames."""
 
     def cells(self) -> list[float]:
-        """Figures for a table, below `COLUMNS`."""
+        """Return the figures of a table's row, in the order of `COLUMNS`."""
         errors = [self.error.mean, self.standard_error, *self.error.mean_absolute]
         return [*errors, self.valid, self.q, self.q_zero_mean, self.accuracy, self.ghost_ratio, self.ghosts]
 
@@ -104,7 +104,7 @@ class Judged:
         return _standard_error(self.length)
 
     def row(self) -> dict[str, Any]:
-        """Figures for ``reproduce.json``."""
+        """Return the figures of ``reproduce.json``."""
         return {
             "error_voxel": self.error.mean,
             "standard_error_voxel": self.standard_error,
@@ -123,7 +123,7 @@ class Judged:
 
 
 class Bench:
-    """A calibrated rig, a volume, and what was reconstructed in it; finished runs are kept in a folder."""
+    """A calibrated rig and a volume. Reconstructions are stored in a folder and not computed twice."""
 
     def __init__(self, rig: rigs.Rig, size_mm: tuple[float, float, float], folder: Path, seed: int):
         self.rig, self.size_mm, self.folder, self.seed = rig, size_mm, folder, seed
@@ -133,13 +133,13 @@ class Bench:
         self._weights: tuple[tuple[CalibratedCamera, ...], Weights | None] = ((), None)
 
     def positions(self, pair: Pair) -> list[np.ndarray]:
-        """Particles of both frames (n, 3) [mm]."""
+        """Return the particles of both frames (n, 3) [mm]."""
         middle = rigs.random_particles(self.size_mm, pair.ppm, [self.seed, 31, round(1000 * pair.ppm)])
         displacement = self.flow(middle)
         return [middle - displacement / 2, middle + displacement / 2]
 
     def images(self, pair: Pair, cameras: tuple[str, ...]) -> list[dict[str, np.ndarray]]:
-        """Both frames of a pair by some cameras, with noise; the last pair's are kept at hand."""
+        """Return both frames of a pair by some cameras, with noise. The last pair stays in memory."""
         if self._images[0] != pair:
             self._images = (pair, [{}, {}])
         missing = [name for name in cameras if name not in self._images[1][0]]
@@ -154,7 +154,7 @@ class Bench:
         return self._images[1]
 
     def weights(self, calibration: Calibration, cameras: tuple[str, ...]) -> Weights:
-        """Weights of some of a calibration's cameras; the last ones are kept at hand."""
+        """Return the weights of some of a calibration's cameras. The last ones stay in memory."""
         chosen = Calibration({name: calibration.cameras[name] for name in cameras})
         key = tuple(chosen.cameras.values())
         last, weights = self._weights
@@ -175,31 +175,31 @@ class Bench:
         floor: float | None = None,
         flat_guess: bool = False,
     ) -> tuple[list[xr.DataArray], dict[str, float]]:
-        """Reconstruct both frames, or take them from the folder, and say what the images were like.
+        """Reconstruct both frames, or read them from the folder, and measure their images.
 
         Parameters
         ----------
         name : str
-            File to keep the volumes in. It stands for the calibration, which is not compared with the file's.
+            Name of the file of the volumes. It must differ by calibration, which the file does not record.
         pair : Pair
-            What is recorded.
+            Recorded particles.
         cameras : tuple of str
-            Which cameras are used.
+            Cameras of the measurement.
         calibration : Calibration, optional
-            In place of the rig's own.
+            Default: that of the rig.
         smart : Smart, optional
-            SMART's settings; default: this software's.
+            Settings of SMART. Default: this software's.
         floor, flat_guess
-            SMART's noise floor [count] in place of the measured one; the same light in every voxel to start with.
+            Noise floor [count], default: measured. Whether SMART starts from the same light in every voxel.
 
         Returns
         -------
         list of DataArray
             One volume of each frame.
         dict
-            Means of all images: ``electrons`` that one camera receives of a particle; ``snr``: the image's brightness
-            sum I^2 / sum I over its shot and read-out noise; ``saturated``: part of the pixels. And ``iterations``, and
-            ``sieve_voxel``, the size of the Gaussians that the volumes are made of.
+            Means over all images: ``electrons`` that one camera receives of a particle; ``snr``, brightness
+            sum I^2 / sum I over shot and read-out noise; ``saturated``, part of the pixels. Means over the volumes:
+            ``iterations``, and ``sieve_voxel``, the size of their Gaussians.
         """
         smart = smart or Smart()
         settings = {
@@ -225,11 +225,15 @@ class Bench:
                 means[key] = np.mean([volume.attrs[key] for volume in found])
             return {"volumes": np.stack([volume.values for volume in found]), **means}
 
-        kept = store.kept_arrays(self.folder / f"{name}.npz", settings, compute)
+        arrays = store.cached_arrays(self.folder / f"{name}.npz", settings, compute)
+        return self.unpacked(arrays)
+
+    def unpacked(self, arrays: Mapping[str, np.ndarray]) -> tuple[list[xr.DataArray], dict[str, float]]:
+        """Return the volumes of both frames and the other figures from stored arrays."""
+        figures = {key: float(value) for key, value in arrays.items() if key != "volumes"}
         coords = {axis: (axis, self.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
-        pair_values, signal = kept.pop("volumes"), {key: float(value) for key, value in kept.items()}
-        attributes = {"sieve_voxel": signal["sieve_voxel"]}  # the correlation smooths what is not smooth already
-        return [xr.DataArray(values, coords, AXES, attrs=attributes) for values in pair_values], signal
+        attributes = {"sieve_voxel": figures["sieve_voxel"]}  # the correlation adds the missing smoothing
+        return [xr.DataArray(values, coords, AXES, attrs=attributes) for values in arrays["volumes"]], figures
 
     def judge(
         self,
@@ -239,7 +243,7 @@ class Bench:
         pair: Pair,
         correlation: Correlation | None = None,
     ) -> Judged:
-        """Correlate the volumes of `volumes` and compare everything with the truth."""
+        """Correlate a pair of volumes, and compare volumes and vectors with the truth."""
         vectors = correlate(*volumes, dt_s=rigs.DT_S, **(correlation or Correlation()).model_dump())
         field = np.stack([vectors[f"displacement_{axis}"].values for axis in "xyz"], axis=-1)
         edge = json.loads(vectors.attrs["settings"])["windows"][-1]
@@ -266,11 +270,11 @@ class Bench:
         )
 
     def true_volumes(self, pair: Pair) -> list[xr.DataArray]:
-        """Both frames' particles drawn on the voxels: what reconstruction cannot better."""
+        """Return both frames' particles as blobs on the voxels, the best possible reconstruction."""
         return [rigs.truth(at, self.grid) for at in self.positions(pair)]
 
     def _flat(self, weights: Weights, images: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the same light in every voxel, as much as the images hold."""
+        """Return a volume of equal voxels with the light of the images."""
         flat = np.ones(self.grid.shape, np.float32)
         modelled = weights(flat)
         light = [
@@ -280,7 +284,7 @@ class Bench:
         return flat * np.float32(sum(light) / sum(float(image.sum()) for image in modelled.values()))
 
     def _signal(self, weights: Weights, name: str, image: np.ndarray, pair: Pair) -> dict[str, float]:
-        """Tell how strong one image is against its noise, whose own squares are taken off sum I^2."""
+        """Measure signal and noise of one image. The squares of the noise are subtracted from sum I^2."""
         noise, number = self.rig.scene.noise, list(self.rig.calibration.cameras).index(name)
         per_count = noise.full_well_e / FULL_SCALE
         light = image.astype(float) - weights.cameras[name].decoder.background(image)[0]
@@ -295,25 +299,25 @@ class Bench:
 
 
 def open_bench(root: Path, scale: str, seed: int, progress: Progress) -> Bench:
-    """Return the three cameras' bench, simulated and calibrated in `root` or taken from there."""
+    """Return the bench, simulated and calibrated in `root` unless `root` holds it."""
     rig = rigs.calibrated_rig(bench_scene(scale, seed), root / "rig", progress)
     return Bench(rig, SIZE_MM[scale], root / "runs", seed)
 
 
 def bench_scene(scale: str, seed: int) -> Scene:
-    """Cameras of Table 2's numerical column, off their plan by up to a degree, with shot and read-out noise."""
+    """Return three cameras of Table 2's numerical column, turned by up to a degree, with shot and read-out noise."""
     return scene(scale, seed, MISALIGNED, name="bench of three cameras")
 
 
 def scene(scale: str, seed: int, cameras: Mapping[str, Mapping[str, Any]], *, name: str, **shared: Any) -> Scene:
-    """Scene of cameras around this bench's volume and board.
+    """Return a scene of cameras around this bench's volume and board.
 
     Parameters
     ----------
     scale, seed
-        See the package.
+        As for `lfpiv.reproduce.study.compute`.
     cameras : mapping
-        Name -> keys of ``[[camera]]`` beside the optics'.
+        Name -> keys of ``[[camera]]`` without those of the optics.
     name : str
         Name of the scene.
     **shared
@@ -333,10 +337,7 @@ def scene(scale: str, seed: int, cameras: Mapping[str, Mapping[str, Any]], *, na
                 "dot_diameter_mm": 0.1,
                 "planes_mm": tuple(float(z) for z in PLANES_MM[scale]),
             },
-            # the data set's own particles only complete it: the cases render their own
-            "volume": {"size_mm": (1.0, 1.0, 1.0), "voxel_mm": rigs.VOXEL_MM},
-            "particles": {"count": 8, "sigma_mm": rigs.BLOB_VOXEL * rigs.VOXEL_MM},
-            "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
+            **rigs.UNUSED_TABLES,
             **SHARED,
             **shared,
         }
@@ -344,14 +345,14 @@ def scene(scale: str, seed: int, cameras: Mapping[str, Mapping[str, Any]], *, na
 
 
 def run_name(pair: Pair, what: str) -> str:
-    """File name of a run: the cases that share the bench find one another's by it."""
+    """Return the file name of a run, the same for all cases."""
     return f"{what}_{pair.ppm:g}_ppm_{pair.counts:g}_counts"
 
 
 def difference(judged: Judged, reference: Judged) -> tuple[float, float]:
-    """Mean error less that of another measurement of the same pair, and its standard error [voxel].
+    """Return the mean error minus that of another measurement of the pair, and its standard error [voxel].
 
-    Where both have the same windows the difference is taken vector by vector.
+    With equal windows the standard error is that of the differences vector by vector.
     """
     if judged.length.shape != reference.length.shape:
         gap = judged.error.mean - reference.error.mean
@@ -361,15 +362,15 @@ def difference(judged: Judged, reference: Judged) -> tuple[float, float]:
 
 
 def _standard_error(values: np.ndarray) -> float:
-    """Of the mean over a pair's vectors: windows overlap by a half along three axes, so an eighth is independent."""
+    """Return the standard error of a mean over vectors. Windows overlap by a half, so an eighth is independent."""
     return float(values.std() * np.sqrt(8 / values.size))
 
 
 def recalibrated(bench: Bench, name: str, **network: Any) -> Calibration:
-    """Calibrate two cameras of a bench again from the same images, with other settings of ``[network]``; kept."""
+    """Calibrate two cameras from the same images with other settings of ``[network]``, or read that calibration."""
     stored = bench.folder / f"{name}.h5"
     experiment = bench.rig.experiment
-    asked = replace(
+    changed = replace(
         experiment,
         cameras=tuple(experiment.camera(camera) for camera in TWO),
         network=experiment.network.model_copy(update=network),
@@ -377,6 +378,6 @@ def recalibrated(bench: Bench, name: str, **network: Any) -> Calibration:
     if not stored.exists():
         scratch = stored.with_name(f".{stored.name}")
         stored.parent.mkdir(parents=True, exist_ok=True)
-        calibrate(asked).save(scratch)
+        calibrate(changed).save(scratch)
         scratch.replace(stored)
     return load_calibration(stored)

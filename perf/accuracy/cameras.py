@@ -1,8 +1,8 @@
-"""One, two and three cameras beside one another on the same particles and flow."""
+"""Compare one, two and three cameras on the same particles and flow."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 from bench import Bench, Judged, Pair
 
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots, rigs
-from lfpiv.reproduce.study import Progress
 
 TITLE = "One, two and three cameras"
 
@@ -47,6 +47,10 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
             shown[name] = volumes[0]
     progress("cameras", 1.0)
     _draw(judged, ppms, shown, work / "cameras.png")
+    return _result(own, judged, ppms, seed)
+
+
+def _result(own: Bench, judged: Mapping[tuple[str, float], Judged], ppms: Sequence[float], seed: int) -> dict[str, Any]:
     densest = ppms[-1]
     rows = [[NAMES[name], ppm, *one.cells(), one.elongation] for (name, ppm), one in judged.items()]
     return page.result(
@@ -98,7 +102,7 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
             _about_depth(judged, densest),
             f"One pair of each seeding. {bench.ABOUT_STANDARD_ERROR}",
             "The correlation of the true particles, drawn as blobs on the voxels, shows what the windows themselves "
-            "leave: no camera can do better.",
+            "leave. No camera can do better.",
             "R_acc, R_g and ghosts count peaks: a single camera's are few and long. Where particles touch, peaks of "
             "the true volume are displaced or lost too.",
             "A single camera's vectors pass the validation although their depth is wrong: neighbours share the error.",
@@ -107,7 +111,7 @@ def compute(own: Bench, ppms: tuple[float, ...], work: Path, *, seed: int, progr
 
 
 def _about_depth(judged: Mapping[tuple[str, float], Judged], ppm: float) -> str:
-    """Say what each set of cameras makes of depth."""
+    """Describe the depth error of each set of cameras."""
     parts = []
     for name in SETS:
         x, y, z = judged[name, ppm].error.mean_absolute

@@ -1,4 +1,4 @@
-"""What each choice is worth that the paper leaves open or this software makes: one at a time, on the same pair."""
+"""Effect of single choices on one pair: choices that the paper leaves open, and options of this software."""
 
 from __future__ import annotations
 
@@ -13,22 +13,20 @@ import xarray as xr
 from bench import DEFAULT, Bench, Judged
 from numpy.typing import ArrayLike
 
-from lfpiv.calibration.cameras import Calibration, thin_lens
+from lfpiv.calibration.camera import Calibration
+from lfpiv.calibration.cameras import thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.settings import Correlation, Smart
-from lfpiv.geometry.grid import AXES
+from lfpiv.progress import Progress
 from lfpiv.reconstruction.motion import reconstruct_pair
 from lfpiv.reproduce import page, plots, rigs, store
-from lfpiv.reproduce.study import Progress
 
 TITLE = "What each choice is worth"
 
 ALMOST_NO_FLOOR = 1e-3
-"""Noise floor that stands for none [count]: the logarithm of a dark pixel needs one."""
-SURE = 2.0
-"""Standard errors beyond which a difference is called one, if it is also"""
-WORTH = 0.01
-"""this part of the default error."""
+"""Noise floor of "no floor" [count]. The logarithm of a dark pixel needs one."""
+SURE, WORTH = 2.0, 0.01
+"""A difference counts above so many standard errors and this part of the default error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +34,7 @@ class Choice:
     """One departure from the defaults."""
 
     label: str
-    """What is done instead."""
+    """Description of the choice."""
     smart: Mapping[str, Any] = field(default_factory=dict)
     """Settings of SMART that differ."""
     correlation: Mapping[str, Any] = field(default_factory=dict)
@@ -48,13 +46,13 @@ class Choice:
     drt: bool = False
     """Rays by direct ray tracing at the nominal angles."""
     apart_mm: float = 0.0
-    """Distance along y by which ray tracing takes the cameras' axes to miss each other, wrongly [mm]."""
+    """Wrong distance of the cameras' axes along y in ray tracing [mm]."""
     like: str | None = None
-    """Choice whose volumes are correlated; absent: its own."""
+    """Choice whose volumes are correlated. Default: this one."""
     floor: float | None = None
     flat_guess: bool = False
     both_frames: bool = False
-    """Both frames are reconstructed from what they share along their motion."""
+    """Both frames are reconstructed at once, by motion passes."""
 
     @property
     def reconstructs(self) -> bool:
@@ -65,7 +63,7 @@ class Choice:
 PAPER_SMART = {"iterations": 10, "accelerate": False, "floor_share": 0.0, "tolerance": 0.0, "sieve_voxel": 0.0}
 OPEN = {
     "exponent": Choice(label="exponent as printed in Eq. 5, not by the column sum", smart={"normalisation": "paper"}),
-    "noise_floor": Choice(label="floor: the measured noise alone", smart={"floor_share": 0.0}),
+    "noise_floor": Choice(label="floor: the measured noise only", smart={"floor_share": 0.0}),
     "no_floor": Choice(
         label=f"floor: {ALMOST_NO_FLOOR:g} count, as good as none", smart={"floor_share": 0.0}, floor=ALMOST_NO_FLOOR
     ),
@@ -74,9 +72,9 @@ OPEN = {
     "gaussian_dots": Choice(label="dots by the paper's Gaussian fits", network={"estimator": "gaussian"}),
     "bare_network": Choice(label="network without the thin lens under it", network={"baseline": "none"}),
     "drt": Choice(label="no network: DRT at the nominal angles", drt=True),
-    "drt_apart": Choice(label="the same, and one camera 0.1 mm higher than thought", drt=True, apart_mm=0.1),
+    "drt_apart": Choice(label="the same, and one camera 0.1 mm higher than assumed", drt=True, apart_mm=0.1),
 }
-"""Where the paper is silent or two ways are open."""
+"""Choices that the paper does not state."""
 OWN = {
     "no_momentum": Choice(label="SMART without momentum", smart={"accelerate": False}),
     "ten_iterations": Choice(label="10 SMART iterations", smart={"iterations": 10}),
@@ -141,6 +139,17 @@ def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int,
             )
         judged[key] = own.judge(*made, pair=pair, correlation=Correlation(**choice.correlation))
     progress("choices", 1.0)
+    return _result(own, {key: choices[key] for key in judged}, default, judged, mapping, work)
+
+
+def _result(
+    own: Bench,
+    choices: Mapping[str, Choice],
+    default: Judged,
+    judged: Mapping[str, Judged],
+    mapping: Mapping[str, float],
+    work: Path,
+) -> dict[str, Any]:
     gaps = {key: bench.difference(one, default) for key, one in judged.items()}
     _draw(choices, judged, gaps, default, work / "choices.png")
     return page.result(
@@ -173,26 +182,27 @@ def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int,
             (
                 "choices.png",
                 "Change of the mean displacement error (left; lines: two standard errors) and of Q (right) by each "
-                "choice alone: blue where the paper is silent, green this software's own options. To the right of the "
+                "choice: blue where the paper states nothing, green this software's own options. To the right of the "
                 "line the error grows, to the left of it Q falls.",
             )
         ],
         tables=[
-            _table("Where the paper is silent", {k: choices[k] for k in choices if k in OPEN}, judged, gaps, default),
-            _table(
-                "This software's own options", {k: choices[k] for k in choices if k not in OPEN}, judged, gaps, default
-            ),
+            _table(caption, {key: choices[key] for key in choices if (key in OPEN) is is_open}, judged, gaps, default)
+            for caption, is_open in (
+                ("Choices that the paper does not state", True),
+                ("This software's own options", False),
+            )
         ],
         notes=[
             f"One pair of the ring vortex at {DEFAULT.ppm:g} ppm, two misaligned cameras, noisy images; every line "
-            "changes one thing and keeps all else at the defaults. Errors are mean lengths against the flow's mean "
+            "changes one thing from the defaults. Errors are mean lengths against the flow's mean "
             "over each window, in voxels; x, y, z: mean absolute components.",
             "The standard error is that of the vector-by-vector difference; with other windows, of the two means. "
-            f"{bench.ABOUT_STANDARD_ERROR} It tells how sure the difference is for this pair and flow; another flow or "
-            "seeding may rank the choices otherwise (docs/accuracy.md).",
+            f"{bench.ABOUT_STANDARD_ERROR} It applies to this pair and flow. Another flow or "
+            "seeding may change the order of the choices (docs/accuracy.md).",
             _verdict(choices, gaps, default),
-            "Q is held against blobs of "
-            f"{rigs.BLOB_VOXEL:g} voxel, points too, which they are not. Choices of the correlation leave Q as it is.",
+            "Q is measured against blobs of "
+            f"{rigs.BLOB_VOXEL:g} voxel, also for points. Choices of the correlation do not change Q.",
             *_about_smoothing(judged),
             *_about_mapping(choices, mapping),
         ],
@@ -200,7 +210,7 @@ def compute(own: Bench, choices: Mapping[str, Choice], work: Path, *, seed: int,
 
 
 def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray], dict[str, float]]:
-    """Reconstruct the usual pair by motion passes, or take it from the folder: `Bench.volumes` takes frames alone."""
+    """Reconstruct the usual pair by motion passes, or read it from the folder."""
     settings = {
         "seed": own.seed,
         "size_mm": own.size_mm,
@@ -223,15 +233,11 @@ def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray
             "sieve_voxel": np.mean([volume.attrs["sieve_voxel"] for volume in found]),
         }
 
-    kept = store.kept_arrays(own.folder / f"{name}.npz", settings, compute)
-    coords = {axis: (axis, own.grid.axis_mm(number)) for number, axis in enumerate("zyx")}
-    smooth = {"sieve_voxel": float(kept["sieve_voxel"])}
-    volumes = [xr.DataArray(values, coords, AXES, attrs=smooth) for values in kept["volumes"]]
-    return volumes, {"iterations": float(kept["iterations"])}
+    return own.unpacked(store.cached_arrays(own.folder / f"{name}.npz", settings, compute))
 
 
 def _traced(own: Bench, choice: Choice) -> Calibration:
-    """Thin lenses at the nominal angles, as wrong about their height as the choice says."""
+    """Return thin lenses at the nominal angles with the choice's error of height."""
     experiment, cameras = own.rig.experiment, {}
     nominal = thin_lens(experiment).cameras
     for sign, name in zip((0.5, -0.5), bench.TWO, strict=True):
@@ -243,7 +249,7 @@ def _traced(own: Bench, choice: Choice) -> Calibration:
 
 
 def _mapping(own: Bench, calibration: Calibration, seed: int) -> float:
-    """Mean distance from the true rays, worse of the two cameras [pitch]."""
+    """Return the mean distance from the true rays, worse of the two cameras [pitch]."""
     errors = rigs.ray_errors_pitch(own.rig, calibration, own.grid, seed)
     return max(float(errors[name].mean()) for name in bench.TWO)
 
@@ -273,7 +279,7 @@ def _table(
 
 
 def _verdict(choices: Mapping[str, Choice], gaps: Mapping[str, tuple[float, float]], default: Judged) -> str:
-    """Say which choices differ from the defaults by more than chance."""
+    """Name the choices that differ from the defaults by more than chance."""
     notable = {
         key: gap for key, (gap, error) in gaps.items() if abs(gap) > max(SURE * error, WORTH * default.error.mean)
     }
@@ -286,16 +292,16 @@ def _verdict(choices: Mapping[str, Choice], gaps: Mapping[str, tuple[float, floa
         f"Beyond {SURE:g} standard errors and {100 * WORTH:g} % of the error, {len(notable) - len(better)} of "
         f"{len(gaps)} choices are worse than the defaults; better: {'; '.join(better) or 'none'}."
     )
-    return f"{text} Those that cost most: {share}."
+    return f"{text} The worst: {share}."
 
 
 def _about_smoothing(judged: Mapping[str, Judged]) -> list[str]:
     if not {"points", "no_sieve", "unsmoothed", "unsmoothed_points"} <= judged.keys():
         return []
     return [
-        "Volumes are smoothed by 0.5 voxel before correlation for the sake of particles smaller than a voxel; those "
-        "made of Gaussians by a sieve are as smooth already. Error with and without it here: blobs without a sieve "
-        f"{judged['no_sieve'].error.mean:.3f} and {judged['unsmoothed'].error.mean:.3f}, points "
+        "Volumes are smoothed by 0.5 voxel before correlation, which helps if particles are smaller than a voxel. "
+        "Volumes of a sieve's Gaussians are already as smooth. Error with and without smoothing here: blobs without "
+        f"a sieve {judged['no_sieve'].error.mean:.3f} and {judged['unsmoothed'].error.mean:.3f}, points "
         f"{judged['points'].error.mean:.3f} and {judged['unsmoothed_points'].error.mean:.3f} voxel."
     ]
 
@@ -306,9 +312,8 @@ def _about_mapping(choices: Mapping[str, Choice], mapping: Mapping[str, float]) 
     parts = ", ".join(f"{choices[key].label} {value:.4f}" for key, value in mapping.items() if key != "default")
     return [
         "Mapping against the true rays, mean in microlens pitches: defaults "
-        f"{mapping['default']:.4f}, {parts}. Where a camera stands to a tenth of a millimetre, and its angle to half a "
-        "degree, is not known on a bench; the network needs neither, and a small volume forgives angles sooner than "
-        "places."
+        f"{mapping['default']:.4f}, {parts}. On a bench, the place of a camera is not known to 0.1 mm, nor its "
+        "angle to 0.5 degree. The network needs neither. In a small volume, errors of the place matter more."
     ]
 
 

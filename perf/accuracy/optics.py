@@ -1,4 +1,4 @@
-"""Real optics, which direct ray tracing does not know and the network learns: windows, a liquid, aberrations."""
+"""Windows, a liquid and aberrations: direct ray tracing ignores these optics, the network learns them."""
 
 from __future__ import annotations
 
@@ -12,35 +12,40 @@ import numpy as np
 import xarray as xr
 from bench import DEFAULT, Bench, Judged
 
-from lfpiv.calibration.cameras import Calibration, thin_lens
+from lfpiv.calibration.camera import Calibration
+from lfpiv.calibration.cameras import thin_lens
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots, rigs
-from lfpiv.reproduce.study import Progress
 from lfpiv.simulation.scene import Scene, true_mapping
 
 TITLE = "Real optics: where ray tracing fails and the network does not"
 
 ANGLE_DEG = 45.0
-"""The cameras stand exactly where they are said to, at this angle to either side: ray tracing errs by the optics
-alone."""
+"""Exact angle of the cameras to either side. The optics are the only error of ray tracing."""
 GLASS = {"thickness_mm": 10.0, "index": 1.52}
 COMA = {"coma_pitch": 0.3, "distortion_percent": 1.0, "centre_mm": (-1.5, 0.8)}
 SPHERICAL = {"spherical_pitch": 0.2}
-"""Third-order aberrations of a main lens, the first one decentred: of the order of what fast lenses have."""
+"""Third-order aberrations of a main lens, the first one decentred. Fast lenses have aberrations of this order."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Optics:
-    """What stands between particles and sensors."""
+    """Optics between particles and sensors."""
 
     label: str
     short: str
-    """For pictures."""
+    """Label in pictures, with line breaks."""
     shared: Mapping[str, Any] = field(default_factory=dict)
     """Tables of the scene."""
     water: bool = False
     """The particles are in water, behind 8 mm of acrylic glass facing each camera."""
     measured: bool = False
-    """Whether a pair is measured through it, with both cameras; else one camera's rays are compared."""
+    """Whether both cameras measure a pair through it. Otherwise the rays of one camera are compared."""
+
+    @property
+    def name(self) -> str:
+        """Label on one line."""
+        return self.short.replace("\n", " ")
 
 
 OPTICS = {
@@ -75,16 +80,16 @@ OPTICS = {
 MAPPINGS = ("network", "fitted", "drt")
 COLUMNS = ("drt", "fitted", "network", "labels")
 CORRELATED = ("network", "drt")
-"""Mappings a pair is measured by."""
+"""Mappings that measure a pair."""
 NAMES = {"network": "network", "fitted": "fitted thin lens", "drt": "DRT", "truth": "true particles"}
 NAMES |= {"labels": "the dots' own rays"}
 COLOURS = {"network": plots.COLOURS["network"], "fitted": plots.COLOURS["no_sieve"], "drt": plots.COLOURS["drt"]}
 RayErrors = dict[str, dict[str, float]]
 """Mapping, or "labels" -> "mean" and "largest" distance from the true rays [pitch]."""
 SMALLEST_PITCH = 2e-4
-"""Lowest ray error shown [pitch]: DRT's through ideal optics is none."""
+"""Lowest ray error shown [pitch]. DRT has none through ideal optics."""
 FURTHER = 1.5
-"""A fitted lens this many times further off than the nominal one is described."""
+"""Ratio of the fitted lens's error to the nominal lens's above which it is described."""
 SLICE_VOXEL = 2
 """Thickness of the slices that are shown [voxel]."""
 
@@ -95,13 +100,13 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 
 
 def compute(scale: str, work: Path, optics: Mapping[str, Optics], *, seed: int, progress: Progress) -> dict[str, Any]:
-    """Do it for some optics."""
+    """Calibrate and measure through some optics."""
     size = bench.SIZE_MM[scale]
     errors, judged, shown = {}, {}, {}
     for done, (key, one) in enumerate(optics.items()):
 
         def step(what: str, fraction: float, done: int = done, one: Optics = one) -> None:
-            progress(f"{one.short.replace(chr(10), ' ')}: {what}", (done + fraction) / len(optics))
+            progress(f"{one.name}: {what}", (done + fraction) / len(optics))
 
         rig = rigs.calibrated_rig(optics_scene(scale, seed, one), work / key / "rig", step)
         own = Bench(rig, size, work / key / "runs", seed)
@@ -124,7 +129,7 @@ def compute(scale: str, work: Path, optics: Mapping[str, Optics], *, seed: int, 
 
 
 def optics_scene(scale: str, seed: int, optics: Optics) -> Scene:
-    """Scene of cameras exactly at their angles behind some optics: two, or one where only its rays are compared."""
+    """Return the scene of two cameras behind some optics, or of one if only its rays are compared."""
     cameras = {"left": ANGLE_DEG, "right": -ANGLE_DEG} if optics.measured else {"left": ANGLE_DEG}
     tables: dict[str, dict[str, Any]] = {name: {"nominal_angle_deg": angle} for name, angle in cameras.items()}
     if optics.water:
@@ -147,13 +152,13 @@ def ways(rig: rigs.Rig) -> dict[str, Calibration]:
 
 
 def _ray_errors(own: Bench, mapping: Calibration, seed: int) -> dict[str, float]:
-    """Mean and largest distance from the true rays, worst camera [pitch]."""
+    """Return mean and largest distance from the true rays, worst camera [pitch]."""
     errors = list(rigs.ray_errors_pitch(own.rig, mapping, own.grid, seed).values())
     return {"mean": max(float(e.mean()) for e in errors), "largest": max(float(e.max()) for e in errors)}
 
 
 def _label_errors(rig: rigs.Rig) -> dict[str, float]:
-    """Mean and largest distance of the dots' rays from the true ones, worst camera [pitch]."""
+    """Return mean and largest distance of the dots' rays from the true ones, worst camera [pitch]."""
     errors = []
     for camera in rig.scene.camera:
         dots = rig.labels(camera.name)
@@ -169,28 +174,13 @@ def _result(
     size: tuple[float, float, float],
 ) -> dict[str, Any]:
     measured = [key for key, one in optics.items() if one.measured]
-    rows = []
-    for key in optics:
-        for name in ("drt", "network"):
-            rows.append(
-                page.compare(
-                    f"rays off by, {NAMES[name]}, {optics[key].short.replace(chr(10), ' ')}",
-                    errors[key][name]["mean"],
-                    at_most=0.015 if name == "network" else None,
-                    unit="pitch",
-                )
-            )
-    for key in measured:
-        for name in ("drt", "network"):
-            what = f"{NAMES[name]}, {optics[key].short.replace(chr(10), ' ')}"
-            rows.append(page.compare(f"displacement error, {what}", judged[key, name].error.mean, unit="voxel"))
     return page.result(
         {
             "mapping_error_pitch": errors,
             "pairs": {key: {name: judged[key, name].row() for name in (*CORRELATED, "truth")} for key in measured},
             "size_mm": size,
         },
-        comparison=rows,
+        comparison=_comparison(optics, errors, judged),
         figures=[
             (
                 "optics.png",
@@ -217,18 +207,18 @@ def _result(
                 "flow's mean over each window",
                 "columns": ["optics", "mapping", "error", "x", "y", "z", "valid", "Q", "R_acc", "R_g", "ghosts"],
                 "rows": [
-                    [optics[key].short.replace("\n", " "), NAMES[name], one.error.mean, *one.error.mean_absolute]
+                    [optics[key].name, NAMES[name], one.error.mean, *one.error.mean_absolute]
                     + [one.valid, one.q, one.accuracy, one.ghost_ratio, one.ghosts]
                     for (key, name), one in judged.items()
                 ],
             },
         ],
         notes=[
-            "The cameras stand exactly at 45 degrees to either side and in focus through their windows, as they would "
-            "be set up on a bench: what DRT gets wrong is the optics alone. The simulator refracts every ray exactly "
+            "The cameras stand exactly at 45 degrees to either side and are in focus through their windows, as on a "
+            "bench. So the optics are DRT's only error. The simulator refracts every ray exactly "
             "at the window's faces and adds the lens's third-order aberrations; the calibration sees only the images.",
-            "Fitted thin lens: pose and scale free, fitted to the same dots as the network. It mends what a shift or "
-            "a defocus can mend, such as water behind a wall that faces the camera.",
+            "Fitted thin lens: pose and scale free, fitted to the same dots as the network. It corrects "
+            "shift and defocus, such as by water behind a wall that faces the camera.",
             "The network is as good as its labels, the dots' own rays. A dot's rays are fitted as quadratics of the "
             "pupil point, which hold coma and the window's astigmatism; cubic terms, which spherical aberration needs, "
             "are fitted once for all dots of a camera.",
@@ -240,8 +230,24 @@ def _result(
     )
 
 
+def _comparison(
+    optics: Mapping[str, Optics], errors: Mapping[str, RayErrors], judged: Mapping[tuple[str, str], Judged]
+) -> list[dict[str, Any]]:
+    rows = []
+    for key, one in optics.items():
+        for name in ("drt", "network"):
+            goal = 0.015 if name == "network" else None
+            what = f"rays off by, {NAMES[name]}, {one.name}"
+            rows.append(page.compare(what, errors[key][name]["mean"], at_most=goal, unit="pitch"))
+    for key, one in optics.items():
+        for name in ("drt", "network") if one.measured else ():
+            what = f"displacement error, {NAMES[name]}, {one.name}"
+            rows.append(page.compare(what, judged[key, name].error.mean, unit="voxel"))
+    return rows
+
+
 def _about_fits(optics: Mapping[str, Optics], errors: Mapping[str, RayErrors]) -> list[str]:
-    """Say where the fitted thin lens is worse than the nominal one."""
+    """Name the optics where the fitted thin lens is worse than the nominal one."""
     lost = [
         one.label
         for key, one in optics.items()
@@ -250,8 +256,8 @@ def _about_fits(optics: Mapping[str, Optics], errors: Mapping[str, RayErrors]) -
     if not lost:
         return []
     return [
-        f"Further off by the fit than by DRT: {'; '.join(lost)}. There the fit of the pose has run away from the data "
-        "sheet; within the board the network mends what it leaves."
+        f"Further off by the fit than by DRT: {'; '.join(lost)}. There the fitted pose is far from the data sheet. "
+        "Within the board, the network corrects the rest."
     ]
 
 
@@ -291,7 +297,7 @@ def _draw(
             place = np.arange(3) + (number + 0.5) * width - 0.4
             panel.bar(place, one.error.mean_absolute, width, color=COLOURS[name], label=f"Q {one.q:.2f}")
         panel.set_xticks(range(3), ["x", "y", "z"])
-        panel.set_title(optics[key].short.replace("\n", " "), fontsize=9)
+        panel.set_title(optics[key].name, fontsize=9)
         panel.set_ylabel("mean absolute error [voxel]")
     top = max(one.error.mean_absolute[k] for (_, name), one in judged.items() if name in CORRELATED for k in range(3))
     for panel in axes:
@@ -308,6 +314,5 @@ def _draw_slices(optics: Mapping[str, Optics], shown: Mapping[tuple[str, str], x
     columns = ("truth", *CORRELATED)
     for row, key in zip(drawn.subplots(len(measured), len(columns), squeeze=False), measured, strict=True):
         for axes, name in zip(row, columns, strict=True):
-            short = optics[key].short.replace("\n", " ")
-            plots.draw_slice(axes, shown[key, name], SLICE_VOXEL, f"{short}:\n{NAMES[name]}")
+            plots.draw_slice(axes, shown[key, name], SLICE_VOXEL, f"{optics[key].name}:\n{NAMES[name]}")
     plots.save(drawn, path)

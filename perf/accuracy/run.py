@@ -1,4 +1,4 @@
-"""Measure what this software's choices are worth: cases beside the paper's, on one page as `lfpiv reproduce` makes it.
+"""Measure the effect of cameras, optics, noise and choices of method, on one page like that of `lfpiv reproduce`.
 
     python perf/accuracy/run.py [CASE ...] --out DIR [--scale small|paper] [--seed N]
 
@@ -15,7 +15,7 @@ from lfpiv.reproduce.study import SCALES, Study, compute
 
 ACCURACY = Study(
     title="Beyond the paper",
-    about="What the paper did not show, on rigs of the same main and microlenses with smaller volumes and noisy images",
+    about="Cases beyond the paper, on rigs with the same main lens and microlenses, smaller volumes and noisy images",
     modules={key: key for key in ("optics", "cameras", "sweeps", "choices")},
 )
 

@@ -10,8 +10,8 @@ from typing import Any
 import bench
 from bench import DEFAULT, Bench, Judged, Pair
 
+from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots
-from lfpiv.reproduce.study import Progress
 
 TITLE = "Noise and seeding"
 
@@ -20,7 +20,11 @@ PPM = {"small": (0.05, 0.2, 0.5, 1.0, 2.0), "paper": (0.02, 0.05, 0.1, 0.2, 0.5,
 COUNTS = {"small": (300.0, 30.0, 8.0, 2.5), "paper": (300.0, 100.0, 30.0, 15.0, 8.0, 4.0, 2.5)}
 """Level of a pixel lit by one particle [count], at the bench's seeding; the noise stays as it is."""
 Signal = dict[str, float]
-"""What the images of a run were like; see `Bench.volumes`."""
+"""Signal and noise of the images of a run, see `Bench.volumes`."""
+Seeding = tuple[float, Judged, Signal, Judged]
+"""Seeding [ppm], measurement, its images, and the correlation of the true particles."""
+Noise = tuple[float, Judged, Signal]
+"""Signal to noise, measurement, and its images."""
 AXES = {"x": "#2f81d6", "y": "#2ca36b", "z": "#e0762a"}
 
 
@@ -49,6 +53,10 @@ def compute(
     seeding = [(pair.ppm, *judged[pair], truth[pair]) for pair in pairs[: len(ppms)]]
     noise = [(judged[pair][1]["snr"], *judged[pair]) for pair in pairs[len(ppms) :]]
     _draw(seeding, noise, work / "sweeps.png")
+    return _result(own, seeding, noise)
+
+
+def _result(own: Bench, seeding: Sequence[Seeding], noise: Sequence[Noise]) -> dict[str, Any]:
     best, worst = min(seeding, key=lambda row: row[1].error.mean), max(seeding, key=lambda row: row[1].error.mean)
     return page.result(
         {
@@ -98,9 +106,9 @@ def compute(
             f"{own.rig.scene.noise.read_noise:g} counts, {own.rig.scene.noise.full_well_e:g} electrons at full scale. "
             "Particles become dimmer, the noise stays; at a low exposure a longer one or more laser power is the "
             "remedy.",
-            "Dense volumes are nearly full, the true ones too, and their means alone agree: Q does not tell how well "
+            "Dense volumes are nearly full, the true ones too, and their means agree. So Q does not show how well "
             "particles are found there. With the means subtracted it is a correlation coefficient.",
-            "Sparse seeding: few particles to a window, so the true particles' correlation has errors of its own. "
+            "Sparse seeding: few particles in a window, so the true particles' correlation has errors as well. "
             "Dense seeding: particles and ghosts merge, so fewer peaks stand for either and R_acc falls.",
             *_about_saturation(seeding),
         ],
@@ -108,11 +116,11 @@ def compute(
 
 
 def _electrons(signal: Signal) -> int:
-    """Electrons of a particle, to what is worth reading."""
+    """Return the electrons of a particle, rounded to two digits."""
     return int(float(f"{signal['electrons']:.2g}"))
 
 
-def _about_saturation(seeding: Sequence[tuple[float, Judged, Signal, Judged]]) -> list[str]:
+def _about_saturation(seeding: Sequence[Seeding]) -> list[str]:
     clipped = [(ppm, signal["saturated"]) for ppm, _, signal, _ in seeding if signal["saturated"] > 1e-4]
     if not clipped:
         return []
@@ -120,9 +128,7 @@ def _about_saturation(seeding: Sequence[tuple[float, Judged, Signal, Judged]]) -
     return [f"The exposure is the same for every seeding, so some pixels saturate: {text}."]
 
 
-def _draw(
-    seeding: Sequence[tuple[float, Judged, Signal, Judged]], noise: Sequence[tuple[float, Judged, Signal]], path: Path
-) -> None:
+def _draw(seeding: Sequence[Seeding], noise: Sequence[Noise], path: Path) -> None:
     drawn = plots.figure(8.5, 5.2)
     (error_by_ppm, error_by_snr), (q_by_ppm, q_by_snr) = drawn.subplots(2, 2, sharex="col", sharey="row")
     for number, (axis, colour) in enumerate(AXES.items()):

@@ -8,11 +8,12 @@ import pytest
 import tifffile
 from scipy.spatial import cKDTree
 
-from lfpiv.calibration.board.board import DotBoard, measure_board
+from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.detect import on_lattice, search_radius_mm
 from lfpiv.calibration.board.dot_fit import DotFit
 from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
 from lfpiv.calibration.board.dot_shared import estimate_bend, follow_bend
+from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated
 from lfpiv.calibration.board.planes import HELD_BYTES, Planes
 from lfpiv.calibration.board.pose import BIN_PITCHES

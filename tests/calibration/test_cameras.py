@@ -303,7 +303,9 @@ def test_a_volume_that_the_calibrated_camera_does_not_see_is_refused(rig, caplog
     sees = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
     assert coverage.seen_share(calibration.cameras["only"], sees) == 1
     beside = lfpiv.Grid.from_extent(centre_mm=(0, 4.0, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
-    with pytest.raises(lfpiv.InputError, match=r"around \(0, 4, 0\) mm of which camera 'only' sees nothing"):
+    with pytest.raises(
+        lfpiv.InputError, match=r"around \(0, 4, 0\) mm that camera 'only', as calibrated, does not see"
+    ):
         coverage.require_seen(experiment.path, calibration, beside)
     half = lfpiv.Grid.from_extent(centre_mm=(0, 2.2, 0), size_mm=(2, 2, 1), voxel_mm=0.1)
     with caplog.at_level(logging.WARNING):

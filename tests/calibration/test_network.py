@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from lfpiv.calibration import levenberg_marquardt as trainers
 from lfpiv.calibration.levenberg_marquardt import (
     Samples,
+    TrainingRules,
     TrainingStop,
     levenberg_marquardt,
     normal_equations,
@@ -150,7 +151,7 @@ def test_training_error_never_rises_and_reaches_what_scipy_reaches():
     outputs = np.stack([np.sin(2 * inputs[:, 0]) * inputs[:, 1], np.exp(-((inputs**2).sum(1)))], axis=1)
     layers = [rng.normal(0, 0.7, (3, 5)), rng.normal(0, 0.7, (6, 2))]
     samples = Samples(inputs=inputs, outputs=outputs, weights=np.ones((400, 1)))
-    fit = levenberg_marquardt(layers, samples, samples, epochs=120, patience=120, tolerance=0.0)
+    fit = levenberg_marquardt(layers, samples, samples, TrainingRules(epochs=120, patience=120, tolerance=0.0))
     assert (np.diff(fit.training_rms) <= 0).all()
     theta = np.concatenate([layer.ravel() for layer in layers])
     oracle = least_squares(

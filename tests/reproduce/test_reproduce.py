@@ -44,7 +44,7 @@ def cases(monkeypatch):
 
     def broken(scale, work, *, seed=0, progress):
         calls.append(("broken", scale, seed))
-        store.kept(work / "part.json", {"seed": seed}, lambda: calls.append("part") or [1, 2])
+        store.cached(work / "part.json", {"seed": seed}, lambda: calls.append("part") or [1, 2])
         if not (work / "mended").exists():
             raise RuntimeError("power cut")
         return page.result({}, comparison=[])
@@ -126,7 +126,7 @@ def test_arrays_are_kept_for_the_same_settings_only(tmp_path):
         return {"field": np.arange(6.0).reshape(2, 3), "number": 3.5}
 
     for settings, expected in (({"x": (1, 2)}, 1), ({"x": [1, 2]}, 1), ({"x": (1, 3)}, 2)):
-        arrays = store.kept_arrays(path, settings, compute)
+        arrays = store.cached_arrays(path, settings, compute)
         assert len(calls) == expected and set(arrays) == {"field", "number"}
         np.testing.assert_array_equal(arrays["field"], np.arange(6.0).reshape(2, 3))
 

@@ -8,7 +8,7 @@ import xarray as xr
 from support import scenes
 
 import lfpiv
-from lfpiv.calibration.cameras import Calibration
+from lfpiv.calibration.camera import Calibration
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.results import netcdf
 from lfpiv.simulation.simulator import simulate

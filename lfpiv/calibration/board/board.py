@@ -17,12 +17,10 @@ from lfpiv.calibration.board.detect import find_dots
 from lfpiv.calibration.board.dots import BoardDots, Detection, DotBoard, Labels
 from lfpiv.calibration.board.label import label_by_integral
 from lfpiv.calibration.board.label_gaussian import label_by_gaussian
-from lfpiv.calibration.board.planes import Planes, Signals
+from lfpiv.calibration.board.planes import Signals
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
-from lfpiv.lightfield.decoder import LightFieldDecoder
-
-__all__ = ["ESTIMATORS", "BoardDots", "DotBoard", "Planes", "agreeing_dots", "few_pixels", "measure_board"]
+from lfpiv.lightfield.decoder import NORMAL_MAD, LightFieldDecoder
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +33,6 @@ NEIGHBOURS = 16
 """Neighbouring dots in space that a dot is compared with."""
 FEW_ACROSS_PX = 7.0
 """Diameter of microimages below which focused dots may light too few pixels for the integrated model [pixel]."""
-
-_NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 def measure_board(
@@ -131,7 +127,7 @@ def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) ->
     mean = np.stack([np.bincount(inverse, weights=column) / count for column in departure_mm.T], axis=1)
     _, neighbour = cKDTree(dots.points_mm[first]).query(dots.points_mm[first], k=min(NEIGHBOURS + 1, len(number)))
     misfit = np.linalg.norm(mean - np.median(mean[neighbour[:, 1:]], axis=1), axis=1)
-    bad = misfit > max(OUTLIER * _NORMAL_MAD * float(np.median(misfit)), OUTLIER_PITCH * pitch_mm)
+    bad = misfit > max(OUTLIER * NORMAL_MAD * float(np.median(misfit)), OUTLIER_PITCH * pitch_mm)
     if bad.any():
         log.info("%d dots disagree with their neighbours and are left out: %s", bad.sum(), number[bad].tolist())
     good: np.ndarray = ~bad[inverse]
@@ -139,7 +135,6 @@ def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) ->
 
 
 def _count(labels: Labels, board: DotBoard, detection: Detection) -> BoardDots:
-    """Add the world points, and the number of dots of each plane."""
     planes = len(board.planes_mm)
     found = np.bincount(labels.measured_dot // board.size, minlength=planes)
     visible = detection.in_field.copy()

@@ -90,7 +90,7 @@ def _find_first_lattice(
     signals: Signals, rectify: Rectifier, board: DotBoard, plan: CameraPose, optics: Optics
 ) -> _FirstLattice:
     """Find the lattice with the nominal pose in one of the planes nearest to z = 0."""
-    order = _order(board)
+    order = _planes_from_middle(board)
     found: list[_FirstLattice] = []
     for plane in order:
         if len(found) >= _FIRST_PLANES and any(lattice.regular for lattice in found):
@@ -104,7 +104,7 @@ def _find_first_lattice(
     fewest = min(max(FEWEST_DOTS, _FEWEST_SHARE * visible), board.size)
     if len(start.points_mm) < fewest or not start.regular:
         chance = len(start.points_mm) > 0 and not start.regular
-        blobs = f" among blobs of which only {start.share:.0%} lie on one lattice" if chance else ""
+        blobs = f"; only {start.share:.0%} of the blobs lie on one lattice" if chance else ""
         raise InputError(
             f"board: expected a lattice of {board.dots[0]} x {board.dots[1]} dots, {board.spacing_mm:g} mm apart, near "
             f"z = {board.planes_mm[order[0]]:g} mm; found {len(start.points_mm)} dots of it{blobs}. Check that these "
@@ -113,8 +113,7 @@ def _find_first_lattice(
     return start
 
 
-def _order(board: DotBoard) -> np.ndarray:
-    """Return the planes by their distance from z = 0."""
+def _planes_from_middle(board: DotBoard) -> np.ndarray:
     return np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
 
 
@@ -209,7 +208,7 @@ def _find_in_planes(
 ) -> tuple[list[_PlaneDots], CameraPose]:
     """Find the dots of every plane near where the pose expects them; fit the pose again after each plane."""
     seen: dict[int, _PlaneDots] = {}
-    for plane in _order(board):
+    for plane in _planes_from_middle(board):
         z_mm, sites = board.planes_mm[plane], board.points_mm(plane, MARGIN)
         rectified = rectify(signals.of_plane(plane), pose, z_mm)
         blobs = _near_sites(rectified, sites[:, :2], board, sign)
@@ -243,17 +242,8 @@ def on_lattice(miss: np.ndarray, sites_mm: np.ndarray, board: DotBoard, bin_mm: 
     """Return whether blobs found near the expected sites are a board's dots, not chance.
 
     The misses of a board's dots vary smoothly over the sites, here by a robust linear function. Chance spreads the
-    misses over the whole search radius.
-
-    Parameters
-    ----------
-    miss : ndarray, shape (n, 2)
-        Position of each blob minus its site [mm].
-    sites_mm : ndarray, shape (n, 2)
-        The sites (x, y) [mm].
-    board : DotBoard
-    bin_mm : float
-        Spacing of the elements of the rectified image [mm].
+    misses over the whole search radius. `miss` is the position of each blob minus its site, `bin_mm` the spacing of the
+    elements of the rectified image [mm].
     """
     radius = search_radius_mm(board)
     if len(miss) < _JUDGED_DOTS or radius < _JUDGED_BINS * bin_mm:

@@ -121,18 +121,9 @@ class DotFit:
 def fit_dots(
     model: LensIntegral, pixels: BoardPixels, expected: Sequence[ExpectedDot], margin_mm: float
 ) -> list[DotFit | None]:
-    """Fit dots, each to the pixels that its light may reach; None where a dot lights too few pixels.
+    """Fit dots, sorted by plane, each to the pixels that its light may reach. None where a dot lights too few pixels.
 
-    Parameters
-    ----------
-    model : LensIntegral
-        Dot model of the camera.
-    pixels : BoardPixels
-        Pixels of all planes.
-    expected : sequence of ExpectedDot
-        The dots, plane by plane.
-    margin_mm : float
-        Distance beyond the expected light that is fitted too [mm].
+    The pixels reach `margin_mm` beyond the expected light.
     """
     return [
         _fit_dot(_Problem.of_dot(model, pixels, dot, signal, margin_mm))
@@ -288,8 +279,6 @@ class _Problem:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """Result of one iteration."""
-
     state: _State
     damping: float
     converged: bool

@@ -5,7 +5,7 @@ point u. Phi holds the powers of u up to the second; each dot has its own coeffi
 all dots of a camera share their coefficients b, the bend. A ray that leaves the dot at d from its centre lands at
 s(u) + A(u) d, where A is d(s, t)/d(x, y) of the board, linear in u where the board is tilted. The pixel at X under the
 lens s_l sees the pupil point u_i = -(X - X_c) s_i / f_m through the lens's centre (see `lfpiv.lightfield.decoder`). Its
-rays obey X = s_l + (f_m/s_i)(s - u) (Eq. 9), hence they land at
+rays obey X = s_l + (f_m/s_i)(s - u) (Eq. 9), so they land at
 
     s - s_l = g + (I - K)^-1 (A d + K h),      g = (I - K)^-1 (s(u_i) - s_l),
 
@@ -28,7 +28,7 @@ import numpy as np
 from scipy import fft, special
 from scipy.spatial import Voronoi
 
-from lfpiv.geometry.optics import LensLattice, Optics, float_pair, spread_over_pupil
+from lfpiv.geometry.optics import NEIGHBOURS, LensLattice, Optics, float_pair, spread_over_pupil
 
 _BEND_ORDER = 3
 _POWERS = [(order - j, j) for order in range(_BEND_ORDER + 1) for j in range(order + 1)]  # of (u, v)
@@ -286,7 +286,6 @@ _PER_U, _PER_V = _derivative(0), _derivative(1)
 
 @functools.lru_cache(maxsize=8)
 def _spread_terms(pupil_radius_mm: float) -> np.ndarray:
-    """Return `ray_terms` at points spread evenly over the pupil."""
     return ray_terms(spread_over_pupil(pupil_radius_mm), pupil_radius_mm)
 
 
@@ -304,6 +303,5 @@ def _cell_spectrum(basis: Basis, step_mm: float) -> np.ndarray:
 
 def _neighbours(basis: Basis) -> np.ndarray:
     """Return the vectors to the eight lattice neighbours of a lens [mm], shape (8, 2)."""
-    steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)], float)
-    neighbours: np.ndarray = steps @ np.asarray(basis)
+    neighbours: np.ndarray = NEIGHBOURS @ np.asarray(basis)
     return neighbours

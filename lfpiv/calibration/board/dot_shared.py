@@ -17,6 +17,7 @@ from scipy import stats
 from lfpiv.calibration.board.dot_fit import BoardPixels, DotFit, converged, fit_dots
 from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
 from lfpiv.calibration.board.dots import ExpectedDot
+from lfpiv.lightfield.decoder import NORMAL_MAD
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
@@ -32,7 +33,6 @@ _CHANCE = 1e-3  # probability that dots without a bend show one by chance
 _OUTLIER_CHI2 = 2.0  # fits with this many times the typical residual are left out
 _SHARE = 0.3  # pixels with at least this share of a dot measure noise and pixel response
 _CALM_SIGMA, _CALM_DEVIATION = 4.0, 0.5  # pixels further off in light or response are left out
-_NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 def estimate_shared(
@@ -44,18 +44,8 @@ def estimate_shared(
     """Fit the shared parameters to a sample of the dots.
 
     A model dot of the wrong size is fitted in the wrong position where a lens's edge cuts its light. The diameter acts
-    at all depths, the blur grows with the slope of the rays, so planes at different depths separate the two.
-
-    Parameters
-    ----------
-    pixels : BoardPixels
-        Pixels of all planes.
-    expected : sequence of ExpectedDot
-        The dots.
-    stated_diameter_mm : float
-        Diameter in the experiment file [mm].
-    margin_mm : float
-        Distance beyond the expected light of a dot that is fitted too [mm].
+    at all depths, the blur grows with the slope of the rays, so planes at different depths separate the two. The
+    fitted pixels reach `margin_mm` beyond the expected light of a dot.
     """
     optics, lattice = pixels.decoder.optics, pixels.decoder.lattice
     chosen = np.unique(np.linspace(0, len(expected) - 1, _SAMPLE).astype(int))
@@ -105,16 +95,8 @@ def estimate_bend(shared: SharedParameters, fits: Sequence[DotFit | None], pitch
     """Return the shared parameters with the bend that all dots show; no bend where chance explains it.
 
     The bends of single dots scatter about the common bend, by model errors too. An F-test compares the common bend with
-    that scatter. Without the test the noise would give a perfect lens a bend.
-
-    Parameters
-    ----------
-    shared : SharedParameters
-        Parameters that the dots were fitted with.
-    fits : sequence of DotFit or None
-        Fits of all dots, by weak priors.
-    pitch_mm : float
-        Microlens pitch [mm].
+    that scatter. Without the test the noise would give a perfect lens a bend. `fits` are the fits of all dots by
+    `shared` and by weak priors.
     """
     sure, typical = _typical(fits)
     start = shared.bend_mm.T.ravel()
@@ -136,15 +118,7 @@ def estimate_bend(shared: SharedParameters, fits: Sequence[DotFit | None], pitch
 
 
 def follow_bend(fits: Sequence[DotFit | None], change_mm: np.ndarray) -> list[DotFit | None]:
-    """Return the fits with the coefficients that belong to a changed bend, to first order.
-
-    Parameters
-    ----------
-    fits : sequence of DotFit or None
-        Fits by the former bend.
-    change_mm : ndarray, shape (BENDS, 2)
-        New bend minus former bend [mm].
-    """
+    """Return the fits with the coefficients that belong to a bend changed by `change_mm`, to first order."""
     change = change_mm.T.ravel()
     return [
         fit and replace(fit, coefficients=fit.coefficients + (fit.following[:, 2:] @ change).reshape(2, TERMS).T)
@@ -181,8 +155,8 @@ def estimate_pixels(pixels: BoardPixels, fits: Sequence[DotFit | None]) -> Board
         return pixels.measured(1.0, decoder.counts_per_photon)
     deviation, expected, miss = (np.concatenate(part).astype(float) for part in (deviations, lights, misses))
     relative = miss / expected
-    limit = _CALM_SIGMA * _NORMAL_MAD * np.median(np.abs(relative))
+    limit = _CALM_SIGMA * NORMAL_MAD * np.median(np.abs(relative))
     calm = (np.abs(relative) < limit) & (np.abs(deviation) < _CALM_DEVIATION)
     share = float(np.clip((deviation * relative)[calm].sum() / max((deviation**2)[calm].sum(), 1e-12), 0, 1))
     left = (miss - share * deviation * expected) ** 2 / expected
-    return pixels.measured(share, max(float(np.median(left)) * _NORMAL_MAD**2, 1e-3))
+    return pixels.measured(share, max(float(np.median(left)) * NORMAL_MAD**2, 1e-3))

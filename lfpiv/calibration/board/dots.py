@@ -6,13 +6,16 @@ A dot of plane p, row j and column i has the number p * (nx ny) + j * nx + i. A 
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lfpiv.calibration.board.pose import CameraPose
-from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.optics import NEIGHBOURS, Optics
+
+if TYPE_CHECKING:
+    from lfpiv.experiment.settings import Board
 
 FEWEST_DOTS = 4
 """Least number of dots that make a board."""
@@ -30,6 +33,16 @@ class DotBoard:
     """Diameter of a dot [mm]."""
     planes_mm: tuple[float, ...]
     """Depth z of each plane [mm]."""
+
+    @classmethod
+    def from_settings(cls, board: Board) -> DotBoard:
+        """Return the board of an experiment file's table ``[board]``."""
+        return cls(
+            dots=board.dots,
+            spacing_mm=board.spacing_mm,
+            diameter_mm=board.dot_diameter_mm,
+            planes_mm=tuple(board.planes_mm),
+        )
 
     @property
     def size(self) -> int:
@@ -90,24 +103,13 @@ class ExpectedDot:
 def expect_dots(
     pose: CameraPose, board: DotBoard, optics: Optics, dots: np.ndarray, theta: np.ndarray, sigma: np.ndarray
 ) -> list[ExpectedDot]:
-    """Return the prior knowledge of dots.
+    """Return the prior knowledge of dots, given by number.
 
-    Parameters
-    ----------
-    pose : CameraPose
-    board : DotBoard
-    optics : Optics
-    dots : ndarray, shape (d,)
-        Numbers of the dots.
-    theta : ndarray, shape (d, 6, 2)
-        Expected ray models [mm].
-    sigma : ndarray, shape (d, 6, 2)
-        Their standard deviations [mm].
+    `theta` and `sigma` are the means and standard deviations of their ray models, shape (d, 6, 2) [mm].
     """
     points = board.of_dots_mm(dots)
     jacobians, tilts = pose.board_jacobian(points, optics.pupil_radius_mm)
-    steps = [step for step in itertools.product((-1, 0, 1), repeat=2) if any(step)]
-    around = np.stack([pose.rays(points + board.spacing_mm * np.array([*step, 0]))[0] for step in steps], axis=1)
+    around = np.stack([pose.rays(points + board.spacing_mm * np.array([*step, 0]))[0] for step in NEIGHBOURS], axis=1)
     neighbours = around - pose.rays(points)[0][:, None]
     information = (1 / sigma**2).transpose(0, 2, 1).reshape(len(dots), -1)
     return [

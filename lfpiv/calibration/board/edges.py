@@ -63,18 +63,10 @@ class Extent:
 
 
 def sites_found(sites: Sequence[np.ndarray], dots: tuple[int, int]) -> np.ndarray:
-    """Return which lattice sites have a dot.
+    """Return the lattice sites with a dot, bool, shape (plane, rows + 2 MARGIN, columns + 2 MARGIN).
 
-    Parameters
-    ----------
-    sites : sequence of ndarray
-        Numbers of the sites with a dot in each plane, row by row over the lattice with its margin.
-    dots : (int, int)
-        Stated columns and rows.
-
-    Returns
-    -------
-    ndarray of bool, shape (plane, rows + 2 MARGIN, columns + 2 MARGIN)
+    `sites` are their numbers in each plane, row by row over the lattice with its margin. `dots` are the stated columns
+    and rows.
     """
     columns, rows = (n + 2 * MARGIN for n in dots)
     found = np.zeros((len(sites), rows * columns), bool)
@@ -126,7 +118,7 @@ def require_stated(extents: tuple[Extent, Extent], found: np.ndarray) -> None:
     raise InputError(
         f"board.dots: expected the {stated} dots stated (columns x rows), found {seen}, and no dots beyond them where "
         f"the camera would see some ({_per_plane(found)}). Set dots = [{columns}, {rows}], or uncover the board's "
-        "edge: with another number of dots than there are all of them get wrong names."
+        "edge: all dots get wrong names if their stated number is wrong."
     )
 
 

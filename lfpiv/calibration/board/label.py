@@ -22,7 +22,7 @@ from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
-from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.decoder import NORMAL_MAD, LightFieldDecoder
 
 _MARGIN_PITCHES = (0.5, 0.25)  # pixels this far beyond a dot's light are fitted too, first and second round
 _PRIOR_PITCHES = (0.5, 0.3, 0.1)  # prior of the first round on position, slope and curvature over the pupil
@@ -30,9 +30,8 @@ _FLOOR_PITCHES = (0.02, 0.01, 0.005)  # least standard deviation of the second r
 _OUTLIER_CHI2, _OUTLIER_MISFIT = 6.0, 0.1  # a fit is no dot above both: times the typical residual, share of the light
 _OUTLIER_LIGHT = 3.0  # a dot is at most this many times fainter or brighter than the typical dot of its plane
 _OUTLIER_SIGMA, _OUTLIER_PITCHES = 6.0, 0.15  # a dot is less than one of them off its expected position
-_VIEWS = 37  # labels per dot
+_LABELS = 37  # pupil points per dot
 _SEEN_PIXELS = 1.5  # a label lies at most this far from a pixel that saw the dot
-_NORMAL_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _TUKEY = 4.685  # residual without weight in Tukey's biweight [standard deviations]
 _ROBUST_ROUNDS = 15
 
@@ -168,7 +167,7 @@ def _robust_fit(
         root = np.sqrt(weight)[:, None]
         coefficients = np.linalg.lstsq(have * root, y * root[:, 0], rcond=None)[0]
         residual = y - have @ coefficients
-        typical = (_NORMAL_MAD * np.median(np.abs(residual[sharp]))) ** 2
+        typical = (NORMAL_MAD * np.median(np.abs(residual[sharp]))) ** 2
         scatter2 = max(typical - np.median(variance[sharp]), 0.0)
         ratio = np.abs(residual) / (_TUKEY * np.sqrt(variance + max(scatter2, 0.1 * typical) + 1e-16))
         robust = np.where(ratio < 1, (1 - np.minimum(ratio, 1) ** 2) ** 2, 0) + 1e-9
@@ -196,11 +195,11 @@ def _trusted(fits: Sequence[DotFit | None], prior: _Prediction, board: DotBoard,
 
 
 def _spiral(dot: int, radius_mm: float) -> np.ndarray:
-    """Return pupil points spread evenly to the edge, other ones for each dot, shape (_VIEWS, 2) [mm]."""
+    """Return pupil points spread evenly to the edge, other ones for each dot, shape (_LABELS, 2) [mm]."""
     golden = (np.sqrt(5) - 1) / 2
-    number = np.arange(_VIEWS) + dot * golden % 1
+    number = np.arange(_LABELS) + dot * golden % 1
     angle = 2 * np.pi * (number * golden + dot * np.sqrt(2))
-    distance = radius_mm * np.sqrt(number / _VIEWS)
+    distance = radius_mm * np.sqrt(number / _LABELS)
     points: np.ndarray = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return points
 
@@ -211,12 +210,12 @@ def _sample(measured: dict[int, DotFit], rejected: np.ndarray, model: LensIntegr
     near = (_SEEN_PIXELS * model.optics.pupil_pixel_mm) ** 2
     pupil, array, std = [np.empty((0, 2))], [np.empty((0, 2))], [np.empty(0)]
     for dot, fit in measured.items():
-        views = _spiral(dot, radius)
-        views = views[(((views[:, None] - fit.seen_pupil_mm[None]) ** 2).sum(-1) < near).any(1)]
-        terms = ray_terms(views, radius)
+        points = _spiral(dot, radius)
+        points = points[(((points[:, None] - fit.seen_pupil_mm[None]) ** 2).sum(-1) < near).any(1)]
+        terms = ray_terms(points, radius)
         covariance = fit.covariance[:TERMS, :TERMS] + fit.covariance[TERMS:, TERMS:]
         variance = np.einsum("va,ab,vb->v", terms[:, :TERMS], covariance, terms[:, :TERMS]) / 2
-        pupil.append(views)
+        pupil.append(points)
         array.append(model.rays_mm(terms, fit.coefficients))
         std.append(np.sqrt(variance * max(fit.reduced_chi2, 1)))
     numbers, fits = np.array(list(measured), int), measured.values()

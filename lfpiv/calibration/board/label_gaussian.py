@@ -5,13 +5,11 @@ These labels are biased towards the lens centres because a dot is about as wide 
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from lfpiv.calibration.board.dots import Detection, DotBoard, Labels
 from lfpiv.calibration.board.planes import Signals
-from lfpiv.geometry.optics import LensLattice, spread_over_pupil
+from lfpiv.geometry.optics import NEIGHBOURS, LensLattice, spread_over_pupil
 from lfpiv.lightfield.decoder import LightFieldDecoder
 
 _PUPIL_SHARE = 0.92  # views lie within this share of the pupil's radius, where pixels are fully lit
@@ -82,7 +80,7 @@ def _peaks_mm(
 
 def _lens_steps(lattice: LensLattice) -> np.ndarray:
     """Return the lattice steps to a lens itself, then to its neighbours, shape (n, 2)."""
-    steps = np.array([(0, 0)] + [step for step in itertools.product((-1, 0, 1), repeat=2) if any(step)])
+    steps = np.vstack([(0, 0), NEIGHBOURS])
     near: np.ndarray = steps[
         np.hypot(*(steps @ np.asarray(lattice.basis_mm)).T) < _NEIGHBOUR_PITCHES * lattice.pitch_mm
     ]

@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.optimize import least_squares
 
 from lfpiv.geometry.optics import Optics
-from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.decoder import NORMAL_MAD, LightFieldDecoder
 
 BIN_PITCHES = 0.35
 """Size of an element of a rectified image, in microlens pitches projected on the board."""
@@ -45,7 +45,7 @@ class CameraPose:
 
     @property
     def _lens(self) -> tuple[float, float, float]:
-        """Magnification, object distance [mm] and the factor of the slope k."""
+        """Return the magnification, the object distance [mm] and the factor of the slope k."""
         ratio = np.exp(self.parameters[6:])
         return self.nominal[1] * ratio[0], self.nominal[2] * ratio[1], ratio[2]
 
@@ -230,5 +230,5 @@ class Rectifier:
         response = np.zeros(shape)
         response[lit] = narrow[0][lit] / narrow[1][lit] - wide[0][lit] / wide[1][lit]
         response *= np.sqrt(narrow[1] / np.median(narrow[1][lit])) if lit.any() else 0  # noise falls with the light
-        noise = 1.4826 * np.median(np.abs(response[lit])) if lit.any() else 0.0
+        noise = NORMAL_MAD * np.median(np.abs(response[lit])) if lit.any() else 0.0
         return Rectified(response / max(noise, 1e-12), corner, bin_mm)
