@@ -15,22 +15,6 @@ FOREIGN = {"wp", "ti"}
 """Libraries whose private names tests may use, where there are no public ones."""
 SETTERS = {"setattr", "getattr", "delattr", "hasattr"}
 """Functions that take the name of an attribute as a text."""
-NOT_YET = {
-    "calibration/test_board.py",
-    "calibration/test_network.py",
-    "reconstruction/test_volume.py",
-    "perf/test_accuracy.py",
-    "reproduce/test_cases.py",
-    "reproduce/test_lsi.py",
-    "results/test_export.py",
-    "results/test_reader.py",
-    "runs/test_memory.py",
-    "runs/test_workers.py",
-    "selfcalibration/test_selfcalibration.py",
-    "velocity/test_cross_correlation.py",
-    "weights/test_operator.py",
-}
-"""Files that still use private names."""
 
 
 def name_of(path):
@@ -88,7 +72,7 @@ def support():
     return [ast.parse(path.read_text("utf-8")) for path in FILES if path not in TEST_FILES]
 
 
-@pytest.mark.parametrize("path", [path for path in FILES if name_of(path) not in NOT_YET], ids=name_of)
+@pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_tests_use_public_names(path):
     found = list(private_names(ast.parse(path.read_text("utf-8")), kernels=path.parent.name == "kernels"))
     assert not found, f"{name_of(path)} uses {', '.join(found)}: test through public names, or make these public"

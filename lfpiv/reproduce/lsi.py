@@ -100,8 +100,8 @@ def sample_profiles(twin: Twin, volume: LightField, planar: Sequence[Sheet]) -> 
     y_mm = volume["axes_mm"][1]
     half = np.array(window_mm(twin)[:2]) / 2
     sampled = {
-        "light_field": _along(twin, volume["axes_mm"], volume["displacement_mm"][..., :2]),
-        "windows": _along(twin, volume["axes_mm"], volume["truth_mm"][..., :2]),
+        "light_field": along_profiles(twin, volume["axes_mm"], volume["displacement_mm"][..., :2]),
+        "windows": along_profiles(twin, volume["axes_mm"], volume["truth_mm"][..., :2]),
         "mean_windows": true_field(twin.mean, [twin.depths_mm, y_mm, [twin.profile_x_mm]], window_mm(twin))[
             :, :, 0, :2
         ],
@@ -124,7 +124,7 @@ def sample_profiles(twin: Twin, volume: LightField, planar: Sequence[Sheet]) -> 
     return {"y_mm": y_mm} | {name: to_m_s * values for name, values in sampled.items()}
 
 
-def _along(twin: Twin, axes_mm: list[np.ndarray], field: np.ndarray) -> np.ndarray:
+def along_profiles(twin: Twin, axes_mm: list[np.ndarray], field: np.ndarray) -> np.ndarray:
     """Interpolate a field (z, y, x, ...) to the profiles, linear in x, by a cubic spline in z, shape (plane, y, ...).
 
     Linear interpolation midway between two layers of windows would average over 1.5 times their depth.
@@ -170,7 +170,7 @@ def error_by_pairs(twin: Twin, volume: LightField, reference: np.ndarray) -> ByP
     """
     scale = 1 / 1000 / twin.dt_s / np.abs(reference).mean(axis=(0, 1))
     each = np.moveaxis(volume["departures_mm"][..., :2], 0, -2)
-    sampled = np.moveaxis(_along(twin, volume["axes_mm"], each), -2, 0) * scale
+    sampled = np.moveaxis(along_profiles(twin, volume["axes_mm"], each), -2, 0) * scale
     total = len(sampled)
     counts = sorted({n for n in (1, 2, 5, 10, 20, 50, 100, 150) if n < total} | {total})
     scatter = np.nanstd(sampled, axis=0, ddof=1) if total > 1 else np.full(sampled.shape[1:], np.nan)

@@ -125,7 +125,7 @@ def gradient_descent(layers: list[np.ndarray], training: Samples, validation: Sa
             part = Samples(
                 inputs=training.inputs[batch], outputs=training.outputs[batch], weights=training.weights[batch]
             )
-            gradient = flattened(_gradient(unpack(theta), part))
+            gradient = flattened(error_gradient(unpack(theta), part))
             gradient *= min(1.0, LONGEST_GRADIENT / max(float(np.linalg.norm(gradient)), 1e-300))
             step = MOMENTUM * step - rate * gradient
             theta = theta + step
@@ -171,7 +171,7 @@ def _rms(layers: Sequence[np.ndarray], samples: Samples) -> float:
     return math.sqrt(_sum_of_squares(layers, samples) / samples.outputs.size)
 
 
-def _gradient(layers: Sequence[np.ndarray], samples: Samples) -> list[np.ndarray]:
+def error_gradient(layers: Sequence[np.ndarray], samples: Samples) -> list[np.ndarray]:
     """Return the gradient of the mean squared error by the layers, by backpropagation."""
     outputs = forward(layers, samples.inputs)
     residual = _residual(outputs[-1], samples)

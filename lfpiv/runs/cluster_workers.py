@@ -51,7 +51,7 @@ def workers(address: str, shared: Path) -> Iterator[tuple[Any, Capacity]]:
             f"({type(error).__name__}: {reason})."
         ) from None
     try:
-        yield client, _Watch(client, address).capacity
+        yield client, SchedulerWatch(client, address).capacity
     finally:
         if client.status == "running":
             # in a thread, so that a scheduler that hangs cannot stop this process from ending
@@ -62,7 +62,7 @@ def workers(address: str, shared: Path) -> Iterator[tuple[Any, Capacity]]:
             client.close(timeout=CLOSE_S)
 
 
-class _Watch:
+class SchedulerWatch:
     """State of a scheduler. Requests are sent at intervals, without waiting for their answers."""
 
     def __init__(self, client: Any, address: str):

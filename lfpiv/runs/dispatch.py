@@ -71,10 +71,10 @@ def parallel(
         cluster_workers.workers(workers, shared) if isinstance(workers, str) else local_workers.workers(workers, shared)
     )
     with found as (client, capacity):
-        yield from _Dispatch(client, capacity, shared, todo).outcomes(progress)
+        yield from Dispatch(client, capacity, shared, todo).outcomes(progress)
 
 
-class _Dispatch:
+class Dispatch:
     """Pairs of a run on their way to and from the workers of a Dask client."""
 
     def __init__(self, client: Any, capacity: Capacity, shared: Path, todo: Sequence[int]):
@@ -192,7 +192,7 @@ def _in_worker(shared: str, pair: int, topic: str) -> worker.Result:
         host = get_address_host(here.address)
         near = [address for address in client.nthreads() if get_address_host(address) == host]
         places = list(client.run(_place, workers=near, on_error="return").values())
-        return max(_granted_cores() // max(places.count(_place()), 1), 1)
+        return max(granted_cores() // max(places.count(_place()), 1), 1)
 
     return worker.work_on(Path(shared), pair, report, threads)
 
@@ -203,7 +203,7 @@ def _place() -> tuple[Any, ...]:
     return os.environ.get("SLURM_JOB_ID"), *affinity
 
 
-def _granted_cores() -> int:
+def granted_cores() -> int:
     """Return the number of cores of this job; SLURM may grant fewer than the system shows."""
     granted = os.environ.get("SLURM_CPUS_PER_TASK", "")
     return min(cores(), int(granted)) if granted.isdigit() else cores()

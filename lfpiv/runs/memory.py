@@ -91,7 +91,7 @@ def allowed_bytes(experiment: Experiment) -> int:
 
 def available_bytes() -> int:
     """Return the memory this process may take [byte]: the free memory, limited by its control groups."""
-    free = _meminfo("MemAvailable")
+    free = meminfo("MemAvailable")
     if free is None:
         free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
     return max(0, min([free, *_left_in_groups()]))
@@ -133,7 +133,8 @@ def peak_mib() -> float:
     return peak / MIB if sys.platform == "darwin" else peak / 1024
 
 
-def _meminfo(key: str) -> int | None:
+def meminfo(key: str) -> int | None:
+    """Return a figure of the operating system's memory by its key in /proc/meminfo [byte], None where there is none."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:

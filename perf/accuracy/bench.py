@@ -101,7 +101,7 @@ class Judged:
     @property
     def standard_error(self) -> float:
         """Standard error of the mean error over the vectors of this pair [voxel]."""
-        return _standard_error(self.length)
+        return standard_error_of_mean(self.length)
 
     def row(self) -> dict[str, Any]:
         """Return the figures of ``reproduce.json``."""
@@ -358,10 +358,10 @@ def difference(judged: Judged, reference: Judged) -> tuple[float, float]:
         gap = judged.error.mean - reference.error.mean
         return gap, float(np.hypot(judged.standard_error, reference.standard_error))
     gaps = judged.length - reference.length
-    return float(gaps.mean()), _standard_error(gaps)
+    return float(gaps.mean()), standard_error_of_mean(gaps)
 
 
-def _standard_error(values: np.ndarray) -> float:
+def standard_error_of_mean(values: np.ndarray) -> float:
     """Return the standard error of a mean over vectors. Windows overlap by a half, so an eighth is independent."""
     return float(values.std() * np.sqrt(8 / values.size))
 

@@ -136,7 +136,7 @@ def test_cases_share_their_runs_and_the_page_tells_them_apart(tiny, figures):
 def test_standard_errors_are_those_of_independent_vectors():
     rng = np.random.default_rng(0)
     means = [rng.standard_normal((4, 4, 4)) for _ in range(4000)]
-    told = np.mean([bench._standard_error(np.kron(values, np.ones((2, 2, 2)))) for values in means])
+    told = np.mean([bench.standard_error_of_mean(np.kron(values, np.ones((2, 2, 2)))) for values in means])
     assert told == pytest.approx(np.std([values.mean() for values in means]), rel=SAMPLED)  # eight times the same
 
 

@@ -1,5 +1,6 @@
 """SMART: convergence to the minimum of its divergence, its invariants, and a particle that comes back in its place."""
 
+import dataclasses
 import logging
 import re
 from concurrent.futures import ThreadPoolExecutor
@@ -250,9 +251,9 @@ def test_threads_change_nothing(monkeypatch):
     weights = random_system(8, rows=40)
     images, _ = noisy_images(weights, 8)
     many = lfpiv.reconstruct(weights, images, iterations=12)
-    with ThreadPoolExecutor(1) as one:
-        monkeypatch.setattr(runtime, "_pool", one)
-        alone = lfpiv.reconstruct(weights, images, iterations=12)
+    single = dataclasses.replace(runtime.device(), threads=1)
+    monkeypatch.setattr(runtime, "device", lambda: single)
+    alone = lfpiv.reconstruct(weights, images, iterations=12)
     assert alone.values.tobytes() == many.values.tobytes()
     assert alone.misfit == many.misfit
 

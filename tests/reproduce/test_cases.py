@@ -72,7 +72,7 @@ def test_descent_follows_the_gradient():
     def error(parts):
         return np.mean((samples.weights * (samples.outputs - forward(parts, samples.inputs)[-1])) ** 2)
 
-    for number, gradient in enumerate(trainers._gradient(layers, samples)):
+    for number, gradient in enumerate(trainers.error_gradient(layers, samples)):
         for place in ((0, 0), (-1, 1)):
             moved = [[layer.copy() for layer in layers] for _ in range(2)]
             moved[0][number][place] -= DIFFERENCE

@@ -11,12 +11,12 @@ def test_profiles_between_layers_are_not_smoothed():
     axes = [np.linspace(-6, 6, 9), np.linspace(-3, 3, 5), np.array([-1.0, 0.0, 1.0])]
     z, y, x = np.meshgrid(*axes, indexing="ij")
     field = np.stack([z**3 - z + y, 2 - z**2 + x], axis=-1)
-    found = lsi._along(twin, axes, field)
+    found = lsi.along_profiles(twin, axes, field)
     depth, y = np.meshgrid(twin.depths_mm, axes[1], indexing="ij")
     expected = np.stack([depth**3 - depth + y, 2 - depth**2 + twin.profile_x_mm], axis=-1)
     np.testing.assert_allclose(found, expected, atol=1e-9)  # a cubic, at depths between the layers
     field[4, 2] = np.nan  # a window that no pair measured, in the layer at z = 0
-    found = lsi._along(twin, axes, field)
+    found = lsi.along_profiles(twin, axes, field)
     lost = np.isnan(found).any(-1)
     assert lost[1, 2] and lost.sum() == 1
 

@@ -47,12 +47,12 @@ def test_memory_is_what_the_tightest_group_above_the_process_leaves(
     (tmp_path / "own").write_text(f"3:cpu,cpuacct:/\n2:memory:{own}\n0::/\n" if version == 1 else f"0::{own}\n")
     monkeypatch.setattr(memory, "GROUPS", tmp_path)
     monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "own")
-    monkeypatch.setattr(memory, "_meminfo", lambda key: 64 * GIB)
+    monkeypatch.setattr(memory, "meminfo", lambda key: 64 * GIB)
     assert memory.available_bytes() == available * GIB
 
 
 def test_without_control_groups_the_machine_alone_counts(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "GROUPS", tmp_path / "none")
     monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "none either")
-    monkeypatch.setattr(memory, "_meminfo", lambda key: 64 * GIB)
+    monkeypatch.setattr(memory, "meminfo", lambda key: 64 * GIB)
     assert memory.available_bytes() == 64 * GIB

@@ -197,7 +197,7 @@ class DeadlyFuture:
 
 def outcomes(client, todo, width=2):
     fractions = []
-    found = list(dispatch._Dispatch(client, lambda: width, Path("shared"), todo).outcomes(fractions.append))
+    found = list(dispatch.Dispatch(client, lambda: width, Path("shared"), todo).outcomes(fractions.append))
     assert fractions == sorted(fractions) and fractions[-1] <= 1
     return {outcome.pair: outcome.reason for outcome in found}
 
@@ -228,7 +228,7 @@ def test_a_scheduler_that_hangs_is_told_and_given_up(monkeypatch, caplog):
     """The clock is the test's own: nothing until a minute has passed, then a word each minute, an error at last."""
     now = [0.0]
     monkeypatch.setattr(cluster_workers, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    watch = cluster_workers._Watch(SimpleNamespace(status="running"), "tcp://there:1")
+    watch = cluster_workers.SchedulerWatch(SimpleNamespace(status="running"), "tcp://there:1")
     watch.answer = Future()
     with caplog.at_level("INFO", "lfpiv.runs.cluster_workers"):
         for now[0] in np.arange(0.0, cluster_workers.SILENT_S, 1.0):
@@ -253,7 +253,7 @@ def test_a_worker_uses_the_cores_that_its_job_was_given(monkeypatch, granted, ex
     monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
     if granted is not None:
         monkeypatch.setenv("SLURM_CPUS_PER_TASK", granted)
-    assert dispatch._granted_cores() == expected
+    assert dispatch.granted_cores() == expected
 
 
 @pytest.mark.slow
