@@ -31,16 +31,16 @@ struct LensGroup {
           rows(box.last_row - box.first_row + 1.0f),
           column(0.5f * (columns - 1.0f)),
           row(0.5f * (rows - 1.0f)),
-          u0(pupil_point(lenses.centre_s, first_column, voxel.camera.half_columns)),
-          v0(pupil_point(lenses.centre_t, first_row, voxel.camera.half_rows)),
+          u0(pupil_point(lenses.image_s, first_column, voxel.camera.half_columns)),
+          v0(pupil_point(lenses.image_t, first_row, voxel.camera.half_rows)),
           u(u0 - column * voxel.pupil_pixel),
           v(v0 - row * voxel.pupil_pixel),
           local(voxel, box.u, box.v) {}
 
     /// Return where the middle of a pixel looks through the pupil, along one axis.
-    LFPIV_INLINE V pupil_point(V centre, V pixel, float half_sensor) const {
+    LFPIV_INLINE V pupil_point(V image, V pixel, float half_sensor) const {
         const Geometry& g = voxel.camera;
-        return ((1.0f + g.ratio) * centre - (pixel + (0.5f - half_sensor)) * g.pixel) / g.ratio;
+        return (image - (pixel + (0.5f - half_sensor)) * g.pixel) / g.ratio;
     }
 
     /// Find how far from the lens's centre the ray through a pupil point meets the array.
