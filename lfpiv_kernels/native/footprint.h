@@ -329,7 +329,7 @@ LFPIV_INLINE void fill(const WeightInputs& in, const Outline& outline, int index
                        float* scale_out, int* blocks_out, int* bytes_out) {
     const Voxel voxel(in, index);
     ReachedLenses reached(voxel);
-    const Top top(voxel);
+    const Top top(voxel, reached.slope);
     const Bend bend(voxel);
     scale_out[index] = reached.count > 0 ? top.scale(voxel) : 0.0f;
     const int first_block = room.first_block[index], last_block = room.first_block[index + 1];

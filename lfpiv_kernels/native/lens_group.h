@@ -35,7 +35,14 @@ struct LensGroup {
           v0(pupil_point(lenses.image_t, first_row, voxel.camera.half_rows)),
           u(u0 - column * voxel.pupil_pixel),
           v(v0 - row * voxel.pupil_pixel),
-          local(voxel, box.u, box.v) {}
+          local(local_frame(voxel, box.u, box.v)) {}
+
+    /// Return the rays about a pupil point.
+    LFPIV_INLINE static LocalFrame<V> local_frame(const Voxel& voxel, V u, V v) {
+        V k[4];
+        voxel.slope(u, v, k);
+        return LocalFrame<V>(voxel, u, v, k);
+    }
 
     /// Return where the middle of a pixel looks through the pupil, along one axis.
     LFPIV_INLINE V pupil_point(V image, V pixel, float half_sensor) const {

@@ -77,10 +77,10 @@ struct LocalFrame {
     T smears[4];  // widths of the smears, see `smear_widths`
     T area;       // of a pixel's cell on the pupil, relative to one without the voxel's slope
 
-    LFPIV_INLINE LocalFrame(const Voxel& voxel, T u, T v) {
+    /// `k` is the slope at the pupil point (u, v).
+    LFPIV_INLINE LocalFrame(const Voxel& voxel, T u, T v, const T* k) {
         const float* frame = voxel.camera.frame;
-        T s = u, t = v, k[4];
-        voxel.slope(u, v, k);
+        T s = u, t = v;
         T less[4] = {1.0f - k[0], -k[1], -k[2], 1.0f - k[3]}, jacobian[4];
         area = abs(invert(less, jacobian));
         for (int n = 0; n < 2; ++n)
@@ -101,8 +101,8 @@ struct LocalFrame {
 struct Top {
     float area, a, b;
 
-    LFPIV_INLINE explicit Top(const Voxel& voxel) {
-        const LocalFrame<float> local(voxel, 0.0f, 0.0f);
+    LFPIV_INLINE Top(const Voxel& voxel, const float* centre_slope) {
+        const LocalFrame<float> local(voxel, 0.0f, 0.0f, centre_slope);
         const float* smears = local.smears;
         area = HEADROOM * local.area;
         a = HEADROOM * trapezium(0.0f, smears[0], smears[2]) / smears[0];
