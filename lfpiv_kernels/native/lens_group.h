@@ -8,9 +8,6 @@
 
 namespace lfpiv {
 
-/// Width around the pupil within which a pixel still counts as touching it [pixel]: more than its share's rounding.
-constexpr float RIM = 0.05f;
-
 /// `WIDTH` lenses and the pixels under them, one lens per lane.
 struct LensGroup {
     const Voxel& voxel;
@@ -123,7 +120,7 @@ struct Tile {
 
     LFPIV_INLINE Tile(const LensGroup& group, M here, float column0) {
         const Voxel& voxel = group.voxel;
-        const float pupil_pixel = voxel.pupil_pixel, rim = voxel.camera.radius + RIM * pupil_pixel;
+        const float pupil_pixel = voxel.pupil_pixel, rim = voxel.rim;
         const V none = {}, width = min(splat((float)BLOCK_WIDTH), group.columns - column0);
         const V u = group.u0 - (column0 + 0.5f * (width - 1.0f)) * pupil_pixel;
         layer = edge_layer(group, here, u, width);

@@ -15,6 +15,8 @@ constexpr int GEOMETRY_SIZE = 23;
 constexpr float LEVELS = 255.0f;
 /// Smallest smear, in pitches or mm: keeps the closed form finite.
 constexpr float NARROWEST = 1e-4f;
+/// Width around the pupil within which a pixel still counts as touching it [pixel]: more than its share's rounding.
+constexpr float RIM = 0.05f;
 
 /// Polynomials of a voxel's rays in the pupil point (u, v).
 struct RayModel {
@@ -119,6 +121,7 @@ struct Voxel {
     const Geometry& camera;
     const WeightInputs& in;
     const float pupil_pixel;  // width of a pixel on the pupil [mm]
+    const float rim;          // distance from the pupil's centre within which a pixel touches the pupil [mm]
     const int parts;          // into which the voxel is cut
 
     LFPIV_INLINE Voxel(const WeightInputs& in, int voxel)
@@ -126,6 +129,7 @@ struct Voxel {
           camera(*in.geometry),
           in(in),
           pupil_pixel(in.geometry->pixel / in.geometry->ratio),
+          rim(camera.radius + RIM * pupil_pixel),
           parts(in.profiles ? 1 : in.cuts[0] * in.cuts[1] * in.cuts[2]) {}
 
     /// Find (s, t) of the ray through the pupil point (u, v).

@@ -141,12 +141,13 @@ struct Bend {
         const float pixel = voxel.pupil_pixel, square = pixel * pixel;
         const float *s = voxel.model.s, *t = voxel.model.t;
         frame_area = abs(1.0f / invert(voxel.camera.frame, unframe));
-        for (int n = 0; n < 2; ++n)
-            for (int c = 0; c < 2; ++c) {
-                const float* q = (n ? t : s) + 3;
-                along_column[2 * n + c] = pixel * (2.0f * q[0] * unframe[c] + q[1] * unframe[2 + c]);
-                along_row[2 * n + c] = pixel * (q[1] * unframe[c] + 2.0f * q[2] * unframe[2 + c]);
-            }
+        for (int c = 0; c < 2; ++c) {
+            const float a = unframe[c], b = unframe[2 + c];
+            along_column[c] = pixel * (s[4] * b + 2.0f * s[3] * a);
+            along_row[c] = pixel * (s[4] * a + 2.0f * s[5] * b);
+            along_column[2 + c] = pixel * (2.0f * t[3] * a + t[4] * b);
+            along_row[2 + c] = pixel * (t[4] * a + 2.0f * t[5] * b);
+        }
         s_xx = square * s[3], s_xy = square * s[4], s_yy = square * s[5];
         t_xx = square * t[3], t_xy = square * t[4], t_yy = square * t[5];
     }
