@@ -62,6 +62,20 @@ LFPIV_INLINE float middle_of_part(const int* cuts, int part, float x, float y, f
            ((deep + 0.5f) / cuts[2] - 0.5f) * z;
 }
 
+/// Return the same with the products along x and z rounded before they are added.
+LFPIV_INLINE float middle_of_part_rounded(const int* cuts, int part, float x, float y, float z) {
+    const int across = part % cuts[0], down = part / cuts[0] % cuts[1], deep = part / (cuts[0] * cuts[1]);
+    float along_x, along_z;
+    {
+#if defined(__clang__)
+#pragma clang fp contract(off)
+#endif
+        along_x = ((across + 0.5f) / cuts[0] - 0.5f) * x;
+        along_z = ((deep + 0.5f) / cuts[2] - 0.5f) * z;
+    }
+    return along_x + ((down + 0.5f) / cuts[1] - 0.5f) * y + along_z;
+}
+
 /// Replace the voxel's edges by those of its parts.
 template <class T>
 LFPIV_INLINE void cut_edges(const int* cuts, T* edge) {
