@@ -124,7 +124,7 @@ struct CellParts {
         float e[6];
         for (int n = 0; n < 6; ++n) e[n] = in_memory(values.edge[n], lens);
         for (int part = 0; part < voxel.parts; ++part) {
-            part_a[part] = middle_of_part(voxel.in.cuts, part, e[0], e[1], e[2]);
+            part_a[part] = middle_of_part_rounded(voxel.in.cuts, part, e[0], e[1], e[2]);
             part_b[part] = middle_of_part(voxel.in.cuts, part, e[3], e[4], e[5]);
         }
     }
@@ -329,7 +329,7 @@ LFPIV_INLINE void fill(const WeightInputs& in, const Outline& outline, int index
                        float* scale_out, int* blocks_out, int* bytes_out) {
     const Voxel voxel(in, index);
     ReachedLenses reached(voxel);
-    const Top top(voxel);
+    const Top top(voxel, reached.slope);
     const Bend bend(voxel);
     scale_out[index] = reached.count > 0 ? top.scale(voxel) : 0.0f;
     const int first_block = room.first_block[index], last_block = room.first_block[index + 1];

@@ -8,9 +8,6 @@
 
 namespace lfpiv {
 
-/// Width around the pupil within which a pixel still counts as touching it [pixel]: more than its share's rounding.
-constexpr float RIM = 0.05f;
-
 /// `WIDTH` lenses and the pixels under them, one lens per lane.
 struct LensGroup {
     const Voxel& voxel;
@@ -31,16 +28,23 @@ struct LensGroup {
           rows(box.last_row - box.first_row + 1.0f),
           column(0.5f * (columns - 1.0f)),
           row(0.5f * (rows - 1.0f)),
-          u0(pupil_point(lenses.centre_s, first_column, voxel.camera.half_columns)),
-          v0(pupil_point(lenses.centre_t, first_row, voxel.camera.half_rows)),
+          u0(pupil_point(lenses.image_s, first_column, voxel.camera.half_columns)),
+          v0(pupil_point(lenses.image_t, first_row, voxel.camera.half_rows)),
           u(u0 - column * voxel.pupil_pixel),
           v(v0 - row * voxel.pupil_pixel),
-          local(voxel, box.u, box.v) {}
+          local(local_frame(voxel, box.u, box.v)) {}
+
+    /// Return the rays about a pupil point.
+    LFPIV_INLINE static LocalFrame<V> local_frame(const Voxel& voxel, V u, V v) {
+        V k[4];
+        voxel.slope(u, v, k);
+        return LocalFrame<V>(voxel, u, v, k);
+    }
 
     /// Return where the middle of a pixel looks through the pupil, along one axis.
-    LFPIV_INLINE V pupil_point(V centre, V pixel, float half_sensor) const {
+    LFPIV_INLINE V pupil_point(V image, V pixel, float half_sensor) const {
         const Geometry& g = voxel.camera;
-        return ((1.0f + g.ratio) * centre - (pixel + (0.5f - half_sensor)) * g.pixel) / g.ratio;
+        return (image - (pixel + (0.5f - half_sensor)) * g.pixel) / g.ratio;
     }
 
     /// Find how far from the lens's centre the ray through a pupil point meets the array.
@@ -116,7 +120,7 @@ struct Tile {
 
     LFPIV_INLINE Tile(const LensGroup& group, M here, float column0) {
         const Voxel& voxel = group.voxel;
-        const float pupil_pixel = voxel.pupil_pixel, rim = voxel.camera.radius + RIM * pupil_pixel;
+        const float pupil_pixel = voxel.pupil_pixel, rim = voxel.rim;
         const V none = {}, width = min(splat((float)BLOCK_WIDTH), group.columns - column0);
         const V u = group.u0 - (column0 + 0.5f * (width - 1.0f)) * pupil_pixel;
         layer = edge_layer(group, here, u, width);

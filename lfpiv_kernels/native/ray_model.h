@@ -15,6 +15,8 @@ constexpr int GEOMETRY_SIZE = 23;
 constexpr float LEVELS = 255.0f;
 /// Smallest smear, in pitches or mm: keeps the closed form finite.
 constexpr float NARROWEST = 1e-4f;
+/// Width around the pupil within which a pixel still counts as touching it [pixel]: more than its share's rounding.
+constexpr float RIM = 0.05f;
 
 /// Polynomials of a voxel's rays in the pupil point (u, v).
 struct RayModel {
@@ -103,6 +105,7 @@ struct Lenses {
     int index[2 * WIDTH];       // lattice indices (i, j)
     int corner[2 * WIDTH];      // first pixel (column, row) of the block
     V centre_s, centre_t;       // [mm]
+    V image_s, image_t;         // middle of the microimage on the sensor [mm]
     V first_column, first_row;  // `corner` again
 };
 
@@ -118,6 +121,7 @@ struct Voxel {
     const Geometry& camera;
     const WeightInputs& in;
     const float pupil_pixel;  // width of a pixel on the pupil [mm]
+    const float rim;          // distance from the pupil's centre within which a pixel touches the pupil [mm]
     const int parts;          // into which the voxel is cut
 
     LFPIV_INLINE Voxel(const WeightInputs& in, int voxel)
@@ -125,6 +129,7 @@ struct Voxel {
           camera(*in.geometry),
           in(in),
           pupil_pixel(in.geometry->pixel / in.geometry->ratio),
+          rim(camera.radius + RIM * pupil_pixel),
           parts(in.profiles ? 1 : in.cuts[0] * in.cuts[1] * in.cuts[2]) {}
 
     /// Find (s, t) of the ray through the pupil point (u, v).
@@ -258,6 +263,7 @@ struct ReachedLenses {
         const Geometry& g = voxel.camera;
         lenses.centre_s = g.origin[0] + i * g.basis[0] + j * g.basis[2];
         lenses.centre_t = g.origin[1] + i * g.basis[1] + j * g.basis[3];
+        lenses.image_s = (1.0f + g.ratio) * lenses.centre_s, lenses.image_t = (1.0f + g.ratio) * lenses.centre_t;
     }
 
     /// Narrow the part of the pupil that lights some lenses: bound it once more about its own middle.
@@ -289,7 +295,7 @@ struct ReachedLenses {
         V low_u = max(at_u - wide_u, splat(-rim)), high_u = min(at_u + wide_u, splat(rim));
         V low_v = max(at_v - wide_v, splat(-rim)), high_v = min(at_v + wide_v, splat(rim));
         if (!voxel.in.profiles) narrow(lenses, low_u, high_u, low_v, high_v);
-        const V from_s = (1.0f + g.ratio) * lenses.centre_s, from_t = (1.0f + g.ratio) * lenses.centre_t;
+        const V from_s = lenses.image_s, from_t = lenses.image_t;
         const V zero = splat(0.0f);
         const float last = g.edge - 1.0f;
         V column0 = max(ceil((from_s - g.ratio * high_u) / g.pixel - 0.5f + g.half_columns), zero);

@@ -62,6 +62,20 @@ LFPIV_INLINE float middle_of_part(const int* cuts, int part, float x, float y, f
            ((deep + 0.5f) / cuts[2] - 0.5f) * z;
 }
 
+/// Return the same with the products along x and z rounded before they are added.
+LFPIV_INLINE float middle_of_part_rounded(const int* cuts, int part, float x, float y, float z) {
+    const int across = part % cuts[0], down = part / cuts[0] % cuts[1], deep = part / (cuts[0] * cuts[1]);
+    float along_x, along_z;
+    {
+#if defined(__clang__)
+#pragma clang fp contract(off)
+#endif
+        along_x = ((across + 0.5f) / cuts[0] - 0.5f) * x;
+        along_z = ((deep + 0.5f) / cuts[2] - 0.5f) * z;
+    }
+    return along_x + ((down + 0.5f) / cuts[1] - 0.5f) * y + along_z;
+}
+
 /// Replace the voxel's edges by those of its parts.
 template <class T>
 LFPIV_INLINE void cut_edges(const int* cuts, T* edge) {
@@ -77,10 +91,10 @@ struct LocalFrame {
     T smears[4];  // widths of the smears, see `smear_widths`
     T area;       // of a pixel's cell on the pupil, relative to one without the voxel's slope
 
-    LFPIV_INLINE LocalFrame(const Voxel& voxel, T u, T v) {
+    /// `k` is the slope at the pupil point (u, v).
+    LFPIV_INLINE LocalFrame(const Voxel& voxel, T u, T v, const T* k) {
         const float* frame = voxel.camera.frame;
-        T s = u, t = v, k[4];
-        voxel.slope(u, v, k);
+        T s = u, t = v;
         T less[4] = {1.0f - k[0], -k[1], -k[2], 1.0f - k[3]}, jacobian[4];
         area = abs(invert(less, jacobian));
         for (int n = 0; n < 2; ++n)
@@ -101,8 +115,8 @@ struct LocalFrame {
 struct Top {
     float area, a, b;
 
-    LFPIV_INLINE explicit Top(const Voxel& voxel) {
-        const LocalFrame<float> local(voxel, 0.0f, 0.0f);
+    LFPIV_INLINE Top(const Voxel& voxel, const float* centre_slope) {
+        const LocalFrame<float> local(voxel, 0.0f, 0.0f, centre_slope);
         const float* smears = local.smears;
         area = HEADROOM * local.area;
         a = HEADROOM * trapezium(0.0f, smears[0], smears[2]) / smears[0];
@@ -141,12 +155,13 @@ struct Bend {
         const float pixel = voxel.pupil_pixel, square = pixel * pixel;
         const float *s = voxel.model.s, *t = voxel.model.t;
         frame_area = abs(1.0f / invert(voxel.camera.frame, unframe));
-        for (int n = 0; n < 2; ++n)
-            for (int c = 0; c < 2; ++c) {
-                const float* q = (n ? t : s) + 3;
-                along_column[2 * n + c] = pixel * (2.0f * q[0] * unframe[c] + q[1] * unframe[2 + c]);
-                along_row[2 * n + c] = pixel * (q[1] * unframe[c] + 2.0f * q[2] * unframe[2 + c]);
-            }
+        for (int c = 0; c < 2; ++c) {
+            const float a = unframe[c], b = unframe[2 + c];
+            along_column[c] = pixel * (s[4] * b + 2.0f * s[3] * a);
+            along_row[c] = pixel * (s[4] * a + 2.0f * s[5] * b);
+            along_column[2 + c] = pixel * (2.0f * t[3] * a + t[4] * b);
+            along_row[2 + c] = pixel * (t[4] * a + 2.0f * t[5] * b);
+        }
         s_xx = square * s[3], s_xy = square * s[4], s_yy = square * s[5];
         t_xx = square * t[3], t_xy = square * t[4], t_yy = square * t[5];
     }
