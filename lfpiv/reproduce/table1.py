@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +109,16 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress) -> dict[str, Any]:
     """Train all networks on a rig's labels, except those that `work` holds already."""
     cameras = list(rig.calibration.cameras)
-    labels = {name: {"lens_integral": rig.labels(name), "gaussian": _gaussian_labels(rig, name)} for name in cameras}
+    estimators: dict[str, Callable[[str], BoardDots]] = {
+        "lens_integral": rig.labels,
+        "gaussian": cache(partial(_gaussian_labels, rig)),
+    }
+
+    def fitted(file: str, name: str, estimator: str, recipe: Recipe) -> Fit:
+        settings = {"seed": seed, "samples": recipe.samples, "epochs": recipe.epochs}
+        path = work / "networks" / f"{file}_{name}.json"
+        found: Fit = store.cached(path, settings, lambda: fit(rig, name, estimators[estimator](name), recipe))
+        return found
 
     jobs = [(trainer, layers, name) for layers in sizes.layers for trainer in TRAINERS for name in cameras]
     cost = np.cumsum([layers**2 * (0.1 if trainer == "GDM" else 1) for trainer, layers, _ in jobs])
@@ -117,19 +126,17 @@ def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress
     for done, (trainer, layers, name) in enumerate(jobs):
         progress(f"{trainer}, {layers} hidden layers", float(cost[done - 1] / cost[-1]) if done else 0.0)
         epochs = sizes.descent_epochs if trainer == "GDM" else sizes.epochs
-        settings = {"seed": seed, "samples": sizes.samples, "epochs": epochs}
         recipe = Recipe(hidden=(NODES,) * layers, trainer=trainer, epochs=epochs, samples=sizes.samples, seed=seed)
-        path = work / "networks" / f"{trainer}_{layers:02d}_{name}.json"
-        fitted = store.cached(path, settings, partial(fit, rig, name, labels[name]["lens_integral"], recipe))
-        deep[trainer][layers].append(fitted)
+        deep[trainer][layers].append(fitted(f"{trainer}_{layers:02d}", name, "lens_integral", recipe))
     shallow = []
     for estimator, baseline, hidden in itertools.product(ESTIMATORS, ("none", "thin_lens"), SHALLOW):
         recipe = Recipe(hidden=hidden, baseline=baseline, epochs=sizes.shallow_epochs, seed=seed)
-        fits = [fit(rig, name, labels[name][estimator], recipe) for name in cameras]
+        file = f"shallow_{estimator}_{baseline}_{'_'.join(map(str, hidden))}"
+        fits = [fitted(file, name, estimator, recipe) for name in cameras]
         shallow.append({"estimator": estimator, "baseline": baseline, "hidden": hidden, "cameras": fits})
     progress("networks", 1.0)
     _draw(deep, shallow, work / "table1.png")
-    return _result(deep, shallow, labels, sizes)
+    return _result(deep, shallow, {name: len(rig.labels(name).dot) for name in cameras}, sizes)
 
 
 def fit(rig: Rig, name: str, dots: BoardDots, recipe: Recipe) -> Fit:
@@ -231,9 +238,7 @@ class Best:
         return max(_both(self.shallow["cameras"]))
 
 
-def _result(
-    deep: Deep, shallow: Sequence[Fit], labels: Mapping[str, Mapping[str, BoardDots]], sizes: Sizes
-) -> dict[str, Any]:
+def _result(deep: Deep, shallow: Sequence[Fit], labels: Mapping[str, int], sizes: Sizes) -> dict[str, Any]:
     best = Best.of(deep, shallow)
     return page.result(
         {
@@ -353,12 +358,12 @@ def _notes(deep: Deep, best: Best) -> list[str]:
     return notes
 
 
-def _cut_notes(labels: Mapping[str, Mapping[str, BoardDots]], sizes: Sizes) -> list[str]:
+def _cut_notes(labels: Mapping[str, int], sizes: Sizes) -> list[str]:
     """Describe what a small scale leaves out."""
     left_out = [layers for layers in PAPER["LM"] if layers not in sizes.layers]
     if sizes.samples is None and not left_out:
         return []
-    available = min(len(part["lens_integral"].dot) for part in labels.values())
+    available = min(labels.values())
     taken = available if sizes.samples is None else min(sizes.samples, available)
     return [
         f"Cut at this scale: deep networks see {taken} of {available} labels, at most {sizes.epochs} epochs (GDM "

@@ -277,6 +277,7 @@ def test_a_wrong_f_number_is_refused_or_warned_of(rig):
             with_f_number(number)
 
 
+@pytest.mark.slow
 def test_small_microimages_leave_enough_pixels(rig, tmp_path):
     """Microimages at f/8 are six pixels wide."""
     small = SCENE.replace("f_number = 4.0", "f_number = 8.0").replace("[-0.8, -0.4, 0.0, 0.4, 0.8]", "[-0.8, 0.0, 0.8]")

@@ -224,6 +224,7 @@ def test_network_learns_the_rays_of_a_camera(angle, noise, goal):
     assert training.sigma_nor <= np.hypot(noise * np.sqrt(np.pi / 2) * 1.05, goal)
 
 
+@pytest.mark.slow
 def test_two_hidden_layers_beat_the_goal_too():
     rng = np.random.default_rng(12)
     points, pupil, array, dot = board_labels(aberrated, 4000, rng)
@@ -249,6 +250,7 @@ def test_labels_count_by_their_standard_deviation():
     assert errors[1] < errors[0] / 10  # the better half has a hundredth of the noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.005, 0.04])
 def test_network_on_a_fitted_thin_lens_extrapolates(noise):
     rng = np.random.default_rng(14)

@@ -162,6 +162,7 @@ def test_a_failure_inside_is_one_line_and_a_traceback_only_on_request(monkeypatc
     assert "Traceback" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_real_processes_end_with_the_same_status(tiny_experiment, tmp_path):
     assert run("--version") == (0, f"lfpiv {lfpiv.__version__}\n", "")
     (tiny_experiment.parent / "white/left.tif").unlink()

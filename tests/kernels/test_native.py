@@ -98,6 +98,7 @@ def test_constants_are_read_from_headers():
         native.constant("projector.h", "NO_SUCH")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
 @pytest.mark.parametrize("module", warp_modules())
 def test_kernels_compile_for_a_gpu_where_there_is_none(module, tmp_path):

@@ -146,6 +146,7 @@ def spoilt(small_run, tmp_path_factory):
     return file, out, summary
 
 
+@pytest.mark.slow
 def test_the_images_of_every_pair_are_checked(spoilt):
     """A copied image fails its pair; each doubt appears once with its pairs, independent of the log level."""
     _, out, summary = spoilt
@@ -164,6 +165,7 @@ def test_the_images_of_every_pair_are_checked(spoilt):
     )
 
 
+@pytest.mark.slow
 def test_a_pair_of_noise_enters_no_mean(spoilt):
     """The correlation marks its vectors as valid, but the images show no particles."""
     file, out, summary = spoilt
@@ -180,6 +182,7 @@ def test_a_pair_of_noise_enters_no_mean(spoilt):
     assert netcdf.read_vectors(out / "vectors" / "pair_0000.nc").equals(vectors)
 
 
+@pytest.mark.slow
 def test_warnings_outlive_the_invocation(spoilt, tmp_path, monkeypatch):
     """A second run and a new report give the warnings of the first run."""
     file, out, first = spoilt

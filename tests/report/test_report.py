@@ -178,6 +178,7 @@ def test_mean_and_fluctuation_are_those_of_the_valid_vectors(reported):
     assert (found.mean["valid"].values == (counts > 0)).all() and found.read == 3
 
 
+@pytest.mark.slow
 def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, monkeypatch):
     """Five thousand pairs, the files of two: the page hardly grows, and a sample of files is read."""
     pairs = 5000
@@ -346,6 +347,7 @@ def test_a_report_before_any_pair_is_finished(reported, tmp_path, monkeypatch):
     assert "No pair is finished yet." in page.text["p"] and not page.all("canvas")
 
 
+@pytest.mark.slow
 def test_ray_tracing_at_nominal_angles_is_reported_without_dots(reported):
     traced = lfpiv.thin_lens(reported.experiment)
     cameras = {name: CameraFigures.model_validate(camera.report.to_json()) for name, camera in traced.cameras.items()}

@@ -123,6 +123,7 @@ def changed(experiment, folder, old, new):
     return file
 
 
+@pytest.mark.slow
 def test_only_what_changed_is_done_anew(finished, tmp_path, caplog):
     """Other windows: vectors from the volumes that are there. Pairs not asked for stay, outside the summary."""
     experiment, out, _ = finished

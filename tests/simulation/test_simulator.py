@@ -180,6 +180,7 @@ def test_dots_traced_forward_and_backward_agree(device, rig, tilt_error):
     assert np.linalg.norm(forward - backward) < (tilt_error + 0.02) * np.linalg.norm(backward)  # 2 %: noise of the rays
 
 
+@pytest.mark.slow
 def test_images_add_exactly_and_do_not_depend_on_threads(device, tmp_path):
     renderer, rays = render_camera(camera(), seed=4), render.ray_table(4096, "ball", 0)
     centres, counts = points(40), np.random.default_rng(1).uniform(5e4, 2e5, 40)

@@ -80,6 +80,7 @@ def counted(camera, centre, seed, voxel_mm):
     return whole(camera.gain, counts[0] / total[0], corner[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "microlenses"), [*((name, 1) for name in RIGS), ("rolled 40", 0.5), ("rolled 40", 2), ("hexagonal 15", 2)]
 )
