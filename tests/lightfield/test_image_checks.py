@@ -50,6 +50,7 @@ def pair_of_cameras(request, tmp_path_factory, device):
     return experiment, lfpiv.thin_lens(experiment)
 
 
+@pytest.mark.slow
 def test_light_between_the_microimages_shows_another_cameras_image(pair_of_cameras):
     experiment, calibration = pair_of_cameras
     left, right = (calibration.cameras[name].decoder for name in ("left", "right"))

@@ -640,6 +640,7 @@ def half_seen_rig():
     return IdealRig({"cam1": wide["cam1"], "cam2": IdealCamera("cam2", wide["cam2"].pose, optics=optics(200, 260))})
 
 
+@pytest.mark.slow
 def test_a_volume_tells_what_fewer_than_two_cameras_see(tmp_path, caplog):
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.8, 1.8, 0.8), voxel_mm=0.1)
     weights = lfpiv.build_weights(half_seen_rig(), grid)

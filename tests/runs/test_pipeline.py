@@ -91,6 +91,7 @@ def test_the_report_tells_of_this_run(finished):
         assert html.escape(warning) in page
 
 
+@pytest.mark.slow
 def test_a_second_run_does_nothing_anew(finished):
     experiment, out, first = finished
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*.[hn][5c]")}
@@ -102,6 +103,7 @@ def test_a_second_run_does_nothing_anew(finished):
     assert second["pairs"] == first["pairs"] and second["timings_s"]["total"] < first["timings_s"]["total"]
 
 
+@pytest.mark.slow
 def test_steps_one_at_a_time_give_the_same(finished):
     experiment, out, _ = finished
     path = out / "vectors" / "pair_0001.nc"

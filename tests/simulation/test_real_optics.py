@@ -207,6 +207,7 @@ def test_sources_seen_through_real_optics_equal_their_twin(device, name):
     assert relative_difference(ideal, expected) > 10 * MOVED_RAYS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tank", "all"])
 def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
     """Trace the rays of each pixel of a small sensor back in float64, without the short cut of the kernel."""
