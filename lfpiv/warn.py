@@ -71,11 +71,13 @@ class Code(enum.Enum):
     """A code that this version does not know, or a sentence stored by version 0.1.0."""
 
 
+_MISPLACED = (
+    "light falls between the microimages of the white image. Is it of the same camera, focus, zoom and aperture, and "
+    "are f_number and microlens_focal_length_mm right?"
+)
+
 SENTENCES: Mapping[Code, str] = {
-    Code.MISPLACED: (
-        "light falls between the microimages of the white image. Is it of the same camera, focus, zoom and aperture, "
-        "and are f_number and microlens_focal_length_mm right?"
-    ),
+    Code.MISPLACED: _MISPLACED,
     Code.SATURATED: (
         "{share:percent} % of the bright pixels are saturated; clipped particles make ghosts, lower the laser's "
         "power or the camera's gain"
@@ -112,10 +114,7 @@ SENTENCES: Mapping[Code, str] = {
         "{share:percent} % of the bright pixels of {path} are saturated and left out, so the dots are measured less "
         "accurately; expose the board to two thirds of the range."
     ),
-    Code.BOARD_MISPLACED: (
-        "{path}: light falls between the microimages of the white image. Is it of the same camera, focus, zoom and "
-        "aperture, and are f_number and microlens_focal_length_mm right?"
-    ),
+    Code.BOARD_MISPLACED: "{path}: " + _MISPLACED,
     Code.BOARD_RENAMED: "the board's dots were renamed by {columns} columns and {rows} rows to match its outline",
     Code.BOARD_EDGE_UNSEEN: (
         "no edge of the board is in view along {axis} ({count} dots, {stated} stated): their numbers are right only "
@@ -239,8 +238,10 @@ class Warning:
             return cls(code=Code.OTHER, figures={"text": stored})
         if "what" in stored:
             subject = stored["camera"] + (f", frame {stored['frame']}" if stored["frame"] else "")
-            figure = {_FINDING_FIGURES[stored["what"]]: stored["value"], "ratio": 4.0}
-            return cls(code=Code(stored["what"]), subject=subject, figures=figure)
+            figures = {_FINDING_FIGURES[stored["what"]]: stored["value"]}
+            if stored["what"] == Code.UNEVEN.value:
+                figures["ratio"] = 4.0  # the limit of version 0.1.0
+            return cls(code=Code(stored["what"]), subject=subject, figures=figures)
         code, pairs = stored["code"], tuple(stored.get("pairs", ()))
         if code not in {known.value for known in Code}:
             values = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
@@ -283,11 +284,11 @@ def from_text(text: str) -> tuple[Warning, ...]:
 
 
 def gather(warnings: Iterable[Warning]) -> list[Warning]:
-    """Merge warnings of equal code and subject: their pairs in one, their figures as ranges. Sorted by code."""
-    groups: dict[tuple[Code, str, tuple[str, ...]], list[Warning]] = {}
+    """Merge warnings of equal code, subject and texts: their pairs in one, their numbers as ranges. Sorted by code."""
+    groups: dict[tuple[Code, str, tuple[tuple[str, str], ...]], list[Warning]] = {}
     for warning in warnings:
-        names = tuple(str(value) for value in warning.figures.values() if isinstance(value, str))
-        groups.setdefault((warning.code, warning.subject, names), []).append(warning)
+        fixed = ((name, value if isinstance(value, str) else "") for name, value in warning.figures.items())
+        groups.setdefault((warning.code, warning.subject, tuple(sorted(fixed))), []).append(warning)
     order = list(Code)
     return [_merged(group) for _, group in sorted(groups.items(), key=lambda item: order.index(item[0][0]))]
 

@@ -56,6 +56,15 @@ def test_warnings_of_other_versions_are_read(stored, sentence):
     assert Warning.from_json(stored).sentence.startswith(sentence)
 
 
+def test_pairs_of_several_versions_are_gathered():
+    """A folder may hold pairs of version 0.1.0 and of this one."""
+    older = {"what": "saturated", "camera": "left", "frame": "a", "value": 0.25}
+    (found,) = gather([Warning.from_json(older).of_pair(0), dark(0.5).of_pair(1)])
+    assert found.sentence.startswith("left, frame a, pairs 0, 1: 25 to 50 % of the bright pixels")
+    other = Warning(code=Code.SATURATED, subject="left, frame a", figures={"share": 0.5, "bits": 12})
+    assert len(gather([dark(0.5), other])) == 2  # figures of another form are not merged
+
+
 def test_many_pairs_with_the_same_trouble_are_one_line():
     (found,) = gather(dark(0.1 + number / 1e4).of_pair(number) for number in range(1000))
     assert found.sentence.startswith("left, frame a, pairs 0, 1, 2, 3, 4 and 995 more: 10 to 20 % of the bright pixels")
