@@ -24,11 +24,22 @@ from lfpiv.experiment.settings import (
     Volume,
 )
 from lfpiv.experiment.toml import read_toml
+from lfpiv.simulation.board_errors import BoardErrors
 from lfpiv.simulation.flows import KINDS, Flow, Tracers
-from lfpiv.simulation.scene_camera import Aberrations, SceneCamera, Windows, true_mapping
+from lfpiv.simulation.light import Brightness, Sheet, StrayLight
+from lfpiv.simulation.scene_camera import (
+    SHARED_TABLES,
+    Aberrations,
+    ArrayFaults,
+    SceneCamera,
+    Windows,
+    true_mapping,
+)
+from lfpiv.simulation.sensor import Noise, Sensor
+from lfpiv.simulation.surfaces import Surfaces, Walls, solid
 from lfpiv.simulation.turbulence import Turbulence, TurbulentFlow
 
-__all__ = ["Scene", "SceneCamera", "open_scene", "true_mapping"]
+__all__ = ["Noise", "Scene", "SceneCamera", "open_scene", "true_mapping"]
 
 
 class SceneBoard(NominalBoard):
@@ -36,6 +47,14 @@ class SceneBoard(NominalBoard):
 
     inverted: Flag = False
     """Dark dots on a bright board."""
+    errors: BoardErrors | None = None
+    """Errors of stage, dots and light."""
+
+    @model_validator(mode="after")
+    def _errors_of_bright_dots(self) -> SceneBoard:
+        if self.inverted and self.errors is not None:
+            raise ValueError("no table errors with inverted = true: errors are simulated of bright dots only")
+        return self
 
     def dots_mm(self, plane_mm: float) -> np.ndarray:
         """Return the dot centres (x, y, z) at one depth, x fastest, shape (dot, 3) [mm]."""
@@ -57,11 +76,14 @@ class SceneParticles(Table):
     per_microlens: Positive | None = None
     """Particles per microlens of the seeded region's x-y face (the paper's ppm). Alternative to `count`."""
     count: Count | None = None
-    """Particles of each pair."""
+    """Particles of each pair, before those in walls are removed."""
     pairs: Count = 1
     """Number of image pairs, each with other particles."""
     fill: Positive = 1.0
     """Edges of the seeded region relative to the volume's. Above 1, particles are outside the volume too."""
+    margin_mm: tuple[NonNegative, NonNegative, NonNegative] | None = None
+    """Distance by which the seeded region reaches beyond `fill` times the volume on each side (x, y, z), for light that
+    reaches farther than the volume. `per_microlens` then holds within the volume, `count` in all [mm]."""
     intensity_sd: NonNegative = 0.0
     """Standard deviation of the particles' intensity about 1."""
     sigma_mm: Positive | None = None
@@ -89,15 +111,11 @@ class Exposure(Table):
     """Level of a pixel lit by one point-like particle of intensity 1, whose light covers the area of a microimage."""
 
 
-class Noise(Table):
-    """Table ``[noise]``: noise of the cameras."""
+class Background(Table):
+    """Table ``[background]``: images of each camera and frame without particles (`background_image` of experiments)."""
 
-    background: NonNegative = 40.0
-    """Level without light [count]."""
-    read_noise: NonNegative = 3.0
-    """Standard deviation of the read-out [count]."""
-    full_well_e: NonNegative = 10_000.0
-    """Electrons at full scale, which determine the shot noise; 0 switches it off."""
+    averaged: Annotated[int, Field(strict=True, ge=1, le=1000)] = 1
+    """Number of recordings whose mean is written, rounded to whole counts."""
 
 
 class Quality(Table):
@@ -125,6 +143,10 @@ class Scene(Table):
     """Windows of all cameras that state none."""
     aberrations: Aberrations | None = None
     """Aberrations of all cameras that state none."""
+    array: ArrayFaults | None = None
+    """Faults of the microlens arrays of all cameras that state none."""
+    sensor: Sensor | None = None
+    """Sensor of all cameras that state none."""
     board: SceneBoard
     volume: SceneVolume
     particles: SceneParticles
@@ -132,6 +154,18 @@ class Scene(Table):
     """Displacement between the two frames, equal for all pairs. With turbulence it is the mean."""
     turbulence: Turbulence | None = None
     """Fluctuation added to the flow, different for each pair."""
+    sheet: Sheet | None = None
+    """Light sheet; absent: both pulses light all particles alike."""
+    brightness: Brightness | None = None
+    """Scatter of the particles' brightness."""
+    stray_light: StrayLight | None = None
+    """Light in the particle images that is not from particles."""
+    surface: Surfaces | None = None
+    """Bright surfaces in the particle images."""
+    wall: Walls | None = None
+    """Solid regions without particles."""
+    background: Background | None = None
+    """Images without particles."""
     exposure: Exposure = Exposure()
     noise: Noise = Noise()
     quality: Quality = Quality()
@@ -150,10 +184,9 @@ class Scene(Table):
     @field_validator("window", "aberrations")
     @classmethod
     def _suit_every_camera(cls, value: Any, info: ValidationInfo) -> Any:
-        optics: dict[str, Any] = {"window": (), "aberrations": None} | {str(info.field_name): value}
         try:
             for camera in info.data.get("camera", ()):
-                camera.with_optics(**optics)
+                camera.with_shared({"window": (), "aberrations": None} | {str(info.field_name): value})
         except ValidationError as error:
             raise error.errors()[0]["ctx"]["error"] from None
         return value
@@ -167,7 +200,8 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _hand_optics_to_cameras(self) -> Scene:
-        cameras = tuple(camera.with_optics(self.window, self.aberrations) for camera in self.camera)
+        shared = {name: getattr(self, name) for name in SHARED_TABLES}
+        cameras = tuple(camera.with_shared(shared) for camera in self.camera)
         object.__setattr__(self, "camera", cameras)
         return self
 
@@ -183,6 +217,10 @@ class Scene(Table):
             if unknown:
                 raise ValueError(f"for kind {kind!r} only the keys {', '.join(known)} (not {unknown[0]!r})")
         return table
+
+    def solid(self, points_mm: np.ndarray) -> np.ndarray:
+        """Return which points (n, 3) [mm] are in a wall, shape (n,)."""
+        return solid(self.wall, points_mm)
 
     def flow_of(self, pair: int) -> Flow | TurbulentFlow:
         """Return the flow of one pair, mean and turbulence, as a function of points (n, 3) [mm]."""

@@ -10,11 +10,16 @@ from pydantic import AfterValidator, BeforeValidator, Field, field_validator, mo
 
 from lfpiv.experiment.settings import Count, Flag, NominalCamera, NonNegative, Number, Point, Positive, Table
 from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.simulation.sensor import Sensor
 from lfpiv_kernels.rendering import real_optics
 
 Pair = tuple[Number, Number]
 Pitches = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Index = Annotated[float, Field(strict=True, ge=1, le=4)]
+Drift = Annotated[float, Field(strict=True, ge=-0.05, le=0.05)]
+
+SHARED_TABLES = ("window", "aberrations", "array", "sensor")
+"""Tables of a camera that a scene may state once for all cameras."""
 
 FOCUS_STEPS = 200
 """Largest number of steps that move a camera into focus through its windows."""
@@ -83,6 +88,32 @@ class Aberrations(Table):
     lens, which then has coma on its axis."""
 
 
+class ArrayFaults(Table):
+    """Table ``[array]`` or ``[camera.array]``: faults of the microlens array and of the main lens's mount."""
+
+    dead_share: Annotated[float, Field(strict=True, ge=0, le=0.2)] = 0.0
+    """Share of the microlenses that pass no light."""
+    pitch_drift: tuple[Drift, Drift] = (0.0, 0.0)
+    """Relative growth of the pitch along s and t from the sensor's centre to its edge; it falls as much on the other
+    side. The pitch is the stated one in the centre."""
+    cats_eye: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.0
+    """Shift of a second aperture across the pupil in the sensor's corner, in pupil radii. The pupil seen from there is
+    the part that both apertures share, a cat's eye."""
+
+
+class Moved(Table):
+    """Table ``[camera.moved]``: how the camera moved after white image and board were recorded."""
+
+    shift_mm: Point = (0.0, 0.0, 0.0)
+    """Shift of the point in focus at the sensor's centre (x, y, z) [mm]."""
+    yaw_deg: Number = 0.0
+    """Increase of the camera's angle about y [degree]."""
+    pitch_deg: Number = 0.0
+    """Increase of the rotation about the camera's x axis [degree]."""
+    roll_deg: Number = 0.0
+    """Increase of the rotation about the camera's z axis [degree]."""
+
+
 class SceneCamera(NominalCamera):
     """Table ``[[camera]]``: nominal optics for the experiment file, and the truth, which is not in that file."""
 
@@ -116,6 +147,12 @@ class SceneCamera(NominalCamera):
     """Windows of this camera, from the particles outwards; absent: the scene's."""
     aberrations: Aberrations | None = None
     """Aberrations of this camera's main lens; absent: the scene's."""
+    array: ArrayFaults | None = None
+    """Faults of this camera's microlens array; absent: the scene's."""
+    sensor: Sensor | None = None
+    """Sensor of this camera; absent: the scene's."""
+    moved: Moved | None = None
+    """Movement of this camera between board and particles."""
 
     @model_validator(mode="after")
     def _windows_face_the_camera(self) -> SceneCamera:
@@ -138,12 +175,29 @@ class SceneCamera(NominalCamera):
             )
         return self
 
-    def with_optics(self, window: tuple[Window, ...], aberrations: Aberrations | None) -> SceneCamera:
-        """Return this camera with the scene's windows and aberrations in place of missing ones."""
+    def with_shared(self, shared: Mapping[str, Any]) -> SceneCamera:
+        """Return this camera with the scene's tables, of `SHARED_TABLES`, in place of missing ones."""
         own = {name: getattr(self, name) for name in type(self).model_fields}
-        for name, shared in (("window", window), ("aberrations", aberrations)):
-            own[name] = shared if own[name] is None else own[name]
+        for name, table in shared.items():
+            own[name] = table if own[name] is None else own[name]
         return type(self)(**own)
+
+    @property
+    def at_particles(self) -> SceneCamera:
+        """The camera where it stood when the particles were recorded."""
+        if self.moved is None:
+            return self
+        yaw = self.nominal_angle_deg if self.true_yaw_deg is None else self.true_yaw_deg
+        offset = tuple(a + b for a, b in zip(self.true_offset_mm, self.moved.shift_mm, strict=True))
+        return self.model_copy(
+            update={
+                "true_offset_mm": offset,
+                "true_yaw_deg": yaw + self.moved.yaw_deg,
+                "true_pitch_deg": self.true_pitch_deg + self.moved.pitch_deg,
+                "true_roll_deg": self.true_roll_deg + self.moved.roll_deg,
+                "moved": None,
+            }
+        )
 
     @property
     def optics(self) -> Optics:
@@ -220,8 +274,16 @@ class SceneCamera(NominalCamera):
         return np.array([*lens.centre_mm, 1 / optics.pupil_radius_mm, 1 / field, *transverse])
 
     @property
+    def faults(self) -> np.ndarray:
+        """Drift of the pitch and cat's eye in the form of `array_faults.Faults`, shape (3,)."""
+        optics, array = self.optics, self.array or ArrayFaults()
+        half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
+        drift = np.asarray(array.pitch_drift, float) / (2 * half)
+        return np.array([*drift, array.cats_eye * optics.pupil_radius_mm / np.hypot(*half)])
+
+    @property
     def lattice(self) -> LensLattice:
-        """True microlens array in its own plane."""
+        """True microlens array in its own plane, without `array.pitch_drift`."""
         pitch = self.true_microlens_pitch_mm or self.microlens_pitch_mm
         roll = np.radians(self.true_array_roll_deg)
         second = np.radians(60 if self.microlens_layout == "hexagonal" else 90)

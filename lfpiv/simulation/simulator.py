@@ -1,7 +1,7 @@
 """Simulate an experiment: render a scene's white, board and particle images and write them with their truth.
 
 A camera consists of main lens, microlens array and sensor, misaligned as the scene states (Eqs. 1-3 and 9), with
-windows and third-order aberrations. Images are rendered by rays, blurred, exposed, and read out with noise to 12 bits.
+windows, aberrations and faults. Images are rendered by rays, blurred, exposed, and read out with noise.
 """
 
 from __future__ import annotations
@@ -11,146 +11,57 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import tifffile
-from scipy.ndimage import gaussian_filter
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.images import FLIPS
 from lfpiv.progress import Progress, ignore_progress
-from lfpiv.simulation.flows import Tracers
-from lfpiv.simulation.scene import Noise, Scene, open_scene
+from lfpiv.simulation import truth
+from lfpiv.simulation.camera_images import (
+    AREA_STEP_MM,
+    FRAMES,
+    StaticLight,
+    board_truth,
+    camera_images,
+    image_area,
+    render_camera,
+    static_light,
+    white_image,
+)
+from lfpiv.simulation.particles import (
+    LEAST_INTENSITY,
+    LitParticles,
+    PlacedParticles,
+    lit_particles,
+    place_particles,
+    seeded_size_mm,
+)
+from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
-from lfpiv_kernels.rendering import collect, real_optics, render
+from lfpiv.simulation.sensor import FULL_SCALE, SensorPattern, draw_pattern, expose
+from lfpiv_kernels.rendering import real_optics
+
+__all__ = [
+    "AREA_STEP_MM",
+    "FRAMES",
+    "FULL_SCALE",
+    "LEAST_INTENSITY",
+    "PlacedParticles",
+    "expose",
+    "image_area",
+    "place_particles",
+    "render_camera",
+    "simulate",
+]
 
 log = logging.getLogger(__name__)
 
-FRAMES = ("a", "b")
-"""Names of the two frames of a pair."""
-
-FULL_SCALE = 4095
-"""Largest count of the simulated 12-bit cameras."""
-
-AREA_STEP_MM = 1e-3
-"""Step of the differences that give the area of a dot's image [mm]."""
-
-LEAST_INTENSITY = 0.3
-"""Lower limit of a particle's intensity, relative to the mean."""
-
-
-class PlacedParticles(NamedTuple):
-    """Particles of one image pair."""
-
-    position_mm: np.ndarray
-    """Positions midway between the frames (x, y, z) [mm], shape (particle, 3)."""
-    displacement_mm: np.ndarray
-    """Displacements from the first to the second frame [mm], shape (particle, 3)."""
-    intensity: np.ndarray
-    """Intensities relative to the mean, shape (particle,)."""
-
-    def at_frame(self, frame: str) -> np.ndarray:
-        """Return the positions in frame "a" or "b", shape (particle, 3) [mm]."""
-        return self.position_mm + (-0.5 if frame == "a" else 0.5) * self.displacement_mm
-
-
-def render_camera(camera: SceneCamera, *, seed: int | list[int] = 0) -> render.RenderCamera:
-    """Return the renderer's form of a camera. `seed` determines the transmission of its microlenses."""
-    optics, lattice = camera.optics, camera.lattice
-    half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
-    corners = (half + 3 * lattice.pitch_mm) * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    index = (corners - lattice.origin_mm) @ np.linalg.inv(lattice.basis_mm)
-    first, last = np.floor(index.min(0)).astype(int), np.ceil(index.max(0)).astype(int)
-    i, j = (np.arange(low, high + 1) for low, high in zip(first, last, strict=True))
-    centre = lattice.centres_mm(np.stack(np.meshgrid(i, j, indexing="ij"), axis=-1))
-    gain = 1 - camera.vignetting * np.clip((centre**2).sum(-1) / (half**2).sum(), 0, 1)
-    spread = np.random.default_rng(seed).standard_normal(gain.shape)
-    return render.RenderCamera(
-        object_distance_mm=optics.object_distance_mm,
-        image_distance_mm=optics.image_distance_mm,
-        pupil_radius_mm=optics.pupil_radius_mm,
-        sensor_per_pupil=optics.sensor_per_pupil,
-        pixel_mm=optics.pixel_mm,
-        sensor_shape=optics.sensor_shape,
-        rotation=camera.rotation,
-        offset_mm=camera.axis_point_mm,
-        origin_mm=np.asarray(lattice.origin_mm, float),
-        basis_mm=np.asarray(lattice.basis_mm, float),
-        hexagonal=lattice.layout == "hexagonal",
-        lens_gain=gain * np.maximum(0, 1 + camera.lens_gain_sd * spread),
-        first_lens=(int(first[0]), int(first[1])),
-        plates=camera.plates,
-        aberrations=camera.seidel,
-    )
-
-
-def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
-    """Return the area on the array per area of a plane of constant z, averaged over the pupil.
-
-    Points have shape (n, 3) [mm], the result has shape (n,).
-    """
-    optics, points_mm = camera.optics, np.asarray(points_mm, float)
-    if not camera.window and camera.aberrations is None:
-        distance = optics.object_distance_mm - camera.local_mm(points_mm)[:, 2]
-        scale: np.ndarray = abs(camera.rotation[2, 2]) * (optics.image_distance_mm / distance) ** 2
-        return scale
-    ring, angle = np.meshgrid(np.sqrt((np.arange(4) + 0.5) / 4), 2 * np.pi * np.arange(8) / 8)
-    pupil = optics.pupil_radius_mm * np.stack([ring * np.cos(angle), ring * np.sin(angle)], -1).reshape(-1, 2)
-    mapping, step = true_mapping(camera), AREA_STEP_MM * np.eye(3)[:2]
-    at, pupil = np.repeat(points_mm, len(pupil), axis=0), np.tile(pupil, (len(points_mm), 1))
-    along_x, along_y = ((mapping(at + h, pupil) - mapping(at - h, pupil)) / (2 * AREA_STEP_MM) for h in step)
-    area: np.ndarray = np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0])
-    mean: np.ndarray = area.reshape(len(points_mm), -1).mean(axis=1)
-    return mean
-
-
-def place_particles(scene: Scene, pair: int) -> PlacedParticles:
-    """Place the particles of one image pair.
-
-    Parameters
-    ----------
-    scene : Scene
-        The scene.
-    pair : int
-        Number of the pair, from 0. Each pair has its own particles.
-
-    Returns
-    -------
-    PlacedParticles
-
-    Raises
-    ------
-    InputError
-        If the scene has less than one particle.
-    """
-    rng = np.random.default_rng([scene.seed, 1, pair])
-    particles, volume = scene.particles, scene.volume
-    size = particles.fill * np.asarray(volume.size_mm)
-    count = particles.count
-    if count is None:
-        first = scene.camera[0]
-        cell = abs(np.linalg.det(first.lattice.basis_mm)) / first.magnification**2  # area of a microlens in the volume
-        count = round(particles.per_microlens * size[0] * size[1] / cell)
-    if count < 1:
-        raise InputError(
-            f"particles.per_microlens: expected at least one particle, found {particles.per_microlens:g}, which "
-            "gives none in this volume. Raise it, or give particles.count."
-        )
-    if isinstance(scene.flow, Tracers) and scene.flow.as_given:
-        position, displacement = scene.flow.tracers()
-        inside = np.flatnonzero((np.abs(position - volume.centre_mm) <= size / 2).all(1))
-        if len(inside) < count:
-            log.warning("pair %d: %d particles wanted, the tracer file has %d in the volume", pair, count, len(inside))
-        chosen = rng.permutation(inside)[:count]
-        position, displacement = position[chosen], displacement[chosen]
-    else:
-        position = np.asarray(volume.centre_mm) + rng.uniform(-0.5, 0.5, (count, 3)) * size
-        displacement = scene.flow_of(pair)(position)
-    intensity = np.maximum(LEAST_INTENSITY, 1 + particles.intensity_sd * rng.standard_normal(len(position)))
-    return PlacedParticles(position, displacement, intensity)
+DIM_SHARE = 0.05
+"""Share of a sheet's light below which it lights no particle worth mentioning."""
 
 
 def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress | None = None) -> Path:
@@ -177,7 +88,8 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     """
     if not isinstance(scene, Scene):
         scene = open_scene(scene)
-    pairs = [place_particles(scene, pair) for pair in range(scene.particles.pairs)]
+    pairs = [lit_particles(scene, pair) for pair in range(scene.particles.pairs)]
+    _check_sheet(scene)
     for camera in scene.camera:
         _check_positions(scene, camera, pairs)
     out = Path(out)
@@ -198,13 +110,20 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     return out / "experiment.toml"
 
 
-def _check_positions(scene: Scene, camera: SceneCamera, pairs: list[PlacedParticles]) -> None:
+def _check_positions(scene: Scene, nominal: SceneCamera, pairs: list[LitParticles]) -> None:
     """Refuse dots and particles too near the lens, and log the share of them in the field of view."""
-    optics = camera.optics
+    optics = nominal.optics
     half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
-    dots = np.concatenate([scene.board.dots_mm(depth) for depth in scene.board.planes_mm])
-    particles = np.concatenate([placed.at_frame(frame) for placed in pairs for frame in FRAMES])
-    for key, label, points in (("board.planes_mm", "the dots", dots), ("volume.size_mm", "the particles", particles)):
+    board = board_truth(scene)
+    dots = np.concatenate(
+        [scene.board.dots_mm(depth) for depth in scene.board.planes_mm] if board is None else board.dots_mm
+    )
+    particles = np.concatenate([lit.placed.at_frame(frame) for lit in pairs for frame in FRAMES])
+    seen = (
+        ("board.planes_mm", "the dots", dots, nominal),
+        ("volume.size_mm", "the particles", particles, nominal.at_particles),
+    )
+    for key, label, points, camera in seen:
         _check_windows(camera, label, points)
         nearest = camera.local_mm(points)[:, 2].max()
         if not nearest < optics.object_distance_mm / 2:
@@ -245,104 +164,80 @@ def _check_windows(camera: SceneCamera, label: str, points: np.ndarray) -> None:
             )
 
 
-def _write(scene: Scene, pairs: list[PlacedParticles], folder: Path, progress: Progress) -> None:
+def _check_sheet(scene: Scene) -> None:
+    """Warn of a sheet that lights fluid beyond the seeded region, where the scene has no particles."""
+    sheet = scene.sheet
+    if sheet is None or sheet.thickness_mm is None:
+        return
+    direction = np.asarray(sheet.direction, float) / np.linalg.norm(sheet.direction)
+    half, centre = np.abs(direction) @ seeded_size_mm(scene) / 2, direction @ scene.volume.centre_mm
+    step = np.linspace(-1, 1, 2001) * 3 * max(np.ravel(sheet.thickness_mm))
+    for pulse in (0, 1):
+        middle = -sheet.distance_mm(np.zeros((1, 3)), pulse)
+        along = middle + step
+        lit = along[sheet.light(along[:, None] * direction, pulse) > DIM_SHARE]
+        beyond = np.abs(lit - centre).max() - half
+        if beyond > 1e-3 * half:
+            log.warning(
+                "the sheet lights up to %.2g mm beyond the seeded region, where there are no particles; "
+                "set particles.margin_mm",
+                beyond,
+            )
+            return
+
+
+def _write(scene: Scene, pairs: list[LitParticles], folder: Path, progress: Progress) -> None:
     """Write images, truth and experiment file."""
     total = len(scene.camera) * (1 + len(scene.board.planes_mm) + 2 * len(pairs))
     total += sum(camera.dark_image for camera in scene.camera)
-    done = 0
+    total += 0 if scene.background is None else 2 * len(scene.camera)
+    done, backgrounds = 0, 0
+    (folder / "truth").mkdir(parents=True)
     for number, camera in enumerate(scene.camera):
-        for path, image in _images(scene, number, pairs):
+        white = white_image(scene, number)
+        static = static_light(scene, number, white)
+        pattern = _pattern(scene, number)
+        for path, image in camera_images(scene, number, pairs, white=white, static=static):
             rng = np.random.default_rng([scene.seed, 2, number, done])
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            exposed = expose(image, camera, scene.noise, rng)
-            tifffile.imwrite(folder / path, exposed, compression="zlib", metadata=None)
+            _write_image(folder / path, expose(image, camera, scene.noise, rng, sensor=camera.sensor, pattern=pattern))
             done += 1
-            progress("simulated images", done / total)
-    (folder / "truth").mkdir()
-    truth: dict[str, Any] = {}
-    for pair, placed in enumerate(pairs):
-        truth[f"pair_{pair:04d}_positions_mm"] = placed.position_mm
-        truth[f"pair_{pair:04d}_displacement_mm"] = placed.displacement_mm
-        truth[f"pair_{pair:04d}_velocity_m_s"] = placed.displacement_mm / scene.dt_s / 1000
-        truth[f"pair_{pair:04d}_intensity"] = placed.intensity
-    np.savez_compressed(folder / "truth" / "particles.npz", **truth)
-    spec = scene.model_dump(mode="json", exclude={"smart", "correlation", "network", "compute"}, exclude_none=True)
-    (folder / "truth" / "spec.json").write_text(json.dumps(spec, indent=1) + "\n", "utf-8")
+            progress("simulated images", (done + backgrounds) / total)
+        if scene.background is not None:
+            for frame in (0, 1):
+                path = f"background/{camera.name}_{FRAMES[frame]}.tif"
+                _write_image(folder / path, _background_image(scene, number, frame, static, pattern))
+                backgrounds += 1
+                progress("simulated images", (done + backgrounds) / total)
+        truth.write_camera(scene, number, folder / "truth", static=static, pattern=pattern)
+    truth.write_scene(scene, pairs, folder / "truth")
     (folder / "experiment.toml").write_text(_experiment_text(scene), "utf-8")
 
 
-def _images(scene: Scene, number: int, pairs: list[PlacedParticles]) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield path and noise-free image [count] of everything one camera records."""
+def _pattern(scene: Scene, number: int) -> SensorPattern | None:
     camera = scene.camera[number]
-    renderer = render_camera(camera, seed=[scene.seed, 3, number])
-    seed = int(np.random.default_rng([scene.seed, 4, number]).integers(2**31))
-    if camera.dark_image:
-        yield f"dark/{camera.name}.tif", np.zeros(renderer.sensor_shape)
-    white = collect.render_white(renderer, samples=scene.quality.pixel_rays, seed=seed)
-    yield f"white/{camera.name}.tif", scene.exposure.white_counts * white
-    yield from _board_images(scene, number, renderer, seed)
-    yield from _particle_images(scene, number, renderer, seed + 1, pairs)
+    if camera.sensor is None:
+        return None
+    return draw_pattern(camera.sensor, camera.optics.sensor_shape, np.random.default_rng([scene.seed, 24, number]))
 
 
-def _board_images(
-    scene: Scene, number: int, renderer: render.RenderCamera, seed: int
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield path and image [count] of each plane of the board."""
-    camera, board, exposure, quality = scene.camera[number], scene.board, scene.exposure, scene.quality
-    rays = render.ray_table(quality.dot_rays, "disc", seed)
-    for plane, depth in enumerate(board.planes_mm):
-        path = f"board/{camera.name}/plane_{plane:02d}.tif"
-        if board.inverted:
-            image = collect.render_board(
-                renderer,
-                depth,
-                dots=board.dots,
-                spacing_mm=board.spacing_mm,
-                dot_diameter_mm=board.dot_diameter_mm,
-                dot_light=0.0,
-                board_light=1.0,
-                samples=quality.pixel_rays,
-                seed=seed,
-            )
-            yield path, exposure.dot_counts * image
-            continue
-        dots = board.dots_mm(depth)
-        # number of microlenses that the image of a dot covers; each lights its whole microimage
-        lenses = np.pi / 4 * board.dot_diameter_mm**2 * image_area(camera, dots)
-        lenses /= abs(np.linalg.det(renderer.basis_mm))
-        rng = np.random.default_rng([scene.seed, 5, number, plane])
-        counts = exposure.dot_counts * renderer.microimage_px * lenses
-        yield path, render.render_sources(renderer, dots, counts, board.dot_diameter_mm / 2, rays, rng=rng)
+def _background_image(
+    scene: Scene, number: int, frame: int, static: StaticLight | None, pattern: SensorPattern | None
+) -> np.ndarray:
+    """Return the stored image of one camera and frame without particles, a mean of some recordings."""
+    camera, count = scene.camera[number], scene.background.averaged if scene.background else 1
+    rng = np.random.default_rng([scene.seed, 28, number, frame])
+    pulses = np.random.default_rng([scene.seed, 29, frame])  # equal for all cameras
+    mean = np.zeros(camera.optics.sensor_shape)
+    for _ in range(count):
+        power = np.ones(2) if scene.sheet is None else scene.sheet.powers(pulses)
+        light = mean * 0 if static is None else static.at_powers(power)[frame]
+        mean += expose(light, camera, scene.noise, rng, sensor=camera.sensor, pattern=pattern) / count
+    return np.rint(mean).astype(np.uint16)
 
 
-def _particle_images(
-    scene: Scene, number: int, renderer: render.RenderCamera, seed: int, pairs: list[PlacedParticles]
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield path and image [count] of both frames of each pair."""
-    particles, name = scene.particles, scene.camera[number].name
-    rays = render.ray_table(scene.quality.particle_rays, "ball" if particles.sigma_mm is None else "gaussian", seed)
-    size = particles.sigma_mm or particles.radius_mm or 0.0
-    for pair, placed in enumerate(pairs):
-        counts = scene.exposure.particle_counts * renderer.microimage_px * placed.intensity
-        for frame in FRAMES:
-            rng = np.random.default_rng([scene.seed, 6, number, pair, frame == "b"])
-            image = render.render_sources(renderer, placed.at_frame(frame), counts, size, rays, rng=rng)
-            yield f"particles/{name}/pair_{pair:04d}_{frame}.tif", image
-
-
-def expose(image: np.ndarray, camera: SceneCamera, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """Turn light [count] into a stored image: blurred, with noise, 12 bits, flipped as the camera does."""
-    if camera.blur_px > 0:
-        image = gaussian_filter(image, camera.blur_px)
-    if noise.full_well_e > 0:
-        per_count = noise.full_well_e / FULL_SCALE
-        image = rng.poisson(image * per_count) / per_count
-    image = image + noise.background + noise.read_noise * rng.standard_normal(image.shape)
-    saturated = float((image > FULL_SCALE).mean())
-    if saturated > 1e-3:
-        log.warning("camera %s: %.1f %% of an image's pixels saturate; lower [exposure]", camera.name, 100 * saturated)
-    image = np.clip(np.rint(image), 0, FULL_SCALE).astype(np.uint16)
-    return np.ascontiguousarray(image[FLIPS[camera.image_flip]])
+def _write_image(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tifffile.imwrite(path, image, compression="zlib", metadata=None)
 
 
 def _experiment_text(scene: Scene) -> str:
@@ -356,6 +251,8 @@ def _experiment_text(scene: Scene) -> str:
         known = {"name": camera.name, "white_image": f"white/{camera.name}.tif"}
         if camera.dark_image:
             known["dark_image"] = f"dark/{camera.name}.tif"
+        if scene.background is not None:
+            known["background_image"] = f"background/{camera.name}_{{frame}}.tif"
         if camera.image_flip != "none":
             known["image_flip"] = camera.image_flip
         optics = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")

@@ -12,7 +12,7 @@ from scipy.stats import qmc
 
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
-from lfpiv_kernels.rendering import real_optics
+from lfpiv_kernels.rendering import array_faults, real_optics
 from lfpiv_kernels.rendering.render import Matrix, Optics, RenderCamera
 
 SPREAD_RAYS = 4096
@@ -72,6 +72,9 @@ def _collect_pixels(
     first_j: ti.i32,
     plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.pack_plates`
     aberrations: real_optics.Aberrations,
+    faults: array_faults.Faults,
+    drifting: ti.template(),  # whether the pitch of the lenses drifts
+    clipped: ti.template(),  # whether a second aperture clips the pupil
     offset: Vector,
     reach: ti.i32,  # lenses to each side whose light can reach a pixel
     board: Board,
@@ -97,10 +100,16 @@ def _collect_pixels(
         x = (column + 0.5 - 0.5 * columns) * pixel
         y = (row + 0.5 - 0.5 * rows) * pixel
         home = nearest_lens(lattice, x / (1 + scale), y / (1 + scale), hexagonal)
+        if ti.static(drifting):
+            regular = array_faults.undrifted(x / (1 + scale), y / (1 + scale), faults)
+            home = nearest_lens(lattice, regular[0], regular[1], hexagonal)
         total = 0.0
         for a, b in ti.ndrange((-reach, reach + 1), (-reach, reach + 1)):
             i, j = ti.cast(home[0], ti.i32) + a - first_i, ti.cast(home[1], ti.i32) + b - first_j
-            middle = lens_centre(lattice, home[0] + a, home[1] + b)
+            regular_centre = lens_centre(lattice, home[0] + a, home[1] + b)
+            middle = regular_centre
+            if ti.static(drifting):
+                middle = array_faults.drifted(middle, faults)
             distance = ti.sqrt((x - middle[0] * (1 + scale)) ** 2 + (y - middle[1] * (1 + scale)) ** 2)
             on_array = i >= 0 and i < lens_gain.shape[0] and j >= 0 and j < lens_gain.shape[1]
             if on_array and distance < outer:
@@ -119,19 +128,24 @@ def _collect_pixels(
                         even = ti.abs(far - board[4]) > widest
                         light = board[5] if far < board[4] else board[6]
                 seen = light
-                if distance > inner or not even:
+                if distance > inner or not even or ti.static(clipped):
                     seen = 0.0
                     for n in range(count):
                         px, py = x + samples[n, 0] * pixel, y + samples[n, 1] * pixel
                         p, q = samples[n, 2], samples[n, 3]  # a cell of the lattice: same area, same centre
-                        s = middle[0] + p * lattice[2] + q * lattice[4]
-                        t = middle[1] + p * lattice[3] + q * lattice[5]
+                        s = regular_centre[0] + p * lattice[2] + q * lattice[4]
+                        t = regular_centre[1] + p * lattice[3] + q * lattice[5]
                         if ti.static(hexagonal):  # fold the corners of the rhombus into the lens's own hexagon
                             own = nearest_lens(lattice, s, t, True)
                             folded = lens_centre(lattice, own[0], own[1])
-                            s, t = s - folded[0] + middle[0], t - folded[1] + middle[1]
+                            s, t = s - folded[0] + regular_centre[0], t - folded[1] + regular_centre[1]
+                        if ti.static(drifting):
+                            s, t = s + middle[0] - regular_centre[0], t + middle[1] - regular_centre[1]
                         u, v = s - (px - middle[0]) / scale, t - (py - middle[1]) / scale
-                        if u * u + v * v < radius * radius:
+                        open_ = u * u + v * v < radius * radius
+                        if ti.static(clipped):
+                            open_ = open_ and array_faults.passes(s, t, u, v, radius, faults)
+                        if open_:
                             if ti.static(has_board):
                                 if not even:
                                     far = 0.0

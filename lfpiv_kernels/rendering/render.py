@@ -16,7 +16,7 @@ from scipy.stats import qmc
 
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens, pack_lattice
-from lfpiv_kernels.rendering import real_optics
+from lfpiv_kernels.rendering import array_faults, real_optics
 
 FIXED = 1 << 20
 """Integer units per count: 20 bits below one count, 43 bits above."""
@@ -66,6 +66,8 @@ class RenderCamera:
     """Windows between particles and lens, the one next to the particles first: `real_optics.pack_plates`."""
     aberrations: np.ndarray = field(default_factory=lambda: np.zeros(9))
     """Third-order aberrations of the main lens: `real_optics.Aberrations`."""
+    faults: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """Drift of the microlenses' pitch and cat's eye of the main lens: `array_faults.Faults`."""
 
     @property
     def ideal(self) -> bool:
@@ -83,7 +85,7 @@ class RenderCamera:
         return math.pi * (self.pupil_radius_mm * self.sensor_per_pupil / self.pixel_mm) ** 2
 
     def arguments(self) -> tuple:
-        """Return the arguments of both kernels from `rotation` to `aberrations`."""
+        """Return the arguments of the kernels from `rotation` to `clipped`."""
         scale = (self.object_distance_mm, self.image_distance_mm, self.pupil_radius_mm, self.sensor_per_pupil)
         return (
             Matrix(np.asarray(self.rotation, float).tolist()),
@@ -93,6 +95,9 @@ class RenderCamera:
             *map(int, self.first_lens),
             np.ascontiguousarray(self.plates if len(self.plates) else real_optics.NO_PLATE, np.float32),
             real_optics.Aberrations(*np.asarray(self.aberrations, float)),
+            array_faults.Faults(*np.asarray(self.faults, float)),
+            bool(np.any(self.faults[:2])),
+            bool(self.faults[2]),
         )
 
 
@@ -152,6 +157,9 @@ def _trace_sources(
     first_j: ti.i32,
     plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.pack_plates`
     aberrations: real_optics.Aberrations,
+    faults: array_faults.Faults,
+    drifting: ti.template(),  # whether the pitch of the lenses drifts
+    clipped: ti.template(),  # whether a second aperture clips the pupil
     per_task: ti.i32,
     glass: ti.template(),  # whether there are windows
     aberrated: ti.template(),  # whether there are aberrations
@@ -190,8 +198,17 @@ def _trace_sources(
                 passes = (s * s + t * t) * aberrations[3] ** 2 < real_optics.FIELD_STOP**2
                 error = real_optics.aberration(s, t, u, v, aberrations)
                 s, t = s + error[0], t + error[1]
-            lens = nearest_lens(lattice, s, t, hexagonal)
-            centre_st = lens_centre(lattice, lens[0], lens[1])
+            if ti.static(clipped):
+                passes = passes and array_faults.passes(s, t, u, v, radius, faults)
+            lens = ti.Vector([0.0, 0.0])
+            centre_st = ti.Vector([0.0, 0.0])
+            if ti.static(drifting):
+                place_st = array_faults.undrifted(s, t, faults)
+                lens = nearest_lens(lattice, place_st[0], place_st[1], hexagonal)
+                centre_st = array_faults.drifted(lens_centre(lattice, lens[0], lens[1]), faults)
+            else:
+                lens = nearest_lens(lattice, s, t, hexagonal)
+                centre_st = lens_centre(lattice, lens[0], lens[1])
             i, j = ti.cast(lens[0], ti.i32) - first_i, ti.cast(lens[1], ti.i32) - first_j
             column = ti.cast(ti.floor((centre_st[0] + scale * (s - u)) / pixel + 0.5 * columns), ti.i32)
             row = ti.cast(ti.floor((centre_st[1] + scale * (t - v)) / pixel + 0.5 * rows), ti.i32)

@@ -1,0 +1,167 @@
+"""Sensor of a simulated camera: fixed patterns, bad pixels, noise, and conversion to stored counts."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.ndimage import gaussian_filter
+
+from lfpiv.experiment.images import FLIPS
+from lfpiv.experiment.settings import NonNegative, Positive, Table
+
+if TYPE_CHECKING:
+    from lfpiv.simulation.scene_camera import SceneCamera
+
+log = logging.getLogger(__name__)
+
+FULL_SCALE = 4095
+"""Largest count of a camera of 12 bits."""
+
+SmallShare = Annotated[float, Field(strict=True, ge=0, le=0.1)]
+
+
+class Noise(Table):
+    """Table ``[noise]``: noise of the cameras."""
+
+    background: NonNegative = 40.0
+    """Level without light [count]."""
+    read_noise: NonNegative = 3.0
+    """Standard deviation of the read-out [count]."""
+    full_well_e: NonNegative = 10_000.0
+    """Electrons at full scale, which determine the shot noise; 0 switches it off."""
+
+
+class Sensor(Table):
+    """Table ``[sensor]`` or ``[camera.sensor]``: fixed patterns and range of the sensor.
+
+    Patterns are drawn once for each camera and are equal in all its images, dark image included.
+    """
+
+    gain_sd: Annotated[float, Field(strict=True, ge=0, le=0.3)] = 0.0
+    """Standard deviation of the pixels' gain, relative."""
+    column_sd_counts: NonNegative = 0.0
+    """Standard deviation of the columns' offset [count]."""
+    dark_counts: NonNegative = 0.0
+    """Mean level of the dark current, which has shot noise [count]."""
+    dark_log_sd: Annotated[float, Field(strict=True, ge=0, le=2)] = 0.0
+    """Standard deviation of the logarithm of the pixels' dark current; its mean is unchanged."""
+    hot_share: SmallShare = 0.0
+    """Share of hot pixels."""
+    hot_counts: Positive | None = None
+    """Largest dark level of hot pixels, whose levels spread evenly below it [count]; absent: full scale."""
+    dead_share: SmallShare = 0.0
+    """Share of dead pixels, which record no light."""
+    bits: Annotated[int, Field(strict=True, ge=8, le=16)] = 12
+    """Bits of a stored pixel."""
+    saturation_counts: Positive | None = None
+    """Level at which pixels saturate, offsets included [count]; absent: full scale."""
+
+    @model_validator(mode="after")
+    def _saturates_within_bits(self) -> Sensor:
+        if self.saturation_counts is not None and self.saturation_counts > self.full_scale:
+            raise ValueError(f"saturation_counts up to {self.full_scale}, the full scale of {self.bits} bits")
+        return self
+
+    @property
+    def full_scale(self) -> int:
+        """Largest stored count."""
+        return int(2**self.bits) - 1
+
+    @property
+    def largest(self) -> float:
+        """Largest count that a pixel reaches."""
+        return self.full_scale if self.saturation_counts is None else self.saturation_counts
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SensorPattern:
+    """Fixed pattern of one camera's sensor; all arrays have shape (rows, columns), before `image_flip`."""
+
+    gain: np.ndarray
+    """Counts per count of light; 0 at dead pixels."""
+    offset: np.ndarray
+    """Offset of the read-out, without `Noise.background` [count]."""
+    dark: np.ndarray
+    """Dark current [count]."""
+    hot: np.ndarray
+    """Whether a pixel is hot."""
+    dead: np.ndarray
+    """Whether a pixel is dead."""
+
+
+def draw_pattern(sensor: Sensor, shape: tuple[int, int], rng: np.random.Generator) -> SensorPattern:
+    """Draw the fixed pattern of a sensor.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Its table.
+    shape : (int, int)
+        Rows and columns.
+    rng : Generator
+        Generator. Each table key draws the same whatever the other keys are.
+
+    Returns
+    -------
+    SensorPattern
+    """
+    gain = np.maximum(0, 1 + sensor.gain_sd * rng.standard_normal(shape))
+    offset = np.broadcast_to(sensor.column_sd_counts * rng.standard_normal(shape[1]), shape)
+    spread = sensor.dark_log_sd * rng.standard_normal(shape)
+    dark = sensor.dark_counts * np.exp(spread - sensor.dark_log_sd**2 / 2)
+    chosen, level = rng.random(shape), rng.random(shape)
+    hot, dead = chosen < sensor.hot_share, chosen >= 1 - sensor.dead_share
+    dark = np.where(hot, dark + level * (sensor.hot_counts or sensor.full_scale), np.where(dead, 0, dark))
+    return SensorPattern(gain=np.where(dead, 0, gain), offset=offset, dark=dark, hot=hot, dead=dead)
+
+
+def expose(
+    image: np.ndarray,
+    camera: SceneCamera,
+    noise: Noise,
+    rng: np.random.Generator,
+    *,
+    sensor: Sensor | None = None,
+    pattern: SensorPattern | None = None,
+) -> np.ndarray:
+    """Turn light into a stored image: blurred, with noise, in whole counts, flipped as the camera does.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        Light [count].
+    camera : SceneCamera
+        The camera; of it `blur_px` and `image_flip` are used.
+    noise : Noise
+        Noise and level without light.
+    rng : Generator
+        Generator of the noise.
+    sensor : Sensor, optional
+        Range of the sensor; default: 12 bits.
+    pattern : SensorPattern, optional
+        Fixed pattern; default: none.
+
+    Returns
+    -------
+    ndarray of uint16, shape (rows, columns)
+    """
+    sensor = sensor or Sensor()
+    if camera.blur_px > 0:
+        image = gaussian_filter(image, camera.blur_px)
+    if pattern is not None:
+        image = image * pattern.gain + pattern.dark
+    if noise.full_well_e > 0:
+        per_count = noise.full_well_e / sensor.full_scale
+        image = rng.poisson(image * per_count) / per_count
+    image = image + noise.background + noise.read_noise * rng.standard_normal(image.shape)
+    if pattern is not None:
+        image = image + pattern.offset
+    saturated = float((image > sensor.largest).mean())
+    if saturated > 1e-3:
+        log.warning("camera %s: %.1f %% of an image's pixels saturate; lower [exposure]", camera.name, 100 * saturated)
+    image = np.clip(np.rint(image), 0, np.floor(sensor.largest)).astype(np.uint16)
+    return np.ascontiguousarray(image[FLIPS[camera.image_flip]])

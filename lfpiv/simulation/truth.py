@@ -1,0 +1,123 @@
+"""Write the truth of a simulated experiment: the scene, its particles, and what differs from the ideal images.
+
+===========================  ==========================================================================================
+file in ``truth/``           content
+===========================  ==========================================================================================
+``spec.json``                the scene, with all defaults
+``particles.npz``            particles of each pair; light of each in each camera and frame, and power of the pulses,
+                             where the scene has a table ``[sheet]`` or ``[brightness]``
+``light_CAMERA.npz``         light that is not from particles, where the scene has ``[[surface]]`` or ``[stray_light]``
+``sensor_CAMERA.npz``        fixed pattern, where the camera has a table ``sensor``
+``array_CAMERA.npz``         dead lenses, where the camera has a table ``array``
+``board.npz``                true dots, where the scene has a table ``[board.errors]``
+``walls.npz``                solid voxels, where the scene has a ``[[wall]]``
+===========================  ==========================================================================================
+
+Images in these files are oriented as the stored images.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv.experiment.images import FLIPS
+from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.simulation.camera_images import StaticLight, board_truth, render_camera
+from lfpiv.simulation.particles import LitParticles
+from lfpiv.simulation.scene import Scene
+from lfpiv.simulation.sensor import SensorPattern
+
+
+def write_scene(scene: Scene, pairs: list[LitParticles], folder: Path) -> None:
+    """Write the scene, its particles, its board and its walls.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    pairs : list of LitParticles
+        Particles of each pair.
+    folder : Path
+        Existing folder.
+    """
+    np.savez_compressed(folder / "particles.npz", **_particles(scene, pairs))
+    spec = scene.model_dump(mode="json", exclude={"smart", "correlation", "network", "compute"}, exclude_none=True)
+    (folder / "spec.json").write_text(json.dumps(spec, indent=1) + "\n", "utf-8")
+    board = board_truth(scene)
+    if board is not None:
+        np.savez_compressed(folder / "board.npz", dots_mm=board.dots_mm, present=board.present, light=board.light)
+    if scene.wall is not None:
+        np.savez_compressed(folder / "walls.npz", **_walls(scene))
+
+
+def _particles(scene: Scene, pairs: list[LitParticles]) -> dict[str, Any]:
+    """Return the arrays of the particles."""
+    arrays: dict[str, Any] = {}
+    for pair, (placed, power, brightness) in enumerate(pairs):
+        arrays[f"pair_{pair:04d}_positions_mm"] = placed.position_mm
+        arrays[f"pair_{pair:04d}_displacement_mm"] = placed.displacement_mm
+        arrays[f"pair_{pair:04d}_velocity_m_s"] = placed.displacement_mm / scene.dt_s / 1000
+        arrays[f"pair_{pair:04d}_intensity"] = placed.intensity
+        if scene.brightness is not None:
+            arrays[f"pair_{pair:04d}_diameter"] = placed.diameter
+        if scene.brightness is not None or scene.sheet is not None:
+            arrays[f"pair_{pair:04d}_brightness"] = brightness
+            arrays[f"pair_{pair:04d}_power"] = power
+    return arrays
+
+
+def _walls(scene: Scene) -> dict[str, Any]:
+    """Return the voxels whose centres are in a wall, (z, y, x), and the centres along each axis [mm]."""
+    volume = scene.volume
+    grid = Grid.from_extent(centre_mm=volume.centre_mm, size_mm=volume.size_mm, voxel_mm=volume.voxel_mm)
+    axes = {f"{name}_mm": grid.axis_mm(number) for number, name in enumerate(AXES)}
+    return {"solid": scene.solid(grid.centres_mm()).reshape(grid.shape), **axes}
+
+
+def write_camera(
+    scene: Scene, number: int, folder: Path, *, static: StaticLight | None, pattern: SensorPattern | None
+) -> None:
+    """Write what one camera's images contain that ideal ones do not.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    number : int
+        Number of the camera.
+    folder : Path
+        Existing folder.
+    static : StaticLight or None
+        Its light that is not from particles.
+    pattern : SensorPattern or None
+        Fixed pattern of its sensor.
+    """
+    camera = scene.camera[number]
+    flip = FLIPS[camera.image_flip]
+    if static is not None:
+        images = {f"surface_{index}": image for index, (_, image) in enumerate(static.surfaces)}
+        images |= {"stray": static.stray, "ambient": static.ambient}
+        stored: dict[str, Any] = {name: image[flip].astype(np.float32) for name, image in images.items()}
+        np.savez_compressed(folder / f"light_{camera.name}.npz", **stored)
+    if pattern is not None:
+        arrays = {name: value[flip] for name, value in vars(pattern).items()}
+        stored = {name: value if value.dtype == bool else value.astype(np.float32) for name, value in arrays.items()}
+        np.savez_compressed(folder / f"sensor_{camera.name}.npz", **stored)
+    if camera.array is not None:
+        renderer = render_camera(camera, seed=[scene.seed, 3, number])
+        index = np.argwhere(renderer.lens_gain == 0) + renderer.first_lens
+        np.savez_compressed(
+            folder / f"array_{camera.name}.npz", dead_index=index, dead_centre_mm=_centres_mm(scene, number, index)
+        )
+
+
+def _centres_mm(scene: Scene, number: int, index: np.ndarray) -> np.ndarray:
+    """Return the centres (s, t) of lenses (n, 2), drift of the pitch included [mm]."""
+    camera = scene.camera[number]
+    regular = camera.lattice.centres_mm(index)
+    centres: np.ndarray = regular + camera.faults[:2] * regular**2
+    return centres
