@@ -1,19 +1,25 @@
-"""Noise-free images of one simulated camera: white, board, particles, and light that is not from particles."""
+"""Images of one simulated camera: white, board, particles, light that is not from particles, and their exposure."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
+from lfpiv.experiment.images import FLIPS
 from lfpiv.simulation.board_errors import BoardTruth, true_board
 from lfpiv.simulation.light import StrayLight
 from lfpiv.simulation.particles import LitParticles
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
+from lfpiv.simulation.sensor import Noise, Sensor, SensorPattern
 from lfpiv.simulation.surfaces import Surface
 from lfpiv_kernels.rendering import collect, render, surfaces
+
+log = logging.getLogger(__name__)
 
 FRAMES = ("a", "b")
 """Names of the two frames of a pair."""
@@ -228,3 +234,51 @@ def _particle_images(
             rng = np.random.default_rng([scene.seed, 6, number, pair, frame == "b"])
             image = render.render_sources(renderer, lit.placed.at_frame(frame), counts, size, rays, rng=rng)
             yield f"particles/{name}/pair_{pair:04d}_{frame}.tif", image if other is None else image + other[pulse]
+
+
+def expose(
+    image: np.ndarray,
+    camera: SceneCamera,
+    noise: Noise,
+    rng: np.random.Generator,
+    *,
+    sensor: Sensor | None = None,
+    pattern: SensorPattern | None = None,
+) -> np.ndarray:
+    """Turn light into a stored image: blurred, with noise, in whole counts, flipped as the camera does.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        Light [count].
+    camera : SceneCamera
+        The camera; of it `blur_px` and `image_flip` are used.
+    noise : Noise
+        Noise and level without light.
+    rng : Generator
+        Generator of the noise.
+    sensor : Sensor, optional
+        Range of the sensor; default: 12 bits.
+    pattern : SensorPattern, optional
+        Fixed pattern; default: none.
+
+    Returns
+    -------
+    ndarray of uint16, shape (rows, columns)
+    """
+    sensor = sensor or Sensor()
+    if camera.blur_px > 0:
+        image = gaussian_filter(image, camera.blur_px)
+    if pattern is not None:
+        image = image * pattern.gain + pattern.dark
+    if noise.full_well_e > 0:
+        per_count = noise.full_well_e / sensor.full_scale
+        image = rng.poisson(image * per_count) / per_count
+    image = image + noise.background + noise.read_noise * rng.standard_normal(image.shape)
+    if pattern is not None:
+        image = image + pattern.offset
+    saturated = float((image > sensor.largest).mean())
+    if saturated > 1e-3:
+        log.warning("camera %s: %.1f %% of an image's pixels saturate; lower [exposure]", camera.name, 100 * saturated)
+    image = np.clip(np.rint(image), 0, np.floor(sensor.largest)).astype(np.uint16)
+    return np.ascontiguousarray(image[FLIPS[camera.image_flip]])

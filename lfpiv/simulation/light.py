@@ -34,7 +34,8 @@ class Brightness(Table):
 
     def diameters(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Draw diameters relative to the median, shape (count,)."""
-        return np.exp(self.size_log_sd * rng.standard_normal(count))
+        diameter: np.ndarray = np.exp(self.size_log_sd * rng.standard_normal(count))
+        return diameter
 
     def of_diameters(self, diameter: np.ndarray) -> np.ndarray:
         """Return the brightness of particles of given relative diameters, of mean 1 over the distribution."""
@@ -45,7 +46,8 @@ class Brightness(Table):
     def of_cameras(self, cameras: int, count: int, rng: np.random.Generator) -> np.ndarray:
         """Draw the particles' brightness in each camera, of mean 1, shape (cameras, count)."""
         drawn = self.camera_log_sd * rng.standard_normal((cameras, count))
-        return np.exp(drawn - self.camera_log_sd**2 / 2)
+        factor: np.ndarray = np.exp(drawn - self.camera_log_sd**2 / 2)
+        return factor
 
 
 class Sheet(Table):
@@ -106,14 +108,14 @@ class Sheet(Table):
         if self.thickness_mm is None:
             return np.ones(len(points_mm))
         distance, half = self.distance_mm(points_mm, pulse), _of_pulse(self.thickness_mm, pulse) / 2
-        if self.profile == "top_hat":
-            return (np.abs(distance) <= half).astype(float)
+        top_hat: np.ndarray = np.abs(distance) <= half
         gaussian: np.ndarray = np.exp(-2 * (distance / half) ** 2)
-        return gaussian
+        return top_hat.astype(float) if self.profile == "top_hat" else gaussian
 
     def powers(self, rng: np.random.Generator) -> np.ndarray:
         """Draw the power of both pulses of one pair, shape (2,)."""
-        return np.maximum(0, np.asarray(self.power) * (1 + self.power_sd * rng.standard_normal(2)))
+        power: np.ndarray = np.clip(np.asarray(self.power) * (1 + self.power_sd * rng.standard_normal(2)), 0, None)
+        return power
 
 
 def _of_pulse(value: float | tuple[float, float], pulse: int) -> float:

@@ -105,7 +105,7 @@ def _count(scene: Scene) -> int:
         return particles.count
     first, size = scene.camera[0], particles.fill * np.asarray(scene.volume.size_mm)
     cell = abs(np.linalg.det(first.lattice.basis_mm)) / first.magnification**2  # area of a microlens in the volume
-    count = round(particles.per_microlens * size[0] * size[1] / cell)
+    count: int = round(particles.per_microlens * size[0] * size[1] / cell)
     if particles.margin_mm is not None:
         count = round(count * float(np.prod(seeded_size_mm(scene) / size)))
     if count < 1:

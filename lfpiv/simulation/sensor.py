@@ -1,22 +1,14 @@
-"""Sensor of a simulated camera: fixed patterns, bad pixels, noise, and conversion to stored counts."""
+"""Sensor of a simulated camera: noise, range, fixed patterns and bad pixels."""
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.ndimage import gaussian_filter
 
-from lfpiv.experiment.images import FLIPS
 from lfpiv.experiment.settings import NonNegative, Positive, Table
-
-if TYPE_CHECKING:
-    from lfpiv.simulation.scene_camera import SceneCamera
-
-log = logging.getLogger(__name__)
 
 FULL_SCALE = 4095
 """Largest count of a camera of 12 bits."""
@@ -117,51 +109,3 @@ def draw_pattern(sensor: Sensor, shape: tuple[int, int], rng: np.random.Generato
     hot, dead = chosen < sensor.hot_share, chosen >= 1 - sensor.dead_share
     dark = np.where(hot, dark + level * (sensor.hot_counts or sensor.full_scale), np.where(dead, 0, dark))
     return SensorPattern(gain=np.where(dead, 0, gain), offset=offset, dark=dark, hot=hot, dead=dead)
-
-
-def expose(
-    image: np.ndarray,
-    camera: SceneCamera,
-    noise: Noise,
-    rng: np.random.Generator,
-    *,
-    sensor: Sensor | None = None,
-    pattern: SensorPattern | None = None,
-) -> np.ndarray:
-    """Turn light into a stored image: blurred, with noise, in whole counts, flipped as the camera does.
-
-    Parameters
-    ----------
-    image : ndarray, shape (rows, columns)
-        Light [count].
-    camera : SceneCamera
-        The camera; of it `blur_px` and `image_flip` are used.
-    noise : Noise
-        Noise and level without light.
-    rng : Generator
-        Generator of the noise.
-    sensor : Sensor, optional
-        Range of the sensor; default: 12 bits.
-    pattern : SensorPattern, optional
-        Fixed pattern; default: none.
-
-    Returns
-    -------
-    ndarray of uint16, shape (rows, columns)
-    """
-    sensor = sensor or Sensor()
-    if camera.blur_px > 0:
-        image = gaussian_filter(image, camera.blur_px)
-    if pattern is not None:
-        image = image * pattern.gain + pattern.dark
-    if noise.full_well_e > 0:
-        per_count = noise.full_well_e / sensor.full_scale
-        image = rng.poisson(image * per_count) / per_count
-    image = image + noise.background + noise.read_noise * rng.standard_normal(image.shape)
-    if pattern is not None:
-        image = image + pattern.offset
-    saturated = float((image > sensor.largest).mean())
-    if saturated > 1e-3:
-        log.warning("camera %s: %.1f %% of an image's pixels saturate; lower [exposure]", camera.name, 100 * saturated)
-    image = np.clip(np.rint(image), 0, np.floor(sensor.largest)).astype(np.uint16)
-    return np.ascontiguousarray(image[FLIPS[camera.image_flip]])

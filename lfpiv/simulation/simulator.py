@@ -27,6 +27,7 @@ from lfpiv.simulation.camera_images import (
     StaticLight,
     board_truth,
     camera_images,
+    expose,
     image_area,
     render_camera,
     static_light,
@@ -42,7 +43,7 @@ from lfpiv.simulation.particles import (
 )
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
-from lfpiv.simulation.sensor import FULL_SCALE, SensorPattern, draw_pattern, expose
+from lfpiv.simulation.sensor import FULL_SCALE, SensorPattern, draw_pattern
 from lfpiv_kernels.rendering import real_optics
 
 __all__ = [

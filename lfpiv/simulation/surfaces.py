@@ -105,7 +105,8 @@ class Box(Table):
     def contains(self, points_mm: np.ndarray) -> np.ndarray:
         """Return which points (n, 3) [mm] are in the box, shape (n,)."""
         inside = np.abs(np.asarray(points_mm, float) - self.centre_mm) < np.divide(self.size_mm, 2)
-        return np.all(inside, axis=1)
+        every: np.ndarray = np.logical_and.reduce(inside, axis=1)
+        return every
 
 
 Wall = Annotated[HalfSpace | Box, Field(discriminator="kind")]
