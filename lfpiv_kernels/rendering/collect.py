@@ -78,7 +78,7 @@ def _collect_pixels(
     offset: Vector,
     reach: ti.i32,  # lenses to each side whose light can reach a pixel
     board: Board,
-    widest: ti.f32,  # see `_widest_spread`; used where not ideal [mm]
+    widest: ti.f32,  # see `widest_spread`; used where not ideal [mm]
     has_board: ti.template(),  # whether the rays end on a board or in uniform light
     ideal: ti.template(),  # whether windows and aberrations are left out
     hexagonal: ti.template(),
@@ -161,8 +161,24 @@ def _collect_pixels(
         image_out[row, column] = total
 
 
-def _widest_spread(camera: RenderCamera, plane_mm: float, seed: int) -> float:
-    """Return a bound of the distance on the board between a pixel's middle ray and its others [mm]."""
+def widest_spread(camera: RenderCamera, normal: np.ndarray, level_mm: float, seed: int) -> float:
+    """Return a bound of the distance on a plane between a pixel's middle ray and its others [mm].
+
+    Parameters
+    ----------
+    camera : RenderCamera
+        The camera.
+    normal : ndarray, shape (3,)
+        Unit normal of the plane in the camera's frame.
+    level_mm : float
+        Product of the normal and a point of the plane in the camera's frame [mm].
+    seed : int
+        Seed of the rays that are tried.
+
+    Returns
+    -------
+    float
+    """
     rng = np.random.default_rng(seed)
     radius, turn = np.sqrt(rng.random(SPREAD_RAYS)), rng.uniform(0, 2 * np.pi, SPREAD_RAYS)
     pupil = camera.pupil_radius_mm * radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -170,15 +186,14 @@ def _widest_spread(camera: RenderCamera, plane_mm: float, seed: int) -> float:
     array = rng.uniform(-half, half, (SPREAD_RAYS, 2))
     turn = rng.uniform(0, 2 * np.pi, SPREAD_RAYS)
     step = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    normal, hits = camera.rotation[:, 2], []
-    level = normal @ (camera.rotation @ (np.array([0, 0, plane_mm]) - camera.offset_mm))
+    hits = []
     scales = (camera.object_distance_mm, camera.image_distance_mm)
     for lens, pixel in ((0, 0), (1, 0), (0, 1), (1, 1), (1, -1)):
         moved = 0.7072 * (lens * camera.pitch_mm + pixel * camera.pixel_mm / camera.sensor_per_pupil) * step
         start, direction = real_optics.object_lines(
             array + 0.7072 * lens * camera.pitch_mm * step, pupil + moved, *scales, camera.plates, camera.aberrations
         )
-        hits.append(start + ((level - start @ normal) / (direction @ normal))[:, None] * direction)
+        hits.append(start + ((level_mm - start @ normal) / (direction @ normal))[:, None] * direction)
     return 1.3 * float(np.linalg.norm(np.array(hits[1:]) - hits[0], axis=-1).max())
 
 
@@ -191,13 +206,18 @@ def _collect(camera: RenderCamera, samples: int, seed: int, board: tuple | None)
     # a lens k steps away lies at least (k cos 30 - 0.58) pitch from a point nearest to its own lens
     reach = max(1, math.ceil((ratio + 0.6) / 0.866) - 1)
     image = np.empty(camera.sensor_shape, np.float32)
+    widest = 0.0
+    if board is not None and not camera.ideal:
+        normal = camera.rotation[:, 2]
+        level = normal @ (camera.rotation @ (np.array([0, 0, board[0]]) - camera.offset_mm))
+        widest = widest_spread(camera, normal, level, seed)
     _collect_pixels(
         (table - 0.5).astype(np.float32),
         *camera.arguments(),
         Vector(*np.asarray(camera.offset_mm, float)),
         reach,
         Board(*(board or (0.0,) * 7)),
-        0.0 if board is None or camera.ideal else _widest_spread(camera, board[0], seed),
+        widest,
         board is not None,
         camera.ideal or board is None,  # uniform light looks the same through windows and aberrations
         bool(camera.hexagonal),

@@ -9,6 +9,7 @@ from scipy.stats import qmc
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
 from lfpiv_kernels.rendering import array_faults, real_optics
+from lfpiv_kernels.rendering.collect import widest_spread
 from lfpiv_kernels.rendering.render import Optics, RenderCamera
 
 Patch = ti.types.vector(14, ti.f32)
@@ -17,21 +18,31 @@ length, half width [mm] or their standard deviations, whether the edges along an
 and the level of the plane, its normal times its centre [mm]."""
 
 
-@ti.func
-def _patch_light(s, t, u, v, so, si, plates: ti.template(), aberrations, patch):
-    """Return the radiance at the end of the ray from (s, t) on the array through (u, v) on the pupil.
+GAUSSIAN_REACH = 6.0
+"""Distance in standard deviations beyond which a Gaussian edge is dark: 1.5e-8 of the light is left."""
 
-    It has nine parameters because they are numbers of one ray, of the camera and of the patch, which Taichi inlines.
+
+@ti.func
+def _place(s, t, u, v, so, si, plates: ti.template(), aberrations, patch, ideal: ti.template()):
+    """Return where the ray from (s, t) through (u, v) meets the patch's plane: distances along and across [mm].
+
+    It has ten parameters because they are numbers of one ray, of the camera and of the patch, which Taichi inlines.
     """
     along = ti.Vector([patch[3], patch[4], patch[5]])
     across = ti.Vector([patch[6], patch[7], patch[8]])
     normal = along.cross(across)
-    hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, normal, patch[13])
+    hit = ti.Vector([0.0, 0.0, 0.0])
+    if ti.static(ideal):
+        start = ti.Vector([-s * so / si, -t * so / si, 0.0])
+        slope = ti.Vector([u / so + s / si, v / so + t / si, 1.0])
+        hit = start + (patch[13] - normal.dot(start)) / normal.dot(slope) * slope
+    else:
+        hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, normal, patch[13])
     arm = hit - ti.Vector([patch[0], patch[1], patch[2]])
-    light = 0.0
-    if hit[2] < so:  # the plane of the patch may also meet the ray behind the lens
-        light = _edge(arm.dot(along), patch[9], patch[11]) * _edge(arm.dot(across), patch[10], patch[12])
-    return light
+    place = ti.Vector([arm.dot(along), arm.dot(across)])
+    if not hit[2] < so:  # the plane meets the ray behind the lens, or never
+        place = ti.Vector([1e30, 1e30])
+    return place
 
 
 @ti.func
@@ -61,6 +72,8 @@ def _collect_patch(
     clipped: ti.template(),  # whether a second aperture clips the pupil
     reach: ti.i32,  # lenses to each side whose light can reach a pixel
     patch: Patch,
+    widest: ti.f32,  # see `collect.widest_spread` [mm]
+    ideal: ti.template(),  # whether windows and aberrations are left out
     hexagonal: ti.template(),
     # out
     image_out: ti.types.ndarray(dtype=ti.f32, ndim=2),  # light relative to a fully lit pixel
@@ -73,6 +86,9 @@ def _collect_patch(
     rows, columns, pitch = optics[5], optics[6], optics[7]
     count = samples.shape[0]
     outer = radius * scale + 0.7072 * (pixel + pitch * scale)
+    dark = ti.Vector([0.0, 0.0])  # distances from the middle of the patch beyond which a pixel sees none of it
+    for axis in ti.static(range(2)):
+        dark[axis] = patch[9 + axis] * (GAUSSIAN_REACH if patch[11 + axis] > 0.0 else 1.0) + widest
     for row, column in image_out:
         x = (column + 0.5 - 0.5 * columns) * pixel
         y = (row + 0.5 - 0.5 * rows) * pixel
@@ -91,7 +107,12 @@ def _collect_patch(
             on_array = i >= 0 and i < lens_gain.shape[0] and j >= 0 and j < lens_gain.shape[1]
             if on_array and distance < outer:
                 seen = 0.0
-                for n in range(count):
+                u0, v0 = middle[0] - (x - middle[0]) / scale, middle[1] - (y - middle[1]) / scale
+                far = ti.abs(_place(middle[0], middle[1], u0, v0, so, si, plates, aberrations, patch, ideal))
+                rays = 0
+                if far[0] < dark[0] and far[1] < dark[1]:
+                    rays = count
+                for n in range(rays):
                     px, py = x + samples[n, 0] * pixel, y + samples[n, 1] * pixel
                     p, q = samples[n, 2], samples[n, 3]
                     s = regular_centre[0] + p * lattice[2] + q * lattice[4]
@@ -106,7 +127,9 @@ def _collect_patch(
                     if ti.static(clipped):
                         open_ = open_ and array_faults.passes(s, t, u, v, radius, faults)
                     if open_:
-                        seen += _patch_light(s, t, u, v, so, si, plates, aberrations, patch) / count
+                        place = _place(s, t, u, v, so, si, plates, aberrations, patch, ideal)
+                        light = _edge(place[0], patch[9], patch[11]) * _edge(place[1], patch[10], patch[12])
+                        seen += light / count
                 total += seen * lens_gain[i, j]
         image_out[row, column] = total
 
@@ -160,6 +183,8 @@ def render_patch(
         *camera.arguments()[1:],
         reach,
         Patch(*centre, *along, *across, *map(float, half_mm), *map(float, gaussian), level),
+        widest_spread(camera, np.cross(along, across), level, seed),
+        camera.ideal,
         bool(camera.hexagonal),
         image,
     )
