@@ -78,8 +78,9 @@ def _explain(error: ValidationError, model: type[BaseModel], values: Mapping[str
 def _key(location: tuple[int | str, ...], values: Any) -> str:
     """Return the name of a location: ``camera 'cam1', f_number``, ``smart.iterations`` or ``volume.size_mm[2]``."""
     key = ""
-    for part in location:
-        if isinstance(part, str) and isinstance(values, Mapping):
+    for place, part in enumerate(location):
+        tag = isinstance(values, Mapping) and part not in values and place < len(location) - 1
+        if isinstance(part, str) and isinstance(values, Mapping) and not tag:
             key += part if not key or key.endswith(", ") else f".{part}"
             values = values.get(part)
         elif isinstance(part, int) and isinstance(values, list):

@@ -13,6 +13,9 @@ Pulses = tuple[NonNegative, NonNegative]
 LogSd = Annotated[float, Field(strict=True, ge=0, le=2)]
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 
+DIM_SHARE = 0.05
+"""Share of a sheet's light below which it lights no particle worth mentioning."""
+
 MODES = 24
 """Cosines that make up the slow variation of stray light."""
 
@@ -111,6 +114,14 @@ class Sheet(Table):
         top_hat: np.ndarray = np.abs(distance) <= half
         gaussian: np.ndarray = np.exp(-2 * (distance / half) ** 2)
         return top_hat.astype(float) if self.profile == "top_hat" else gaussian
+
+    def lit_mm(self, pulse: int) -> tuple[float, float]:
+        """Return from where to where a pulse lights particles along `direction`, but for the dimmest `DIM_SHARE` [mm]."""
+        if self.thickness_mm is None:
+            return -np.inf, np.inf
+        half, middle = _of_pulse(self.thickness_mm, pulse) / 2, _of_pulse(self.position_mm, pulse)
+        reach = half if self.profile == "top_hat" else half * float(np.sqrt(-np.log(DIM_SHARE) / 2))
+        return middle - reach, middle + reach
 
     def powers(self, rng: np.random.Generator) -> np.ndarray:
         """Draw the power of both pulses of one pair, shape (2,)."""

@@ -65,7 +65,7 @@ def place_particles(scene: Scene, pair: int) -> PlacedParticles:
     Raises
     ------
     InputError
-        If the scene has less than one particle.
+        If the scene has less than one particle, or its walls leave none.
     """
     rng = np.random.default_rng([scene.seed, 1, pair])
     size, count = seeded_size_mm(scene), _count(scene)
@@ -88,6 +88,11 @@ def place_particles(scene: Scene, pair: int) -> PlacedParticles:
         return PlacedParticles(position, displacement, intensity, diameter, factor)
     # at no instant is a particle in a wall
     fluid = ~np.any([scene.solid(position + part * displacement) for part in (-0.5, 0.0, 0.5)], axis=0)
+    if not fluid.any():
+        raise InputError(
+            f"wall: expected fluid in the volume, found that the walls leave no particle of pair {pair}. Move or "
+            "shrink them."
+        )
     return PlacedParticles(position[fluid], displacement[fluid], intensity[fluid], diameter[fluid], factor[:, fluid])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -112,11 +113,22 @@ class Box(Table):
 Wall = Annotated[HalfSpace | Box, Field(discriminator="kind")]
 
 
+WALLS = {"half_space": HalfSpace, "box": Box}
+"""Kinds of walls."""
+
+
 def _as_list(value: Any) -> Any:
     return value if isinstance(value, (list, tuple)) else (value,)
 
 
-Walls = Annotated[tuple[Wall, ...], BeforeValidator(_as_list)]
+def _known_walls(value: Any) -> Any:
+    walls = _as_list(value)
+    if any(isinstance(wall, Mapping) and wall.get("kind") not in WALLS for wall in walls):
+        raise ValueError(f"a wall with kind = {' or '.join(map(repr, WALLS))}")
+    return walls
+
+
+Walls = Annotated[tuple[Wall, ...], BeforeValidator(_known_walls)]
 """Solid regions without particles. They hide nothing behind them."""
 Surfaces = Annotated[tuple[Surface, ...], BeforeValidator(_as_list)]
 

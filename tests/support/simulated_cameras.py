@@ -1,8 +1,15 @@
 """Simulated cameras of several kinds, a small scene file, and a sensor that adds up rays by definition."""
 
+import sys
+
 import numpy as np
 
-from lfpiv.simulation.scene import SceneCamera
+from lfpiv.simulation.scene import Scene, SceneCamera
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 ROUNDING = 1e-12  # float64, a few operations on millimetres
 MONTE_CARLO = 5.0  # standard errors; 1e-6 chance per comparison
@@ -101,6 +108,14 @@ iterations = 3
 windows = [4]
 """
 """Scene file of two cameras, a board and a swirl, with a key of each kind."""
+
+
+def small_scene(**tables):
+    """Return the small scene with some tables added; keys of tables that it has already are replaced one by one."""
+    content = tomllib.loads(SMALL_SCENE)
+    for name, table in tables.items():
+        content[name] = content.get(name, {}) | table if isinstance(table, dict) else table
+    return Scene.model_validate(content)
 
 
 def camera(rig="misaligned", **changes):
