@@ -116,7 +116,7 @@ class Sheet(Table):
         return top_hat.astype(float) if self.profile == "top_hat" else gaussian
 
     def lit_mm(self, pulse: int) -> tuple[float, float]:
-        """Return from where to where a pulse lights particles along `direction`, but for the dimmest `DIM_SHARE` [mm]."""
+        """Return from where to where along `direction` a pulse has more than `DIM_SHARE` of its light [mm]."""
         if self.thickness_mm is None:
             return -np.inf, np.inf
         half, middle = _of_pulse(self.thickness_mm, pulse) / 2, _of_pulse(self.position_mm, pulse)
