@@ -1,17 +1,17 @@
 """Write the truth of a simulated experiment: the scene, its particles, and what differs from the ideal images.
 
-===========================  ==========================================================================================
-file in ``truth/``           content
-===========================  ==========================================================================================
-``spec.json``                the scene, with all defaults
-``particles.npz``            particles of each pair; light of each in each camera and frame, and power of the pulses,
-                             where the scene has a table ``[sheet]`` or ``[brightness]``
-``light_CAMERA.npz``         light that is not from particles, where the scene has ``[[surface]]`` or ``[stray_light]``
-``sensor_CAMERA.npz``        fixed pattern, where the camera has a table ``sensor``
-``array_CAMERA.npz``         dead lenses, where the camera has a table ``array``
-``board.npz``                true dots, where the scene has a table ``[board.errors]``
-``walls.npz``                solid voxels, where the scene has a ``[[wall]]``
-===========================  ==========================================================================================
+============================  =========================================================================================
+file                          content
+============================  =========================================================================================
+``truth/spec.json``           the scene, with all defaults
+``truth/particles.npz``       particles of each pair; light of each in each camera and frame, and power of the pulses,
+                              where the scene has a table ``[sheet]`` or ``[brightness]``
+``truth/light_CAMERA.npz``    light that is not from particles, where the scene has ``[[surface]]`` or ``[stray_light]``
+``truth/sensor_CAMERA.npz``   fixed pattern, where the camera has a table ``sensor``
+``truth/array_CAMERA.npz``    dead lenses, where the camera has a table ``array``
+``truth/board.npz``           true dots, where the scene has a table ``[board.errors]``
+``truth/walls.npz``           solid voxels, where the scene has a ``[[wall]]``
+============================  =========================================================================================
 
 Images in these files are oriented as the stored images.
 """

@@ -11,7 +11,7 @@ import numpy as np
 from lfpiv.experiment.settings import CameraTable, ExperimentTable
 from lfpiv.simulation.scene import Scene
 
-SIZE_MM = {"small": (4.4, 4.0, 2.2), "paper": (6.0, 5.6, 2.6)}
+SIZE_MM = {"small": (4.6, 4.4, 2.4), "paper": (6.0, 5.6, 2.6)}
 """Size of the volume (x, y, z)."""
 SENSOR_PX = {"small": (700, 840), "paper": (980, 1080)}
 """Rows and columns. They cover the volume and the board at 42 degrees."""
@@ -22,7 +22,7 @@ SERIES = {"small": 8, "paper": 20}
 VOXEL_MM = 0.1
 PPM = 0.4
 """Particles per microlens of the volume's face."""
-COUNTS = 500.0
+COUNTS = 300.0
 """Level of a pixel lit by one particle [count]."""
 OPTICS = {
     "focal_length_mm": 85.0,
@@ -36,8 +36,8 @@ READ_E = 2.0
 """Read-out noise of dim images [electron]; they have as many electrons per count as the others."""
 PER_COUNT = 10_000 / 4095
 """Electrons per count."""
-FACE_COUNTS = 1900.0
-"""Counts that the brightest thousandth of the ideal row's pixels exceed, from which dim rows are scaled."""
+FACE_COUNTS = 775.0
+"""Counts that the brightest thousandth of the ideal row's pixels exceed; dim rows are scaled from it."""
 
 
 @dataclass(frozen=True, kw_only=True)
