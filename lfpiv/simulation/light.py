@@ -11,7 +11,6 @@ from lfpiv.experiment.settings import NonNegative, Number, Point, Positive, Tabl
 
 Pulses = tuple[NonNegative, NonNegative]
 LogSd = Annotated[float, Field(strict=True, ge=0, le=2)]
-Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 
 DIM_SHARE = 0.05
 """Share of a sheet's light below which it lights no particle worth mentioning."""

@@ -120,7 +120,7 @@ def _judge(scene: Scene, pair: int, path: Path) -> dict[str, Any]:
     """Compare the vectors of one pair with the flow's mean over the fluid of their windows."""
     with xr.open_dataset(path, engine="h5netcdf") as stored:
         vectors = stored.load()
-    exact, fluid = _truth(scene, pair, vectors)
+    exact, fluid = truth_of(scene, pair, vectors)
     field, spread = (
         np.stack([vectors[f"{name}_{axis}"].values for axis in "xyz"], axis=-1)
         for name in ("displacement", "uncertainty")
@@ -145,7 +145,7 @@ def _judge(scene: Scene, pair: int, path: Path) -> dict[str, Any]:
     }
 
 
-def _truth(scene: Scene, pair: int, vectors: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+def truth_of(scene: Scene, pair: int, vectors: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Return the flow's mean over the fluid of each window (z, y, x, 3) [voxel], and the part that is fluid."""
     edge = np.array(json.loads(vectors.attrs["settings"])["windows"][-1][::-1]) * VOXEL_MM
     z, y, x = np.meshgrid(*(vectors[axis].values for axis in "zyx"), indexing="ij")
@@ -179,7 +179,7 @@ def _true_error(scene: Scene, work: Path) -> float:
         grid = Grid.from_extent(centre_mm=volume.centre_mm, size_mm=volume.size_mm, voxel_mm=volume.voxel_mm)
         volumes = [rigs.truth(placed.at_frame(frame), grid) for frame in "ab"]
         vectors = correlate(*volumes, dt_s=scene.dt_s, **scene.correlation.model_dump())
-        exact, fluid = _truth(scene, 0, vectors)
+        exact, fluid = truth_of(scene, 0, vectors)
         field = np.stack([vectors[f"displacement_{axis}"].values for axis in "xyz"], axis=-1)
         return float(np.nanmean(np.linalg.norm(field - exact, axis=-1)[fluid >= LEAST_FLUID]))
 

@@ -5,11 +5,14 @@ import json
 import bench
 import cameras
 import choices
+import imperfect_scenes
+import imperfections
 import numpy as np
 import optics
 import pytest
 import run
 import sweeps
+import xarray as xr
 
 from lfpiv.reproduce.study import compute
 from lfpiv.weights import counting
@@ -24,12 +27,13 @@ RAYS_PITCH = (
 FAILS = 5.0  # DRT's rays through 10 mm of glass at 45 degrees miss by 0.6 pitch, this network's by 0.02
 DEPTH = 2.0  # a single camera's depth error over that of two; 4 to 5 in volumes that hold more vectors
 ROUNDING = 1e-9
+ROWS = imperfect_scenes.rows("small") | {"unknown": imperfect_scenes.Row(label="a key of tomorrow", needs="tomorrow")}
 SAMPLED = 0.05  # relative: statistics of 4,000 draws
 
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
-    """Output folder of the four cases on rigs of 2.4 mm."""
+    """Output folder of the cases on rigs of 2.4 mm."""
     patch = pytest.MonkeyPatch()
     for table, tiny_value in (
         (bench.SIZE_MM, (2.4, 2.4, 1.6)),
@@ -39,6 +43,9 @@ def tiny(tmp_path_factory):
         (cameras.PPM, (PPM,)),
         (sweeps.PPM, (PPM,)),
         (sweeps.COUNTS, (300.0, DIM)),
+        (imperfect_scenes.SIZE_MM, (2.4, 2.4, 1.6)),
+        (imperfect_scenes.SENSOR_PX, (420, 500)),
+        (imperfect_scenes.PAIRS, 1),
     ):
         patch.setitem(table, "small", tiny_value)
     pair = bench.Pair(ppm=PPM)
@@ -51,6 +58,7 @@ def tiny(tmp_path_factory):
         (choices, "CHOICES", {key: choices.CHOICES[key] for key in FEW}),
         (optics, "DEFAULT", pair),
         (optics, "OPTICS", {key: optics.OPTICS[key] for key in ("window",)}),
+        (imperfect_scenes, "rows", lambda scale: {key: ROWS[key] for key in ("ideal", "e20", "half", "unknown")}),
         (counting, "VOXELS", 1),  # the check by counted rays has tests of its own
     ):
         patch.setattr(module, name, value)
@@ -131,6 +139,47 @@ def test_cases_share_their_runs_and_the_page_tells_them_apart(tiny, figures):
     for key in run.ACCURACY.modules:
         for figure in figures[key]["figures"]:
             assert (tiny / figure["file"]).stat().st_size > 10_000, figure
+
+
+@pytest.mark.slow
+def test_imperfect_images_are_measured_and_judged(figures):
+    case = figures["imperfections"]
+    ideal, dim, half = (case["rows"][key] for key in ("ideal", "e20", "half"))
+    assert list(case["rows"]) == ["ideal", "e20", "half"] and "a key of tomorrow" in case["notes"][-1]
+    assert ideal["true"] < ideal["all"] < dim["all"] and ideal["no_fluid"] is None
+    assert ideal["true"] == dim["true"]  # the same particles
+    assert 0 <= ideal["bad"] <= 100 and 0 < ideal["within"] <= 100 and ideal["failed"] == 0
+    assert half["true"] != ideal["true"] and half["no_fluid"] is not None
+    table = case["tables"][0]
+    assert [row[0] for row in table["rows"]] == [ROWS[key].label for key in case["rows"]]
+    assert table["rows"][1][3] == pytest.approx(dim["all"] / ideal["all"])
+
+
+@pytest.mark.parametrize("scale", ["small", "paper"])
+def test_every_row_is_a_valid_scene_of_the_same_rig(scale):
+    every = imperfect_scenes.rows(scale)
+    ideal = imperfect_scenes.scene(every["ideal"], scale, SEED)
+    for key, row in every.items():
+        scene = imperfect_scenes.scene(row, scale, SEED)
+        assert scene.flow == ideal.flow and scene.volume == ideal.volume, key
+        assert [c.true_yaw_deg for c in scene.camera] == [c.true_yaw_deg for c in ideal.camera]
+        changed = scene.model_dump(exclude={"particles"}) != ideal.model_dump(exclude={"particles"})
+        assert changed == (key != "ideal"), key
+    other = imperfect_scenes.scene(every["ideal"], scale, SEED + 1)
+    assert other.flow != ideal.flow and other.camera[0].true_yaw_deg != ideal.camera[0].true_yaw_deg
+
+
+def test_the_flow_is_averaged_over_the_fluid_of_a_window():
+    settings = json.dumps({"windows": [[12, 12, 12]]})
+    axes = {"z": [0.0], "y": [0.3], "x": [-0.9, -0.3, 0.0, 0.3, 0.9]}
+    vectors = xr.Dataset(coords=axes, attrs={"settings": settings})
+    plain, half = (imperfect_scenes.scene(ROWS[key], "small", SEED) for key in ("ideal", "half"))
+    everywhere, full = imperfections.truth_of(plain, 0, vectors)
+    in_fluid, part = imperfections.truth_of(half, 0, vectors)
+    assert (full == 1).all() and part[0, 0] == pytest.approx([1, 0.75, 0.5, 0.25, 0], abs=0.06)
+    assert in_fluid[0, 0, 0] == pytest.approx(everywhere[0, 0, 0], abs=2e-3)  # midpoints instead of Gauss's nodes
+    assert np.isnan(in_fluid[0, 0, -1]).all()
+    assert in_fluid[0, 0, 3] == pytest.approx(everywhere[0, 0, 2], abs=0.4)  # fluid at the wall, not behind it
 
 
 def test_standard_errors_are_those_of_independent_vectors():
