@@ -113,7 +113,7 @@ class Box(Table):
 Wall = Annotated[HalfSpace | Box, Field(discriminator="kind")]
 
 
-WALLS = {"half_space": HalfSpace, "box": Box}
+WALLS = ("half_space", "box")
 """Kinds of walls."""
 
 
