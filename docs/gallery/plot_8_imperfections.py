@@ -38,7 +38,7 @@ ideal = {
     "volume": {"size_mm": (1.6, 1.6, 1.0), "voxel_mm": 0.1},
     "particles": {"per_microlens": 0.15, "sigma_mm": 0.02},
     "flow": {"kind": "uniform", "displacement_mm": (0.05, 0.0, 0.0)},
-    "quality": {"particle_rays": 32_768, "dot_rays": 65_536, "pixel_rays": 64},
+    "quality": {"particle_rays": 16_384, "dot_rays": 32_768, "pixel_rays": 64},
 }
 streak = {
     "centre_mm": (-0.3, 0.0, -0.6),

@@ -15,6 +15,8 @@ SIZE_MM = {"small": (4.6, 4.4, 2.4), "paper": (6.0, 5.6, 2.6)}
 """Size of the volume (x, y, z)."""
 SENSOR_PX = {"small": (700, 840), "paper": (980, 1080)}
 """Rows and columns. They cover the volume and the board at 42 degrees."""
+DOTS = {"small": (8, 8), "paper": (10, 10)}
+"""Dots of the board. They cover the volume's face."""
 PAIRS = {"small": 2, "paper": 3}
 """Pairs that are measured."""
 SERIES = {"small": 8, "paper": 20}
@@ -92,8 +94,8 @@ def ideal_tables(scale: str, seed: int) -> dict[str, Any]:
         "dt_s": 1e-4,
         "camera": cameras,
         "board": {
-            "dots": (8, 8),
-            "spacing_mm": round((size[0] + 0.2) / 7, 2),
+            "dots": DOTS[scale],
+            "spacing_mm": round((size[0] + 0.2) / (DOTS[scale][0] - 1), 2),
             "dot_diameter_mm": 0.1,
             "planes_mm": tuple(np.round(np.linspace(-depth, depth, 5), 2).tolist()),
         },
