@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from lfpiv.experiment.settings import NonNegative, Table
 
@@ -63,12 +64,14 @@ def true_board(errors: BoardErrors, nominal_mm: np.ndarray, cameras: int, rng: n
     scatter = errors.dot_sd_mm * rng.standard_normal((dots, 2))
     present = np.greater_equal(rng.random(dots), errors.missing_share)
     shift = rng.standard_normal((planes, 3)) * (errors.stage_xy_sd_mm, errors.stage_xy_sd_mm, errors.stage_z_sd_mm)
-    tilt = np.tan(np.radians(errors.tilt_sd_deg * rng.standard_normal((planes, 2))))
+    tilt = np.radians(errors.tilt_sd_deg * rng.standard_normal((planes, 2)))
     angle = rng.uniform(0, 2 * np.pi, cameras)
     true = nominal_mm.astype(float)
     true[..., :2] += scatter
-    # small tilts about the axes x and y through the board's middle: depth grows along y and falls along x
-    true[..., 2] += tilt[:, :1] * true[..., 1] - tilt[:, 1:] * true[..., 0]
+    for plane, (about_x, about_y) in enumerate(tilt):  # a rigid board turns about its middle
+        middle = np.array([0.0, 0.0, nominal_mm[plane, 0, 2]])
+        turn = Rotation.from_rotvec([about_x, about_y, 0.0]).as_matrix()
+        true[plane] = (true[plane] - middle) @ turn.T + middle
     true += shift[:, None]
     across = nominal_mm[0, :, :2] @ np.stack([np.cos(angle), np.sin(angle)])
     across = (across - across.min(0)) / np.maximum(np.ptp(across, axis=0), 1e-12)
