@@ -97,6 +97,8 @@ class PairSolver:
         How often the motion is measured and followed, >= 0.
     correlation : mapping, optional
         Settings of `correlate`, which measures the motion; default: those of an experiment without such a table.
+    mask : ndarray or DataArray, shape (z, y, x), optional
+        Voxels without fluid, as of `reconstruct`.
 
     Raises
     ------
@@ -111,9 +113,10 @@ class PairSolver:
         *,
         motion_passes: int = 0,
         correlation: Mapping[str, Any] | None = None,
+        mask: np.ndarray | xr.DataArray | None = None,
     ):
         require_whole("motion_passes", motion_passes)
-        self.smart = SmartSolver(weights, settings)
+        self.smart = SmartSolver(weights, settings, mask)
         self.motion_passes = motion_passes
         self.correlation = Correlation().model_dump() if correlation is None else dict(correlation)
 
@@ -183,6 +186,7 @@ def reconstruct_pair(
     floor: Sequence[float | Mapping[str, float] | None] = (None, None),
     correlation: Mapping[str, Any] | None = None,
     iterations: int = 10,
+    mask: np.ndarray | xr.DataArray | None = None,
     progress: Callable[[float], None] | None = None,
     **smart: Any,
 ) -> list[xr.DataArray]:
@@ -205,6 +209,8 @@ def reconstruct_pair(
         Settings of `correlate`, which measures the motion; default: those of an experiment without such a table.
     iterations : int
         SMART iterations of the first reconstruction; a pass takes at most `ITERATION_SHARE` of them.
+    mask : ndarray or DataArray, shape (z, y, x), optional
+        Voxels without fluid, as of `reconstruct`.
     progress : callable, optional
         Called with the finished fraction.
     **smart
@@ -227,7 +233,7 @@ def reconstruct_pair(
     if "first" in smart:
         raise ValueError("first: expected no first guess, as each pass makes its own; use `reconstruct` for one.")
     settings = SmartSettings(iterations=iterations, **smart)
-    solver = PairSolver(weights, settings, motion_passes=motion_passes, correlation=correlation)
+    solver = PairSolver(weights, settings, motion_passes=motion_passes, correlation=correlation, mask=mask)
     return solver.solve(images, floor, progress).to_dataarrays()
 
 

@@ -113,6 +113,7 @@ class PairWork:
             SmartSettings(**smart.of_one_frame()),
             motion_passes=smart.motion_passes,
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
+            mask=self.experiment.solid,
         )
 
     def _do(self, pair: int, progress: StepProgress) -> None:
