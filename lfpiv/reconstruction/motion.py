@@ -26,17 +26,17 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.experiment.settings import Correlation
+from lfpiv.geometry.volume import MASKED
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import SmartSettings, require_whole
 from lfpiv.reconstruction.shared_light import MotionField, shared_guesses
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.velocity.multi_pass import peak_ratio
+from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
 from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.velocity.windows import Windows
 from lfpiv.weights.operator import Weights
-from lfpiv_kernels.correlation import deform
 from lfpiv_kernels.correlation.correlate import correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 
@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 ITERATION_SHARE = 0.4
 """Iterations of a motion pass, as a share of those of the first reconstruction."""
 LEAST_VALID = 0.3
-"""Least share of valid vectors, of those that two cameras see, with which the motion is followed."""
+"""Least share of valid vectors, of those that can be measured, with which the motion is followed."""
 
 UNSHARED = "unshared"
 """Coordinate of a volume that shares light with the other frame: the volume of the frame by itself."""
@@ -161,7 +161,8 @@ class PairSolver:
             volumes = [frame.to_dataarray() for frame in frames]
             vectors = correlate(*volumes, dt_s=1.0, **self.correlation)
             valid.append(round(float(vectors.attrs["valid_fraction"]), 4))
-            if valid[-1] < LEAST_VALID * float(vectors.attrs["seen_fraction"]):
+            measurable = min(float(vectors.attrs[name]) for name in ("seen_fraction", "seeded_fraction"))
+            if valid[-1] < LEAST_VALID * measurable:
                 motion = Motion.LOST
                 log.warning("motion: %.0f %% of the vectors are valid; %s", 100 * valid[-1], motion.value)
                 break
@@ -283,12 +284,11 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     missing = missing_smoothing(settings.smoothing_voxel, *volumes)
     unshared = (volume[UNSHARED].values for volume in volumes)  # their scale does not matter
     first, second = (
-        deform.spline_coefficients(
-            preprocess((light - np.median(light)).astype(np.float32), missing, settings.intensity_power)
-        )
+        preprocess((light - np.median(light)).astype(np.float32), missing, settings.intensity_power)
         for light in unshared
     )
-    first, second = deform.deform_pair(first, second, motion.midway.field, motion.midway.spacing)
+    solid = volumes[0].coords[MASKED].values if MASKED in volumes[0].coords else None
+    (first, second), _ = UndeformedPair((first, second), solid).deformed(motion.midway, window)
     step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(motion.nodes, first.shape, strict=True))
     windows = Windows.covering(first.shape, window, step)
     scatter = displacement_deviation(
