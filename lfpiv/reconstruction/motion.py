@@ -161,8 +161,7 @@ class PairSolver:
             volumes = [frame.to_dataarray() for frame in frames]
             vectors = correlate(*volumes, dt_s=1.0, **self.correlation)
             valid.append(round(float(vectors.attrs["valid_fraction"]), 4))
-            measurable = min(float(vectors.attrs[name]) for name in ("seen_fraction", "seeded_fraction"))
-            if valid[-1] < LEAST_VALID * measurable:
+            if valid[-1] < LEAST_VALID * float(vectors.attrs["measurable_fraction"]):
                 motion = Motion.LOST
                 log.warning("motion: %.0f %% of the vectors are valid; %s", 100 * valid[-1], motion.value)
                 break

@@ -176,8 +176,11 @@ def pair_warnings(pairs: Mapping[int, PairFigures]) -> list[Warning]:
             words = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion.verdict}
             found.append(Warning(code=Code.MOTION_LOST, pairs=(pair,), figures=words))
         if figures.verdict != Verdict.GOOD.value:
-            words = {"share": figures.valid_fraction, "verdict": figures.verdict}
+            words = {"share": figures.valid_share, "verdict": figures.verdict}
             found.append(Warning(code=Code.FEW_VALID, pairs=(pair,), figures=words))
+        if figures.lost_unseeded > 0 and figures.verdict != Verdict.FAILED.value:
+            shares = {"share": figures.unseeded_fraction, "lost": figures.lost_unseeded}
+            found.append(Warning(code=Code.UNSEEDED, pairs=(pair,), figures=shares))
     return gather(found)
 
 

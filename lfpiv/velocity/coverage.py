@@ -33,6 +33,17 @@ class Voxels:
     """True where the fluid holds no particles; None: nowhere."""
 
     @property
+    def unseeded_fraction(self) -> float:
+        """Part of the fluid that two cameras see and that holds no particles."""
+        if self.unseeded is None:
+            return 0.0
+        usable = np.ones_like(self.unseeded)
+        for flags in (self.seen, None if self.solid is None else ~self.solid):
+            if flags is not None:
+                usable &= flags
+        return float(self.unseeded[usable].mean()) if usable.any() else 0.0
+
+    @property
     def coarse(self) -> Voxels:
         """Flags for all passes but the last, whose vectors are only predictions."""
         return Voxels(solid=self.solid)
@@ -47,7 +58,7 @@ class Voxels:
         fluid = everywhere if self.solid is None else windows.shares(~self.solid)
         seeded = everywhere
         if self.unseeded is not None:
-            empty = self.unseeded if self.solid is None else self.unseeded & ~self.solid
+            empty = self.unseeded & ~self.solid if self.solid is not None else self.unseeded
             seeded = 1 - np.divide(windows.shares(empty), fluid, out=np.zeros_like(fluid), where=fluid > 0)
         least = min(LEAST_FLUID, math.prod(last) / math.prod(windows.window))
         return Coverage(

@@ -19,6 +19,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import is_finite
 from lfpiv.velocity.coverage import Voxels
 from lfpiv.velocity.multi_pass import Pass, correlate_passes, peak_ratio
+from lfpiv.velocity.seeding import unseeded_voxels
 from lfpiv.velocity.settings import CorrelationSettings, triple, windows_of
 from lfpiv.velocity.volume_pair import (
     VoxelAxes,
@@ -30,6 +31,7 @@ from lfpiv.velocity.volume_pair import (
     seen_by_two,
     solid_voxels,
     voxel_axes,
+    without,
 )
 
 log = logging.getLogger(__name__)
@@ -44,7 +46,11 @@ Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
 
 
 class Verdict(enum.Enum):
-    """Quality of the measurement, from the part of valid vectors in the last pass. The text is advice to the user."""
+    """Quality of the measurement, from the part of the vectors in the last pass that are valid, of those that can be.
+
+    Masked windows, and windows with too few particles or of which two cameras see too little, do not enter. The text is
+    advice to the user.
+    """
 
     GOOD = "most vectors are valid"
     POOR = (
@@ -130,9 +136,10 @@ def correlate(
         after a single pass.
 
         Attributes: ``verdict``, from the vectors that can be measured; ``masked_fraction``, the part of all vectors
-        that are masked; ``valid_fraction``, ``seen_fraction`` and ``seeded_fraction``, the parts of the others that are
-        valid, where two cameras see enough, and where enough particles are; ``settings`` and ``passes``, the figures of
-        each pass, as JSON.
+        that are masked; ``valid_fraction``, ``seen_fraction`` and ``measurable_fraction``, the parts of the others that
+        are valid, where two cameras see enough, and where these show particles too; ``unseeded_fraction``, the part of
+        the volume that has fluid, is seen and holds no particles; ``settings`` and ``passes``, the figures of each
+        pass, as JSON.
 
     Raises
     ------
@@ -159,9 +166,10 @@ def correlate(
         intensity_power=intensity_power,
     )
     first_search = settings.first_search(shape)
+    seen = seen_by_two(volume_a, volume_b)
+    voxels = Voxels(seen=seen, solid=solid, unseeded=unseeded_voxels((first, second), without(solid, seen)))
     missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
     first, second = (preprocess(volume, missing, intensity_power) for volume in (first, second))
-    voxels = Voxels(seen=seen_by_two(volume_a, volume_b), solid=solid)
     last, figures = correlate_passes(first, second, settings, voxels)
     measurable = last.coverage.measurable
     share = float(last.valid[measurable].mean()) if measurable.any() else 0.0
@@ -170,14 +178,17 @@ def correlate(
         if moves_beyond(first, second, first_search):
             verdict = Verdict.TOO_FAR
         log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
+    if voxels.unseeded is not None:
+        log.info("correlation: %.0f %% of the volume holds no particles", 100 * voxels.unseeded_fraction)
     attributes = {
         "title": "displacement and velocity of particles between two volumes",
         "dt_s": float(dt_s),
         "voxel_mm": [float(spacing) for spacing in axes.spacing_mm],
         "valid_fraction": last.valid_fraction,
         "seen_fraction": last.fraction(last.coverage.seen),
-        "seeded_fraction": last.fraction(last.coverage.seeded),
         "masked_fraction": float(last.coverage.masked.mean()),
+        "measurable_fraction": last.fraction(measurable),
+        "unseeded_fraction": voxels.unseeded_fraction,
         "verdict": verdict.value,
         "settings": settings.to_json(),
         "passes": json.dumps([asdict(one) for one in figures]),

@@ -167,6 +167,13 @@ def solid_voxels(
     return solid if solid.any() else None
 
 
+def without(solid: np.ndarray | None, seen: np.ndarray | None) -> np.ndarray | None:
+    """Return the flags of the voxels that are solid or not seen, shape (z, y, x); None if there are none."""
+    if seen is None:
+        return solid
+    return ~seen if solid is None else solid | ~seen
+
+
 def moves_beyond(first: np.ndarray, second: np.ndarray, search: tuple[int, int, int]) -> bool:
     """Return whether two volumes (z, y, x) as a whole clearly correlate at larger lags than `search` reaches.
 
