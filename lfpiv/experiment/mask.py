@@ -84,7 +84,7 @@ def read_mask(path: Path, grid: Grid) -> np.ndarray:
     """
     mask = _load(path)
     try:
-        values = solid_shares(mask.values, mask.name)
+        values = solid_shares(mask.values, str(mask.name))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
     for number, axis in enumerate(AXES):

@@ -149,7 +149,7 @@ def of_pair(experiment: Experiment, calibration: str, pair: int) -> PairStamps:
         "calibration": calibration,
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
-        "mask": None if experiment.solid is None else hashlib.blake2b(np.packbits(experiment.solid)).hexdigest()[:32],
+        "mask": _mask_hash(experiment.solid),
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
@@ -191,3 +191,8 @@ def content_hash(paths: Iterable[Path]) -> str:
                 digest.update(block)
         digest.update(b"end of file" + frame.encode())
     return digest.hexdigest()
+
+
+def _mask_hash(solid: np.ndarray | None) -> str | None:
+    """Hash the flags of the voxels without fluid; None without a mask."""
+    return None if solid is None else hashlib.blake2b(np.packbits(solid).tobytes(), digest_size=16).hexdigest()

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-PARTICLES = 100
+PARTICLES = 64
 """Number of particles over which light is averaged. At a corner of the volume an eighth of them is left."""
 DARK = 0.05
 """Largest mean light of an empty place, as a share of that where most of the light is."""
@@ -70,7 +70,7 @@ def unseeded_voxels(volumes: Sequence[np.ndarray], without: np.ndarray | None = 
 
 def _averaging(extent: float, count: float) -> float:
     """Return the standard deviation of a Gaussian mean that holds `PARTICLES` of `count` in `extent` voxels [voxel]."""
-    return (PARTICLES * extent / count) ** (1 / 3) / math.sqrt(4 * math.pi)
+    return float(np.cbrt(PARTICLES * extent / count)) / math.sqrt(4 * math.pi)
 
 
 def _level(lights: Sequence[np.ndarray], room: np.ndarray, sigma: float) -> np.ndarray:
