@@ -158,6 +158,8 @@ class PairWork:
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         condensed = volumes.condensed()
         figures = pair_figures.measure(vectors, condensed, volumes.warnings)
+        if figures.lost_unseeded > 0:
+            self.log_first([figures.unseeded_warning(files.pair)])
         progress(CORRELATED)
         attributes = {
             "experiment": experiment.name,

@@ -17,7 +17,7 @@ from lfpiv import files
 from lfpiv.reconstruction.motion import Motion
 from lfpiv.results import netcdf
 from lfpiv.results.provenance import Marks
-from lfpiv.warn import Warning
+from lfpiv.warn import Code, Warning
 
 ByFrame = Mapping[str, Mapping[str, float]]
 """Frame -> camera -> figure."""
@@ -90,6 +90,11 @@ class PairFigures:
         if self.measurable_fraction is None:
             return 0.0
         return max(self.seen_fraction - self.measurable_fraction, 0.0)
+
+    def unseeded_warning(self, pair: int) -> Warning:
+        """Return the warning that a part of the volume holds no particles."""
+        shares = {"share": self.unseeded_fraction, "lost": self.lost_unseeded}
+        return Warning(code=Code.UNSEEDED, pairs=(pair,), figures=shares)
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that a file stores; figures that are not known are left out."""

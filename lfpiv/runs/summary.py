@@ -178,9 +178,8 @@ def pair_warnings(pairs: Mapping[int, PairFigures]) -> list[Warning]:
         if figures.verdict != Verdict.GOOD.value:
             words = {"share": figures.valid_share, "verdict": figures.verdict}
             found.append(Warning(code=Code.FEW_VALID, pairs=(pair,), figures=words))
-        if figures.lost_unseeded > 0 and figures.verdict != Verdict.FAILED.value:
-            words = {"share": figures.unseeded_fraction, "lost": figures.lost_unseeded}
-            found.append(Warning(code=Code.UNSEEDED, pairs=(pair,), figures=words))
+        if figures.lost_unseeded > 0:
+            found.append(figures.unseeded_warning(pair))
     return gather(found)
 
 
