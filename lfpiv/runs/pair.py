@@ -202,4 +202,6 @@ def _without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset
     valid = xr.zeros_like(vectors["valid"])  # keeps its attributes
     names = [name for name in vectors.data_vars if str(name).startswith("uncertainty")]
     changed = {"valid": valid, **{str(name): vectors[name].where(valid) for name in names}}
-    return vectors.assign(changed).assign_attrs(verdict=NO_PARTICLES, valid_fraction=0.0)
+    seen = vectors.attrs["seen_fraction"]  # no part of the volume is blamed for it
+    attributes = {"valid_fraction": 0.0, "measurable_fraction": seen, "unseeded_fraction": 0.0}
+    return vectors.assign(changed).assign_attrs(verdict=NO_PARTICLES, **attributes)
