@@ -79,6 +79,8 @@ def _key(location: tuple[int | str, ...], values: Any) -> str:
     """Return the name of a location: ``camera 'cam1', f_number``, ``smart.iterations`` or ``volume.size_mm[2]``."""
     key = ""
     for part in location:
+        if isinstance(values, Mapping) and values.get("kind") == part and part not in values:
+            continue  # pydantic's tag for one form of a union, which is not a key of the file
         if isinstance(part, str) and isinstance(values, Mapping):
             key += part if not key or key.endswith(", ") else f".{part}"
             values = values.get(part)

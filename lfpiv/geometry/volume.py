@@ -98,7 +98,8 @@ def solid_shares(values: np.ndarray, name: str) -> np.ndarray:
     if values.dtype.kind not in "fiub" or not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
         found = f"{values.dtype}"
         if values.dtype.kind in "fiu":
-            found = f"numbers from {values.min():g} to {values.max():g}"
+            found = f"numbers from {np.nanmin(values):g} to {np.nanmax(values):g}"
+            found += "" if np.isfinite(values).all() else ", some not finite"
         raise ValueError(f"{name}: expected true (no fluid) and false, or numbers from 0 to 1, got {found}.")
     return values.astype(float)
 

@@ -119,7 +119,7 @@ def test_swapping_the_volumes_reverses_the_vectors_at_a_wall():
     [
         (np.zeros((3, 3, 3), bool), "a voxel for each of the volume"),
         (np.full(SHAPE, 255), "numbers from 255 to 255"),
-        (np.full(SHAPE, np.nan), "from 0 to 1"),
+        (np.where(np.arange(44) < 3, np.nan, np.zeros(SHAPE)), "not finite"),
         (np.full(SHAPE, "wall"), "true"),
         (np.ones(SHAPE, bool), "inverted"),
         (xr.DataArray(np.zeros(SHAPE), dims=("x", "y", "z")), "dims"),

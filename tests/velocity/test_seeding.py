@@ -81,7 +81,9 @@ def test_vectors_without_particles_are_not_valid_and_the_verdict_leaves_them_out
     result = lfpiv.correlate(*pair, dt_s=1e-3, voxel_mm=1.0, windows=(16, 12, 12))
     valid, share = result["valid"].values, result["seeded_share"].values
     assert not valid[share < LEAST_SEEDED].any() and valid[share >= LEAST_SEEDED].mean() > 0.9
-    assert not valid[..., result["x"].values - 5.5 >= 29].any() and valid[..., result["x"].values + 5.5 < 30].mean() > 0.9
+    assert (
+        not valid[..., result["x"].values - 5.5 >= 29].any() and valid[..., result["x"].values + 5.5 < 30].mean() > 0.9
+    )
     assert not result["masked"].any() and np.isfinite(result["u"]).all()  # replaced, not masked
     assert result.attrs["verdict"] == Verdict.GOOD.value and result.attrs["valid_fraction"] < 0.8
     assert abs(result.attrs["unseeded_fraction"] - 22 / 52) < EDGE / 52
