@@ -101,7 +101,7 @@ def _slice_view(pair: int, first: xr.Dataset) -> str:
         f"Pair {pair}: velocity at several depths, and in the middle from the side. Arrows show the components in the "
         "slice, colour the one across it; pale arrows were replaced after validation; hatched cells are masked.",
     )
-    rows = _depth_rows(first)
+    rows = depth_rows(first)
     table = markup.table(_DEPTH_TITLES, rows, caption="Valid vectors by depth")
     title = f'By depth: <span id="depth-field">pair {pair}</span>'
     return f"""<h3>Slices</h3>
@@ -124,7 +124,7 @@ validation; hatched cells are masked. Point at a vector, or move over them with 
 </div>"""
 
 
-def _depth_rows(vectors: xr.Dataset) -> list[list[str]]:
+def depth_rows(vectors: xr.Dataset) -> list[list[str]]:
     """Return rows of figures of the valid vectors at each depth; masked ones are left out.
 
     ``slices.js`` writes the same for other fields.
