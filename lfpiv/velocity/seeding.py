@@ -81,9 +81,11 @@ def _peaks(light: np.ndarray) -> np.ndarray:
         along[:-1] &= values[:-1] >= values[1:]
     at = np.flatnonzero(peak)
     steps = [np.ravel_multi_index(near, (3,) + light.shape[1:]) for near in np.ndindex(3, 3, 3)]
-    found, flat = light.ravel()[at], light.ravel()
-    highest: np.ndarray = np.all([found >= flat[at + step - steps[13]] for step in steps], axis=0)
-    return found[highest]
+    flat = light.ravel()
+    found: np.ndarray = flat[at]
+    highest = np.all([found >= flat[at + step - steps[13]] for step in steps], axis=0)
+    peaks: np.ndarray = found[highest]
+    return peaks
 
 
 def _averaging(extent: float, count: float) -> float:
