@@ -63,6 +63,7 @@ class Code(enum.Enum):
     DIVERGED = "diverged"
     MOTION_LOST = "motion_lost"
     FEW_VALID = "few_valid"
+    UNSEEDED = "unseeded"
     # the run
     FEWER_WORKERS = "fewer_workers"
     ONE_GPU = "one_gpu"
@@ -179,6 +180,10 @@ SENTENCES: Mapping[Code, str] = {
     Code.DIVERGED: "SMART: {verdict}",
     Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
+    Code.UNSEEDED: (
+        "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
+        "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"
+    ),
     Code.FEWER_WORKERS: (
         "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "
         "{weights_gib:.1f} GiB of weights"

@@ -134,8 +134,8 @@ def test_named_commands_and_options_exist(name):
 
 
 def uncommented(text):
-    """An example with its optional keys, `# key = value`, in force."""
-    return re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE)
+    """An example with its optional keys, `# key = value`, and tables, `# [[table]]`, in force."""
+    return re.sub(r"^# (\w+ = |\[\[)", r"\1", text, flags=re.MULTILINE)
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -159,10 +159,12 @@ def test_the_annotated_experiment_shows_every_key_and_its_default():
     for path, model in models(ExperimentTable):
         part = shown
         for key in path:
-            part = getattr(part, key)[0] if key == "camera" else getattr(part, key)
+            part = getattr(part, key)
+            if isinstance(part, tuple):  # one table of each kind
+                part = next(one for one in part if isinstance(one, model))
         assert part.model_fields_set == set(type(part).model_fields), path
         for key, field in model.model_fields.items():
-            if not field.is_required() and field.default is not None and not isinstance(field.default, BaseModel):
+            if not field.is_required() and field.default not in (None, ()) and not isinstance(field.default, BaseModel):
                 assert getattr(part, key) == field.default, (path, key)
 
 

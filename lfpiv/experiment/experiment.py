@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import string
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import images, nominal_checks
+from lfpiv.experiment.mask import solid_voxels
 from lfpiv.experiment.settings import (
     SMALLEST_WINDOW,
     Board,
@@ -74,6 +75,8 @@ class Experiment:
     compute: Compute
     particle_images: str
     """Path pattern of the particle images, relative to the experiment file."""
+    solid: np.ndarray | None = field(default=None, compare=False, repr=False)
+    """True for voxels without fluid, shape (z, y, x); None without a mask."""
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
@@ -186,6 +189,7 @@ def read_experiment(path: str | Path) -> Experiment:
         network=table.network,
         compute=table.compute,
         particle_images=particles.images,
+        solid=solid_voxels(path, table.volume, grid),
     )
     for camera in experiment.cameras:
         nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)

@@ -218,6 +218,42 @@ class Volume(Table):
     """Edge of a voxel [mm]."""
 
 
+class HalfSpace(Table):
+    """Table ``[[volume.solid]]`` of kind "half_space": solid behind a plane."""
+
+    kind: Literal["half_space"]
+    point_mm: Point
+    """A point (x, y, z) on the solid's surface [mm]."""
+    normal: Point
+    """Direction (x, y, z) from the surface into the fluid, of any length."""
+
+    @field_validator("normal")
+    @classmethod
+    def _has_direction(cls, normal: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not any(normal):
+            raise ValueError("a direction other than (0, 0, 0)")
+        return normal
+
+
+class Box(Table):
+    """Table ``[[volume.solid]]`` of kind "box": solid inside, its faces normal to x, y, z."""
+
+    kind: Literal["box"]
+    centre_mm: Point
+    """Centre (x, y, z) of the box [mm]."""
+    size_mm: tuple[Positive, Positive, Positive]
+    """Edges (x, y, z) of the box [mm]."""
+
+
+class ExperimentVolume(Volume):
+    """Table ``[volume]`` of an experiment: the voxel grid, and where it holds no fluid."""
+
+    mask: Annotated[str, Field(min_length=1)] | None = None
+    """Path of a NetCDF file, true or 1 where there is solid, over z, y, x with coordinates in mm; absent: none."""
+    solid: tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...] = ()
+    """Solids in the volume, each a table."""
+
+
 class Particles(Table):
     """Table ``[particles]``: the image pairs."""
 
@@ -245,7 +281,7 @@ class ExperimentTable(Table):
     """Time between the two frames of a pair [s]."""
     camera: Annotated[tuple[CameraTable, ...], Field(min_length=1)]
     board: Board
-    volume: Volume
+    volume: ExperimentVolume
     particles: Particles
     smart: Smart = Smart()
     correlation: Correlation = Correlation()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+from collections.abc import Sequence
 from typing import TypeGuard
 
 import numpy as np
@@ -13,6 +14,9 @@ from lfpiv.geometry.grid import AXES, Grid
 
 VIEWS = "views"
 """Name of a volume's coordinate with the number of cameras that see each voxel."""
+
+MASKED = "masked"
+"""Name of a volume's coordinate that is true for voxels without fluid."""
 
 SPACING_TOLERANCE = 1e-3
 """Largest unevenness of coordinates, relative to the spacing. Coordinates stored as float32 are slightly uneven."""
@@ -56,6 +60,48 @@ def in_order(volume: xr.DataArray | np.ndarray, name: str) -> xr.DataArray | np.
             f"{name}: expected dims (z, y, x), got ({', '.join(map(str, volume.dims))}). Use .transpose('z', 'y', 'x')."
         )
     return volume
+
+
+def checked_mask(mask: xr.DataArray | np.ndarray, axes_mm: Sequence[np.ndarray], name: str = "mask") -> np.ndarray:
+    """Return a mask of voxels as flags, true where there is no fluid.
+
+    Parameters
+    ----------
+    mask : DataArray or ndarray, shape (z, y, x)
+        True, or a number of 0.5 to 1, where there is no fluid; false, or a number from 0, elsewhere.
+    axes_mm : sequence of three ndarrays
+        Voxel centres along z, y, x [mm], which the coordinates of a DataArray must equal.
+    name : str
+        Name of the argument in messages.
+
+    Raises
+    ------
+    ValueError
+        If shape, coordinates or values are wrong, or no voxel is left.
+    """
+    values = np.asarray(in_order(mask, name))
+    shape = tuple(len(axis) for axis in axes_mm)
+    if values.shape != shape:
+        raise ValueError(f"{name}: expected a voxel for each of the volume, {shape} (z, y, x), got {values.shape}.")
+    if isinstance(mask, xr.DataArray):
+        for axis, centres in zip(AXES, axes_mm, strict=True):
+            if axis in mask.coords and np.abs(np.asarray(mask[axis], float) - centres).max() > POSITION_TOLERANCE_MM:
+                raise ValueError(f"{name}: expected the coordinates {axis} of the volume [mm], got others.")
+    solid = solid_shares(values, name) >= 0.5
+    if solid.all():
+        raise ValueError(f"{name}: expected some voxels of fluid (false), got none. Is the mask inverted?")
+    return solid
+
+
+def solid_shares(values: np.ndarray, name: str) -> np.ndarray:
+    """Return the values of a mask as shares of solid, or raise ValueError if they are not flags or from 0 to 1."""
+    if values.dtype.kind not in "fiub" or not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
+        found = f"{values.dtype}"
+        if values.dtype.kind in "fiu":
+            found = f"numbers from {np.nanmin(values):g} to {np.nanmax(values):g}"
+            found += "" if np.isfinite(values).all() else ", some not finite"
+        raise ValueError(f"{name}: expected true (no fluid) and false, or numbers from 0 to 1, got {found}.")
+    return values.astype(float)
 
 
 def _grid_of(volume: xr.DataArray, name: str) -> Grid:

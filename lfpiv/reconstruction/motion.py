@@ -26,17 +26,17 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.experiment.settings import Correlation
+from lfpiv.geometry.volume import MASKED
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import SmartSettings, require_whole
 from lfpiv.reconstruction.shared_light import MotionField, shared_guesses
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.velocity.multi_pass import peak_ratio
+from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
 from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.velocity.windows import Windows
 from lfpiv.weights.operator import Weights
-from lfpiv_kernels.correlation import deform
 from lfpiv_kernels.correlation.correlate import correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 
@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 ITERATION_SHARE = 0.4
 """Iterations of a motion pass, as a share of those of the first reconstruction."""
 LEAST_VALID = 0.3
-"""Least share of valid vectors, of those that two cameras see, with which the motion is followed."""
+"""Least share of valid vectors, of those that can be measured, with which the motion is followed."""
 
 UNSHARED = "unshared"
 """Coordinate of a volume that shares light with the other frame: the volume of the frame by itself."""
@@ -97,6 +97,8 @@ class PairSolver:
         How often the motion is measured and followed, >= 0.
     correlation : mapping, optional
         Settings of `correlate`, which measures the motion; default: those of an experiment without such a table.
+    mask : ndarray or DataArray, shape (z, y, x), optional
+        Voxels without fluid, as of `reconstruct`.
 
     Raises
     ------
@@ -111,9 +113,10 @@ class PairSolver:
         *,
         motion_passes: int = 0,
         correlation: Mapping[str, Any] | None = None,
+        mask: np.ndarray | xr.DataArray | None = None,
     ):
         require_whole("motion_passes", motion_passes)
-        self.smart = SmartSolver(weights, settings)
+        self.smart = SmartSolver(weights, settings, mask)
         self.motion_passes = motion_passes
         self.correlation = Correlation().model_dump() if correlation is None else dict(correlation)
 
@@ -158,7 +161,7 @@ class PairSolver:
             volumes = [frame.to_dataarray() for frame in frames]
             vectors = correlate(*volumes, dt_s=1.0, **self.correlation)
             valid.append(round(float(vectors.attrs["valid_fraction"]), 4))
-            if valid[-1] < LEAST_VALID * float(vectors.attrs["seen_fraction"]):
+            if valid[-1] < LEAST_VALID * float(vectors.attrs["measurable_fraction"]):
                 motion = Motion.LOST
                 log.warning("motion: %.0f %% of the vectors are valid; %s", 100 * valid[-1], motion.value)
                 break
@@ -183,6 +186,7 @@ def reconstruct_pair(
     floor: Sequence[float | Mapping[str, float] | None] = (None, None),
     correlation: Mapping[str, Any] | None = None,
     iterations: int = 10,
+    mask: np.ndarray | xr.DataArray | None = None,
     progress: Callable[[float], None] | None = None,
     **smart: Any,
 ) -> list[xr.DataArray]:
@@ -205,6 +209,8 @@ def reconstruct_pair(
         Settings of `correlate`, which measures the motion; default: those of an experiment without such a table.
     iterations : int
         SMART iterations of the first reconstruction; a pass takes at most `ITERATION_SHARE` of them.
+    mask : ndarray or DataArray, shape (z, y, x), optional
+        Voxels without fluid, as of `reconstruct`.
     progress : callable, optional
         Called with the finished fraction.
     **smart
@@ -227,7 +233,7 @@ def reconstruct_pair(
     if "first" in smart:
         raise ValueError("first: expected no first guess, as each pass makes its own; use `reconstruct` for one.")
     settings = SmartSettings(iterations=iterations, **smart)
-    solver = PairSolver(weights, settings, motion_passes=motion_passes, correlation=correlation)
+    solver = PairSolver(weights, settings, motion_passes=motion_passes, correlation=correlation, mask=mask)
     return solver.solve(images, floor, progress).to_dataarrays()
 
 
@@ -277,12 +283,11 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     missing = missing_smoothing(settings.smoothing_voxel, *volumes)
     unshared = (volume[UNSHARED].values for volume in volumes)  # their scale does not matter
     first, second = (
-        deform.spline_coefficients(
-            preprocess((light - np.median(light)).astype(np.float32), missing, settings.intensity_power)
-        )
+        preprocess((light - np.median(light)).astype(np.float32), missing, settings.intensity_power)
         for light in unshared
     )
-    first, second = deform.deform_pair(first, second, motion.midway.field, motion.midway.spacing)
+    solid = volumes[0].coords[MASKED].values if MASKED in volumes[0].coords else None
+    (first, second), _ = UndeformedPair((first, second), solid).deformed(motion.midway, window)
     step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(motion.nodes, first.shape, strict=True))
     windows = Windows.covering(first.shape, window, step)
     scatter = displacement_deviation(

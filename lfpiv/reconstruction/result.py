@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES, Grid
-from lfpiv.geometry.volume import VIEWS
+from lfpiv.geometry.volume import MASKED, VIEWS
 from lfpiv.reconstruction.settings import SmartSettings
 
 
@@ -32,6 +32,8 @@ class Reconstruction:
     """Particle intensity [counts per unit weight], shape (z, y, x), float32."""
     views: np.ndarray | None
     """Number of cameras that see each voxel, shape (z, y, x). None for one camera, or if two see every voxel."""
+    solid: np.ndarray | None
+    """True for voxels without fluid, shape (z, y, x); None without a mask."""
     residual: tuple[float, ...]
     """||I - P|| / ||I|| before each iteration and after the last."""
     misfit: tuple[float, ...]
@@ -67,6 +69,8 @@ class Reconstruction:
         if self.views is not None:
             about = {"units": "1", "long_name": "number of cameras that see the voxel"}
             coordinates[VIEWS] = (AXES, self.views, about)
+        if self.solid is not None:
+            coordinates[MASKED] = (AXES, self.solid, {"long_name": "no fluid in the voxel"})
         settings = self.settings
         attributes = {
             "long_name": "particle intensity",

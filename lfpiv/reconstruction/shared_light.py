@@ -14,6 +14,7 @@ import xarray as xr
 from scipy import ndimage
 
 from lfpiv.velocity.predictor import Predictor
+from lfpiv.velocity.validation import fill
 from lfpiv_kernels.correlation import deform
 
 SMOOTHING_VOXEL = 0.7
@@ -91,6 +92,7 @@ class MotionField:
         """Positions of the vectors along each axis [voxel]."""
         nz, ny, nx = volume.shape
         displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], axis=-1).astype(float)
+        displacement = fill(displacement, np.isfinite(displacement).all(-1))  # masked vectors have none
         self.midway = Predictor.between(self.nodes, displacement, (nz, ny, nx))
         """Displacement of what is at a control point midway in time."""
         trust = vectors["valid"].values.astype(float)

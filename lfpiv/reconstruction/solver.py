@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import xarray as xr
 
+from lfpiv.geometry.volume import checked_mask
 from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.particle_size import ParticleSizer
@@ -61,11 +63,21 @@ class SmartSolver:
         The operator.
     settings : SmartSettings
         Settings of every reconstruction.
+    mask : ndarray or DataArray, shape (z, y, x), optional
+        Voxels without fluid, as of `lfpiv.reconstruct`.
+
+    Raises
+    ------
+    ValueError
+        If the mask does not fit the volume.
     """
 
-    def __init__(self, weights: Weights, settings: SmartSettings):
+    def __init__(self, weights: Weights, settings: SmartSettings, mask: np.ndarray | xr.DataArray | None = None):
         self.weights = weights
         self.settings = settings
+        grid = weights.grid
+        self.solid = None if mask is None else checked_mask(mask, [grid.axis_mm(axis) for axis in range(3)])
+        """True for voxels without fluid, shape (z, y, x); None without a mask."""
 
     def solve(
         self,
@@ -90,6 +102,8 @@ class SmartSolver:
         gains = (np.float32(one.camera_gain) for one in recordings.values())
         column_sum = sum(gain * own for gain, own in zip(gains, self.weights.camera_sums, strict=True))
         lit = column_sum > LEAST_COLUMN_SUM * column_sum.max()
+        if self.solid is not None:
+            lit &= stored.store(~self.solid) > 0
         if first is None:
             guess = multiplicative_guess(cameras, [one.peak for one in recordings.values()], column_sum, lit)
         else:
@@ -114,7 +128,8 @@ class SmartSolver:
         last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
         return Reconstruction(
             grid=self.weights.grid,
-            volume=stored.restore(volume),
+            volume=self._without_solid(stored.restore(volume)),
+            solid=self.solid,
             views=self._views,
             residual=tuple(float(np.sqrt(squares)) / norm for squares in history.squares),
             misfit=tuple(history.divergence),
@@ -125,6 +140,10 @@ class SmartSolver:
             sieve_voxel=sieve.sigma_voxel,
             settings=settings,
         )
+
+    def _without_solid(self, volume: np.ndarray) -> np.ndarray:
+        """Return a volume (z, y, x) without the light that the sieve spreads into the solid."""
+        return volume if self.solid is None else np.where(self.solid, np.float32(0), volume)
 
     def _sieve_voxel(self, images: Mapping[str, np.ndarray]) -> float:
         sieve = self.settings.sieve_voxel

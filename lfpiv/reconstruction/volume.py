@@ -27,6 +27,7 @@ def reconstruct(
     active_share: float = 0.0,
     tolerance: float = 0.0,
     first: np.ndarray | None = None,
+    mask: np.ndarray | xr.DataArray | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> xr.DataArray:
     """Reconstruct a particle volume from the cameras' images by SMART.
@@ -84,6 +85,8 @@ def reconstruct(
     first : ndarray, shape (z, y, x), optional
         First guess, to continue an iteration or to start from your own; with a sieve, of c. Finite and >= 0. Voxels
         that are zero stay zero and cost no time.
+    mask : ndarray or DataArray, shape (z, y, x), optional
+        True, or a number of 0.5 to 1, where a voxel holds no fluid. These voxels stay dark and cost no time.
     progress : callable, optional
         Called with the finished fraction.
 
@@ -91,7 +94,8 @@ def reconstruct(
     -------
     xarray.DataArray, shape (z, y, x), float32
         Volume [counts per unit weight] with coordinates in mm. If fewer than two of several cameras see some voxels,
-        the coordinate ``views`` is the number of cameras that see each voxel. Attributes: `residual`, ||I - P|| /
+        the coordinate ``views`` is the number of cameras that see each voxel. With a mask the coordinate ``masked`` is
+        true where there is no fluid; `correlate` reads it. Attributes: `residual`, ||I - P|| /
         ||I||, and `misfit`, the Kullback-Leibler divergence sum P' log(P'/I') - P' + I' with P' = P + b, I' = I + b,
         which SMART lowers [counts]: both before each iteration and after the last, over the pixels that voxels light;
         `light_outside`, by camera, the part of an image's light in the other pixels: from particles beyond the volume,
@@ -117,4 +121,5 @@ def reconstruct(
         active_share=active_share,
         tolerance=tolerance,
     )
-    return SmartSolver(weights, settings).solve(images, floor=floor, first=first, progress=progress).to_dataarray()
+    solver = SmartSolver(weights, settings, mask)
+    return solver.solve(images, floor=floor, first=first, progress=progress).to_dataarray()

@@ -118,7 +118,8 @@ def _like(first: xr.Dataset, velocity: np.ndarray, valid: np.ndarray) -> xr.Data
     """Build a dataset of a velocity field on the axes of another."""
     variables = {name: (AXES, part, {"units": "m/s"}) for name, part in zip("uvw", velocity, strict=True)}
     coordinates = {axis: first[axis].variable for axis in "zyx"}
-    return xr.Dataset({**variables, "valid": (AXES, valid)}, coordinates)
+    masked = {"masked": first["masked"].variable} if "masked" in first else {}
+    return xr.Dataset({**variables, "valid": (AXES, valid), **masked}, coordinates)
 
 
 def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
@@ -160,6 +161,9 @@ def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
             block += stored.tobytes()
         entry["valid"] = len(block)
         block += thin["valid"].values.astype("<i2").tobytes()
+        if "masked" in thin and thin["masked"].values.any():
+            entry["masked"] = len(block)
+            block += thin["masked"].values.astype("<i2").tobytes()
         entry |= {axis: [round(float(value), 6) for value in thin[axis].values] for axis in "xyz"}
         described.append(entry)
     meta = {"fields": described, "colours": {name: colour_stops(map_) for name, map_ in _COLOUR_MAPS.items()}}

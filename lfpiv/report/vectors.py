@@ -5,17 +5,20 @@ The scripts in ``static`` draw the interactive views. Still panels drawn here re
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
+import pathlib
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from matplotlib.transforms import Affine2D
 
 from lfpiv.report import markup
 from lfpiv.report.fields import Survey, embed, survey
@@ -42,6 +45,8 @@ MOST_IN_SPACE = 500
 """Largest number of arrows of the view in space."""
 ARROW_TINTS = ("#101418", "#9aa0a6")
 """Colours of measured and of replaced vectors in a slice."""
+MASKED_FILL, MASKED_LINE = "#d5d8db", "#9aa0a6"
+"""Colours of masked cells in a slice and of their hatching."""
 
 COMPONENTS = {"x": "u", "y": "v", "z": "w"}
 """Axis -> name of the velocity component along it."""
@@ -58,7 +63,7 @@ _DEPTH_TITLES = (
 )
 
 
-def section(vectors: Mapping[int, Path]) -> str:
+def section(vectors: Mapping[int, pathlib.Path]) -> str:
     """Return the section on the vectors, as HTML, with the data of its views.
 
     Parameters
@@ -94,9 +99,9 @@ def _slice_view(pair: int, first: xr.Dataset) -> str:
     still = markup.figure(
         [*slices(first), *slices(first, normal="y", most=1)],
         f"Pair {pair}: velocity at several depths, and in the middle from the side. Arrows show the components in the "
-        "slice, colour the one across it; pale arrows were replaced after validation.",
+        "slice, colour the one across it; pale arrows were replaced after validation; hatched cells are masked.",
     )
-    rows = _depth_rows(first)
+    rows = depth_rows(first)
     table = markup.table(_DEPTH_TITLES, rows, caption="Valid vectors by depth")
     title = f'By depth: <span id="depth-field">pair {pair}</span>'
     return f"""<h3>Slices</h3>
@@ -112,26 +117,31 @@ def _slice_view(pair: int, first: xr.Dataset) -> str:
 <canvas id="slice-canvas" tabindex="0" role="img" aria-describedby="slice-reading"></canvas>
 <p id="slice-reading" class="reading" aria-live="polite"></p>
 <p class="caption">Arrows show the velocity in the slice, colour the quantity chosen; pale arrows were replaced after
-validation. Point at a vector, or move over them with the arrow keys, to read it.</p>
+validation; hatched cells are masked. Point at a vector, or move over them with the arrow keys, to read it.</p>
 </div>
 <div class="still">{still}</div>
 <details><summary>{title}</summary><div id="depth-table">{table}</div></details>
 </div>"""
 
 
-def _depth_rows(vectors: xr.Dataset) -> list[list[str]]:
-    """Return rows of figures of the valid vectors at each depth. ``slices.js`` writes the same for other fields."""
+def depth_rows(vectors: xr.Dataset) -> list[list[str]]:
+    """Return rows of figures of the valid vectors at each depth; masked ones are left out.
+
+    ``slices.js`` writes the same for other fields.
+    """
     rows = []
     for k, depth in enumerate(vectors["z"].values):
         slab = vectors.isel(z=k)
         velocity = np.stack([slab[name].values for name in "uvw"]).astype(float)
         good = slab["valid"].values & np.isfinite(velocity).all(0)
+        fluid = ~masked_of(slab)
         velocity = velocity[:, good]
         speed = np.linalg.norm(velocity, axis=0)
         known = good.any()
         means = [significant(float(part.mean())) if known else markup.NONE for part in velocity]
         ends = (float(np.sqrt((speed**2).mean())), float(speed.max())) if known else (None, None)
-        counts = [number(float(depth), 3), str(good.size), percent(float(good.mean()), 1)]
+        share = percent(float(good[fluid].mean()), 1) if fluid.any() else markup.NONE
+        counts = [number(float(depth), 3), str(int(fluid.sum())), share]
         rows.append([*counts, *means, *map(significant, ends)])
     return rows
 
@@ -187,7 +197,7 @@ def slices(vectors: xr.Dataset, normal: str = "z", most: int = MOST_SLICES) -> l
     Parameters
     ----------
     vectors : Dataset
-        Vectors over z, y, x. Replaced vectors (not ``valid``) are drawn pale.
+        Vectors over z, y, x. Replaced vectors (not ``valid``) are drawn pale, the cells of ``masked`` ones hatched.
     normal : {"z", "y"}
         Axis normal to the slices.
     most : int
@@ -221,14 +231,15 @@ def _slice(slab: xr.Dataset, normal: str, across: str, up: str, limit: float, lo
         origin="lower",
         interpolation="none",
     )
+    _hatch(axes, masked_of(slab), edges)
     step = max(-(-max(slab.sizes.values()) // MOST_ARROWS), 1)
     thin = slab.isel({across: slice(step // 2, None, step), up: slice(step // 2, None, step)})
     apart = step * min(spans[0] / slab.sizes[across], spans[1] / slab.sizes[up])
     length = arrow_scale(longest, apart)
     start = np.stack(np.meshgrid(thin[across].values, thin[up].values), axis=-1).reshape(-1, 2)
     velocity = np.stack([thin[COMPONENTS[axis]].values for axis in (across, up)], axis=-1).reshape(-1, 2)
-    valid = thin["valid"].values.ravel()
-    for chosen, tint in ((valid, ARROW_TINTS[0]), (~valid, ARROW_TINTS[1])):
+    valid, known = thin["valid"].values.ravel(), np.isfinite(velocity).all(1)
+    for chosen, tint in ((valid & known, ARROW_TINTS[0]), (~valid & known, ARROW_TINTS[1])):
         if chosen.any():
             path = arrows(start[chosen], velocity[chosen] * length, 0.35 * apart)
             axes.add_patch(PathPatch(path, fill=False, edgecolor=tint, linewidth=0.8))
@@ -242,6 +253,28 @@ def _slice(slab: xr.Dataset, normal: str, across: str, up: str, limit: float, lo
     colour_bar(figure, shown, axes, f"{through} [m/s]", location="bottom")
     parts = f"{COMPONENTS[across]} and {COMPONENTS[up]}"
     return to_svg(figure, f"Slice at {normal} = {place:.2f} mm: arrows are {parts}, colour is {through}.")
+
+
+def masked_of(vectors: xr.Dataset) -> np.ndarray:
+    """Return which vectors are masked, in the shape of ``u``; files of version 0.1.0 do not have the flag."""
+    if "masked" in vectors:
+        return np.asarray(vectors["masked"].values, bool)
+    return np.zeros(vectors["u"].shape, bool)
+
+
+def _hatch(axes: Axes, masked: np.ndarray, edges: Sequence[tuple[float, float]]) -> None:
+    """Hatch the masked cells (up, across) of a slice whose outer edges are (across, up) [mm]."""
+    if not masked.any():
+        return
+    across, up = (np.linspace(*ends, n + 1) for ends, n in zip(edges, masked.shape[::-1], strict=True))
+    cells = [
+        Path.unit_rectangle().transformed(
+            Affine2D().scale(across[1] - across[0], up[1] - up[0]).translate(across[column], up[row])
+        )
+        for row, column in np.argwhere(masked)
+    ]
+    outline = Path.make_compound_path(*cells)
+    axes.add_patch(PathPatch(outline, facecolor=MASKED_FILL, edgecolor=MASKED_LINE, hatch="////", linewidth=0))
 
 
 def arrow_scale(longest: float, apart: float) -> float:

@@ -281,7 +281,8 @@ def _write_csv(results: xr.Dataset, target: Path, progress: StepProgress) -> lis
         units = {name: vectors[name].attrs.get("units", "1") for name in vectors.variables}
         names = ["x", "y", "z", *vectors.data_vars]
         titles = [str(name) if units[name] == "1" else f"{name} [{units[name]}]" for name in names]
-        table = vectors.assign(valid=vectors["valid"].astype(np.uint8)).to_dataframe(dim_order=list(AXES))
+        flags = {name: vectors[name].astype(np.uint8) for name, item in vectors.data_vars.items() if item.dtype == bool}
+        table = vectors.assign(flags).to_dataframe(dim_order=list(AXES))
         path = target / f"pair_{pair:04d}.csv"
         with replacing(path) as scratch:
             table.reset_index().to_csv(
@@ -315,7 +316,10 @@ def _plane(results: xr.Dataset, interval_s: float | None) -> xr.Dataset:
         text = f"velocity along {derived.COMPONENTS[name]}"
         variables[variable] = (dims, values, {"units": "mm/s", "long_name": text, **standard})
     flags = results["valid"].transpose("y", "x", "pair").values.astype(float)
-    variables["chc"] = (dims, flags, {"standard_name": "validity_flag", "long_name": "1: measured, 0: replaced"})
+    if "masked" in results:
+        flags[results["masked"].transpose("y", "x", "pair").values] = -1
+    text = "1: measured, 0: replaced, -1: masked"
+    variables["chc"] = (dims, flags, {"standard_name": "validity_flag", "long_name": text})
     time = {"units": "frame", "long_name": "number of the pair"}
     if interval_s is not None:
         time = {"units": "s", "long_name": _TIME}

@@ -54,6 +54,7 @@ _DESCRIPTIONS: dict[str, dict[str, Any]] = {
         "flag_values": np.array([0, 1], np.int8),
         "flag_meanings": "replaced measured",
     },
+    "masked": {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "fluid masked"},
 }  # attributes of the CF conventions, for plotting and geometry tools
 
 OF_IMAGES = ("structure", "camera_gain", "light_outside")

@@ -16,6 +16,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lfpiv import files, warn
 from lfpiv.experiment.davis import split_frame
 from lfpiv.experiment.experiment import Experiment
@@ -147,6 +149,7 @@ def of_pair(experiment: Experiment, calibration: str, pair: int) -> PairStamps:
         "calibration": calibration,
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
+        "mask": _mask_hash(experiment.solid),
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
@@ -188,3 +191,8 @@ def content_hash(paths: Iterable[Path]) -> str:
                 digest.update(block)
         digest.update(b"end of file" + frame.encode())
     return digest.hexdigest()
+
+
+def _mask_hash(solid: np.ndarray | None) -> str | None:
+    """Hash the flags of the voxels without fluid; None without a mask."""
+    return None if solid is None else hashlib.blake2b(np.packbits(solid).tobytes(), digest_size=16).hexdigest()

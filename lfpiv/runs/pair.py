@@ -113,6 +113,7 @@ class PairWork:
             SmartSettings(**smart.of_one_frame()),
             motion_passes=smart.motion_passes,
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
+            mask=self.experiment.solid,
         )
 
     def _do(self, pair: int, progress: StepProgress) -> None:
@@ -157,6 +158,8 @@ class PairWork:
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         condensed = volumes.condensed()
         figures = pair_figures.measure(vectors, condensed, volumes.warnings)
+        if figures.lost_unseeded > 0:
+            self.log_first([figures.unseeded_warning(files.pair)])
         progress(CORRELATED)
         attributes = {
             "experiment": experiment.name,
@@ -199,4 +202,6 @@ def _without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset
     valid = xr.zeros_like(vectors["valid"])  # keeps its attributes
     names = [name for name in vectors.data_vars if str(name).startswith("uncertainty")]
     changed = {"valid": valid, **{str(name): vectors[name].where(valid) for name in names}}
-    return vectors.assign(changed).assign_attrs(verdict=NO_PARTICLES, valid_fraction=0.0)
+    seen = vectors.attrs["seen_fraction"]  # no part of the volume is blamed for it
+    attributes = {"valid_fraction": 0.0, "measurable_fraction": seen, "unseeded_fraction": 0.0}
+    return vectors.assign(changed).assign_attrs(verdict=NO_PARTICLES, **attributes)

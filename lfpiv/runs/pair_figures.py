@@ -17,7 +17,7 @@ from lfpiv import files
 from lfpiv.reconstruction.motion import Motion
 from lfpiv.results import netcdf
 from lfpiv.results.provenance import Marks
-from lfpiv.warn import Warning
+from lfpiv.warn import Code, Warning
 
 ByFrame = Mapping[str, Mapping[str, float]]
 """Frame -> camera -> figure."""
@@ -62,6 +62,12 @@ class PairFigures:
     """Median over the valid vectors."""
     peak_ratio: float | None
     """Median over the valid vectors."""
+    masked_fraction: float = 0.0
+    """Part of all vectors that are masked; the other parts are of those that are not."""
+    measurable_fraction: float | None = None
+    """Part of the vectors that two cameras see and where there are particles; None in files that do not state it."""
+    unseeded_fraction: float = 0.0
+    """Part of the volume that holds no particles."""
     motion: MotionFigures | None = None
     """None without motion passes."""
     residual: Mapping[str, Sequence[float]] | None = None
@@ -71,6 +77,24 @@ class PairFigures:
     light_outside: ByFrame | None = None
     stop: Mapping[str, str] | None = None
     """Frame -> why the iteration ended."""
+
+    @property
+    def valid_share(self) -> float:
+        """Part of the vectors that are valid, of those that can be."""
+        can = self.seen_fraction if self.measurable_fraction is None else self.measurable_fraction
+        return min(self.valid_fraction / can, 1.0) if can > 0 else 0.0
+
+    @property
+    def lost_unseeded(self) -> float:
+        """Part of the vectors that are not valid because there are no particles."""
+        if self.measurable_fraction is None:
+            return 0.0
+        return max(self.seen_fraction - self.measurable_fraction, 0.0)
+
+    def unseeded_warning(self, pair: int) -> Warning:
+        """Return the warning that a part of the volume holds no particles."""
+        shares = {"share": self.unseeded_fraction, "lost": self.lost_unseeded}
+        return Warning(code=Code.UNSEEDED, pairs=(pair,), figures=shares)
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that a file stores; figures that are not known are left out."""
@@ -103,11 +127,15 @@ def measure(vectors: xr.Dataset, condensed: xr.Dataset | None, warnings: Iterabl
     """Measure the figures of a pair from its vectors and, if known, its volumes from `netcdf.build_reconstruction`."""
     valid = vectors["valid"].values
     finite = np.isfinite(vectors["u"].values) & np.isfinite(vectors["v"].values) & np.isfinite(vectors["w"].values)
+    fluid = ~vectors["masked"].values if "masked" in vectors else np.ones_like(valid)
     known = {} if condensed is None else _of_volumes(condensed)
     return PairFigures(
         vectors=list(vectors["u"].shape),
-        valid_fraction=float(valid.mean()),
-        finite_fraction=float(finite.mean()),
+        valid_fraction=float(valid[fluid].mean()) if fluid.any() else 0.0,
+        finite_fraction=float(finite[fluid].mean()) if fluid.any() else 0.0,
+        masked_fraction=float(1 - fluid.mean()),
+        measurable_fraction=float(vectors.attrs.get("measurable_fraction", vectors.attrs.get("seen_fraction", 1.0))),
+        unseeded_fraction=float(vectors.attrs.get("unseeded_fraction", 0.0)),
         seen_fraction=float(vectors.attrs.get("seen_fraction", 1.0)),
         verdict=str(vectors.attrs["verdict"]),
         warnings=tuple(warnings),

@@ -176,8 +176,10 @@ def pair_warnings(pairs: Mapping[int, PairFigures]) -> list[Warning]:
             words = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion.verdict}
             found.append(Warning(code=Code.MOTION_LOST, pairs=(pair,), figures=words))
         if figures.verdict != Verdict.GOOD.value:
-            words = {"share": figures.valid_fraction, "verdict": figures.verdict}
+            words = {"share": figures.valid_share, "verdict": figures.verdict}
             found.append(Warning(code=Code.FEW_VALID, pairs=(pair,), figures=words))
+        if figures.lost_unseeded > 0:
+            found.append(figures.unseeded_warning(pair))
     return gather(found)
 
 

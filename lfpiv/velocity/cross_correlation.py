@@ -17,16 +17,21 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import is_finite
+from lfpiv.velocity.coverage import Voxels
 from lfpiv.velocity.multi_pass import Pass, correlate_passes, peak_ratio
+from lfpiv.velocity.seeding import unseeded_voxels
 from lfpiv.velocity.settings import CorrelationSettings, triple, windows_of
 from lfpiv.velocity.volume_pair import (
     VoxelAxes,
     missing_smoothing,
     moves_beyond,
     normalise,
+    numbers_of,
     preprocess,
     seen_by_two,
+    solid_voxels,
     voxel_axes,
+    without,
 )
 
 log = logging.getLogger(__name__)
@@ -41,7 +46,11 @@ Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
 
 
 class Verdict(enum.Enum):
-    """Quality of the measurement, from the part of valid vectors in the last pass. The text is advice to the user."""
+    """Quality of the measurement, from the part of the vectors in the last pass that are valid, of those that can be.
+
+    Masked windows, and windows with too few particles or of which two cameras see too little, do not enter. The text is
+    advice to the user.
+    """
 
     GOOD = "most vectors are valid"
     POOR = (
@@ -66,6 +75,7 @@ def correlate(
     max_displacement_voxel: float | None = None,
     smoothing_voxel: float = 0.0,
     intensity_power: float = 1.0,
+    mask: xr.DataArray | np.ndarray | None = None,
 ) -> xr.Dataset:
     """Measure the displacement of the particles between two volumes.
 
@@ -101,24 +111,35 @@ def correlate(
     intensity_power : float
         Power of the smoothed intensities that is correlated, negative intensities as 0; 1: no change. Below 1, bright
         particles and their ghosts weigh less against the others.
+    mask : DataArray or ndarray, shape (z, y, x), optional
+        True, or a number of 0.5 to 1, where a voxel holds no fluid. What the volumes hold there has no effect. Default:
+        the coordinate ``masked`` of the volumes, if they have one.
 
     Returns
     -------
     Dataset
-        Dims z, y, x: window centres [mm]. All vectors are means over the window.
+        Dims z, y, x: window centres [mm]. All vectors are means over the window. Where part of a window is masked, its
+        fluid is correlated, and the field of the pass before continues the vector to the window's centre.
 
-        ``u``, ``v``, ``w`` [m/s] and ``displacement_x``, ``_y``, ``_z`` [voxel]: finite unless no vector is valid.
+        ``u``, ``v``, ``w`` [m/s] and ``displacement_x``, ``_y``, ``_z`` [voxel]: finite unless no vector is valid; NaN
+        where masked.
         ``valid``: true where the vector was measured and passed validation, false where it was replaced. If the volumes
         have the coordinate ``views``, vectors are also replaced where two cameras see less than three quarters of the
-        window.
+        window. They are replaced where less than half of the window's fluid holds particles
+        (`lfpiv.velocity.seeding`).
+        ``masked``: true where less than half of the window is fluid, so that nothing is measured; ``valid`` is false.
+        ``fluid_share``: part of the window that is fluid. ``seeded_share``: part of this fluid that holds particles.
         ``peak_ratio``: highest correlation over the highest one more than two lags away.
         ``correlation``: coefficient at the peak.
         ``uncertainty`` [voxel]: standard deviation of the displacement vector from the correlation statistics of [1]_,
         the root of the summed variances of ``uncertainty_x``, ``_y``, ``_z``. NaN where the vector was replaced and
         after a single pass.
 
-        Attributes: ``verdict``; ``valid_fraction`` and ``seen_fraction``, the parts of all vectors that are valid and
-        where two cameras see enough; ``settings`` and ``passes``, the figures of each pass, as JSON.
+        Attributes: ``verdict``, from the vectors that can be measured; ``masked_fraction``, the part of all vectors
+        that are masked; ``valid_fraction``, ``seen_fraction`` and ``measurable_fraction``, the parts of the others that
+        are valid, where two cameras see enough, and where these show particles too; ``unseeded_fraction``, the part of
+        the volume that has fluid, is seen and holds no particles; ``settings`` and ``passes``, the figures of each
+        pass, as JSON.
 
     Raises
     ------
@@ -130,8 +151,10 @@ def correlate(
     .. [1] B. Wieneke, "PIV uncertainty quantification from correlation statistics", Meas. Sci. Technol. 26 (2015)
        074002, doi:10.1088/0957-0233/26/7/074002.
     """
-    first, second = normalise(volume_a, "volume_a"), normalise(volume_b, "volume_b")
+    first, second = numbers_of(volume_a, "volume_a"), numbers_of(volume_b, "volume_b")
     axes = voxel_axes(volume_a, volume_b, voxel_mm)
+    solid = solid_voxels(mask, volume_a, volume_b, axes)
+    first, second = normalise(first, "volume_a", solid), normalise(second, "volume_b", solid)
     if not (is_finite(dt_s) and dt_s > 0):
         raise ValueError(f"dt_s: expected a positive time [s], got {dt_s!r}.")
     shape = triple(first.shape)
@@ -143,21 +166,29 @@ def correlate(
         intensity_power=intensity_power,
     )
     first_search = settings.first_search(shape)
+    seen = seen_by_two(volume_a, volume_b)
+    voxels = Voxels(seen=seen, solid=solid, unseeded=unseeded_voxels((first, second), without(solid, seen)))
     missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
     first, second = (preprocess(volume, missing, intensity_power) for volume in (first, second))
-    last, figures = correlate_passes(first, second, settings, seen=seen_by_two(volume_a, volume_b))
-    share = float(last.valid[last.seen].mean()) if last.seen.any() else 0.0
+    last, figures = correlate_passes(first, second, settings, voxels)
+    measurable = last.coverage.measurable
+    share = float(last.valid[measurable].mean()) if measurable.any() else 0.0
     verdict = Verdict.GOOD if share >= GOOD_SHARE else Verdict.POOR if share >= POOR_SHARE else Verdict.FAILED
     if verdict is not Verdict.GOOD:
         if moves_beyond(first, second, first_search):
             verdict = Verdict.TOO_FAR
         log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
+    if voxels.unseeded is not None:
+        log.info("correlation: %.0f %% of the volume holds no particles", 100 * voxels.unseeded_fraction)
     attributes = {
         "title": "displacement and velocity of particles between two volumes",
         "dt_s": float(dt_s),
         "voxel_mm": [float(spacing) for spacing in axes.spacing_mm],
-        "valid_fraction": float(last.valid.mean()),
-        "seen_fraction": float(last.seen.mean()),
+        "valid_fraction": last.valid_fraction,
+        "seen_fraction": last.fraction(last.coverage.seen),
+        "masked_fraction": float(last.coverage.masked.mean()),
+        "measurable_fraction": last.fraction(measurable),
+        "unseeded_fraction": voxels.unseeded_fraction,
         "verdict": verdict.value,
         "settings": settings.to_json(),
         "passes": json.dumps([asdict(one) for one in figures]),
@@ -167,10 +198,11 @@ def correlate(
 
 def _variables(result: Pass, axes: VoxelAxes, dt_s: float) -> dict[str, Variable]:
     """Return displacement, velocity, uncertainty and quality of the last pass as variables over (z, y, x)."""
-    deviation = result.deviation()
+    deviation, coverage = result.deviation(), result.coverage
+    known = np.where(coverage.masked, np.nan, 1.0)
     fields: dict[str, tuple[np.ndarray, str, str]] = {}
     for k, (name, axis) in enumerate(zip("wvu", AXES, strict=True)):
-        displacement, metres = result.field[..., k], axes.spacing_mm[k] * 1e-3
+        displacement, metres = result.field[..., k] * known, axes.spacing_mm[k] * 1e-3
         fields[name] = (displacement * metres / dt_s, "m/s", f"velocity along {axis}")
         fields[f"displacement_{axis}"] = (displacement, "voxel", f"displacement along {axis}, mean over the window")
         text = f"standard deviation of the displacement along {axis}"
@@ -178,13 +210,17 @@ def _variables(result: Pass, axes: VoxelAxes, dt_s: float) -> dict[str, Variable
     text = "standard deviation of the displacement vector, correlation statistics"
     fields["uncertainty"] = (np.sqrt((deviation**2).sum(-1)), "voxel", text)
     text = "highest correlation over the highest more than two lags away"
-    fields["peak_ratio"] = (peak_ratio(result.peaks), "1", text)
-    fields["correlation"] = (result.peaks.correlation, "1", "correlation coefficient at the peak")
+    fields["peak_ratio"] = (peak_ratio(result.peaks) * known, "1", text)
+    fields["correlation"] = (result.peaks.correlation * known, "1", "correlation coefficient at the peak")
+    fields["fluid_share"] = (coverage.fluid_share, "1", "part of the window that is fluid")
+    fields["seeded_share"] = (coverage.seeded_share, "1", "part of the window's fluid that holds particles")
     variables: dict[str, Variable] = {
         name: (AXES, values.astype(np.float32), {"units": units, "long_name": text})
         for name, (values, units, text) in fields.items()
     }
-    variables["valid"] = (AXES, result.valid, {"long_name": "measured and passed validation; false: replaced"})
+    text = "measured and passed validation; false: replaced or masked"
+    variables["valid"] = (AXES, result.valid, {"long_name": text})
+    variables["masked"] = (AXES, coverage.masked, {"long_name": "too little fluid in the window to be measured"})
     return variables
 
 

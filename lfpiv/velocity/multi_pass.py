@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from lfpiv.velocity import validation
+from lfpiv.velocity.continuation import continued
+from lfpiv.velocity.coverage import Coverage, MaskedPair, Voxels
 from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings, Triple, triple
 from lfpiv.velocity.windows import Windows
@@ -39,7 +42,9 @@ class PassInput:
     search: Triple
     """Largest lag (z, y, x) [voxel]."""
     volumes: tuple[np.ndarray, np.ndarray]
-    """The two volumes, deformed onto each other in all passes but the first."""
+    """The two volumes, deformed onto each other in all passes but the first, with a mask less their local mean."""
+    fluid: np.ndarray | None = None
+    """True for voxels that hold fluid in both volumes, shape (z, y, x); None without a mask."""
     predicted: np.ndarray | None = None
     """Displacement removed by the deformation, as window means, shape (z, y, x, 3) [voxel]; None in the first pass."""
 
@@ -55,9 +60,9 @@ class PassFigures:
     vectors: int
     """Number of vectors."""
     valid: float
-    """Part of the vectors that are valid."""
+    """Part of the vectors that are valid, of those that are not masked."""
     median_correlation: float
-    """Median of the coefficients at the highest peaks."""
+    """Median of the coefficients at the highest peaks where the vectors are not masked."""
     median_step_voxel: float | None
     """Median change of the valid vectors against the pass before [voxel]; None if no vector is valid."""
 
@@ -69,11 +74,11 @@ class Pass:
     given: PassInput
     peaks: WindowPeaks
     field: np.ndarray
-    """Displacement, replaced where not valid, shape (z, y, x, 3) [voxel]."""
+    """Displacement, replaced where not valid, also where masked, shape (z, y, x, 3) [voxel]."""
     valid: np.ndarray
     """True where the displacement was measured and passed validation, shape (z, y, x)."""
-    seen: np.ndarray
-    """True where two cameras see the window, shape (z, y, x)."""
+    coverage: Coverage
+    """Contents of the windows."""
 
     @property
     def figures(self) -> PassFigures:
@@ -84,10 +89,25 @@ class Pass:
             window=self.given.windows.window,
             search=self.given.search,
             vectors=self.valid.size,
-            valid=round(float(self.valid.mean()), 4),
-            median_correlation=round(float(np.median(self.peaks.correlation)), 4),
+            valid=round(self.valid_fraction, 4),
+            median_correlation=round(float(np.median(self.peaks.correlation[self._open])), 4),
             median_step_voxel=round(float(np.median(steps)), 4) if steps.size else None,
         )
+
+    @property
+    def valid_fraction(self) -> float:
+        """Part of the vectors that are valid, of those that are not masked."""
+        return self.fraction(self.valid)
+
+    def fraction(self, flags: np.ndarray) -> float:
+        """Return the part of the vectors that are flagged, of those that are not masked."""
+        return float(flags[self._open].mean())
+
+    @property
+    def _open(self) -> np.ndarray:
+        """True where a vector is not masked; everywhere if all are, so that medians have values."""
+        masked = self.coverage.masked
+        return np.ones_like(masked) if masked.all() else ~masked
 
     @property
     def next_guess(self) -> np.ndarray:
@@ -113,18 +133,19 @@ class Pass:
 
 
 def correlate_passes(
-    first: np.ndarray, second: np.ndarray, settings: CorrelationSettings, *, seen: np.ndarray | None = None
+    first: np.ndarray, second: np.ndarray, settings: CorrelationSettings, voxels: Voxels
 ) -> tuple[Pass, tuple[PassFigures, ...]]:
     """Correlate two volumes in one pass per window of the settings.
 
     Parameters
     ----------
     first, second : ndarray, shape (z, y, x), float32
-        Volumes without background.
+        Volumes without background, 0 where there is no fluid.
     settings : CorrelationSettings
         Windows, overlap and largest displacement.
-    seen : ndarray of bool, shape (z, y, x), optional
-        Voxels that two cameras see. Windows of the last pass that hold too few of them are not valid.
+    voxels : Voxels
+        Voxels that two cameras see, that hold no fluid, that hold no particles. Windows of the last pass with too few
+        usable voxels are not valid.
 
     Returns
     -------
@@ -134,26 +155,66 @@ def correlate_passes(
         Figures of every pass.
     """
     shape, last = triple(first.shape), len(settings.windows) - 1
+    pair = UndeformedPair((first, second), voxels.solid)
     coarse = max(settings.overlap, COARSE_OVERLAP)
     overlaps = [coarse] * last + [settings.overlap]
     windows = _cover(shape, settings.windows[0], overlaps[0])
+    volumes, fluid = pair.given(windows.window)
     given = PassInput(
         windows=windows,
         overlap=overlaps[0],
         centres=windows.centres,
         search=settings.first_search(shape),
-        volumes=(first, second),
+        volumes=volumes,
+        fluid=fluid,
     )
-    result = _correlate_pass(given, seen if last == 0 else None, symmetric=last > 0)
+    flags = [voxels.coarse] * last + [voxels]
+    coverage = flags[0].coverage(windows, settings.windows[-1])
+    result = _correlate_pass(given, coverage, symmetric=last > 0)
     figures = [result.figures]
-    if last > 0:
-        splines = deform.spline_coefficients(first), deform.spline_coefficients(second)
-        for number in range(1, last + 1):
-            given = _deform(splines, result, settings.windows[number], overlaps[number])
-            result = _correlate_pass(given, seen if number == last else None, symmetric=True)
-            figures.append(result.figures)
+    for number in range(1, last + 1):
+        given = _deform(pair, result, settings.windows[number], overlaps[number])
+        coverage = flags[number].coverage(given.windows, settings.windows[-1])
+        result = _correlate_pass(given, coverage, symmetric=True)
+        figures.append(result.figures)
     log.debug("correlation passes: %s", figures)
     return result, tuple(figures)
+
+
+@dataclass(frozen=True)
+class UndeformedPair:
+    """The two volumes before any deformation, and the voxels that hold no fluid."""
+
+    volumes: tuple[np.ndarray, np.ndarray]
+    """Volumes without background, shape (z, y, x), float32."""
+    solid: np.ndarray | None
+    """True for voxels without fluid, shape (z, y, x); None without a mask."""
+
+    def given(self, window: Triple) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray | None]:
+        """Return the volumes of the first pass and their fluid."""
+        if self.solid is None:
+            return self.volumes, None
+        masked = MaskedPair(volumes=self.volumes, solids=(self.solid, self.solid))
+        return masked.levelled(window), masked.fluid
+
+    def deformed(self, predictor: Predictor, window: Triple) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray | None]:
+        """Return the volumes of a later pass, deformed onto each other by the predicted field, and their fluid."""
+        first, second = self._splines
+        volumes = deform.deform_pair(first, second, predictor.field, predictor.spacing)
+        if self._solid_spline is None:
+            return volumes, None
+        solids = deform.deform_pair(self._solid_spline, self._solid_spline, predictor.field, predictor.spacing)
+        masked = MaskedPair(volumes=volumes, solids=(solids[0] > 0.5, solids[1] > 0.5))
+        return masked.levelled(window), masked.fluid
+
+    @cached_property
+    def _splines(self) -> tuple[np.ndarray, np.ndarray]:
+        first, second = self.volumes
+        return deform.spline_coefficients(first), deform.spline_coefficients(second)
+
+    @cached_property
+    def _solid_spline(self) -> np.ndarray | None:
+        return None if self.solid is None else deform.spline_coefficients(self.solid.astype(np.float32))
 
 
 def _cover(shape: Triple, window: Triple, overlap: float) -> Windows:
@@ -161,41 +222,42 @@ def _cover(shape: Triple, window: Triple, overlap: float) -> Windows:
     return Windows.covering(shape, window, triple(max(1, round(edge * (1 - overlap))) for edge in window))
 
 
-def _deform(splines: tuple[np.ndarray, np.ndarray], before: Pass, window: Triple, overlap: float) -> PassInput:
+def _deform(pair: UndeformedPair, before: Pass, window: Triple, overlap: float) -> PassInput:
     """Deform both volumes by the field of the pass before, and lay out the windows of the next one."""
     shape = triple(before.given.volumes[0].shape)
     windows = _cover(shape, window, overlap)
     predictor = Predictor.between(before.given.centres, before.next_guess, shape)
+    volumes, fluid = pair.deformed(predictor, window)
     return PassInput(
         windows=windows,
         overlap=overlap,
         centres=[centre + deform.OFFSET for centre in windows.centres],
         search=(REFINE_SEARCH,) * 3,
-        volumes=deform.deform_pair(*splines, predictor.field, predictor.spacing),
+        volumes=volumes,
+        fluid=fluid,
         predicted=predictor.window_means(windows),
     )
 
 
-def _correlate_pass(given: PassInput, seen: np.ndarray | None, *, symmetric: bool) -> Pass:
+def _correlate_pass(given: PassInput, coverage: Coverage, *, symmetric: bool) -> Pass:
     """Correlate the windows of two volumes and validate the peaks."""
     grid, predicted = given.windows, given.predicted
     peaks = correlate_windows(
         *given.volumes, window=grid.window, step=grid.step, search=given.search, symmetric=symmetric
     )
-    windows_seen = np.ones(grid.count, bool)
-    if seen is not None:
-        windows_seen = validation.seen_windows(seen, grid)
     offset = np.zeros(3) if predicted is None else predicted
     field, valid = validation.validate(
         peaks.displacement + offset,
         peaks.second_displacement + offset,
         peaks.measured,
         given.search,
-        seen=windows_seen,
+        seen=coverage.measurable,
         predicted=predicted if given.overlap < COARSE_OVERLAP else None,
         peak_ratio=peak_ratio(peaks),
     )
-    return Pass(given=given, peaks=peaks, field=field, valid=valid, seen=windows_seen)
+    if given.fluid is not None:
+        field = continued(field, offset, valid, given.fluid, grid)
+    return Pass(given=given, peaks=peaks, field=field, valid=valid, coverage=coverage)
 
 
 def peak_ratio(peaks: WindowPeaks) -> np.ndarray:

@@ -105,11 +105,7 @@ def seen_windows(seen: np.ndarray, windows: Windows) -> np.ndarray:
 
     `seen` is true where two cameras see the voxel, shape (z, y, x).
     """
-    share = seen.astype(float)
-    for axis, (edge, start) in enumerate(zip(windows.window, windows.first_voxels, strict=True)):
-        below = np.insert(share.cumsum(axis), 0, 0, axis)
-        share = (below.take(start + edge, axis) - below.take(start, axis)) / edge
-    return share >= LEAST_SEEN * (1 - 1e-9)  # the shares have rounding errors
+    return windows.shares(seen) >= LEAST_SEEN * (1 - 1e-9)  # the shares have rounding errors
 
 
 def _agrees(field: np.ndarray, prediction: Prediction, search: tuple[float, float, float]) -> np.ndarray:

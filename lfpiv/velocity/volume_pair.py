@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import fft
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.geometry.volume import SPACING_TOLERANCE, VIEWS, is_finite
+from lfpiv.geometry.volume import MASKED, SPACING_TOLERANCE, VIEWS, checked_mask, is_finite
 
 LARGEST_BLOCK = 128
 """Largest edge of the central block that is correlated as a whole [voxel]."""
@@ -33,11 +33,8 @@ class VoxelAxes:
     """Distance of voxels along z, y, x [mm]."""
 
 
-def normalise(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
-    """Return a copy of a volume as float32, without background and scaled to a largest magnitude of 1.
-
-    The background is the median of the voxels. Raise ValueError if the volume is not three-dimensional or not finite.
-    """
+def numbers_of(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
+    """Return the values of a volume as float32, NaN where masked; raise ValueError if it is not three-dimensional."""
     try:
         values = np.asarray(volume)
     except ValueError:  # rows of unequal length
@@ -50,13 +47,27 @@ def normalise(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
         values = values.astype(np.float32, copy=isinstance(volume, np.ma.MaskedArray))
     if isinstance(volume, np.ma.MaskedArray):
         values[np.ma.getmaskarray(volume)] = np.nan
+    return values
+
+
+def normalise(values: np.ndarray, name: str, solid: np.ndarray | None = None) -> np.ndarray:
+    """Return a copy of a volume (z, y, x) without background and scaled to a largest magnitude of 1.
+
+    The background is the median of the voxels. Voxels flagged in `solid`, shape (z, y, x), may hold anything; the
+    result is 0 there. Raise ValueError if other values are not finite.
+    """
+    if solid is not None:
+        values = np.where(solid, np.float32(0), values)
     lowest, highest = float(values.min()), float(values.max())
     if not (math.isfinite(lowest) and math.isfinite(highest)):
         bad = values.size - int(np.isfinite(values).sum())
         raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
-    background = np.median(values.ravel()[:: 1 + values.size // _BACKGROUND_SAMPLES])
+    inside = values.ravel() if solid is None else values[~solid]
+    background = np.median(inside[:: 1 + inside.size // _BACKGROUND_SAMPLES])
     normalised: np.ndarray = values - background
     normalised /= max(highest - float(background), float(background) - lowest, float(np.finfo(np.float32).tiny))
+    if solid is not None:
+        normalised[solid] = 0
     return normalised
 
 
@@ -134,6 +145,33 @@ def seen_by_two(volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np
             raise ValueError(f"{VIEWS}: expected a coordinate over (z, y, x), got {count.dims}.")
     both: np.ndarray = np.minimum(views[0].values, views[-1].values) >= 2
     return both
+
+
+def solid_voxels(
+    mask: xr.DataArray | np.ndarray | None,
+    volume_a: xr.DataArray | np.ndarray,
+    volume_b: xr.DataArray | np.ndarray,
+    axes: VoxelAxes,
+) -> np.ndarray | None:
+    """Return the flags of the voxels without fluid, shape (z, y, x); None if there are none.
+
+    Without `mask`, the coordinate ``masked`` of the volumes is taken.
+    """
+    if mask is not None:
+        masks = [checked_mask(mask, axes.centres_mm)]
+    else:
+        volumes = [volume for volume in (volume_a, volume_b) if isinstance(volume, xr.DataArray)]
+        found = [volume[MASKED] for volume in volumes if MASKED in volume.coords]
+        masks = [checked_mask(one.drop_vars(MASKED), axes.centres_mm, MASKED) for one in found]
+    solid = np.logical_or.reduce(masks) if masks else np.zeros(1, bool)
+    return solid if solid.any() else None
+
+
+def without(solid: np.ndarray | None, seen: np.ndarray | None) -> np.ndarray | None:
+    """Return the flags of the voxels that are solid or not seen, shape (z, y, x); None if there are none."""
+    if seen is None:
+        return solid
+    return ~seen if solid is None else solid | ~seen
 
 
 def moves_beyond(first: np.ndarray, second: np.ndarray, search: tuple[int, int, int]) -> bool:

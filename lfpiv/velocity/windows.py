@@ -29,6 +29,14 @@ class Windows:
         origin, count = window_grid(shape, window, step)
         return cls(window=window, origin=origin, step=step, count=count)
 
+    def shares(self, flags: np.ndarray) -> np.ndarray:
+        """Return the share of each window's voxels that are flagged, shape (z, y, x); `flags` has the volume's."""
+        share = flags.astype(float)
+        for axis, (edge, start) in enumerate(zip(self.window, self.first_voxels, strict=True)):
+            below = np.insert(share.cumsum(axis), 0, 0, axis)
+            share = (below.take(start + edge, axis) - below.take(start, axis)) / edge
+        return share
+
     @property
     def centres(self) -> list[np.ndarray]:
         """Window centres along each axis [voxel]."""

@@ -36,6 +36,7 @@ class Field {
     this.shape = AXES.map((name) => this.axis[name].length);
     this.size = this.shape[0] * this.shape[1] * this.shape[2];
     this.valid = new Int16Array(block, entry.valid, this.size);
+    this.masked = "masked" in entry ? new Int16Array(block, entry.masked, this.size) : null;
     this.cache = {};
   }
 
@@ -77,6 +78,11 @@ class Field {
     return (k * this.shape[1] + j) * this.shape[2] + i;
   }
 
+  /** Return whether a vector is masked: without fluid. */
+  isMasked(index) {
+    return this.masked !== null && this.masked[index] !== 0;
+  }
+
   /** Return whether a vector is valid and finite. */
   isValid(index) {
     return this.valid[index] !== 0 && Number.isFinite(this.values("speed")[index]);
@@ -100,10 +106,11 @@ class Field {
     return known.length ? known[0] : 1;
   }
 
-  /** Return counts, mean velocity, rms and largest speed of the valid vectors of a slice. */
+  /** Return counts, mean velocity, rms and largest speed of the valid vectors of a slice; masked ones do not count. */
   sliceStatistics(normal, layer) {
     const sums = { count: 0, good: 0, u: 0, v: 0, w: 0, square: 0, largest: 0 };
     this.forSlice(normal, layer, (index) => {
+      if (this.isMasked(index)) return;
       sums.count += 1;
       if (!this.isValid(index)) return;
       const speed = this.values("speed")[index];

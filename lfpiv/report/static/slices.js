@@ -109,10 +109,11 @@ class SliceView {
     const scale = this.scale();
     const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
     this.field.forSlice(this.normal, this.layer, (index, column, row) => {
-      if (!Number.isFinite(values[index])) return;
-      context.fillStyle = colourAt(scale.stops, scale.share(values[index]));
       const x = box.left + column * cell[0];
       const y = box.top + box.height - (row + 1) * cell[1];
+      if (this.field.isMasked(index)) hatch(context, [x, y], cell);
+      if (!Number.isFinite(values[index])) return;
+      context.fillStyle = colourAt(scale.stops, scale.share(values[index]));
       context.fillRect(Math.floor(x), Math.floor(y), Math.ceil(cell[0]) + 1, Math.ceil(cell[1]) + 1);
     });
     context.clearRect(box.left + box.width, 0, box.outerWidth, box.total); // parts of cells beyond the frame
@@ -267,6 +268,7 @@ class SliceView {
       const [label, unit] = field.title(name).split(" [");
       return `${label} ${significant(field.values(name)[index])} ${unit.slice(0, -1)}`;
     });
+    if (field.isMasked(index)) return `(x, y, z) = (${where}) mm: masked, too little fluid.`;
     const replaced = field.isVector ? "replaced after validation" : "valid in too few pairs";
     return `(x, y, z) = (${where}) mm: ${values.join(", ")}; ${field.valid[index] ? "valid" : replaced}.`;
   }
@@ -278,7 +280,7 @@ class SliceView {
       const statistics = this.field.sliceStatistics("z", k);
       const row = document.createElement("tr");
       const cells = [
-        String(statistics.count), `${((100 * statistics.good) / statistics.count).toFixed(1)} %`,
+        String(statistics.count), statistics.count ? `${((100 * statistics.good) / statistics.count).toFixed(1)} %` : "–",
         ...["u", "v", "w", "rms", "largest"].map((name) => significant(statistics[name])),
       ];
       const head = document.createElement("th");
@@ -289,6 +291,17 @@ class SliceView {
     });
     document.querySelector("#depth-table tbody").replaceChildren(...rows);
   }
+}
+
+/** Hatch a masked cell. */
+function hatch(context, [x, y], [width, height]) {
+  context.fillStyle = "#d5d8db";
+  context.fillRect(x, y, width, height);
+  context.strokeStyle = "#9aa0a6";
+  context.lineWidth = 1;
+  line(context, [x, y + height], [x + width, y]);
+  line(context, [x, y + height / 2], [x + width / 2, y]);
+  line(context, [x + width / 2, y + height], [x + width, y + height / 2]);
 }
 
 /** Draw an arrow with its tail at `from`; arrows shorter than half a pixel are left out. */

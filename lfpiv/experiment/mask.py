@@ -1,0 +1,158 @@
+"""Voxels without fluid: from the file and the solids that an experiment names, sampled onto its grid.
+
+A voxel is masked if more than half of it is solid. Half-spaces and boxes are tested at the voxel's centre. A file is
+interpolated linearly between its points and averaged over the voxel.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.errors import InputError
+from lfpiv.experiment.settings import Box, ExperimentVolume, HalfSpace
+from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.geometry.volume import solid_shares
+
+VARIABLE = "mask"
+"""Name of the mask in a file with several variables."""
+MOST_SAMPLES = 16
+"""Largest number of samples along an edge of a voxel, for files with far smaller spacing."""
+
+
+def solid_voxels(path: Path, volume: ExperimentVolume, grid: Grid) -> np.ndarray | None:
+    """Return the flags of the voxels without fluid, shape (z, y, x); None if the volume has no mask.
+
+    Parameters
+    ----------
+    path : Path
+        The experiment file, from which the path of the mask starts.
+    volume : ExperimentVolume
+        Its table ``[volume]``.
+    grid : Grid
+        The voxels.
+
+    Raises
+    ------
+    InputError
+        If a file is no mask, a mask or a solid does not meet the volume, or no fluid is left.
+    """
+    if volume.mask is None and not volume.solid:
+        return None
+    solid = np.zeros(grid.shape, bool)
+    if volume.mask is not None:
+        solid |= read_mask(path.parent / volume.mask, grid)
+    for number, one in enumerate(volume.solid):
+        inside = _inside(one, grid)
+        if not inside.any():
+            raise InputError(
+                f"{path}: volume.solid[{number}]: expected a {one.kind} that reaches into the volume, found none of "
+                "its voxels inside. Check its lengths [mm], or leave it out."
+            )
+        solid |= inside
+    if solid.all():
+        raise InputError(f"{path}: volume: expected some fluid in the volume, found only solid. {_INVERTED}")
+    return solid
+
+
+_INVERTED = "True, and the side from which a half-space's normal points away, are solid: is a mask inverted?"
+
+
+def _inside(solid: HalfSpace | Box, grid: Grid) -> np.ndarray:
+    """Return the flags of the voxels whose centres are in a solid, shape (z, y, x)."""
+    z, y, x = np.meshgrid(*(grid.axis_mm(axis) for axis in range(3)), indexing="ij", sparse=True)
+    if isinstance(solid, HalfSpace):
+        away = sum(n * (at - p) for n, at, p in zip(solid.normal, (x, y, z), solid.point_mm, strict=True))
+        return np.asarray(away < 0)
+    near = [abs(at - c) <= s / 2 for at, c, s in zip((x, y, z), solid.centre_mm, solid.size_mm, strict=True)]
+    return np.asarray(near[0] & near[1] & near[2])
+
+
+def read_mask(path: Path, grid: Grid) -> np.ndarray:
+    """Read a mask from a NetCDF file and sample it onto a grid: true for voxels that are more than half solid.
+
+    The file has one variable, or one named ``mask``, over z, y, x with coordinates [mm], evenly spaced or not: true, or
+    1, where there is solid; false, or 0, where there is fluid. Beyond the file's points there is fluid.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is no such mask, lies beside the volume, or marks no voxel.
+    """
+    mask = _load(path)
+    try:
+        values = solid_shares(mask.values, str(mask.name))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    for number, axis in enumerate(AXES):
+        nodes, voxels = mask[axis].values, grid.axis_mm(number)
+        low, high = nodes[0] - _half_step(nodes, 0), nodes[-1] + _half_step(nodes, -1)
+        if not (low < voxels[-1] + grid.voxel_mm / 2 and high > voxels[0] - grid.voxel_mm / 2):
+            raise InputError(
+                f"{path}: expected a mask that overlaps the volume, {axis} from {voxels[0]:g} to {voxels[-1]:g} mm, "
+                f"found {axis} from {nodes[0]:g} to {nodes[-1]:g}. Are its coordinates in mm, in the board's frame?"
+            )
+        values = np.moveaxis(np.tensordot(_sampling(nodes, voxels, grid.voxel_mm), values, (1, number)), 0, number)
+    solid: np.ndarray = values > 0.5
+    if not solid.any():
+        raise InputError(
+            f"{path}: expected some solid (true) in the volume, found only fluid there. Check the mask's coordinates "
+            "[mm], or leave volume.mask out."
+        )
+    return solid
+
+
+def _load(path: Path) -> xr.DataArray:
+    """Return the mask in a file, its coordinates rising."""
+    if not path.is_file():
+        raise InputError(f"{path}: expected the NetCDF file of volume.mask, found no such file. Check the path.")
+    try:
+        stored = xr.load_dataset(path)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())[:100]
+        raise InputError(f"{path}: expected a NetCDF file, found one that cannot be read ({reason}).") from None
+    names = [str(name) for name in stored.data_vars]
+    if VARIABLE not in names and len(names) != 1:
+        found = ", ".join(names) or "none"
+        raise InputError(f"{path}: expected one variable, or one named {VARIABLE!r}, found {found}.")
+    mask = stored[VARIABLE if VARIABLE in names else names[0]]
+    if set(mask.dims) != set(AXES) or mask.ndim != 3 or any(axis not in mask.coords for axis in AXES):
+        raise InputError(
+            f"{path}: expected {mask.name!r} over z, y, x with coordinates [mm], found "
+            f"{dict(mask.sizes)} with coordinates {list(map(str, mask.coords))}."
+        )
+    for axis in AXES:
+        unit, nodes = mask[axis].attrs.get("units", "mm"), mask[axis].values
+        steps = np.diff(nodes) if nodes.dtype.kind in "fiu" else np.array([0.0])
+        if unit != "mm" or not ((steps > 0).all() or (steps < 0).all()):
+            raise InputError(
+                f"{path}: expected coordinates {axis} in mm that rise or fall throughout, found {unit}, "
+                f"{np.array2string(nodes, threshold=6, edgeitems=2)}."
+            )
+    return mask.transpose(*AXES).sortby(list(AXES))
+
+
+def _half_step(nodes: np.ndarray, end: int) -> float:
+    """Return half the distance of the outermost points at one end (0 or -1) [mm]; 0 for a single point."""
+    return float(abs(np.diff(nodes)[end])) / 2 if len(nodes) > 1 else 0.0
+
+
+def _sampling(nodes: np.ndarray, voxels: np.ndarray, voxel_mm: float) -> np.ndarray:
+    """Return the matrix from values at a file's points to their means over voxels along an axis, (voxel, point).
+
+    Half a step beyond the outermost points the value is theirs, farther out it is 0.
+    """
+    finest = float(np.diff(nodes).min()) if len(nodes) > 1 else voxel_mm
+    count = min(max(1, math.ceil(voxel_mm / finest)), MOST_SAMPLES)
+    within = ((np.arange(count) + 0.5) / count - 0.5) * voxel_mm
+    matrix = np.zeros((len(voxels), len(nodes)))
+    low, high = nodes[0] - _half_step(nodes, 0), nodes[-1] + _half_step(nodes, -1)
+    for offset in within:
+        at = voxels + offset
+        inside = (at >= low) & (at <= high) if len(nodes) > 1 else np.abs(at - nodes[0]) <= voxel_mm / 2
+        hats = np.stack([np.interp(at, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
+        matrix += hats * inside[:, None] / count
+    return matrix

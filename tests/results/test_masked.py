@@ -1,0 +1,102 @@
+"""Masked vectors in files, exports, figures and the report."""
+
+import csv
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.vector_sets import random_vectors
+
+import lfpiv
+from lfpiv.experiment.experiment import open_experiment
+from lfpiv.report import vectors as report
+from lfpiv.results import netcdf, provenance
+from lfpiv.runs import pair_figures
+
+DIMS = ("z", "y", "x")
+
+
+def masked_vectors(seed=0):
+    vectors = random_vectors(seed)
+    masked = np.zeros(vectors["u"].shape, bool)
+    masked[..., :2] = True
+    hidden = vectors.where(~masked).assign(valid=vectors["valid"] & ~xr.DataArray(masked, dims=DIMS))
+    attributes = {"verdict": "", "reconstruction_s": 1.0, "correlation_s": 1.0, "seen_fraction": 1.0}
+    attributes |= {"measurable_fraction": 0.9, "unseeded_fraction": 0.2}
+    return hidden.assign(masked=(DIMS, masked)).assign_attrs(vectors.attrs | attributes), masked
+
+
+@pytest.fixture
+def run(tmp_path):
+    vectors, masked = masked_vectors()
+    netcdf.write_vectors(vectors, tmp_path / "vectors" / "pair_0000.nc", attributes={"pair": 0})
+    return tmp_path, masked
+
+
+def test_files_hold_the_flag_with_its_meaning(run):
+    folder, masked = run
+    read = netcdf.read_vectors(folder / "vectors" / "pair_0000.nc")
+    assert read["masked"].dtype == bool and read["masked"].attrs["flag_meanings"] == "fluid masked"
+    np.testing.assert_array_equal(lfpiv.open_results(folder)["masked"].values[0], masked)
+
+
+def test_a_table_has_the_flag_and_no_numbers_where_masked(run):
+    folder, masked = run
+    (path,) = lfpiv.export_results(folder, "csv")
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    np.testing.assert_array_equal([row["masked"] == "1" for row in rows], masked.ravel())
+    assert {row["masked"] for row in rows} == {"0", "1"}
+    assert all((row["u [m/s]"] == "") == (row["masked"] == "1") for row in rows)
+
+
+def test_planes_tell_masked_from_replaced(run):
+    folder, masked = run
+    path = lfpiv.export_results(folder, "pivpy")[0]
+    with xr.open_dataset(path) as plane:
+        np.testing.assert_array_equal(plane["chc"].isel(t=0).values == -1, masked[0])
+        assert "-1: masked" in plane["chc"].attrs["long_name"]
+
+
+def test_images_hold_the_flag(run):
+    pyvista = pytest.importorskip("pyvista")
+    folder, masked = run
+    lfpiv.export_results(folder, "vti")
+    image = pyvista.read(folder / "export" / "pair_0000.vti")
+    np.testing.assert_array_equal(np.asarray(image.point_data["masked"]) == 1, masked.ravel())
+
+
+def test_figures_leave_masked_vectors_out_and_name_unseeded_ones():
+    vectors, masked = masked_vectors()
+    figures = pair_figures.measure(vectors, None, ())
+    assert figures.valid_fraction == vectors["valid"].values[~masked].mean() and figures.finite_fraction == 1
+    assert figures.masked_fraction == pytest.approx(masked.mean())
+    assert figures.lost_unseeded == pytest.approx(0.1)
+    assert figures.valid_share == pytest.approx(min(figures.valid_fraction / 0.9, 1))
+    sentence = figures.unseeded_warning(3).sentence
+    assert sentence.startswith("pair 3: 20 % of the volume holds no particles; 10 % of the vectors")
+    old = pair_figures.PairFigures.from_json(
+        {name: value for name, value in figures.to_json().items() if name not in ("measurable_fraction",)}
+    )
+    assert old.lost_unseeded == 0  # files of version 0.1.0 do not tell
+
+
+def test_slices_hatch_masked_cells_only():
+    vectors, masked = masked_vectors()
+    assert "<pattern" not in report.slices(vectors.drop_vars("masked"), most=1)[0]
+    panel = report.slices(vectors, most=1)[0]
+    assert "<pattern" in panel and report.MASKED_FILL in panel
+    rows = report.depth_rows(vectors)
+    assert [row[1] for row in rows] == [str(n) for n in (~masked).sum((1, 2))]
+
+
+def test_another_mask_makes_another_volume(tiny_experiment):
+    plain = open_experiment(tiny_experiment)
+    box = '[[volume.solid]]\nkind = "box"\ncentre_mm = [0.4, 0.3, {z}]\nsize_mm = [0.2, 0.2, 0.2]\n'
+    text = tiny_experiment.read_text()
+    stamps = [provenance.of_pair(plain, "", 0)]
+    for z in (0.3, 0.25):
+        tiny_experiment.write_text(text.replace("[particles]", box.format(z=z) + "\n[particles]"))
+        stamps.append(provenance.of_pair(open_experiment(tiny_experiment), "", 0))
+    assert len({stamp.volumes.hash for stamp in stamps}) == 3
+    assert "mask" in stamps[1].volumes.changes(provenance.Marks(**stamps[2].volumes.attributes))
