@@ -66,10 +66,14 @@ def frame_light(
         raw, dark = experiment.particle_image(name, pair, frame), darks[name]
         image = raw if dark is None else raw - dark
         level, noise[name] = camera.decoder.background(image)
-        light = images[name] = image - np.float32(level)
+        light = image - np.float32(level)
+        if camera.standing is not None:
+            light, noise[name] = camera.standing.subtract(light, noise[name], experiment.frames.index(frame))
+        images[name] = light
         structure[name] = seen_structure(light, camera.decoder)
         fingerprints[name] = image_checks.fingerprint(raw)
-        warnings += image_checks.image_warnings(raw, light, camera.decoder, name, frame)
+        judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
+        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, frame)
     return FrameLight(
         frame=frame,
         images=images,
