@@ -60,12 +60,15 @@ class CalibratedCamera:
 
     def with_standing(self, standing: StandingLight) -> CalibratedCamera:
         """Return the camera with light that stands still in its images, and without gain in unusable pixels."""
-        decoder, usable = self.decoder, ~standing.unusable
-        decoder = replace(decoder, gain=decoder.gain * usable, smooth_gain=decoder.smooth_gain * usable)
-        return replace(self, decoder=decoder, standing=standing)
+        return replace(self, standing=standing)
 
     @cached_property
     def gain(self) -> np.ndarray:
+        """White-image gain of every pixel, 0 where standing light makes it unusable, shape (rows, columns), float32."""
+        return self.white_gain if self.standing is None else self.white_gain * ~self.standing.unusable
+
+    @cached_property
+    def white_gain(self) -> np.ndarray:
         """White-image gain of every pixel, shape (rows, columns), float32.
 
         The board's dots show which part of the white image's variance from pixel to pixel is pixel response. All of it

@@ -21,6 +21,10 @@ CHANCE = 99.99
 """Percentile of the shifted images' minimum above which a pixel's light stands."""
 CLEAR_SIGMA = 5.0
 """Least count of a pixel with standing light in a background image [noise]."""
+NOISE_SIGMA = 3.0
+"""Least count of a pixel that is counted among those brighter than chance [noise]."""
+LEAST_STANDING = 0.005
+"""Share of an image's light below which compact standing light is left alone: chance reaches a fifth of it."""
 LEAST_RATIO_PIXELS = 500
 """Least number of bright pixels that give the brightness of the standing light in an image."""
 POWER_RANGE = (0.5, 2.0)
@@ -120,6 +124,8 @@ class Series:
     count: int = 0
     noise: float = 0.0
     """Mean noise of the images so far [counts]."""
+    light: float = 0.0
+    """Mean light of the images so far, summed over the sensor [counts]."""
     smallest: np.ndarray = field(init=False)
     """Smallest count of each pixel, float32."""
     half: np.ndarray = field(init=False)
@@ -154,6 +160,7 @@ class Series:
             if self.count % 2 == 0:
                 np.minimum(self.half, light, out=self.half)
             self.saturated += saturated
+        self.light += (float(light.sum(dtype=float)) - self.light) / (self.count + 1)
         self.noise += (noise - self.noise) / (self.count + 1)
         self.count += 1
 
@@ -202,11 +209,14 @@ def standing_light(first: Series, second: Series, *, everywhere: bool = False) -
     scales = (1.0, ratio) if pooled is not None else (1.0, 1.0)
     for part, smooth, scale in zip(parts, stray, scales, strict=True):
         excess = part.smallest - smooth / np.float32(scale)
-        stands = _stands(excess, part.shifted - smooth / np.float32(scale), decoder)
-        if everywhere:
-            stands = np.ones_like(stands)
-        region |= stands
         level = np.maximum(excess + part.bias(decoder), 0)
+        if everywhere:
+            stands = np.ones_like(region)
+        else:
+            stands = _stands(excess, part.shifted - smooth / np.float32(scale), part.noise, decoder)
+            if level.sum(where=stands, dtype=float) < LEAST_STANDING * min(first.light, second.light):
+                stands = np.zeros_like(region)
+        region |= stands
         light.append(((np.where(stands, level, 0)) * np.float32(scale) + smooth).astype(np.float32))
     unusable = _unusable(first, second)
     return StandingLight(
@@ -261,11 +271,11 @@ def _pool(first: Series, second: Series) -> tuple[_Minimum | None, float]:
     ), ratio
 
 
-def _stands(excess: np.ndarray, chance: np.ndarray, decoder: LightFieldDecoder) -> np.ndarray:
+def _stands(excess: np.ndarray, chance: np.ndarray, noise: float, decoder: LightFieldDecoder) -> np.ndarray:
     """Return the pixels whose light stands: far brighter than chance by themselves, or with many bright ones around."""
-    stands = excess > _MARGIN_OF_ONE * float(chance.max())
+    stands = excess > max(_MARGIN_OF_ONE * float(chance.max()), CLEAR_SIGMA * noise)
     reach = 2 * int(_REACH_PITCHES * decoder.optics.microimage_pitch_px) + 1
-    for level in np.percentile(chance, _LEVELS):
+    for level in np.maximum(np.percentile(chance, _LEVELS), NOISE_SIGMA * noise):
         found, usual = (ndimage.uniform_filter((part > level).astype(np.float32), reach) for part in (excess, chance))
         stands |= found > _MARGIN * max(float(usual.max()), _LEAST_SHARE)
     return stands
