@@ -39,8 +39,10 @@ _MARGIN_OF_ONE = 1.5  # least count of a single pixel over the largest one of th
 _LEAST_SHARE = 0.05  # lower limit of the share of such pixels in the shifted images
 _TILE_PITCHES = 6.0  # edge of the tiles of smooth stray light
 _TILE_NEIGHBOURS = 5  # tiles along each axis whose median removes compact reflections from the stray light
-_LEAST_GAIN = 0.2
-_LEAST_TILE_PIXELS = 300
+_COPIES = np.array([(3.0, 0.0), (0.0, 3.0)])  # shifts of the copies that tell stray light from particles [lens]
+_UNEVEN = 0.15  # accepted relative decrease of stray light over such a shift
+_LEAST_GAIN = 0.2  # least gain of a pixel that counts
+_LEAST_TILE_PIXELS = 300  # least number of pixels of a tile
 _BRIGHT = 50.0  # percentile of the standing light above which pixels tell its brightness
 _UNLIKE = 0.3  # relative difference of the frames' standing light that counts as unlike
 _UNLIKE_SHARE = 0.15  # share of unlike pixels above which the frames have backgrounds of their own
@@ -128,8 +130,6 @@ class Series:
     """Mean light of the images so far, summed over the sensor [counts]."""
     smallest: np.ndarray = field(init=False)
     """Smallest count of each pixel, float32."""
-    half: np.ndarray = field(init=False)
-    """Smallest count over every second image, float32."""
     shifted: np.ndarray = field(init=False)
     """Smallest count over the images shifted against each other by whole microlenses, float32."""
     largest: np.ndarray = field(init=False)
@@ -151,14 +151,12 @@ class Series:
         """
         shifted = np.roll(light, lens_shift(self.decoder, 2 * self.count + self.frame), (0, 1))
         if self.count == 0:
-            self.smallest, self.half, self.largest = light.copy(), light.copy(), light.copy()
+            self.smallest, self.largest = light.copy(), light.copy()
             self.shifted, self.saturated = shifted, saturated.astype(np.uint16)
         else:
             np.minimum(self.smallest, light, out=self.smallest)
             np.minimum(self.shifted, shifted, out=self.shifted)
             np.maximum(self.largest, light, out=self.largest)
-            if self.count % 2 == 0:
-                np.minimum(self.half, light, out=self.half)
             self.saturated += saturated
         self.light += (float(light.sum(dtype=float)) - self.light) / (self.count + 1)
         self.noise += (noise - self.noise) / (self.count + 1)
@@ -284,13 +282,15 @@ def _stands(excess: np.ndarray, chance: np.ndarray, noise: float, decoder: Light
 def _stray(series: Series, decoder: LightFieldDecoder) -> np.ndarray:
     """Return the smooth stray light, from the mode of the minimum in tiles of some microlenses.
 
-    It is 0 where the minimum over half the images is brighter by more than noise: particles light the pixels then.
+    Smooth light stays where the minimum over two shifted copies is taken, too. Where that is darker by more than noise,
+    the light is that of particles, and the stray light is 0.
     """
+    aside, down = (np.roll(series.smallest, shift, (0, 1)) for shift in _whole_lenses(decoder, _COPIES))
+    thinned = np.minimum(np.minimum(aside, down), series.smallest)
     shape, tile = series.smallest.shape, int(_TILE_PITCHES * decoder.optics.microimage_pitch_px)
     cells = [max(n // tile, 1) for n in shape]
     core = (decoder.coverage > CORE_COVERAGE) & (decoder.gain > _LEAST_GAIN)
     values = np.zeros(cells, float)
-    halves = (series.count + 1) // 2
     for i, rows in enumerate(np.array_split(np.arange(shape[0]), cells[0])):
         for j, columns in enumerate(np.array_split(np.arange(shape[1]), cells[1])):
             place = np.ix_(rows, columns)
@@ -298,10 +298,10 @@ def _stray(series: Series, decoder: LightFieldDecoder) -> np.ndarray:
             if np.count_nonzero(chosen) < _LEAST_TILE_PIXELS:
                 continue
             gain = decoder.gain[place][chosen]
-            whole, part = (mode(image[place][chosen] / gain) for image in (series.smallest, series.half))
-            whole -= least_of_normal(series.count) * series.noise
-            part -= least_of_normal(halves) * series.noise
-            values[i, j] = whole if part - whole < series.noise else 0.0
+            found, darker = (mode(image[place][chosen] / gain) for image in (series.smallest, thinned))
+            found -= least_of_normal(series.count) * series.noise
+            darker -= least_of_normal(3 * series.count) * series.noise
+            values[i, j] = found if found - darker < series.noise + _UNEVEN * found else 0.0
     values = ndimage.median_filter(values, _TILE_NEIGHBOURS, mode="nearest")
     if np.median(values) < series.noise:
         return np.zeros(shape, np.float32)
@@ -336,11 +336,22 @@ def _unusable(first: Series, second: Series) -> np.ndarray:
 def lens_shift(decoder: LightFieldDecoder, number: int) -> tuple[int, int]:
     """Return a shift by whole microlenses, another for each number, as (rows, columns) [pixel]; 0 for number 0."""
     optics = decoder.optics
-    basis = np.asarray(decoder.lattice.basis_mm)[:, ::-1] * (1 + optics.sensor_per_pupil) / optics.pixel_mm
     reach = np.minimum(_SHIFT_PITCHES * optics.microimage_pitch_px, np.array(optics.sensor_shape) / 3)
     target = (np.array(_GOLDEN) * number % 1) * reach
-    rows, columns = np.rint(np.rint(target @ np.linalg.inv(basis)) @ basis).astype(int)
-    return int(rows), int(columns)
+    (shift,) = _whole_lenses(decoder, np.rint(target @ np.linalg.inv(_lens_vectors(decoder)))[None])
+    return shift
+
+
+def _whole_lenses(decoder: LightFieldDecoder, lenses: np.ndarray) -> list[tuple[int, int]]:
+    """Return shifts (i, j) of the lattice, shape (n, 2), as (rows, columns) [pixel]."""
+    return [(int(rows), int(columns)) for rows, columns in np.rint(lenses @ _lens_vectors(decoder))]
+
+
+def _lens_vectors(decoder: LightFieldDecoder) -> np.ndarray:
+    """Return the vectors (rows, columns) between neighbouring microimages [pixel], shape (2, 2)."""
+    optics = decoder.optics
+    vectors: np.ndarray = np.asarray(decoder.lattice.basis_mm)[:, ::-1]
+    return vectors * ((1 + optics.sensor_per_pupil) / optics.pixel_mm)
 
 
 def least_of_normal(count: int) -> float:
