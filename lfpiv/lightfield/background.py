@@ -10,12 +10,13 @@ where it exceeds what the shifted images show.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
 
 from lfpiv.lightfield.decoder import CORE_COVERAGE, LightFieldDecoder
+from lfpiv.warn import Code, Warning
 
 CHANCE = 99.99
 """Percentile of the shifted images' minimum above which a pixel's light stands."""
@@ -29,8 +30,10 @@ LEAST_RATIO_PIXELS = 500
 """Least number of bright pixels that give the brightness of the standing light in an image."""
 POWER_RANGE = (0.5, 2.0)
 """Accepted brightness of the standing light in an image, relative to the estimate."""
-STANDS_EVERYWHERE = 0.5
-"""Share of the sensor above which light that stands is taken for particles that rest."""
+LARGE_REMAINS = 3.0
+"""Light left after subtraction where light stands, relative to other lit places, above which a warning is due."""
+STANDS_EVERYWHERE = 0.6
+"""Share of the lit parts of a sensor above which light that stands is that of particles at rest."""
 
 _LEVELS = (90.0, 99.0, 99.9)  # percentiles of the chance minimum whose excess is counted around each pixel
 _REACH_PITCHES = 1.0  # half width of the square around a pixel in which excess pixels are counted
@@ -41,12 +44,14 @@ _TILE_PITCHES = 6.0  # edge of the tiles of smooth stray light
 _TILE_NEIGHBOURS = 5  # tiles along each axis whose median removes compact reflections from the stray light
 _COPIES = np.array([(3.0, 0.0), (0.0, 3.0)])  # shifts of the copies that tell stray light from particles [lens]
 _UNEVEN = 0.15  # accepted relative decrease of stray light over such a shift
+_DARK_PERCENTILE = 50.0  # percentile below which a pixel of an image of particles counts as dark
 _LEAST_GAIN = 0.2  # least gain of a pixel that counts
 _LEAST_TILE_PIXELS = 300  # least number of pixels of a tile
 _BRIGHT = 50.0  # percentile of the standing light above which pixels tell its brightness
 _UNLIKE = 0.3  # relative difference of the frames' standing light that counts as unlike
 _UNLIKE_SHARE = 0.15  # share of unlike pixels above which the frames have backgrounds of their own
-_COMPACT_PITCHES, _COMPACT_SHARE = 2.0, 0.35  # half width of a square, and the part of it that a reflection saturates
+_MANY_MICROIMAGES = 20.0  # least area of saturated pixels that no particle lights [squares of a pitch]
+_FEW = 0.03  # least share of the pixels of a lit tile
 _STUCK_PIXELS = 0.01  # number of pixels that repeat their count in all images by chance
 _SHIFT_PITCHES = 24.0  # largest shift of an image along each axis
 _GOLDEN = (0.7548776662466927, 0.5698402909980532)  # steps of an even sequence in the plane
@@ -68,6 +73,10 @@ class StandingLight:
     """Smooth stray light, median over the sensor [counts]."""
     ratio: float | None
     """Brightness of the second frame's standing light relative to the first's; None if the frames differ."""
+    share: float = 0.0
+    """Light in `pixels` as a share of all light of an image; 0 for a background image."""
+    at_rest: bool = False
+    """Whether light stands nearly everywhere, as that of particles at rest, and is therefore not taken."""
 
     @property
     def pixels(self) -> np.ndarray:
@@ -78,7 +87,33 @@ class StandingLight:
     @property
     def figures(self) -> dict[str, object]:
         """Fields that are no arrays."""
-        return {"found": self.found, "stray": self.stray, "ratio": self.ratio}
+        return {"found": self.found, "stray": self.stray, "ratio": self.ratio, "share": self.share}
+
+    @property
+    def place(self) -> str:
+        """Columns and rows of the sensor between which the largest area of standing light lies; empty for none."""
+        areas, count = ndimage.label(self.pixels, np.ones((3, 3)))
+        if not count:
+            return ""
+        largest = 1 + int(np.argmax(np.bincount(areas.ravel())[1:]))
+        rows, columns = ndimage.find_objects(areas)[largest - 1]
+        return f"columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1}"
+
+    def remains(self, first: np.ndarray, second: np.ndarray) -> float:
+        """Return the light left in both frames where light stands, relative to that of other lit places.
+
+        Parameters
+        ----------
+        first, second : ndarray, shape (rows, columns)
+            Frames after `subtract` [counts].
+        """
+        both = np.minimum(first, second)
+        inside, outside = self.region & ~self.unusable, ~self.pixels
+        if np.count_nonzero(inside) < LEAST_RATIO_PIXELS or not outside.any():
+            return 0.0
+        usual = both[outside]
+        usual = usual[usual > np.percentile(usual, _DARK_PERCENTILE)]
+        return float(both[inside].mean() / usual.mean()) if usual.mean() > 0 else 0.0
 
     def subtract(self, light: np.ndarray, noise: float, frame: int) -> tuple[np.ndarray, float]:
         """Subtract the standing light from an image at the brightness that it has there.
@@ -103,6 +138,11 @@ class StandingLight:
         power = self.power(light, frame)
         left = light - np.float32(power) * standing
         left[self.unusable] = 0
+        part = self.region & ~self.unusable
+        below = left[part & (left < 0)]
+        if below.size:  # photon noise of the subtracted light
+            share = np.count_nonzero(part) / part.size
+            noise = float(np.sqrt((1 - share) * noise**2 + share * np.mean(below**2, dtype=float)))
         return left, noise
 
     def power(self, light: np.ndarray, frame: int) -> float:
@@ -217,6 +257,9 @@ def standing_light(first: Series, second: Series, *, everywhere: bool = False) -
         region |= stands
         light.append(((np.where(stands, level, 0)) * np.float32(scale) + smooth).astype(np.float32))
     unusable = _unusable(first, second)
+    if not everywhere and _spread(region, first) > STANDS_EVERYWHERE:
+        return replace(nothing(decoder), at_rest=True)
+    seen = first.smallest.sum(where=region | unusable, dtype=float)
     return StandingLight(
         light=(light[0], light[1]),
         unusable=unusable,
@@ -224,6 +267,7 @@ def standing_light(first: Series, second: Series, *, everywhere: bool = False) -
         region=region,
         stray=float(np.median(stray[0])),
         ratio=ratio if pooled is not None else None,
+        share=float(np.clip(seen / max(first.light, 1e-9), 0, 1)),
     )
 
 
@@ -315,15 +359,12 @@ def _unusable(first: Series, second: Series) -> np.ndarray:
     """Return pixels that are saturated in most images, or repeat one count in all where noise would change it.
 
     Where noise alone may repeat a count, only pixels brighter than chance are meant. One pair alone may show
-    resting particles. So its saturated pixels must fill several microimages.
+    resting particles. So its saturated pixels must lie together and fill many microimages.
     """
     images = first.count + second.count
     often: np.ndarray = first.saturated + second.saturated > images / 2
     if images == 2:
-        optics = first.decoder.optics
-        reach = 2 * int(_COMPACT_PITCHES * optics.microimage_pitch_px) + 1
-        around = ndimage.maximum_filter(ndimage.uniform_filter(often.astype(np.float32), reach), reach)
-        often &= around > _COMPACT_SHARE
+        often = _extended(often, first)
     low, high = np.minimum(first.smallest, second.smallest), np.maximum(first.largest, second.largest)
     stuck: np.ndarray = high == low
     same = 1 / (2 * max(first.noise, 1e-3) * np.sqrt(np.pi))  # chance of two equal counts
@@ -331,6 +372,40 @@ def _unusable(first: Series, second: Series) -> np.ndarray:
         stuck &= low > _MARGIN_OF_ONE * max(float(one.shifted.max()) for one in (first, second))
     unusable: np.ndarray = often | stuck
     return unusable
+
+
+def remains_warnings(standing: StandingLight, first: np.ndarray, second: np.ndarray, camera: str) -> list[Warning]:
+    """Warn of light left in both frames of a camera where standing light was subtracted."""
+    if not standing.remains(first, second) > LARGE_REMAINS:
+        return []
+    left = np.minimum(first, second).sum(where=standing.region, dtype=float)
+    share = float(np.clip(left / max(float(first.sum(dtype=float)), 1e-9), 0, 1))
+    remedy = "what was subtracted does not fit this pair; record a background image (camera.background_image)"
+    figures = {"place": standing.place, "share": share, "remedy": remedy}
+    return [Warning(code=Code.STANDING, subject=camera, figures=figures)]
+
+
+def _extended(often: np.ndarray, series: Series) -> np.ndarray:
+    """Return those pixels that lie together in areas of many microimages; none where they lie all over the sensor."""
+    if _spread(often, series) > STANDS_EVERYWHERE:
+        return np.zeros_like(often)
+    pitch = series.decoder.optics.microimage_pitch_px
+    joined = ndimage.maximum_filter(often, 2 * int(pitch) + 1)
+    areas, count = ndimage.label(joined)
+    sizes = np.bincount(areas[often], minlength=count + 1)
+    large: np.ndarray = often & (sizes > _MANY_MICROIMAGES * pitch**2)[areas]
+    return large
+
+
+def _spread(pixels: np.ndarray, series: Series) -> float:
+    """Return the share of the lit tiles of the sensor in which some of the pixels lie."""
+    tile = int(_TILE_PITCHES * series.decoder.optics.microimage_pitch_px)
+    rows, columns = (np.arange(n) // tile for n in pixels.shape)
+    number = (rows[:, None] * (columns.max() + 1) + columns).ravel()
+    lit = (series.largest > CLEAR_SIGMA * series.noise).ravel()
+    total, light, chosen = (np.bincount(number, part) for part in (None, lit, pixels.ravel()))
+    seen = light > _FEW * total
+    return float((chosen > _FEW * total)[seen].mean()) if seen.any() else 0.0
 
 
 def lens_shift(decoder: LightFieldDecoder, number: int) -> tuple[int, int]:

@@ -137,8 +137,8 @@ def of_calibration(experiment: Experiment) -> Stamp:
     )
 
 
-def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]) -> Stamp | None:
-    """Return the stamp of the standing light; None if nothing is subtracted.
+def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]) -> Stamp:
+    """Return the stamp of the standing light.
 
     Parameters
     ----------
@@ -148,8 +148,6 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
     pairs : sequence of int
         Pairs from which the light is estimated.
     """
-    if experiment.background == "none":
-        return None
     recorded = {camera.name: camera.background for camera in experiment.cameras}
     paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
     images = [

@@ -10,7 +10,7 @@ import hashlib
 import io
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ from lfpiv.lightfield import background, image_checks
 from lfpiv.lightfield.background import Series, StandingLight
 from lfpiv.progress import StepProgress
 from lfpiv.results import provenance
+from lfpiv.warn import Code, Warning, to_text, warn
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -32,10 +33,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+LARGE_SHARE = 0.02
+"""Share of an image's light that stands still and is not subtracted, above which a warning is due."""
 LONGEST_SERIES = 32
 """Largest number of pairs, evenly spread, from which the standing light is estimated."""
 MEDIAN_PAIRS = 7
 """The same for a median, which holds both frames of all pairs in memory."""
+WARNING_PAIRS = 4
+"""The same where nothing is subtracted and the light is only warned of."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,10 @@ class Background:
     """By camera; empty where nothing is subtracted."""
     content: str | None = None
     """Hash of the content; None where nothing is subtracted."""
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of each camera for the summary; empty for cameras without standing light."""
+    warnings: tuple[Warning, ...] = ()
+    """Warnings about light that stands and is not subtracted."""
 
     def seen_by(self, calibration: Calibration) -> Calibration:
         """Return the calibration with cameras that know what stands still, and have no gain in unusable pixels."""
@@ -61,19 +70,21 @@ def prepare(run: Run, calibration: Calibration) -> Background:
     experiment, path = run.experiment, run.folder.background
     pairs = series(experiment)
     stamp = provenance.of_background(experiment, run.calibration_stamp.hash, pairs)
-    if stamp is None:
-        return Background()
     marks = provenance.read_marks(path)
     if marks is not None and marks.figures is not None and stamp.fits(marks):
-        return load(path)
-    found = estimate(experiment, calibration.cameras, pairs, run.step("background"))
-    _write(found, path, stamp.attributes)
+        log.info("background: estimated before from the same images, kept")
+        found = load(path)
+    else:
+        found = estimate(experiment, calibration.cameras, pairs, run.step("background"))
+        _write(found, path, stamp.attributes)
+    for warning in found.warnings:
+        warn(log, warning)
     return found
 
 
 def series(experiment: Experiment) -> list[int]:
     """Return the pairs from which the standing light is estimated, evenly spread over all."""
-    longest = MEDIAN_PAIRS if experiment.background == "median" else LONGEST_SERIES
+    longest = {"median": MEDIAN_PAIRS, "none": WARNING_PAIRS}.get(experiment.background, LONGEST_SERIES)
     count = min(longest, experiment.pairs)
     return [(2 * number + 1) * experiment.pairs // (2 * count) for number in range(count)]
 
@@ -95,38 +106,93 @@ def estimate(
             found[name] = _of_series(experiment, camera, dark, pairs)
         progress((number + 1) / len(cameras))
     standing = {name: light for name, light in found.items() if light.found}
-    return Background(standing, _digest(standing))
+    figures = {name: _figures(light) for name, light in standing.items()}
+    warnings = tuple(_warnings(experiment, standing, len(pairs)))
+    if experiment.background == "none":
+        return Background(figures=figures, warnings=warnings)
+    return Background(standing, _digest(standing), figures, warnings)
+
+
+def _figures(light: StandingLight) -> dict[str, Any]:
+    return {
+        "standing_share": round(float(light.region.mean()), 5),
+        "unusable_share": round(float(light.unusable.mean()), 5),
+        "light_share": round(light.share, 4),
+        "stray_counts": round(light.stray, 2),
+        "power_ratio": None if light.ratio is None else round(light.ratio, 4),
+    }
+
+
+def _warnings(experiment: Experiment, standing: Mapping[str, StandingLight], pairs: int) -> Iterator[Warning]:
+    """Warn of standing light that is not subtracted: not wanted, or around pixels that one pair shows saturated."""
+    for name, light in standing.items():
+        if experiment.camera(name).background is not None and experiment.background != "none":
+            continue
+        if experiment.background == "none" and light.share > LARGE_SHARE:
+            remedy = 'set particles.background = "auto", or record a background image (camera.background_image)'
+        elif pairs == 1 and light.unusable.any():
+            remedy = "one pair does not show how far it reaches; record a background image (camera.background_image)"
+        else:
+            continue
+        figures = {"place": light.place, "share": light.share, "remedy": remedy}
+        yield Warning(code=Code.STANDING, subject=name, figures=figures)
 
 
 def _of_series(
     experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, pairs: list[int]
 ) -> StandingLight:
     """Estimate the standing light of one camera from pairs; those that cannot be used are left out."""
-    first, second = (Series(camera.decoder, frame) for frame in (0, 1))
-    kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     median = experiment.background == "median"
+    everywhere = experiment.background == "minimum"
+    first, second, kept = _read_series(experiment, camera, dark, pairs, keep=median)
+    if not first.count:
+        return background.nothing(camera.decoder)
+    if median:
+        found = background.median_light(first, second, kept)
+    else:
+        found = background.standing_light(first, second, everywhere=everywhere)
+        if found.region.any():  # again, with the images at equal power of the laser
+            first, second, _ = _read_series(experiment, camera, dark, pairs, estimate=found)
+            found = background.standing_light(first, second, everywhere=everywhere)
+    _log_series(camera.name, found, first.count)
+    return found
+
+
+def _read_series(
+    experiment: Experiment,
+    camera: CalibratedCamera,
+    dark: np.ndarray | None,
+    pairs: list[int],
+    *,
+    keep: bool = False,
+    estimate: StandingLight | None = None,
+) -> tuple[Series, Series, tuple[list[np.ndarray], list[np.ndarray]]]:
+    """Read the images of one camera; return the series of both frames, and with `keep` all light.
+
+    An `estimate` gives the power of the laser in each image, by which it is divided.
+    """
+    series = Series(camera.decoder, 0), Series(camera.decoder, 1)
+    kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for pair in pairs:
         try:
             images = [experiment.particle_image(camera.name, pair, frame) for frame in experiment.frames]
         except InputError as error:  # the pair fails when it is reconstructed
             log.debug("background of %s: pair %d is left out: %s", camera.name, pair, error)
             continue
-        for one, image, all_of_frame in zip((first, second), images, kept, strict=True):
+        for number, image in enumerate(images):
             light, noise, saturated = _without_dark(image, dark, camera)
-            one.add(light, noise, saturated)
-            if median:
-                all_of_frame.append(light)
-    if not first.count:
-        return background.nothing(camera.decoder)
-    if median:
-        found = background.median_light(first, second, kept)
-    else:
-        found = background.standing_light(first, second, everywhere=experiment.background == "minimum")
-    _log_series(camera.name, found, first.count)
-    return found
+            power = 1.0 if estimate is None else estimate.power(light, number)
+            series[number].add(light / np.float32(power), noise / power, saturated)
+            if keep:
+                kept[number].append(light)
+    return *series, kept
 
 
 def _log_series(name: str, light: StandingLight, pairs: int) -> None:
+    if light.at_rest:
+        text = "light stands nearly everywhere, as that of particles at rest: nothing is subtracted"
+        log.info('background of %s: %s. particles.background = "minimum" subtracts it', name, text)
+        return
     if not light.found:
         log.info("background of %s: nothing stands out in %d pairs, nothing is subtracted", name, pairs)
         return
@@ -174,7 +240,7 @@ def load(path: Path) -> Background:
 
     try:
         with h5py.File(path, "r") as file:
-            content = json.loads(file.attrs["figures"])["content"]
+            figures, stored = json.loads(file.attrs["figures"]), provenance.stored_warnings(file.attrs)
             found = {}
             for name, group in file.items():
                 first, second = group["light"][()]
@@ -186,7 +252,7 @@ def load(path: Path) -> Background:
                 )
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path}: expected a stored background, could not read it ({error}). Remove it.") from None
-    return Background(found, content)
+    return Background(found, figures["content"], figures["cameras"], stored)
 
 
 def _write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
@@ -195,7 +261,8 @@ def _write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
     with h5py.File(content, "w") as file:
         file.attrs.update(attributes)
-        file.attrs["figures"] = json.dumps({"content": found.content})
+        file.attrs["figures"] = json.dumps({"content": found.content, "cameras": found.figures})
+        file.attrs["warnings"] = to_text(found.warnings)
         for name, light in found.cameras.items():
             group = file.create_group(name)
             arrays = {"light": np.stack(light.light), "unusable": light.unusable, "region": light.region}

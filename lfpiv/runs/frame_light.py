@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.lightfield import image_checks
+from lfpiv.lightfield.background import remains_warnings
 from lfpiv.lightfield.particle_signal import seen_structure
 from lfpiv.warn import Warning
 
@@ -109,4 +110,10 @@ def pair_light(
         for name in cameras
         for warning in image_checks.uneven_warnings(first.images[name], second.images[name], name)
     ]
-    return replace(first, warnings=(*first.warnings, *uneven)), second
+    remains = [
+        warning
+        for name, camera in cameras.items()
+        if camera.standing is not None
+        for warning in remains_warnings(camera.standing, first.images[name], second.images[name], name)
+    ]
+    return replace(first, warnings=(*first.warnings, *uneven, *remains)), second

@@ -80,9 +80,7 @@ def open_run(
                 start_s=start_s,
                 calibration_stamp=provenance.of_calibration(experiment),
                 earlier=summary.read(folder.summary),
-                background=provenance.background_content(folder.background)
-                if experiment.background != "none"
-                else None,
+                background=provenance.background_content(folder.background),
             )
     finally:
         for path in made:
@@ -226,7 +224,10 @@ class Run:
                 vectors[pair] = pair_figures.read_figures(found.vectors, marks)
             elif (both := found.fitting_volumes()) is not None:
                 volumes[pair] = both[0].warnings + both[1].warnings
-        return Contents(vectors=vectors, volumes=volumes)
+        marks = provenance.read_marks(self.folder.background)
+        found_light = {} if marks is None or marks.figures is None else marks.figures["cameras"]
+        warnings = () if marks is None else marks.warnings
+        return Contents(vectors=vectors, volumes=volumes, background=found_light, background_warnings=warnings)
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:
         """Return the time and the peak memory so far, in the form of the summary."""
