@@ -23,7 +23,7 @@ CHANCE = 99.99
 CLEAR_SIGMA = 5.0
 """Least count of a pixel with standing light in a background image [noise]."""
 NOISE_SIGMA = 3.0
-"""Least count of a pixel that is counted among those brighter than chance [noise]."""
+"""Least count of a pixel that is counted among those brighter than chance, and least stray light [noise]."""
 LEAST_STANDING = 0.005
 """Share of an image's light below which compact standing light is left alone: chance reaches a fifth of it."""
 LEAST_RATIO_PIXELS = 500
@@ -51,6 +51,7 @@ _BRIGHT = 50.0  # percentile of the standing light above which pixels tell its b
 _UNLIKE = 0.3  # relative difference of the frames' standing light that counts as unlike
 _UNLIKE_SHARE = 0.15  # share of unlike pixels above which the frames have backgrounds of their own
 _MANY_MICROIMAGES = 20.0  # least area of saturated pixels that no particle lights [squares of a pitch]
+_FILLED = 0.35  # least part of such an area, half a pitch around the pixels included, that is saturated
 _FEW = 0.03  # least share of the pixels of a lit tile
 _STUCK_PIXELS = 0.01  # number of pixels that repeat their count in all images by chance
 _SHIFT_PITCHES = 24.0  # largest shift of an image along each axis
@@ -347,7 +348,7 @@ def _stray(series: Series, decoder: LightFieldDecoder) -> np.ndarray:
             darker -= least_of_normal(3 * series.count) * series.noise
             values[i, j] = found if found - darker < series.noise + _UNEVEN * found else 0.0
     values = ndimage.median_filter(values, _TILE_NEIGHBOURS, mode="nearest")
-    if np.median(values) < series.noise:
+    if np.median(values) < NOISE_SIGMA * series.noise:
         return np.zeros(shape, np.float32)
     at = np.meshgrid(*((np.arange(n) + 0.5) / n * m - 0.5 for n, m in zip(shape, cells, strict=True)), indexing="ij")
     smooth = ndimage.map_coordinates(values, at, order=1, mode="nearest")
@@ -358,18 +359,18 @@ def _stray(series: Series, decoder: LightFieldDecoder) -> np.ndarray:
 def _unusable(first: Series, second: Series) -> np.ndarray:
     """Return pixels that are saturated in most images, or repeat one count in all where noise would change it.
 
-    Where noise alone may repeat a count, only pixels brighter than chance are meant. One pair alone may show
+    Where noise alone may repeat a dark pixel's count, only bright pixels are meant. One pair alone may show
     resting particles. So its saturated pixels must lie together and fill many microimages.
     """
     images = first.count + second.count
     often: np.ndarray = first.saturated + second.saturated > images / 2
     if images == 2:
-        often = _extended(often, first)
+        return _extended(often, first)
     low, high = np.minimum(first.smallest, second.smallest), np.maximum(first.largest, second.largest)
     stuck: np.ndarray = high == low
     same = 1 / (2 * max(first.noise, 1e-3) * np.sqrt(np.pi))  # chance of two equal counts
     if same >= 1 or same ** (images - 1) * low.size > _STUCK_PIXELS:
-        stuck &= low > _MARGIN_OF_ONE * max(float(one.shifted.max()) for one in (first, second))
+        stuck &= low > CLEAR_SIGMA * first.noise
     unusable: np.ndarray = often | stuck
     return unusable
 
@@ -390,10 +391,9 @@ def _extended(often: np.ndarray, series: Series) -> np.ndarray:
     if _spread(often, series) > STANDS_EVERYWHERE:
         return np.zeros_like(often)
     pitch = series.decoder.optics.microimage_pitch_px
-    joined = ndimage.maximum_filter(often, 2 * int(pitch) + 1)
-    areas, count = ndimage.label(joined)
-    sizes = np.bincount(areas[often], minlength=count + 1)
-    large: np.ndarray = often & (sizes > _MANY_MICROIMAGES * pitch**2)[areas]
+    areas, count = ndimage.label(ndimage.maximum_filter(often, 2 * int(pitch / 2) + 1))
+    sizes, around = np.bincount(areas[often], minlength=count + 1), np.bincount(areas.ravel(), minlength=count + 1)
+    large: np.ndarray = often & ((sizes > _MANY_MICROIMAGES * pitch**2) & (sizes > _FILLED * around))[areas]
     return large
 
 

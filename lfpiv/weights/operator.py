@@ -241,7 +241,8 @@ class Weights:
         """Return `camera_sums` with pixels that standing light makes unusable: they hide no part of the volume."""
         sums = self.camera_sums
         for number, (name, camera) in enumerate(self.cameras.items()):
-            if camera.standing is not None and camera.standing.unusable.any():
+            standing = getattr(camera, "standing", None)  # other models of cameras need none
+            if standing is not None and standing.unusable.any():
                 sums = sums.copy() if sums is self.camera_sums else sums
                 gain = np.ascontiguousarray(camera.white_gain, np.float32).reshape(-1)
                 sums[number] = 0
