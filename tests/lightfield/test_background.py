@@ -62,14 +62,15 @@ def series(decoder, standing, pairs, *, power=None, level=1.0, second=0.9, at_re
     return found
 
 
-@pytest.mark.parametrize("pairs", [1, 2, 3, 8])
-@pytest.mark.parametrize("level", [0.2, 1.0])
+@pytest.mark.parametrize(
+    ("pairs", "level"), [(1, 1.0), (3, 0.2), (3, 1.0), pytest.param(8, 0.2, marks=pytest.mark.slow)]
+)
 def test_particles_alone_show_nothing_that_stands(decoder, pairs, level):
     found = standing_light(*series(decoder, np.zeros(decoder.gain.shape), pairs, level=level))
     assert not found.found and not found.light[0].any() and not found.pixels.any() and found.place == ""
 
 
-@pytest.mark.parametrize("pairs", [2, 3, 8])
+@pytest.mark.parametrize("pairs", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_reflection_is_found_where_it_is(decoder, pairs):
     true = streak(decoder)
     found = standing_light(*series(decoder, true, pairs))
@@ -79,6 +80,7 @@ def test_a_reflection_is_found_where_it_is(decoder, pairs):
     assert found.pixels[:, 150].all() and not found.pixels[:, 250:].any()
 
 
+@pytest.mark.slow
 def test_frames_lit_by_unlike_lasers_have_backgrounds_of_their_own(decoder):
     one, other = series(decoder, streak(decoder), 8)
     moved = Series(decoder, 1)
