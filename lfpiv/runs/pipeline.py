@@ -88,7 +88,8 @@ def run(
         current, standing = _with_background(current, calibrated.calibration)
         if (again := current.unfinished(volumes=keep_volumes, quiet=True)).pairs != todo.pairs:
             todo, checked = again, _check(current, again.pairs, workers, scheduler)
-        done = _process(current, standing.seen_by(calibrated.calibration), checked, keep_volumes)
+        calibrated = replace(calibrated, calibration=standing.seen_by(calibrated.calibration))
+        done = _process(current, calibrated.calibration, checked, keep_volumes)
         return current.finish(calibrated, replace(done, reused=todo.reused), report=True)
 
 
@@ -164,7 +165,11 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
         If the folder holds no calibration that fits the experiment.
     """
     with open_run(experiment, out, None, None, writes_results=False) as current:
-        return current.finish(rig.load_calibration(current), Invocation(), report=True)
+        calibrated = rig.load_calibration(current)
+        if current.background is not None:
+            standing = background.load(current.folder.background)
+            calibrated = replace(calibrated, calibration=standing.seen_by(calibrated.calibration))
+        return current.finish(calibrated, Invocation(), report=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,6 +54,7 @@ def test_a_streak_is_found_subtracted_and_stored_once(small_run, tmp_path):
     whole, part = (small_run.calibrated(tmp_path / name) for name in ("whole", "part"))
     summary = pipeline.run(experiment, whole, pairs=(0, 2))
     assert set(summary["background"]) == {"left", "right"}
+    assert (whole / "report.html").read_text("utf-8").count("Light that stands still in left, frame") == 2
     assert all(0.02 < figures["standing_share"] < 0.5 for figures in summary["background"].values())
     assert not any("stands still" in text or "moved" in text for text in summary["warnings"])
     for pair in (0, 1):
@@ -103,7 +104,7 @@ def test_two_ways_to_a_background_are_refused(small_run, tmp_path):
     experiment = small_run.images(tmp_path / "data")
     edited(experiment, 'name = "left"\n', 'name = "left"\nbackground_image = "empty.tif"\n')
     edited(experiment, "[particles]\n", '[particles]\nbackground = "median"\n')
-    with pytest.raises(InputError, match="background_image: expected particles.background"):
+    with pytest.raises(InputError, match=r"background_image: expected particles\.background"):
         read_experiment(experiment)
 
 
