@@ -45,6 +45,7 @@ _TILE_NEIGHBOURS = 5  # tiles along each axis whose median removes compact refle
 _COPIES = np.array([(3.0, 0.0), (0.0, 3.0)])  # shifts of the copies that tell stray light from particles [lens]
 _UNEVEN = 0.15  # accepted relative decrease of stray light over such a shift
 _DARK_PERCENTILE = 50.0  # percentile below which a pixel of an image of particles counts as dark
+_BLOCK_ROWS = 64  # rows whose median is taken at once
 _LEAST_GAIN = 0.2  # least gain of a pixel that counts
 _LEAST_TILE_PIXELS = 300  # least number of pixels of a tile
 _BRIGHT = 50.0  # percentile of the standing light above which pixels tell its brightness
@@ -224,7 +225,7 @@ def median_light(
     first: Series, second: Series, images: tuple[Sequence[np.ndarray], Sequence[np.ndarray]]
 ) -> StandingLight:
     """Return the median of each pixel over a series as standing light, with the series' unusable pixels."""
-    one, other = (np.median(np.stack(frames), axis=0).astype(np.float32) for frames in images)
+    one, other = (_median(frames) for frames in images)
     return StandingLight(
         light=(one, other),
         unusable=_unusable(first, second),
@@ -233,6 +234,15 @@ def median_light(
         stray=0.0,
         ratio=None,
     )
+
+
+def _median(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the median of each pixel, by blocks of rows."""
+    result = np.empty_like(images[0])
+    for first in range(0, len(result), _BLOCK_ROWS):
+        rows = slice(first, first + _BLOCK_ROWS)
+        result[rows] = np.median(np.stack([image[rows] for image in images]), axis=0)
+    return result
 
 
 def standing_light(first: Series, second: Series, *, everywhere: bool = False) -> StandingLight:

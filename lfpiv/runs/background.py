@@ -25,6 +25,7 @@ from lfpiv.lightfield import background, image_checks
 from lfpiv.lightfield.background import Series, StandingLight
 from lfpiv.progress import StepProgress
 from lfpiv.results import provenance
+from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.warn import Code, Warning, to_text, warn
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def prepare(run: Run, calibration: Calibration) -> Background:
     pairs = series(experiment)
     stamp = provenance.of_background(experiment, run.calibration_stamp.hash, pairs)
     marks = provenance.read_marks(path)
-    if marks is not None and marks.figures is not None and stamp.fits(marks):
+    if marks is not None and marks.figures is not None and (stamp.fits(marks) or _images_lost(stamp, marks)):
         log.info("background: estimated before from the same images, kept")
         found = load(path)
     else:
@@ -80,6 +81,14 @@ def prepare(run: Run, calibration: Calibration) -> Background:
     for warning in found.warnings:
         warn(log, warning)
     return found
+
+
+def _images_lost(stamp: Stamp, marks: Marks) -> bool:
+    """Return whether all that changed is that some images are missing, because raw data may be deleted."""
+    if stamp.changes(marks) != ["images"]:
+        return False
+    before = json.loads(marks.depends_on)["images"] or []
+    return all(image in before for image in files.plain(stamp.parts)["images"] or [])
 
 
 def series(experiment: Experiment) -> list[int]:
