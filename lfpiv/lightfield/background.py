@@ -154,6 +154,8 @@ class StandingLight:
         if np.count_nonzero(usable) < LEAST_RATIO_PIXELS:
             return 1.0
         bright = usable & (standing > np.percentile(standing[usable], _BRIGHT))
+        if not bright.any():
+            return 1.0
         found = mode(light[bright] / standing[bright])
         return found if POWER_RANGE[0] < found < POWER_RANGE[1] else 1.0
 
