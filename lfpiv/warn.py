@@ -27,6 +27,7 @@ class Code(enum.Enum):
     MISPLACED = "misplaced"
     SATURATED = "saturated"
     UNEVEN = "uneven"
+    STANDING = "standing"
     DIM = "dim"
     EMPTY = "empty"
     # white image and microlens array
@@ -87,6 +88,7 @@ SENTENCES: Mapping[Code, str] = {
         "{parts:.0f} of 9 parts of the sensor are {ratio:g} times or more as bright in one frame as in the other; "
         "check the laser's pulses and the shutter"
     ),
+    Code.STANDING: ("light stands still at {place}, {share:percent} % of all light there is in the images: {remedy}"),
     Code.DIM: (
         "particles hardly rise above the noise (light of near pixels correlates by {structure:.2f}; clear images "
         "give 0.2 or more): displacements are biased towards zero. More light, more particles or larger windows help"

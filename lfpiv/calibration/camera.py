@@ -21,6 +21,7 @@ from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LensLattice, Optics, float_pair
+from lfpiv.lightfield.background import StandingLight
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.microimage_layout import microimages_of
 from lfpiv.warn import Warning
@@ -54,9 +55,20 @@ class CalibratedCamera:
     """Measured dots and the labels that the mapping was fitted to."""
     test_errors: np.ndarray | None = None
     """Error of each held-out label [microlens pitch], shape (n,)."""
+    standing: StandingLight | None = None
+    """Light that stands still in the particle images, or None. It belongs to a run and is not stored here."""
+
+    def with_standing(self, standing: StandingLight) -> CalibratedCamera:
+        """Return the camera with light that stands still in its images, and without gain in unusable pixels."""
+        return replace(self, standing=standing)
 
     @cached_property
     def gain(self) -> np.ndarray:
+        """White-image gain of every pixel, 0 where standing light makes it unusable, shape (rows, columns), float32."""
+        return self.white_gain if self.standing is None else self.white_gain * ~self.standing.unusable
+
+    @cached_property
+    def white_gain(self) -> np.ndarray:
         """White-image gain of every pixel, shape (rows, columns), float32.
 
         The board's dots show which part of the white image's variance from pixel to pixel is pixel response. All of it

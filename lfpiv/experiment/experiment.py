@@ -22,6 +22,7 @@ from lfpiv.experiment.settings import (
     Correlation,
     ExperimentTable,
     Network,
+    Particles,
     SelfCalibration,
     Smart,
     Volume,
@@ -53,6 +54,8 @@ class CameraSetup:
     """Mirroring of the camera's images, reversed on reading."""
     white_path: Path
     dark_path: Path | None
+    background: str | None = None
+    """Path pattern of the background image, relative to the experiment file, or None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +80,8 @@ class Experiment:
     """Path pattern of the particle images, relative to the experiment file."""
     solid: np.ndarray | None = field(default=None, compare=False, repr=False)
     """True for voxels without fluid, shape (z, y, x); None without a mask."""
+    background: str = "none"
+    """Estimate of the light that stands still: "auto", "none", "minimum" or "median"."""
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
@@ -107,6 +112,16 @@ class Experiment:
         image = _read(path, label, self.camera(name))
         images.require_contrast(image, path, label)
         return image
+
+    def background_image(self, name: str, frame: str) -> np.ndarray | None:
+        """Return the background image of a camera [counts], float32 (rows, columns); None where the file names none."""
+        path = self.background_path(name, frame)
+        return None if path is None else _read(path, f"background_image of camera {name!r}", self.camera(name))
+
+    def background_path(self, name: str, frame: str) -> Path | None:
+        """Return the path of a camera's background image for a frame; None where the file names none."""
+        pattern = self.camera(name).background
+        return None if pattern is None else self.path.parent / pattern.format(frame=frame)
 
     def board_path(self, name: str, plane: int) -> Path:
         """Return the path of a board image."""
@@ -172,6 +187,9 @@ def read_experiment(path: str | Path) -> Experiment:
     _check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
     fields = {"camera": names, "pair": range(particles.pairs), "frame": particles.frames}
     _check_pattern(path, "particles.images", particles.images, fields)
+    for one in table.camera:
+        if one.background_image is not None:
+            _check_background(path, one, particles)
     grid = _grid(path, table.volume)
     _check_windows(path, table.correlation, grid)
     experiment = Experiment(
@@ -190,6 +208,7 @@ def read_experiment(path: str | Path) -> Experiment:
         compute=table.compute,
         particle_images=particles.images,
         solid=solid_voxels(path, table.volume, grid),
+        background=particles.background,
     )
     for camera in experiment.cameras:
         nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)
@@ -249,6 +268,18 @@ def _check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any]
             )
 
 
+def _check_background(path: Path, camera: CameraTable, particles: Particles) -> None:
+    """Refuse a pattern with unknown fields, and an image that `particles.background` would not use."""
+    key = f"camera {camera.name!r}, background_image"
+    assert camera.background_image is not None
+    _check_pattern(path, key, camera.background_image, {"frame": particles.frames[:1]})
+    if particles.background in ("minimum", "median"):
+        raise InputError(
+            f'{path}: {key}: expected particles.background = "auto", which takes this image, found '
+            f'"{particles.background}". Remove one of the two keys.'
+        )
+
+
 def _grid(path: Path, volume: Volume) -> Grid:
     for axis, size in zip("xyz", volume.size_mm, strict=True):
         if not SMALLEST_WINDOW <= size / volume.voxel_mm + 0.5 < 2**31:
@@ -296,6 +327,7 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
         image_flip=table.image_flip,
         white_path=white_path,
         dark_path=None if table.dark_image is None else path.parent / table.dark_image,
+        background=table.background_image,
     )
 
 
@@ -312,6 +344,10 @@ def _check_calibration_images(experiment: Experiment) -> None:
     for camera in experiment.cameras:
         if camera.dark_path is not None:
             _check_shape(camera.dark_path, f"dark_image of camera {camera.name!r}", camera)
+        for frame in experiment.frames:
+            if (path := experiment.background_path(camera.name, frame)) is not None:
+                _check_shape(path, f"background_image of camera {camera.name!r}", camera)
+                experiment.background_image(camera.name, frame)
         for plane in range(len(experiment.board.planes_mm)):
             _check_shape(experiment.board_path(camera.name, plane), _board_label(camera.name, plane), camera)
     for camera in experiment.cameras:

@@ -172,6 +172,9 @@ class CameraTable(NominalCamera):
     """Path of an image of an evenly lit white surface."""
     dark_image: Annotated[str, Field(min_length=1)] | None = None
     """Path of an image with the lens capped; absent: the gaps between microimages give the dark level."""
+    background_image: Annotated[str, Field(min_length=1)] | None = None
+    """Path, optionally with ``{frame}``, of an image of the scene lit by the laser, without particles; absent: the
+    series of image pairs shows what stands still."""
 
 
 class NominalBoard(Table):
@@ -263,6 +266,9 @@ class Particles(Table):
     """Number of image pairs."""
     frames: tuple[Annotated[str, Field(min_length=1)], Annotated[str, Field(min_length=1)]] = ("a", "b")
     """Text for ``{frame}`` in the first and second image of a pair."""
+    background: Literal["auto", "none", "minimum", "median"] = "auto"
+    """Light that stands still, subtracted from the images: that of `background_image`, or what the series of pairs
+    shows beyond chance ("auto"), the minimum or median of each pixel over the series, or nothing ("none")."""
 
     @field_validator("frames")
     @classmethod

@@ -156,6 +156,13 @@ def saturated_share(image: np.ndarray) -> float:
     return count / np.count_nonzero(image > top / 2) if count >= _LEAST_SATURATED else 0.0
 
 
+def saturated_pixels(image: np.ndarray) -> np.ndarray:
+    """Return the pixels at the largest value, if it is the end of a range of 8 to 16 bits, bool."""
+    top = float(image.max())
+    at_end = top.is_integer() and int(top) in _RANGES
+    return image == top if at_end else np.zeros(image.shape, bool)
+
+
 def dark_blocks(first: np.ndarray, second: np.ndarray) -> int:
     """Count the parts of the sensor, of three by three, that are lit in one of two frames and hardly in the other.
 

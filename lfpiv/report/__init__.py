@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from lfpiv import files
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.report import background, markup, overview, pairs, volumes
 from lfpiv.report import calibration as calibration_section
-from lfpiv.report import markup, overview, pairs, volumes
 from lfpiv.report import vectors as vector_section
 from lfpiv.report.summary import Summary
 
@@ -62,6 +62,7 @@ def write_report(
     sections = {
         "run": overview.run_facts(experiment, figures),
         "calibration": calibration_section.section(experiment, calibration, figures.calibration),
+        "background": background.section(experiment, calibration),
         "volumes": volumes.section(figures.pairs, vectors) if vectors else "",
         "vectors": vector_section.section(vectors),
         "pairs": pairs.section(figures.pairs, figures.failed) if figures.pairs else "",

@@ -71,6 +71,7 @@ def contents(sections: Mapping[str, str]) -> str:
     names = {
         "run": "What was run",
         "calibration": "Calibration",
+        "background": "Light that stands still",
         "volumes": "Volumes",
         "vectors": "Vectors",
         "pairs": "All pairs",

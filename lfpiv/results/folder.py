@@ -43,6 +43,11 @@ class Folder:
         return self.path / "self_calibration.h5"
 
     @property
+    def background(self) -> Path:
+        """Light that stands still in the particle images."""
+        return self.path / "background.h5"
+
+    @property
     def summary(self) -> Path:
         """Figures of the run as JSON."""
         return self.path / "summary.json"
@@ -168,7 +173,7 @@ def make_writable(path: Path) -> list[Path]:
             raise InputError(
                 f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
             )
-    for place in (folder.calibration, folder.summary, folder.report):
+    for place in (folder.calibration, folder.background, folder.summary, folder.report):
         if place.is_dir():
             raise InputError(
                 f"{place}: expected a place for a file, found a folder. Remove it or choose another --out."

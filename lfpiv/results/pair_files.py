@@ -68,9 +68,11 @@ class PairFiles:
     stamps: PairStamps
 
     @classmethod
-    def of(cls, experiment: Experiment, calibration: str, folder: Folder, pair: int) -> PairFiles:
-        """Return the files of a pair, given the hash of the calibration's stamp."""
-        stamps = provenance.of_pair(experiment, calibration, pair)
+    def of(
+        cls, experiment: Experiment, calibration: str, folder: Folder, pair: int, background: str | None = None
+    ) -> PairFiles:
+        """Return the files of a pair, given the hashes of the calibration's stamp and of the subtracted light."""
+        stamps = provenance.of_pair(experiment, calibration, pair, background)
         volumes = (folder.volume(pair, 0), folder.volume(pair, 1))
         return cls(pair=pair, vectors=folder.vectors(pair), volumes=volumes, stamps=stamps)
 

@@ -111,6 +111,12 @@ def read_marks(path: Path) -> Marks | None:
     )
 
 
+def background_content(path: Path) -> str | None:
+    """Return the hash of the light in a stored background, whether it fits or not; None if it subtracts nothing."""
+    marks = read_marks(path)
+    return None if marks is None or marks.figures is None else marks.figures["content"]
+
+
 def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
     """Read the warnings in the attributes of a file; version 0.1.0 calls them findings."""
     return warn.from_text(attributes.get("warnings", attributes.get("findings", "[]")))
@@ -133,16 +139,57 @@ def of_calibration(experiment: Experiment) -> Stamp:
     )
 
 
-def of_self_calibration(experiment: Experiment, calibration: str) -> Stamp | None:
-    """Return the stamp of the self-calibration; None if the experiment has none. `calibration` is a stamp's hash."""
+def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]) -> Stamp:
+    """Return the stamp of the standing light.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    calibration : str
+        Hash of the calibration's stamp.
+    pairs : sequence of int
+        Pairs from which the light is estimated.
+    """
+    recorded = {camera.name: camera.background for camera in experiment.cameras}
+    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    images = [
+        path
+        for name in recorded
+        for frame in experiment.frames
+        if (path := experiment.background_path(name, frame)) is not None
+    ]
+    return Stamp(
+        {
+            "calibration": calibration,
+            "background": experiment.background,
+            "background_image": recorded if images else None,
+            "recorded": _identity(images, experiment.path.parent),
+            "images": _identity(_existing(paths), experiment.path.parent) if None in recorded.values() else None,
+        }
+    )
+
+
+def _existing(paths: Iterable[Path]) -> list[Path]:
+    return [path for path in paths if split_frame(path)[0].is_file()]
+
+
+def of_self_calibration(experiment: Experiment, calibration: str, background: str | None = None) -> Stamp | None:
+    """Return the stamp of the self-calibration; None if the experiment has none.
+
+    `calibration` is a stamp's hash, `background` that of the subtracted light.
+    """
     if not experiment.self_calibration.pairs:
         return None
     volume = dataclasses.asdict(experiment.grid)
-    return Stamp({"calibration": calibration, "volume": volume, "self_calibration": _self_calibration(experiment)})
+    parts = {"calibration": calibration, "volume": volume, "self_calibration": _self_calibration(experiment)}
+    return Stamp(parts | {"background": background})
 
 
-def of_pair(experiment: Experiment, calibration: str, pair: int) -> PairStamps:
-    """Return the stamps of the volumes and of the vectors of a pair. `calibration` is the hash of its stamp."""
+def of_pair(experiment: Experiment, calibration: str, pair: int, background: str | None = None) -> PairStamps:
+    """Return the stamps of the volumes and of the vectors of a pair.
+
+    `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images.
+    """
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
     parts = {
@@ -155,6 +202,7 @@ def of_pair(experiment: Experiment, calibration: str, pair: int) -> PairStamps:
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
         "particles": {"images": experiment.particle_images, "frames": list(experiment.frames)},
         "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
+        "background": background,
     }
     of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
     return PairStamps(volumes=Stamp(parts), vectors=Stamp(parts | of_vectors))

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.lightfield import image_checks
+from lfpiv.lightfield.background import remains_warnings
 from lfpiv.lightfield.particle_signal import seen_structure
 from lfpiv.warn import Warning
 
@@ -66,10 +67,14 @@ def frame_light(
         raw, dark = experiment.particle_image(name, pair, frame), darks[name]
         image = raw if dark is None else raw - dark
         level, noise[name] = camera.decoder.background(image)
-        light = images[name] = image - np.float32(level)
+        light = image - np.float32(level)
+        if camera.standing is not None:
+            light, noise[name] = camera.standing.subtract(light, noise[name], experiment.frames.index(frame))
+        images[name] = light
         structure[name] = seen_structure(light, camera.decoder)
         fingerprints[name] = image_checks.fingerprint(raw)
-        warnings += image_checks.image_warnings(raw, light, camera.decoder, name, frame)
+        judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
+        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, frame)
     return FrameLight(
         frame=frame,
         images=images,
@@ -105,4 +110,10 @@ def pair_light(
         for name in cameras
         for warning in image_checks.uneven_warnings(first.images[name], second.images[name], name)
     ]
-    return replace(first, warnings=(*first.warnings, *uneven)), second
+    remains = [
+        warning
+        for name, camera in cameras.items()
+        if camera.standing is not None
+        for warning in remains_warnings(camera.standing, first.images[name], second.images[name], name)
+    ]
+    return replace(first, warnings=(*first.warnings, *uneven, *remains)), second

@@ -72,6 +72,8 @@ class PairWork:
     """Dark image of every camera [counts]; empty if all volumes are in the folder."""
     keep_volumes: bool
     """Write the volumes."""
+    background: str | None = None
+    """Hash of the light that is subtracted from the images; None if there is none."""
     vectors: bool = True
     """Correlate the volumes and write the vectors."""
     log_first: FirstOfEachCode = field(default_factory=lambda: FirstOfEachCode(log))
@@ -117,7 +119,7 @@ class PairWork:
         )
 
     def _do(self, pair: int, progress: StepProgress) -> None:
-        files = PairFiles.of(self.experiment, self.calibration_hash, self.folder, pair)
+        files = PairFiles.of(self.experiment, self.calibration_hash, self.folder, pair, self.background)
         volumes = files.read_volumes()
         if volumes is None:
             volumes = self._reconstruct(files, part_of(progress, 0.0, RECONSTRUCTED))

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import dispatch, local_workers, memory, rig, worker, worker_plan
+from lfpiv.runs import background, dispatch, local_workers, memory, rig, worker, worker_plan
+from lfpiv.runs.background import Background
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, WeightsFigures, Workers
 from lfpiv.runs.pair import Outcome, PairWork
@@ -84,6 +85,10 @@ def run(
         todo = current.unfinished(volumes=keep_volumes)
         checked = _check(current, todo.pairs, workers, scheduler)
         calibrated = rig.calibrate(current)
+        current, standing = _with_background(current, calibrated.calibration)
+        if (again := current.unfinished(volumes=keep_volumes, quiet=True)).pairs != todo.pairs:
+            todo, checked = again, _check(current, again.pairs, workers, scheduler)
+        calibrated = replace(calibrated, calibration=standing.seen_by(calibrated.calibration))
         done = _process(current, calibrated.calibration, checked, keep_volumes)
         return current.finish(calibrated, replace(done, reused=todo.reused), report=True)
 
@@ -113,9 +118,12 @@ def reconstruct(
         todo = current.unfinished(vectors=False, volumes=True)
         checked = _check(current, todo.pairs, 1, None)
         calibrated = rig.calibrate(current)
+        current, standing = _with_background(current, calibrated.calibration)
+        if (again := current.unfinished(vectors=False, volumes=True, quiet=True)).pairs != todo.pairs:
+            todo, checked = again, _check(current, again.pairs, 1, None)
         done = Invocation(outcomes=checked.failed)
         if checked.pairs:
-            weights, figures = rig.build_weights(current, calibrated.calibration, checked.pairs)
+            weights, figures = rig.build_weights(current, standing.seen_by(calibrated.calibration), checked.pairs)
             work = _work(current, weights, keep_volumes=True, vectors=False)
             done = Invocation(outcomes=_sequential(current, work, checked.pairs), weights=figures)
         return current.finish(calibrated, replace(done, reused=todo.reused), report=False)
@@ -157,7 +165,11 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
         If the folder holds no calibration that fits the experiment.
     """
     with open_run(experiment, out, None, None, writes_results=False) as current:
-        return current.finish(rig.load_calibration(current), Invocation(), report=True)
+        calibrated = rig.load_calibration(current)
+        if current.background is not None:
+            standing = background.load(current.folder.background)
+            calibrated = replace(calibrated, calibration=standing.seen_by(calibrated.calibration))
+        return current.finish(calibrated, Invocation(), report=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,6 +225,12 @@ def _process(current: Run, calibration: Calibration, checked: _Checked, keep_vol
     return Invocation(outcomes=outcomes, weights=figures, workers=replace(used, peak_memory_mib=peak_mib or None))
 
 
+def _with_background(current: Run, calibration: Calibration) -> tuple[Run, Background]:
+    """Return the light that stands still in the images, and the run whose results depend on it."""
+    found = background.prepare(current, calibration)
+    return replace(current, background=found.content), found
+
+
 def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
     return PairWork(
         experiment=current.experiment,
@@ -221,6 +239,7 @@ def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors:
         weights=weights,
         darks={} if weights is None else read_darks(current.experiment),
         keep_volumes=keep_volumes,
+        background=current.background,
         vectors=vectors,
     )
 

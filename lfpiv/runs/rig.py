@@ -5,6 +5,7 @@ Each step reuses the result in the output folder if it still fits the experiment
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import logging
@@ -73,14 +74,14 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
     """Correct the calibration by particle images. Return it unchanged, and no figures, without self-calibration."""
     from lfpiv.calibration.camera import load_calibration
 
-    stamp = provenance.of_self_calibration(run.experiment, run.calibration_stamp.hash)
+    stamp = provenance.of_self_calibration(run.experiment, run.calibration_stamp.hash, run.background)
     if stamp is None:
         return calibration, None
     path = run.folder.self_calibration
     marks = provenance.read_marks(path)
     if marks is not None and marks.figures is not None and stamp.fits(marks):
         log.info("self-calibration: finished before with the same settings, kept")
-        return load_calibration(path), SelfCalibrationFigures.from_json(marks.figures)
+        return _with_standing(load_calibration(path), calibration), SelfCalibrationFigures.from_json(marks.figures)
     try:
         corrected, figures = moved_cameras.correct(run.experiment, calibration, run.step("self-calibration"))
     except ValueError as error:
@@ -133,6 +134,15 @@ def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tu
         count_errors=counted,
         self_calibration=self_calibration,
     )
+
+
+def _with_standing(corrected: Calibration, calibration: Calibration) -> Calibration:
+    """Return a stored calibration with the standing light of another one's cameras."""
+    cameras = {
+        name: camera if (standing := calibration.cameras[name].standing) is None else camera.with_standing(standing)
+        for name, camera in corrected.cameras.items()
+    }
+    return dataclasses.replace(corrected, cameras=cameras)
 
 
 def _write(calibration: Calibration, path: Path, attributes: Mapping[str, Any]) -> None:

@@ -80,6 +80,7 @@ def open_run(
                 start_s=start_s,
                 calibration_stamp=provenance.of_calibration(experiment),
                 earlier=summary.read(folder.summary),
+                background=provenance.background_content(folder.background),
             )
     finally:
         for path in made:
@@ -124,6 +125,8 @@ class Run:
     start_s: float
     calibration_stamp: Stamp
     earlier: EarlierSummary
+    background: str | None = None
+    """Hash of the light that is subtracted from the images; None if there is none."""
 
     def step(self, name: str) -> StepProgress:
         """Return the progress of one step of the run."""
@@ -131,14 +134,14 @@ class Run:
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
-        return PairFiles.of(self.experiment, self.calibration_stamp.hash, self.folder, pair)
+        return PairFiles.of(self.experiment, self.calibration_stamp.hash, self.folder, pair, self.background)
 
     def has_volumes(self, pair: int) -> bool:
         """Return whether both volumes of a pair are in the folder and fit."""
         return self.files(pair).fitting_volumes() is not None
 
-    def unfinished(self, *, vectors: bool = True, volumes: bool = False) -> Todo:
-        """Find the selected pairs whose vectors or volumes are missing or do not fit; log the changes."""
+    def unfinished(self, *, vectors: bool = True, volumes: bool = False, quiet: bool = False) -> Todo:
+        """Find the selected pairs whose vectors or volumes are missing or do not fit; log changes unless `quiet`."""
         changed: dict[str, list[int]] = {}
         for pair in self.numbers:
             changes = self.files(pair).outdated(vectors=vectors, volumes=volumes)
@@ -146,10 +149,10 @@ class Run:
                 changed.setdefault(", ".join(changes), []).append(pair)
         todo = sorted(pair for pairs in changed.values() for pair in pairs)
         finished = sorted({*self.numbers}.difference(todo))
-        if finished:
+        if finished and not quiet:
             log.info("%d of %d pairs: finished before with the same settings, kept", len(finished), len(self.numbers))
         for reason, pairs in changed.items():
-            if reason:
+            if reason and not quiet:
                 log.info("%s changed: %s made again", reason, name_pairs(pairs))
         kind = "vectors" if vectors else "volumes"
         return Todo(todo, tuple(f"{kind} of pair {pair}" for pair in finished))
@@ -221,7 +224,10 @@ class Run:
                 vectors[pair] = pair_figures.read_figures(found.vectors, marks)
             elif (both := found.fitting_volumes()) is not None:
                 volumes[pair] = both[0].warnings + both[1].warnings
-        return Contents(vectors=vectors, volumes=volumes)
+        marks = provenance.read_marks(self.folder.background)
+        found_light = {} if marks is None or marks.figures is None else marks.figures["cameras"]
+        warnings = () if marks is None else marks.warnings
+        return Contents(vectors=vectors, volumes=volumes, background=found_light, background_warnings=warnings)
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:
         """Return the time and the peak memory so far, in the form of the summary."""

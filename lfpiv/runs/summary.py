@@ -43,6 +43,10 @@ class Contents:
     """Pair -> figures of its vectors."""
     volumes: Mapping[int, tuple[Warning, ...]]
     """Pair with volumes and no vectors -> warnings about its images."""
+    background: Mapping[str, Any] = field(default_factory=dict)
+    """Camera -> figures of the light that stands still in its images."""
+    background_warnings: tuple[Warning, ...] = ()
+    """Warnings about light that stands still and is not subtracted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +109,7 @@ def build(
         },
         "calibration": reports,
         "weights": weights,
+        "background": dict(contents.background),
         "pairs": [
             {"pair": pair, "file": f"pair_{pair:04d}.nc", **figures.to_json()}
             for pair, figures in contents.vectors.items()
@@ -142,6 +147,7 @@ def _warnings(
     found = [
         *rig_warnings(calibrated.calibration, experiment.grid),
         *map(Warning.from_json, weights.get("warnings", ())),
+        *contents.background_warnings,
         *image_warnings(images),
         *pair_warnings(contents.vectors),
         *done.warnings,

@@ -24,7 +24,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
 from lfpiv.progress import StepProgress
 from lfpiv.results.folder import Folder
-from lfpiv.runs import memory
+from lfpiv.runs import background, memory
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.pair import CORRELATED, Outcome, PairWork
 from lfpiv.version import __version__
@@ -181,7 +181,10 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
         raise InputError(f"{where}: {error}") from None
     work = task.work
     if task.weights is not None:
-        cameras = load_calibration(work.folder.calibration).cameras
+        calibration = load_calibration(work.folder.calibration)
+        if work.background is not None:
+            calibration = background.load(work.folder.background).seen_by(calibration)
+        cameras = calibration.cameras
         weights = open_weights(shared / _WEIGHTS, cameras, task.weights)
         work = dataclasses.replace(work, weights=weights, darks=read_darks(work.experiment))
     _opened.clear()  # the task of an earlier run

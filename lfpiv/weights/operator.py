@@ -235,7 +235,19 @@ class Weights:
         """Camera name -> its record of an evenly lit volume. Empty if the cameras share too little of it."""
         projectors = {name: self.projector(name) for name in self.cameras}
         gains = {name: self.gain(name) for name in self.cameras}
-        return project_even_light(projectors, gains, self.camera_sums)
+        return project_even_light(projectors, gains, self._white_sums())
+
+    def _white_sums(self) -> np.ndarray:
+        """Return `camera_sums` with pixels that standing light makes unusable: they hide no part of the volume."""
+        sums = self.camera_sums
+        for number, (name, camera) in enumerate(self.cameras.items()):
+            standing = getattr(camera, "standing", None)  # other models of cameras need none
+            if standing is not None and standing.unusable.any():
+                sums = sums.copy() if sums is self.camera_sums else sums
+                gain = np.ascontiguousarray(camera.white_gain, np.float32).reshape(-1)
+                sums[number] = 0
+                self.projector(name).back_project(gain, sums[number])
+        return sums
 
     @property
     def affected_pixels(self) -> np.ndarray:

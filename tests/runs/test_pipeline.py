@@ -51,6 +51,7 @@ def test_every_file_of_the_contract_is_there_and_whole(finished):
     _, out, summary = finished
     names = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
     assert names == [
+        "background.h5",
         "calibration.h5",
         "report.html",
         "summary.json",

@@ -1,0 +1,460 @@
+"""Estimate the light that stands still in a series of particle images: reflections, stray light, hot pixels.
+
+Light of particles moves from image to image, and no pixel is lit by particles in all images of a long series. So the
+smallest count of each pixel over the series is standing light, plus noise, plus the light of particles that overlap
+there in every image by chance. How often chance does so is measured: the images are shifted against each other by whole
+microlenses, where standing light no longer overlaps, and the minimum is taken again. Light is taken as standing only
+where it exceeds what the shifted images show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import ndimage
+
+from lfpiv.lightfield.decoder import CORE_COVERAGE, LightFieldDecoder
+from lfpiv.warn import Code, Warning
+
+CHANCE = 99.99
+"""Percentile of the shifted images' minimum above which a pixel's light stands."""
+CLEAR_SIGMA = 5.0
+"""Least count of a pixel with standing light in a background image [noise]."""
+NOISE_SIGMA = 3.0
+"""Least count of a pixel that is counted among those brighter than chance, and least stray light [noise]."""
+LEAST_STANDING = 0.005
+"""Share of an image's light below which compact standing light is left alone: chance reaches a fifth of it."""
+LEAST_RATIO_PIXELS = 500
+"""Least number of bright pixels that give the brightness of the standing light in an image."""
+POWER_RANGE = (0.5, 2.0)
+"""Accepted brightness of the standing light in an image, relative to the estimate."""
+LARGE_REMAINS = 3.0
+"""Light left after subtraction where light stands, relative to other lit places, above which a warning is due."""
+STANDS_EVERYWHERE = 0.6
+"""Share of the lit parts of a sensor above which light that stands is that of particles at rest."""
+
+_LEVELS = (90.0, 99.0, 99.9)  # percentiles of the chance minimum whose excess is counted around each pixel
+_REACH_PITCHES = 1.0  # half width of the square around a pixel in which excess pixels are counted
+_MARGIN = 1.6  # least share of such pixels over the largest one in the shifted images
+_MARGIN_OF_ONE = 1.5  # least count of a single pixel over the largest one of the shifted images
+_LEAST_SHARE = 0.05  # lower limit of the share of such pixels in the shifted images
+_TILE_PITCHES = 6.0  # edge of the tiles of smooth stray light
+_TILE_NEIGHBOURS = 5  # tiles along each axis whose median removes compact reflections from the stray light
+_COPIES = np.array([(3.0, 0.0), (0.0, 3.0)])  # shifts of the copies that tell stray light from particles [lens]
+_UNEVEN = 0.15  # accepted relative decrease of stray light over such a shift
+_DARK_PERCENTILE = 50.0  # percentile below which a pixel of an image of particles counts as dark
+_BLOCK_ROWS = 64  # rows whose median is taken at once
+_LEAST_GAIN = 0.2  # least gain of a pixel that counts
+_LEAST_TILE_PIXELS = 300  # least number of pixels of a tile
+_BRIGHT = 50.0  # percentile of the standing light above which pixels tell its brightness
+_UNLIKE = 0.3  # relative difference of the frames' standing light that counts as unlike
+_UNLIKE_SHARE = 0.15  # share of unlike pixels above which the frames have backgrounds of their own
+_MANY_MICROIMAGES = 20.0  # least area of saturated pixels that no particle lights [squares of a pitch]
+_FILLED = 0.35  # least part of such an area, half a pitch around the pixels included, that is saturated
+_FEW = 0.03  # least share of the pixels of a lit tile
+_STUCK_PIXELS = 0.01  # number of pixels that repeat their count in all images by chance
+_SHIFT_PITCHES = 24.0  # largest shift of an image along each axis
+_GOLDEN = (0.7548776662466927, 0.5698402909980532)  # steps of an even sequence in the plane
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StandingLight:
+    """Light of a camera that stands still, for both frames."""
+
+    light: tuple[np.ndarray, np.ndarray]
+    """Standing light of the first and of the second frame above the dark level [counts], shape (rows, columns)."""
+    unusable: np.ndarray
+    """Pixels that standing light saturates, or that never change, bool."""
+    found: bool
+    """Whether any light stands; without, `light` is 0."""
+    region: np.ndarray
+    """Pixels whose light stands, without smooth stray light, bool."""
+    stray: float
+    """Smooth stray light, median over the sensor [counts]."""
+    ratio: float | None
+    """Brightness of the second frame's standing light relative to the first's; None if the frames differ."""
+    share: float = 0.0
+    """Light in `pixels` as a share of all light of an image; 0 for a background image."""
+    at_rest: bool = False
+    """Whether light stands nearly everywhere, as that of particles at rest, and is therefore not taken."""
+
+    @property
+    def pixels(self) -> np.ndarray:
+        """Pixels with light that stands, or unusable ones: no particle alone saturates them, bool."""
+        either: np.ndarray = self.region | self.unusable
+        return either
+
+    @property
+    def figures(self) -> dict[str, object]:
+        """Fields that are no arrays."""
+        return {"found": self.found, "stray": self.stray, "ratio": self.ratio, "share": self.share}
+
+    @property
+    def place(self) -> str:
+        """Columns and rows of the sensor between which the largest area of standing light lies; empty for none."""
+        areas, count = ndimage.label(self.pixels, np.ones((3, 3)))
+        if not count:
+            return ""
+        largest = 1 + int(np.argmax(np.bincount(areas.ravel())[1:]))
+        rows, columns = ndimage.find_objects(areas)[largest - 1]
+        return f"columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1}"
+
+    def remains(self, first: np.ndarray, second: np.ndarray) -> float:
+        """Return the light left in both frames where light stands, relative to that of other lit places.
+
+        Parameters
+        ----------
+        first, second : ndarray, shape (rows, columns)
+            Frames after `subtract` [counts].
+        """
+        both = np.minimum(first, second)
+        inside, outside = self.region & ~self.unusable, ~self.pixels
+        if np.count_nonzero(inside) < LEAST_RATIO_PIXELS or not outside.any():
+            return 0.0
+        usual = both[outside]
+        usual = usual[usual > np.percentile(usual, _DARK_PERCENTILE)]
+        return float(both[inside].mean() / usual.mean()) if usual.mean() > 0 else 0.0
+
+    def subtract(self, light: np.ndarray, noise: float, frame: int) -> tuple[np.ndarray, float]:
+        """Subtract the standing light from an image at the brightness that it has there.
+
+        Parameters
+        ----------
+        light : ndarray, shape (rows, columns), float32
+            Image without its dark level [counts].
+        noise : float
+            Its noise [counts].
+        frame : int
+            0 or 1.
+
+        Returns
+        -------
+        light : ndarray
+            Image of the particles; unusable pixels are 0.
+        noise : float
+            Noise, of the subtracted light too [counts].
+        """
+        standing = self.light[frame]
+        power = self.power(light, frame)
+        left = light - np.float32(power) * standing
+        left[self.unusable] = 0
+        part = self.region & ~self.unusable
+        below = left[part & (left < 0)]
+        if below.size:  # photon noise of the subtracted light
+            share = np.count_nonzero(part) / part.size
+            noise = float(np.sqrt((1 - share) * noise**2 + share * np.mean(below**2, dtype=float)))
+        return left, noise
+
+    def power(self, light: np.ndarray, frame: int) -> float:
+        """Return the brightness of the standing light in an image relative to the estimate; 1 where it is too dim."""
+        standing = self.light[frame]
+        usable = self.region & ~self.unusable
+        if np.count_nonzero(usable) < LEAST_RATIO_PIXELS:
+            return 1.0
+        bright = usable & (standing > np.percentile(standing[usable], _BRIGHT))
+        if not bright.any():
+            return 1.0
+        found = mode(light[bright] / standing[bright])
+        return found if POWER_RANGE[0] < found < POWER_RANGE[1] else 1.0
+
+
+@dataclass(eq=False)
+class Series:
+    """Running figures of the images of one camera and one frame. `add` takes one image after the other."""
+
+    decoder: LightFieldDecoder
+    frame: int = 0
+    """0 for the first frame, 1 for the second."""
+    count: int = 0
+    noise: float = 0.0
+    """Mean noise of the images so far [counts]."""
+    light: float = 0.0
+    """Mean light of the images so far, summed over the sensor [counts]."""
+    smallest: np.ndarray = field(init=False)
+    """Smallest count of each pixel, float32."""
+    shifted: np.ndarray = field(init=False)
+    """Smallest count over the images shifted against each other by whole microlenses, float32."""
+    largest: np.ndarray = field(init=False)
+    """Largest count of each pixel, float32."""
+    saturated: np.ndarray = field(init=False)
+    """Number of images in which a pixel is saturated, uint16."""
+
+    def add(self, light: np.ndarray, noise: float, saturated: np.ndarray) -> None:
+        """Add an image.
+
+        Parameters
+        ----------
+        light : ndarray, shape (rows, columns), float32
+            Image without its dark level [counts].
+        noise : float
+            Its noise [counts].
+        saturated : ndarray, shape (rows, columns), bool
+            Its saturated pixels.
+        """
+        shifted = np.roll(light, lens_shift(self.decoder, 2 * self.count + self.frame), (0, 1))
+        if self.count == 0:
+            self.smallest, self.largest = light.copy(), light.copy()
+            self.shifted, self.saturated = shifted, saturated.astype(np.uint16)
+        else:
+            np.minimum(self.smallest, light, out=self.smallest)
+            np.minimum(self.shifted, shifted, out=self.shifted)
+            np.maximum(self.largest, light, out=self.largest)
+            self.saturated += saturated
+        self.light += (float(light.sum(dtype=float)) - self.light) / (self.count + 1)
+        self.noise += (noise - self.noise) / (self.count + 1)
+        self.count += 1
+
+
+def nothing(decoder: LightFieldDecoder) -> StandingLight:
+    """Return no standing light."""
+    none = np.zeros(decoder.gain.shape, bool)
+    dark = np.zeros(decoder.gain.shape, np.float32)
+    return StandingLight(light=(dark, dark), unusable=none, found=False, region=none, stray=0.0, ratio=None)
+
+
+def recorded_light(images: Sequence[tuple[np.ndarray, float, np.ndarray]], decoder: LightFieldDecoder) -> StandingLight:
+    """Return the standing light in background images of both frames: light, noise and saturated pixels of each."""
+    (first, noise, clipped), (second, _, clipped_too) = images
+    region = first > CLEAR_SIGMA * noise
+    return StandingLight(
+        light=(first, second), unusable=clipped | clipped_too, found=True, region=region, stray=0.0, ratio=None
+    )
+
+
+def median_light(
+    first: Series, second: Series, images: tuple[Sequence[np.ndarray], Sequence[np.ndarray]]
+) -> StandingLight:
+    """Return the median of each pixel over a series as standing light, with the series' unusable pixels."""
+    one, other = (_median(frames) for frames in images)
+    return StandingLight(
+        light=(one, other),
+        unusable=_unusable(first, second),
+        found=True,
+        region=one > CLEAR_SIGMA * first.noise,
+        stray=0.0,
+        ratio=None,
+    )
+
+
+def _median(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the median of each pixel, by blocks of rows."""
+    result = np.empty_like(images[0])
+    for first in range(0, len(result), _BLOCK_ROWS):
+        rows = slice(first, first + _BLOCK_ROWS)
+        result[rows] = np.median(np.stack([image[rows] for image in images]), axis=0)
+    return result
+
+
+def standing_light(first: Series, second: Series, *, everywhere: bool = False) -> StandingLight:
+    """Estimate the standing light of a camera from the series of both frames.
+
+    `everywhere` takes the minimum of all pixels, also where it is no brighter than chance.
+    """
+    decoder = first.decoder
+    pooled, ratio = _pool(first, second)
+    parts = [pooled, pooled] if pooled is not None else [_Minimum.of(first), _Minimum.of(second)]
+    stray = [_stray(one, decoder) for one in (first, second)]
+    light, region = [], np.zeros(decoder.gain.shape, bool)
+    scales = (1.0, ratio) if pooled is not None else (1.0, 1.0)
+    for part, smooth, scale in zip(parts, stray, scales, strict=True):
+        excess = part.smallest - smooth / np.float32(scale)
+        level = np.maximum(excess + part.bias(decoder), 0)
+        if everywhere:
+            stands = np.ones_like(region)
+        else:
+            stands = _stands(excess, part.shifted - smooth / np.float32(scale), part.noise, decoder)
+            if level.sum(where=stands, dtype=float) < LEAST_STANDING * min(first.light, second.light):
+                stands = np.zeros_like(region)
+        region |= stands
+        light.append(((np.where(stands, level, 0)) * np.float32(scale) + smooth).astype(np.float32))
+    unusable = _unusable(first, second)
+    if not everywhere and _spread(region, first) > STANDS_EVERYWHERE:
+        return replace(nothing(decoder), at_rest=True)
+    seen = first.smallest.sum(where=region | unusable, dtype=float)
+    return StandingLight(
+        light=(light[0], light[1]),
+        unusable=unusable,
+        found=bool(region.any() or unusable.any() or any(s.any() for s in stray)),
+        region=region,
+        stray=float(np.median(stray[0])),
+        ratio=ratio if pooled is not None else None,
+        share=float(np.clip(seen / max(first.light, 1e-9), 0, 1)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Minimum:
+    """Smallest counts of a series, of the shifted series, and their origin."""
+
+    smallest: np.ndarray
+    shifted: np.ndarray
+    count: int
+    noise: float
+
+    @classmethod
+    def of(cls, series: Series) -> _Minimum:
+        return cls(series.smallest, series.shifted, series.count, series.noise)
+
+    def bias(self, decoder: LightFieldDecoder) -> np.ndarray:
+        """Return by how much noise lowers the minimum of each pixel [counts]; photon noise grows with the light."""
+        sigma = np.sqrt(self.noise**2 + decoder.counts_per_photon * np.maximum(self.smallest, 0))
+        bias: np.ndarray = (-least_of_normal(self.count) * sigma).astype(np.float32)
+        return bias
+
+
+def _pool(first: Series, second: Series) -> tuple[_Minimum | None, float]:
+    """Return the minimum over both frames at the first one's power, and the second's power relative to it.
+
+    The minimum is None where the standing light of the frames is unlike, or none is bright enough to tell.
+    """
+    bright = np.percentile(first.shifted, CHANCE)
+    seeds = (first.smallest > bright) & (first.saturated == 0) & (second.saturated == 0)
+    if np.count_nonzero(seeds) < LEAST_RATIO_PIXELS:
+        return None, 1.0
+    quotient = second.smallest[seeds] / first.smallest[seeds]
+    ratio = mode(quotient)
+    if not POWER_RANGE[0] < ratio < POWER_RANGE[1] or np.mean(np.abs(quotient / ratio - 1) > _UNLIKE) > _UNLIKE_SHARE:
+        return None, 1.0
+    scaled = np.float32(1 / ratio)
+    return _Minimum(
+        np.minimum(first.smallest, second.smallest * scaled),
+        np.minimum(first.shifted, second.shifted * scaled),
+        first.count + second.count,
+        (first.noise + second.noise / ratio) / 2,
+    ), ratio
+
+
+def _stands(excess: np.ndarray, chance: np.ndarray, noise: float, decoder: LightFieldDecoder) -> np.ndarray:
+    """Return the pixels whose light stands: far brighter than chance by themselves, or with many bright ones around."""
+    stands = excess > max(_MARGIN_OF_ONE * float(chance.max()), CLEAR_SIGMA * noise)
+    reach = 2 * int(_REACH_PITCHES * decoder.optics.microimage_pitch_px) + 1
+    for level in np.maximum(np.percentile(chance, _LEVELS), NOISE_SIGMA * noise):
+        found, usual = (ndimage.uniform_filter((part > level).astype(np.float32), reach) for part in (excess, chance))
+        stands |= found > _MARGIN * max(float(usual.max()), _LEAST_SHARE)
+    return stands
+
+
+def _stray(series: Series, decoder: LightFieldDecoder) -> np.ndarray:
+    """Return the smooth stray light, from the mode of the minimum in tiles of some microlenses.
+
+    Smooth light stays where the minimum over two shifted copies is taken, too. Where that is darker by more than noise,
+    the light is that of particles, and the stray light is 0.
+    """
+    aside, down = (np.roll(series.smallest, shift, (0, 1)) for shift in _whole_lenses(decoder, _COPIES))
+    thinned = np.minimum(np.minimum(aside, down), series.smallest)
+    shape, tile = series.smallest.shape, int(_TILE_PITCHES * decoder.optics.microimage_pitch_px)
+    cells = [max(n // tile, 1) for n in shape]
+    core = (decoder.coverage > CORE_COVERAGE) & (decoder.gain > _LEAST_GAIN)
+    values = np.zeros(cells, float)
+    for i, rows in enumerate(np.array_split(np.arange(shape[0]), cells[0])):
+        for j, columns in enumerate(np.array_split(np.arange(shape[1]), cells[1])):
+            place = np.ix_(rows, columns)
+            chosen = core[place]
+            if np.count_nonzero(chosen) < _LEAST_TILE_PIXELS:
+                continue
+            gain = decoder.gain[place][chosen]
+            found, darker = (mode(image[place][chosen] / gain) for image in (series.smallest, thinned))
+            found -= least_of_normal(series.count) * series.noise
+            darker -= least_of_normal(3 * series.count) * series.noise
+            values[i, j] = found if found - darker < series.noise + _UNEVEN * found else 0.0
+    values = ndimage.median_filter(values, _TILE_NEIGHBOURS, mode="nearest")
+    if np.median(values) < NOISE_SIGMA * series.noise:
+        return np.zeros(shape, np.float32)
+    at = np.meshgrid(*((np.arange(n) + 0.5) / n * m - 0.5 for n, m in zip(shape, cells, strict=True)), indexing="ij")
+    smooth = ndimage.map_coordinates(values, at, order=1, mode="nearest")
+    light: np.ndarray = (np.maximum(smooth, 0) * decoder.gain * np.minimum(decoder.coverage, 1)).astype(np.float32)
+    return light
+
+
+def _unusable(first: Series, second: Series) -> np.ndarray:
+    """Return pixels that are saturated in most images, or repeat one count in all where noise would change it.
+
+    Where noise alone may repeat a dark pixel's count, only bright pixels are meant. One pair alone may show
+    resting particles. So its saturated pixels must lie together and fill many microimages.
+    """
+    images = first.count + second.count
+    often: np.ndarray = first.saturated + second.saturated > images / 2
+    if images == 2:
+        return _extended(often, first)
+    low, high = np.minimum(first.smallest, second.smallest), np.maximum(first.largest, second.largest)
+    stuck: np.ndarray = high == low
+    same = 1 / (2 * max(first.noise, 1e-3) * np.sqrt(np.pi))  # chance of two equal counts
+    if same >= 1 or same ** (images - 1) * low.size > _STUCK_PIXELS:
+        stuck &= low > CLEAR_SIGMA * first.noise
+    unusable: np.ndarray = often | stuck
+    return unusable
+
+
+def remains_warnings(standing: StandingLight, first: np.ndarray, second: np.ndarray, camera: str) -> list[Warning]:
+    """Warn of light left in both frames of a camera where standing light was subtracted."""
+    if not standing.remains(first, second) > LARGE_REMAINS:
+        return []
+    left = np.minimum(first, second).sum(where=standing.region, dtype=float)
+    share = float(np.clip(left / max(float(first.sum(dtype=float)), 1e-9), 0, 1))
+    remedy = "what was subtracted does not fit this pair; record a background image (camera.background_image)"
+    figures = {"place": standing.place, "share": share, "remedy": remedy}
+    return [Warning(code=Code.STANDING, subject=camera, figures=figures)]
+
+
+def _extended(often: np.ndarray, series: Series) -> np.ndarray:
+    """Return those pixels that lie together in areas of many microimages; none where they lie all over the sensor."""
+    if _spread(often, series) > STANDS_EVERYWHERE:
+        return np.zeros_like(often)
+    pitch = series.decoder.optics.microimage_pitch_px
+    areas, count = ndimage.label(ndimage.maximum_filter(often, 2 * int(pitch / 2) + 1))
+    sizes, around = np.bincount(areas[often], minlength=count + 1), np.bincount(areas.ravel(), minlength=count + 1)
+    large: np.ndarray = often & ((sizes > _MANY_MICROIMAGES * pitch**2) & (sizes > _FILLED * around))[areas]
+    return large
+
+
+def _spread(pixels: np.ndarray, series: Series) -> float:
+    """Return the share of the lit tiles of the sensor in which some of the pixels lie."""
+    tile = int(_TILE_PITCHES * series.decoder.optics.microimage_pitch_px)
+    rows, columns = (np.arange(n) // tile for n in pixels.shape)
+    number = (rows[:, None] * (columns.max() + 1) + columns).ravel()
+    lit = (series.largest > CLEAR_SIGMA * series.noise).ravel()
+    total, light, chosen = (np.bincount(number, part) for part in (None, lit, pixels.ravel()))
+    seen = light > _FEW * total
+    return float((chosen > _FEW * total)[seen].mean()) if seen.any() else 0.0
+
+
+def lens_shift(decoder: LightFieldDecoder, number: int) -> tuple[int, int]:
+    """Return a shift by whole microlenses, another for each number, as (rows, columns) [pixel]; 0 for number 0."""
+    optics = decoder.optics
+    reach = np.minimum(_SHIFT_PITCHES * optics.microimage_pitch_px, np.array(optics.sensor_shape) / 3)
+    target = (np.array(_GOLDEN) * number % 1) * reach
+    (shift,) = _whole_lenses(decoder, np.rint(target @ np.linalg.inv(_lens_vectors(decoder)))[None])
+    return shift
+
+
+def _whole_lenses(decoder: LightFieldDecoder, lenses: np.ndarray) -> list[tuple[int, int]]:
+    """Return shifts (i, j) of the lattice, shape (n, 2), as (rows, columns) [pixel]."""
+    return [(int(rows), int(columns)) for rows, columns in np.rint(lenses @ _lens_vectors(decoder))]
+
+
+def _lens_vectors(decoder: LightFieldDecoder) -> np.ndarray:
+    """Return the vectors (rows, columns) between neighbouring microimages [pixel], shape (2, 2)."""
+    optics = decoder.optics
+    vectors: np.ndarray = np.asarray(decoder.lattice.basis_mm)[:, ::-1]
+    return vectors * ((1 + optics.sensor_per_pupil) / optics.pixel_mm)
+
+
+def least_of_normal(count: int) -> float:
+    """Return the mean of the smallest of `count` normal numbers [standard deviations], Blom's approximation."""
+    from scipy.special import ndtri
+
+    return float(ndtri((1 - 0.375) / (count + 0.25)))
+
+
+def mode(values: np.ndarray) -> float:
+    """Return the half-sample mode: the place where values lie closest, which a tail on one side hardly moves."""
+    values = np.sort(np.asarray(values, float))
+    while len(values) > 3:
+        half = (len(values) + 1) // 2
+        widths = values[half - 1 :] - values[: len(values) - half + 1]
+        narrowest = np.flatnonzero(widths == widths.min())
+        first = int(narrowest[len(narrowest) // 2])
+        values = values[first : first + half]
+    return float(values.mean())

@@ -1,0 +1,282 @@
+"""Light that stands still in the particle images: estimate it once for a run, store it, and hand it to the cameras.
+
+The estimate uses a spread part of all pairs of the experiment, whatever pairs an invocation selects, so that numbers do
+not depend on the selection. Results depend on it by a hash of its content, which is None where nothing is subtracted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lfpiv import files
+from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.files import writing
+from lfpiv.lightfield import background, image_checks
+from lfpiv.lightfield.background import Series, StandingLight
+from lfpiv.progress import StepProgress
+from lfpiv.results import provenance
+from lfpiv.results.provenance import Marks, Stamp
+from lfpiv.warn import Code, Warning, to_text, warn
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera, Calibration
+    from lfpiv.runs.run import Run
+
+log = logging.getLogger(__name__)
+
+LARGE_SHARE = 0.02
+"""Share of an image's light that stands still and is not subtracted, above which a warning is due."""
+LONGEST_SERIES = 32
+"""Largest number of pairs, evenly spread, from which the standing light is estimated."""
+MEDIAN_PAIRS = 7
+"""The same for a median, which holds both frames of all pairs in memory."""
+WARNING_PAIRS = 4
+"""The same where nothing is subtracted and the light is only warned of."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """Light that stands still, of all cameras of a run."""
+
+    cameras: Mapping[str, StandingLight] = field(default_factory=dict)
+    """By camera; empty where nothing is subtracted."""
+    content: str | None = None
+    """Hash of the content; None where nothing is subtracted."""
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of each camera for the summary; empty for cameras without standing light."""
+    warnings: tuple[Warning, ...] = ()
+    """Warnings about light that stands and is not subtracted."""
+
+    def seen_by(self, calibration: Calibration) -> Calibration:
+        """Return the calibration with cameras that know what stands still, and have no gain in unusable pixels."""
+        cameras = {
+            name: camera.with_standing(self.cameras[name]) if name in self.cameras else camera
+            for name, camera in calibration.cameras.items()
+        }
+        return replace(calibration, cameras=cameras)
+
+
+def prepare(run: Run, calibration: Calibration) -> Background:
+    """Estimate the standing light of all cameras and store it, unless the folder holds one that fits."""
+    experiment, path = run.experiment, run.folder.background
+    pairs = series(experiment)
+    stamp = provenance.of_background(experiment, run.calibration_stamp.hash, pairs)
+    marks = provenance.read_marks(path)
+    if marks is not None and marks.figures is not None and (stamp.fits(marks) or _images_lost(stamp, marks)):
+        log.info("background: estimated before from the same images, kept")
+        found = load(path)
+    else:
+        found = estimate(experiment, calibration.cameras, pairs, run.step("background"))
+        _write(found, path, stamp.attributes)
+    for warning in found.warnings:
+        warn(log, warning)
+    return found
+
+
+def _images_lost(stamp: Stamp, marks: Marks) -> bool:
+    """Return whether all that changed is that some images are missing, because raw data may be deleted."""
+    if stamp.changes(marks) != ["images"]:
+        return False
+    before = json.loads(marks.depends_on)["images"] or []
+    return all(image in before for image in files.plain(stamp.parts)["images"] or [])
+
+
+def series(experiment: Experiment) -> list[int]:
+    """Return the pairs from which the standing light is estimated, evenly spread over all."""
+    longest = {"median": MEDIAN_PAIRS, "none": WARNING_PAIRS}.get(experiment.background, LONGEST_SERIES)
+    count = min(longest, experiment.pairs)
+    return [(2 * number + 1) * experiment.pairs // (2 * count) for number in range(count)]
+
+
+def estimate(
+    experiment: Experiment, cameras: Mapping[str, CalibratedCamera], pairs: list[int], progress: StepProgress
+) -> Background:
+    """Estimate the standing light of all cameras from their background images or from some pairs."""
+    found = {}
+    for number, (name, camera) in enumerate(cameras.items()):
+        dark = experiment.dark(name)
+        if experiment.camera(name).background is not None:
+            images = [experiment.background_image(name, frame) for frame in experiment.frames]
+            found[name] = background.recorded_light(
+                [_without_dark(image, dark, camera) for image in images if image is not None], camera.decoder
+            )
+            log.info("background of %s: its background image", name)
+        else:
+            found[name] = _of_series(experiment, camera, dark, pairs)
+        progress((number + 1) / len(cameras))
+    standing = {name: light for name, light in found.items() if light.found}
+    figures = {name: _figures(light) for name, light in standing.items()}
+    warnings = tuple(_warnings(experiment, standing, len(pairs)))
+    if experiment.background == "none":
+        return Background(figures=figures, warnings=warnings)
+    return Background(standing, _digest(standing), figures, warnings)
+
+
+def _figures(light: StandingLight) -> dict[str, Any]:
+    return {
+        "standing_share": round(float(light.region.mean()), 5),
+        "unusable_share": round(float(light.unusable.mean()), 5),
+        "light_share": round(light.share, 4),
+        "stray_counts": round(light.stray, 2),
+        "power_ratio": None if light.ratio is None else round(light.ratio, 4),
+    }
+
+
+def _warnings(experiment: Experiment, standing: Mapping[str, StandingLight], pairs: int) -> Iterator[Warning]:
+    """Warn of standing light that is not subtracted: not wanted, or around pixels that one pair shows saturated."""
+    for name, light in standing.items():
+        if experiment.camera(name).background is not None and experiment.background != "none":
+            continue
+        if experiment.background == "none" and light.share > LARGE_SHARE:
+            remedy = 'set particles.background = "auto", or record a background image (camera.background_image)'
+        elif pairs == 1 and light.unusable.any():
+            remedy = "one pair does not show how far it reaches; record a background image (camera.background_image)"
+        else:
+            continue
+        figures = {"place": light.place, "share": light.share, "remedy": remedy}
+        yield Warning(code=Code.STANDING, subject=name, figures=figures)
+
+
+def _of_series(
+    experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, pairs: list[int]
+) -> StandingLight:
+    """Estimate the standing light of one camera from pairs; those that cannot be used are left out."""
+    median = experiment.background == "median"
+    everywhere = experiment.background == "minimum"
+    first, second, kept = _read_series(experiment, camera, dark, pairs, keep=median)
+    if not first.count:
+        return background.nothing(camera.decoder)
+    if median:
+        found = background.median_light(first, second, kept)
+    else:
+        found = background.standing_light(first, second, everywhere=everywhere)
+        if found.region.any():  # again, with the images at equal power of the laser
+            first, second, _ = _read_series(experiment, camera, dark, pairs, estimate=found)
+            found = background.standing_light(first, second, everywhere=everywhere)
+    _log_series(camera.name, found, first.count)
+    return found
+
+
+def _read_series(
+    experiment: Experiment,
+    camera: CalibratedCamera,
+    dark: np.ndarray | None,
+    pairs: list[int],
+    *,
+    keep: bool = False,
+    estimate: StandingLight | None = None,
+) -> tuple[Series, Series, tuple[list[np.ndarray], list[np.ndarray]]]:
+    """Read the images of one camera; return the series of both frames, and with `keep` all light.
+
+    An `estimate` gives the power of the laser in each image, by which it is divided.
+    """
+    series = Series(camera.decoder, 0), Series(camera.decoder, 1)
+    kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    for pair in pairs:
+        try:
+            images = [experiment.particle_image(camera.name, pair, frame) for frame in experiment.frames]
+        except InputError as error:  # the pair fails when it is reconstructed
+            log.debug("background of %s: pair %d is left out: %s", camera.name, pair, error)
+            continue
+        for number, image in enumerate(images):
+            light, noise, saturated = _without_dark(image, dark, camera)
+            power = 1.0 if estimate is None else estimate.power(light, number)
+            series[number].add(light / np.float32(power), noise / power, saturated)
+            if keep:
+                kept[number].append(light)
+    return *series, kept
+
+
+def _log_series(name: str, light: StandingLight, pairs: int) -> None:
+    if light.at_rest:
+        text = "light stands nearly everywhere, as that of particles at rest: nothing is subtracted"
+        log.info('background of %s: %s. particles.background = "minimum" subtracts it', name, text)
+        return
+    if not light.found:
+        log.info("background of %s: nothing stands out in %d pairs, nothing is subtracted", name, pairs)
+        return
+    frames = "both frames" if light.ratio is not None else "each frame"
+    log.info(
+        "background of %s: estimated from %s of %d pairs; light stands in %.1f %% of the sensor, %d pixels are "
+        "unusable, stray light of %.1f counts",
+        name,
+        frames,
+        pairs,
+        100 * light.region.mean(),
+        np.count_nonzero(light.unusable),
+        light.stray,
+    )
+
+
+def _without_dark(
+    raw: np.ndarray, dark: np.ndarray | None, camera: CalibratedCamera
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Return the light of an image above its dark level, its noise, and its saturated pixels."""
+    image = raw if dark is None else raw - dark
+    level, noise = camera.decoder.background(image)
+    return image - np.float32(level), noise, image_checks.saturated_pixels(raw)
+
+
+def _digest(standing: Mapping[str, StandingLight]) -> str | None:
+    if not standing:
+        return None
+    digest = hashlib.blake2b(digest_size=8)
+    for name, light in standing.items():
+        for array in (*light.light, light.unusable):
+            digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def load(path: Path) -> Background:
+    """Read a background that `prepare` stored.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            figures, stored = json.loads(file.attrs["figures"]), provenance.stored_warnings(file.attrs)
+            found = {}
+            for name, group in file.items():
+                first, second = group["light"][()]
+                found[name] = StandingLight(
+                    light=(first, second),
+                    unusable=group["unusable"][()],
+                    region=group["region"][()],
+                    **json.loads(group.attrs["figures"]),
+                )
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: expected a stored background, could not read it ({error}). Remove it.") from None
+    return Background(found, figures["content"], figures["cameras"], stored)
+
+
+def _write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
+    import h5py
+
+    content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
+    with h5py.File(content, "w") as file:
+        file.attrs.update(attributes)
+        file.attrs["figures"] = json.dumps({"content": found.content, "cameras": found.figures})
+        file.attrs["warnings"] = to_text(found.warnings)
+        for name, light in found.cameras.items():
+            group = file.create_group(name)
+            arrays = {"light": np.stack(light.light), "unusable": light.unusable, "region": light.region}
+            for key, value in arrays.items():
+                group.create_dataset(key, data=value, compression="gzip", compression_opts=1)
+            group.attrs["figures"] = json.dumps(light.figures)
+    with writing(path):
+        files.write_bytes(content.getbuffer(), path)
