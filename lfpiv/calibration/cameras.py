@@ -21,7 +21,8 @@ from lfpiv.calibration.board.board import agreeing_dots, measure_board
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.board.planes import Planes
-from lfpiv.calibration.board_fit import CameraLabels, fit_board
+from lfpiv.calibration.bundle.dot_rays import CameraLabels
+from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
 from lfpiv.calibration.quality import CalibrationQuality, LensArrayQuality
