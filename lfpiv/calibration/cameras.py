@@ -197,9 +197,21 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, _Measured]) -> Boa
     ]
     errors = fit_board(cameras, board)
     pitch = min(setup.optics.microlens_pitch_mm / abs(setup.optics.magnification) for setup in experiment.cameras)
+    _log_board(errors)
     with collected() as warnings:
         checks.check_board(errors, board, pitch)
     return replace(errors, warnings=tuple(warnings))
+
+
+def _log_board(errors: BoardErrors) -> None:
+    if not errors.corrected:
+        log.info("board: no significant errors of its planes and dots; it is used as stated")
+        return
+    off = ", ".join(
+        f"{1e3 * error:+.1f} ({1e3 * std:.1f})"
+        for error, std in zip(errors.plane[:, 2], errors.plane_std[:, 2], strict=True)
+    )
+    log.info("board: errors corrected of %s; planes off along z [um] (standard error): %s", errors.corrected, off)
 
 
 def _calibrate_camera(
@@ -219,8 +231,8 @@ def _calibrate_camera(
     training_dots = len(np.unique(dots.dot[mapping.agreeing][mapping.training.split.training]))
     checks.check_mapping(setup, quality, mapping.training.network, experiment.network.estimator, training_dots)
     log.info(
-        "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots",
-        setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test,
+        "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots, %.4f with the board as stated",
+        setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test, quality.sigma_nor_stated,
     )  # fmt: skip
     step(1.0)
     used = dots.points_mm[mapping.agreeing]

@@ -43,7 +43,8 @@ class BoardErrors:
     @property
     def depth_mm(self) -> np.ndarray:
         """Fitted depth of each plane's middle [mm], shape (plane,)."""
-        return self.planes_mm + self.plane[:, 2]
+        depth: np.ndarray = self.planes_mm + self.plane[:, 2]
+        return depth
 
     def points_mm(self, board: DotBoard, dot: np.ndarray) -> np.ndarray:
         """Return the corrected world positions of dots given by number, shape (n, 3) [mm]."""
@@ -53,8 +54,9 @@ class BoardErrors:
         middle[:, 2] = points[:, 2]
         on_board = points - middle
         on_board[:, :2] += self.dot_mm[site]
-        turned: np.ndarray = Rotation.from_rotvec(self.plane[plane, 3:]).apply(on_board)
-        return turned + middle + self.plane[plane, :3]
+        turned = Rotation.from_rotvec(self.plane[plane, 3:]).apply(on_board)
+        moved: np.ndarray = turned + middle + self.plane[plane, :3]
+        return moved
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures of the planes and the dots' scatter, as the summary stores them."""
@@ -73,5 +75,6 @@ class BoardErrors:
 
 def _listed(values: np.ndarray) -> list[Any]:
     """Return nested lists with None for nan, which JSON does not have."""
-    listed: list[Any] = np.where(np.isnan(values), None, values).tolist()
-    return listed
+    listed = values.astype(object)
+    listed[np.isnan(values)] = None
+    return list(listed.tolist())

@@ -14,6 +14,8 @@ ORDERS = (4, 3, 2, 1)
 """Orders in (s, t) of the cameras' smooth departure, best first."""
 DOTS_PER_TERM = 6
 """Least number of dots for each term of the departure of chief rays. Fewer dots lower the order."""
+LEAST_DOTS = 24
+"""Least number of dots of a camera."""
 LEAST_LABELS = 10
 """Least number of labels of a dot."""
 
@@ -47,9 +49,10 @@ class DotRays:
     def from_labels(cls, camera: CameraLabels) -> DotRays:
         """Fit a quadratic of the pupil point to the labels of each dot, and cubic terms that all dots share."""
         dots, radius = camera.dots, camera.pupil_radius_mm
-        number, first, count = np.unique(dots.dot, return_index=True, return_counts=True)
+        number, count = np.unique(dots.dot, return_counts=True)
         enough = count >= LEAST_LABELS
-        parts = [slice(start, start + n) for start, n in zip(first[enough], count[enough], strict=True)]
+        labels_of = np.split(np.argsort(dots.dot, kind="stable"), np.cumsum(count)[:-1])
+        parts = [labels for labels, chosen in zip(labels_of, enough, strict=True) if chosen]
         terms = _pupil_terms(dots.pupil_mm / radius)
         bases = [np.linalg.qr(terms[part, :6]) for part in parts]
         beyond = [without(basis.Q, np.hstack([terms[part, 6:], dots.array_mm[part]]))
@@ -61,7 +64,7 @@ class DotRays:
             inverse = np.linalg.pinv(basis.R)
             quadratic = dots.array_mm[part] - terms[part, 6:] @ shared
             rays[k] = (inverse @ (basis.Q.T @ quadratic))[:3]
-            spread = (inverse**2).sum(1) * (part.stop - part.start) * np.mean(dots.std_mm[part] ** 2)
+            spread = (inverse**2).sum(1) * len(part) * np.mean(dots.std_mm[part] ** 2)
             variance[k] = spread[0], spread[1:3].mean()
         variance = (1 + variance / np.median(variance, axis=0)) / 2 if len(parts) else variance
         return cls(
@@ -108,6 +111,8 @@ def smooth_terms(rays: np.ndarray, depth: np.ndarray, lens: ThinLensModel) -> np
     derivative by u or v, for (s, t) moves with (u, v) along the rays of a dot.
     """
     chief = rays[:, 0]
+    if len(chief) < LEAST_DOTS:
+        return None
     half = np.maximum(np.ptp(chief, axis=0) / 2, 1e-9)
     place, slope = (chief - chief.min(0)) / half - 1, rays[:, 1:] / half
     z = (depth - depth.mean()) / max(float(np.ptp(depth)) / 2, 1e-9)

@@ -27,6 +27,7 @@ class Effects:
 
     @property
     def size(self) -> int:
+        """Number of unknowns."""
         return len(self.kind)
 
     @classmethod

@@ -30,7 +30,6 @@ from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.bundle.dot_rays import CameraLabels, DotRays, smooth_terms, thin_lens_rays, without
 from lfpiv.calibration.bundle.effects import Effects
-from lfpiv.calibration.bundle.linear_part import fit_linear_part
 from lfpiv.calibration.bundle.mixed_model import NormalEquations, Solution
 from lfpiv.lightfield.decoder import NORMAL_MAD
 
@@ -38,6 +37,8 @@ FIRST_STD = {"depth": 0.05, "shift": 0.05, "tilt": 0.005, "rotation": 0.005, "do
 """Standard deviation of each kind of error from which the fit starts [mm or rad]."""
 FIRST_NOISE_MM = 1e-4
 """Noise of chief rays and slopes from which the fit starts [mm]. So small that the errors of the board start free."""
+LEAST_NOISE_MM = 1e-6
+"""Lower limit of the noise [mm]."""
 RANK_TOLERANCE = 1e-9
 """Singular value below which the dots do not determine a combination of smooth terms, relative to the largest one."""
 LEAST_FREEDOM = 0.1
@@ -94,8 +95,7 @@ def _fit_planes(data: Sequence[DotRays], board: DotBoard) -> BoardErrors:
         effects, values, found = fit.effects, fit.values, fit.errors
         if not found.corrected:
             return found
-    seen = [part for part, camera in zip(data, equations, strict=True) if camera is not None]
-    return fit_linear_part(seen, fit.weights, board, found, fit.std)
+    return found
 
 
 def _no_errors(board: DotBoard) -> BoardErrors:
@@ -187,8 +187,6 @@ class _Fit:
     effects: Effects
     values: np.ndarray
     errors: BoardErrors
-    std: dict[str, float]  # standard deviation of each kind of errors that is corrected
-    weights: list[np.ndarray]  # square root of the weights of each camera's chief rays and slopes [1/mm], (3d,)
 
 
 def _fit_effects(equations: Sequence[Equations], effects: Effects, board: BoardErrors) -> _Fit:
@@ -205,17 +203,13 @@ def _fit_effects(equations: Sequence[Equations], effects: Effects, board: BoardE
         for k, (camera, of) in enumerate(zip(equations, weighted, strict=True)):
             residual = np.abs(of.residual(solution)) / np.sqrt(robust[k])
             scatter = [NORMAL_MAD * float(np.median(residual[:, camera.kind == kind])) for kind in range(2)]
-            scale = np.maximum([*scatter, 1.0], np.finfo(float).tiny)
+            scale = np.maximum([*scatter, 1.0], LEAST_NOISE_MM / noise[k])
             noise[k] = noise[k] * scale
             robust[k] = _robust_weights(residual / scale[camera.kind], camera.kind)
     kept = normal.significant_std(std)
-    return _Fit(
-        effects=(chosen := effects.as_most_planes(normal.solve(kept).values, board.planes_mm)),
-        values=normal.solve(kept).values,
-        errors=_errors(normal, kept, chosen, board),
-        std=kept,
-        weights=[of.root[camera.kind < 2] for camera, of in zip(equations, weighted, strict=True)],
-    )
+    values = normal.solve(kept).values
+    effects = effects.as_most_planes(values, board.planes_mm)
+    return _Fit(effects=effects, values=values, errors=_errors(normal, kept, effects, board))
 
 
 def _errors(normal: NormalEquations, std: dict[str, float], effects: Effects, board: BoardErrors) -> BoardErrors:

@@ -63,9 +63,9 @@ class NormalEquations:
         likelihood = right @ cho_solve(factor, right) / 2 - np.log(factor[0].diagonal()).sum()
         return Solution(values=values, covariance=covariance, likelihood=float(likelihood))
 
-    def best_std(self, start: Mapping[str, float], fixed: Mapping[str, float] | None = None) -> dict[str, float]:
-        """Return the most likely standard deviations of the kinds in `start`, given `fixed` ones of others."""
-        kinds, fixed = list(start), fixed or {}
+    def best_std(self, start: Mapping[str, float]) -> dict[str, float]:
+        """Return the most likely standard deviations of the kinds in `start`; unknowns of other kinds are 0."""
+        kinds = list(start)
         if not kinds:
             return {}
         typical = np.array([self.typical[kind] for kind in kinds])
@@ -73,7 +73,7 @@ class NormalEquations:
 
         def cost(logarithm: np.ndarray) -> tuple[float, np.ndarray]:
             std = typical * np.exp(logarithm)
-            found = self.solve({**fixed, **dict(zip(kinds, std, strict=True))})
+            found = self.solve(dict(zip(kinds, std, strict=True)))
             square = found.values**2 + found.covariance.diagonal()
             rise = [square[of].sum() / s**2 - of.sum() for of, s in zip(members, std, strict=True)]
             return -found.likelihood, -np.array(rise)
