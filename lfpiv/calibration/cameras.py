@@ -167,7 +167,6 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
     step(0.2)
     dots = _measure_dots(experiment, setup, sensor.decoder, step)
     lens = _fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
-    checks.check_pupil(experiment, setup, dots, lens)
     step(1.0)
     return _Measured(sensor=sensor, dots=dots, lens=lens)
 
@@ -223,6 +222,7 @@ def _calibrate_camera(
         corrected = errors.points_mm(DotBoard.from_settings(experiment.board), dots.dot)
         dots = replace(dots, points_mm=corrected)
         lens = _fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
+    checks.check_pupil(experiment, setup, dots, lens)
     mapping = _fit_mapping(experiment, setup, dots, stated_mm, lens, sensor.lattice.pitch_mm)
     step(0.9)
     rejected = dots.rejected + _disagreeing_per_plane(dots, mapping.agreeing, math.prod(experiment.board.dots))
