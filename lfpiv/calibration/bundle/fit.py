@@ -48,7 +48,11 @@ OUTLIER = 4.0
 PASSES, ROUNDS = 2, 6
 """Linearisations about the corrected positions, and rounds of weights in each."""
 PLANE_ERROR_PITCH = 0.002
-"""Error that a camera's labels of one plane share, of chief rays and of slopes to the pupil's edge [pitch]."""
+"""Least error that a camera's labels of one plane share, of chief rays and of slopes to the pupil's edge [pitch].
+
+It is at least the error of a single dot, because what disturbs single dots, such as light of their neighbours, depends
+on the plane's focus too.
+"""
 BELIEVED = 0.5
 """Error of a plane above which its image is taken for another plane's, and not used [distance of the planes]."""
 
@@ -114,14 +118,16 @@ class Equations:
     """Linear equations of one camera: departure from the thin lens = smooth terms + errors of the board + noise.
 
     Rows are the chief rays of all dots and their slopes along u and v. An error that the camera's labels of one plane
-    share has a column in `smooth` and a row of its own, which states that it is 0 within `PLANE_ERROR_PITCH`.
+    share has a column in `smooth` and a row of its own, which states that it is 0 within the noise of a dot, at least
+    within `PLANE_ERROR_PITCH`.
     """
 
     smooth: np.ndarray  # (3d + 3 planes, terms + 3 planes)
     effects: np.ndarray  # for s and t, (2, 3d + 3 planes, size)
     departure: np.ndarray  # for s and t [mm], (2, 3d + 3 planes)
-    variance: np.ndarray  # variance of the rows, relative to the noise's where there is one, (3d + 3 planes,)
-    kind: np.ndarray  # 0 for chief rays, 1 for slopes, 2 for the statements, (3d + 3 planes,)
+    variance: np.ndarray  # variance of the rows, relative to that of their kind, (3d + 3 planes,)
+    kind: np.ndarray  # 0 for chief rays, 1 for slopes, 2 and 3 for the statements on them, (3d + 3 planes,)
+    least_mm: float  # lower limit of the errors that a plane's labels share [mm]
 
     @classmethod
     def of(
@@ -143,10 +149,9 @@ class Equations:
             smooth=np.block([[smooth, shared], [np.zeros((stated, smooth.shape[1])), np.eye(stated)]]),
             effects=np.pad(moved, ((0, 0), (0, stated), (0, 0))),
             departure=np.pad(departure, ((0, 0), (0, stated))),
-            variance=np.append(
-                data.variance[:, [0, 1, 1]].T.ravel(), np.full(stated, (PLANE_ERROR_PITCH * data.pitch_mm) ** 2)
-            ),
-            kind=np.repeat([0, 1, 2], [count, 2 * count, stated]),
+            variance=np.append(data.variance[:, [0, 1, 1]].T.ravel(), np.ones(stated)),
+            kind=np.repeat([0, 1, 2, 3], [count, 2 * count, len(planes), 2 * len(planes)]),
+            least_mm=PLANE_ERROR_PITCH * data.pitch_mm,
         )
 
 
@@ -161,8 +166,9 @@ class WeightedEquations:
 
     @classmethod
     def of(cls, system: Equations, noise: np.ndarray, robust: np.ndarray) -> WeightedEquations:
-        """Weight by the noise of each kind of row [mm], and by the robust weights of the rows."""
-        root = np.sqrt(robust / system.variance) / noise[system.kind]
+        """Weight by the noise of chief rays and slopes [mm], and by the robust weights of the rows."""
+        of_kind = np.append(noise, np.maximum(noise, system.least_mm))
+        root = np.sqrt(robust / system.variance) / of_kind[system.kind]
         left, strength, _ = np.linalg.svd(system.smooth * root[:, None], full_matrices=False)
         basis = left[:, strength > RANK_TOLERANCE * strength[0]]
         return cls(
@@ -191,7 +197,7 @@ class _Fit:
 
 def _fit_effects(equations: Sequence[Equations], effects: Effects, board: BoardErrors) -> _Fit:
     """Fit the errors of the board with robust weights, and keep the kinds of errors that are significant."""
-    noise = [np.array([FIRST_NOISE_MM, FIRST_NOISE_MM, 1.0]) for _ in equations]
+    noise = [np.full(2, FIRST_NOISE_MM) for _ in equations]
     robust = [np.ones(len(camera.variance)) for camera in equations]
     std: dict[str, float] = dict(FIRST_STD)
     for _ in range(ROUNDS):
@@ -203,9 +209,9 @@ def _fit_effects(equations: Sequence[Equations], effects: Effects, board: BoardE
         for k, (camera, of) in enumerate(zip(equations, weighted, strict=True)):
             residual = np.abs(of.residual(solution)) / np.sqrt(robust[k])
             scatter = [NORMAL_MAD * float(np.median(residual[:, camera.kind == kind])) for kind in range(2)]
-            scale = np.maximum([*scatter, 1.0], LEAST_NOISE_MM / noise[k])
+            scale = np.maximum(scatter, LEAST_NOISE_MM / noise[k])
             noise[k] = noise[k] * scale
-            robust[k] = _robust_weights(residual / scale[camera.kind], camera.kind)
+            robust[k] = _robust_weights(residual / np.append(scale, [1.0, 1.0])[camera.kind], camera.kind)
     kept = normal.significant_std(std)
     values = normal.solve(kept).values
     effects = effects.as_most_planes(values, board.planes_mm)
