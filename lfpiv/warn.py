@@ -45,6 +45,7 @@ class Code(enum.Enum):
     DOTS_MISSING = "dots_missing"
     PLANE_EMPTY = "plane_empty"
     PLANE_LEFT_OUT = "plane_left_out"
+    PLANE_OFF = "plane_off"
     TURNED = "turned"
     MAGNIFIED = "magnified"
     FEW_LABELS = "few_labels"
@@ -135,6 +136,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.PLANE_LEFT_OUT: (
         "{left_out} of {seen} dots of plane {plane} of the board (z = {z_mm:g} mm) do not fit the others and are "
         "left out: check that place in board.planes_mm, and {path}."
+    ),
+    Code.PLANE_OFF: (
+        "plane {plane} of the board stands at z = {fitted_mm:.3f} mm, not at {z_mm:g} mm, shifted by {x_mm:.3f} and "
+        "{y_mm:.3f} mm along x and y and tilted by {tilt_deg:.2f} degrees, as its dots show; the calibration corrects "
+        "it. Check that place in board.planes_mm, and the stage."
     ),
     Code.TURNED: (
         "the board's dots show the camera {turn_deg:.0f} degrees away from nominal_angle_deg = {nominal_deg:g}. Are "

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 
 from lfpiv.calibration.board.dots import BoardDots
+from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
@@ -163,6 +164,8 @@ class Calibration:
 
     cameras: dict[str, CalibratedCamera]
     """Cameras by name."""
+    board: BoardErrors | None = None
+    """Errors of the board that the calibration corrected. None without a board, and in older files."""
 
     def save(self, path: str | Path) -> None:
         """Write the calibration to an HDF5 file. Overwrite an older file."""
@@ -171,6 +174,8 @@ class Calibration:
             file.attrs["cameras"] = list(self.cameras)
             for name, camera in self.cameras.items():
                 _write_camera(file.create_group(f"camera/{name}"), camera)
+            if self.board is not None:
+                _write_board(file.create_group("board"), self.board)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -198,13 +203,30 @@ def load_calibration(path: str | Path) -> Calibration:
                     f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {version}; "
                     "calibrate again."
                 )
-            return Calibration({name: _read_camera(file[f"camera/{name}"], name) for name in file.attrs["cameras"]})
+            cameras = {name: _read_camera(file[f"camera/{name}"], name) for name in file.attrs["cameras"]}
+            return Calibration(cameras, board=_read_board(file["board"]) if "board" in file else None)
     except (OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(
             f"{path}: expected a calibration file, could not read it ({error}); calibrate again."
         ) from None
+
+
+def _write_board(group: h5py.Group, board: BoardErrors) -> None:
+    for name, value in vars(board).items():
+        if isinstance(value, np.ndarray):
+            group[name] = value
+    group.attrs["corrected"] = list(board.corrected)
+    group.attrs["warnings"] = json.dumps([warning.to_json() for warning in board.warnings])
+
+
+def _read_board(group: h5py.Group) -> BoardErrors:
+    return BoardErrors(
+        **{name: array[()] for name, array in group.items()},
+        corrected=tuple(map(str, group.attrs["corrected"])),
+        warnings=tuple(Warning.from_json(stored) for stored in json.loads(group.attrs["warnings"])),
+    )
 
 
 def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:

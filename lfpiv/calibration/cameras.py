@@ -2,6 +2,7 @@
 
 Section 3.1 of the paper: the white image gives the microlens array, the board images give labelled rays of dots, and a
 thin lens plus a network is fitted to the labels (Eqs. 6-7). The mean error on held-out dots is sigma_nor (Eq. 8).
+Errors of the board that the labels of all cameras show are corrected before.
 `thin_lens` gives the mapping by direct ray tracing (DRT) instead, from the stated optics and angles only (Eqs. 1-3).
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,10 @@ import numpy as np
 from lfpiv.calibration import checks
 from lfpiv.calibration.board.board import agreeing_dots, measure_board
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
+from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.board.planes import Planes
+from lfpiv.calibration.bundle.dot_rays import CameraLabels
+from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
 from lfpiv.calibration.quality import CalibrationQuality, LensArrayQuality
@@ -31,7 +35,7 @@ from lfpiv.geometry.optics import LensLattice
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.lens_array import find_lens_array
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.warn import collected
+from lfpiv.warn import Warning, collected
 
 log = logging.getLogger(__name__)
 
@@ -60,14 +64,23 @@ def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> C
     InputError
         If a white image shows no microlens array or the board's dots cannot be found. Names camera and file.
     """
-    cameras, count = {}, len(experiment.cameras)
-    whole = progress or (lambda fraction: None)
+    whole, count = progress or (lambda fraction: None), len(experiment.cameras)
+    measured = {}
     for number, setup in enumerate(experiment.cameras):
         with collected() as warnings:
-            camera = _calibrate_camera(experiment, setup, part_of(whole, number / count, (number + 1) / count))
-        named = (replace(warning, subject=setup.name) for warning in warnings)
-        cameras[setup.name] = replace(camera, warnings=tuple(named))
-    return Calibration(cameras)
+            seen = _measure_camera(
+                experiment, setup, part_of(whole, 0.75 * number / count, 0.75 * (number + 1) / count)
+            )
+        measured[setup.name] = replace(seen, warnings=tuple(warnings))
+    errors = _fit_board(experiment, measured)
+    cameras = {}
+    for number, setup in enumerate(experiment.cameras):
+        step = part_of(whole, 0.75 + 0.25 * number / count, 0.75 + 0.25 * (number + 1) / count)
+        with collected() as warnings:
+            camera = _calibrate_camera(experiment, setup, measured[setup.name], errors, step)
+        found = (replace(warning, subject=setup.name) for warning in (*measured[setup.name].warnings, *warnings))
+        cameras[setup.name] = replace(camera, warnings=tuple(found))
+    return Calibration(cameras, board=errors)
 
 
 def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibration:
@@ -122,6 +135,18 @@ class _Sensor:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class _Measured:
+    """What the white and board images of one camera show."""
+
+    sensor: _Sensor
+    dots: BoardDots
+    """Labels, with the points of the board as stated."""
+    lens: ThinLensModel
+    """Thin lens fitted to them."""
+    warnings: tuple[Warning, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Mapping:
     """Ray mapping of one camera, fitted to the labels of its dots."""
 
@@ -133,23 +158,81 @@ class _Mapping:
     """Labels used, shape (n,), bool."""
     nominal: NominalDifference
     """Difference from the stated pose and magnification."""
+    sigma_nor_stated: float
+    """Mean error on the held-out dots at their stated places [microlens pitch]."""
 
 
-def _calibrate_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> CalibratedCamera:
+def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> _Measured:
     sensor = _decode(experiment, setup)
-    step(0.15)
+    step(0.2)
     dots = _measure_dots(experiment, setup, sensor.decoder, step)
-    step(0.75)
-    mapping = _fit_mapping(experiment, setup, dots, sensor.lattice.pitch_mm)
-    step(0.95)
+    lens = _fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
+    step(1.0)
+    return _Measured(sensor=sensor, dots=dots, lens=lens)
+
+
+def _fit_lens(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> ThinLensModel:
+    with _input_errors(f"{experiment.path}: labels of camera {setup.name!r}"):
+        std = _label_std(dots, pitch_mm)
+        return fit_thin_lens(dots.points_mm, dots.pupil_mm, dots.array_mm, setup.optics, std=std)
+
+
+def _label_std(dots: BoardDots, pitch_mm: float) -> np.ndarray:
+    std: np.ndarray = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch_mm)
+    return std
+
+
+def _fit_board(experiment: Experiment, measured: Mapping[str, _Measured]) -> BoardErrors:
+    """Fit the errors of the board to the labels of all cameras, and warn of planes far from where they should be."""
+    board = DotBoard.from_settings(experiment.board)
+    cameras = [
+        CameraLabels(
+            dots=measured[setup.name].dots,
+            lens=measured[setup.name].lens,
+            pupil_radius_mm=setup.optics.pupil_radius_mm,
+            pitch_mm=measured[setup.name].sensor.lattice.pitch_mm,
+        )
+        for setup in experiment.cameras
+    ]
+    errors = fit_board(cameras, board)
+    pitch = min(setup.optics.microlens_pitch_mm / abs(setup.optics.magnification) for setup in experiment.cameras)
+    _log_board(errors)
+    with collected() as warnings:
+        checks.check_board(errors, board, pitch)
+    return replace(errors, warnings=tuple(warnings))
+
+
+def _log_board(errors: BoardErrors) -> None:
+    if not errors.corrected:
+        log.info("board: no significant errors of its planes and dots; it is used as stated")
+        return
+    off = ", ".join(
+        f"{1e3 * error:+.1f} ({1e3 * std:.1f})"
+        for error, std in zip(errors.plane[:, 2], errors.plane_std[:, 2], strict=True)
+    )
+    log.info("board: errors corrected of %s; planes off along z [um] (standard error): %s", errors.corrected, off)
+
+
+def _calibrate_camera(
+    experiment: Experiment, setup: CameraSetup, measured: _Measured, errors: BoardErrors, step: StepProgress
+) -> CalibratedCamera:
+    sensor, dots, lens = measured.sensor, measured.dots, measured.lens
+    stated_mm = dots.points_mm
+    if errors.corrected:
+        corrected = errors.points_mm(DotBoard.from_settings(experiment.board), dots.dot)
+        dots = replace(dots, points_mm=corrected)
+        lens = _fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
+    checks.check_pupil(experiment, setup, dots, lens)
+    mapping = _fit_mapping(experiment, setup, dots, stated_mm, lens, sensor.lattice.pitch_mm)
+    step(0.9)
     rejected = dots.rejected + _disagreeing_per_plane(dots, mapping.agreeing, math.prod(experiment.board.dots))
     checks.check_rejected(experiment, setup, dots, rejected)
     quality = _quality(sensor, dots, mapping, int(rejected.sum()))
     training_dots = len(np.unique(dots.dot[mapping.agreeing][mapping.training.split.training]))
     checks.check_mapping(setup, quality, mapping.training.network, experiment.network.estimator, training_dots)
     log.info(
-        "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots",
-        setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test,
+        "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots, %.4f with the board as stated",
+        setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test, quality.sigma_nor_stated,
     )  # fmt: skip
     step(1.0)
     used = dots.points_mm[mapping.agreeing]
@@ -211,13 +294,17 @@ def _measure_dots(
     return dots
 
 
-def _fit_mapping(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> _Mapping:
-    """Fit a thin lens to the labels, leave out dots that disagree with their neighbours, and train the network."""
+def _fit_mapping(
+    experiment: Experiment,
+    setup: CameraSetup,
+    dots: BoardDots,
+    stated_mm: np.ndarray,
+    lens: ThinLensModel,
+    pitch_mm: float,
+) -> _Mapping:
+    """Leave out dots that disagree with their neighbours, and train the network."""
     settings, place = experiment.network, f"{experiment.path}: labels of camera {setup.name!r}"
-    std = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch_mm)
-    with _input_errors(place):
-        lens = fit_thin_lens(dots.points_mm, dots.pupil_mm, dots.array_mm, setup.optics, std=std)
-    checks.check_pupil(experiment, setup, dots, lens)
+    std = _label_std(dots, pitch_mm)
     residual = dots.array_mm - lens(dots.points_mm, dots.pupil_mm)
     typical_residual = float(np.median(np.linalg.norm(residual, axis=1))) / pitch_mm
     nominal = checks.compare_with_nominal(setup, lens, typical_residual)
@@ -240,7 +327,17 @@ def _fit_mapping(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pi
             virtual_samples=sampler_between_dots(points, pupil, target, std, pitch_mm=pitch_mm, seed=settings.seed),
             unit=pitch_mm,
         )
-    return _Mapping(baseline=baseline, training=training, agreeing=agreeing, nominal=nominal)
+    held_out = training.split.test
+    inputs = stated_mm[agreeing][held_out], pupil[held_out]
+    mapped = training.network(np.hstack(inputs)) + (0.0 if baseline is None else baseline(*inputs))
+    stated = np.linalg.norm(mapped - dots.array_mm[agreeing][held_out], axis=1) / pitch_mm
+    return _Mapping(
+        baseline=baseline,
+        training=training,
+        agreeing=agreeing,
+        nominal=nominal,
+        sigma_nor_stated=float(stated.mean()),
+    )
 
 
 def _disagreeing_per_plane(dots: BoardDots, agreeing: np.ndarray, dots_per_plane: int) -> np.ndarray:
@@ -254,6 +351,7 @@ def _quality(sensor: _Sensor, dots: BoardDots, mapping: _Mapping, rejected: int)
         turn_from_nominal_deg=mapping.nominal.turn_deg,
         magnification=mapping.nominal.magnification,
         sigma_nor_test=training.sigma_nor,
+        sigma_nor_stated=mapping.sigma_nor_stated,
         dots_found=int(dots.found.sum()),
         dots_expected=int(dots.expected.sum()),
         dots_found_per_plane=dots.found.tolist(),

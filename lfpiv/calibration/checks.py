@@ -14,7 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lfpiv.calibration.board.board import few_pixels
-from lfpiv.calibration.board.dots import BoardDots
+from lfpiv.calibration.board.dots import BoardDots, DotBoard
+from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel, thin_lens_model
@@ -55,6 +56,8 @@ VALUES_PER_DOT = 12
 """Values that one dot contributes: a ray model for s and t, quadratic in the pupil point."""
 REJECTED = 0.5
 """Part of a plane's dots that is rejected above which a warning is due."""
+OFF_PITCHES = 1.0
+"""Distance of a plane's dots from where they are stated to be above which a warning is due [microlens pitch]."""
 FEWEST_PLANES = 2
 """Least number of planes. One plane does not determine the camera's depth."""
 
@@ -200,6 +203,27 @@ def check_rejected(experiment: Experiment, setup: CameraSetup, dots: BoardDots, 
             "path": str(experiment.board_path(setup.name, plane)),
         }
         warn(log, Warning(code=Code.PLANE_LEFT_OUT, subject=setup.name, figures=figures))
+
+
+def check_board(errors: BoardErrors, board: DotBoard, pitch_mm: float) -> None:
+    """Warn of each plane whose dots lie, root mean square, further off than `OFF_PITCHES`.
+
+    `pitch_mm` is the microlens pitch as an object in focus sees it [mm].
+    """
+    dots = np.arange(len(board.planes_mm) * board.size)
+    off = errors.points_mm(board, dots) - board.of_dots_mm(dots)
+    rms = np.sqrt((off**2).sum(1).reshape(-1, board.size).mean(1))
+    for plane in map(int, np.flatnonzero(rms > OFF_PITCHES * pitch_mm)):
+        x, y = map(float, errors.plane[plane, :2])
+        figures = {
+            "plane": plane,
+            "z_mm": board.planes_mm[plane],
+            "fitted_mm": float(errors.depth_mm[plane]),
+            "x_mm": x,
+            "y_mm": y,
+            "tilt_deg": float(np.degrees(np.hypot(*errors.plane[plane, 3:5]))),
+        }
+        warn(log, Warning(code=Code.PLANE_OFF, figures=figures))
 
 
 def check_mapping(

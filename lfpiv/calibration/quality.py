@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -51,7 +52,10 @@ class CalibrationQuality(LensArrayQuality):
     magnification: float
     """Magnification at the middle of the board."""
     sigma_nor_test: float
-    """Mean error of the mapping on held-out dots, Eq. 8 [microlens pitch]."""
+    """Mean error of the mapping on held-out dots, Eq. 8 [microlens pitch]. Errors of the board are corrected."""
+    sigma_nor_stated: float = math.nan
+    """The same with the dots where they are stated to be: errors of the mapping and of the board together. Equal to
+    `sigma_nor_test` where nothing is corrected; nan in older files."""
     dots_found: int
     """Dots measured in all planes."""
     dots_expected: int

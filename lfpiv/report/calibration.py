@@ -9,11 +9,14 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.patches import PathPatch, Polygon, Rectangle
 
+from lfpiv.calibration.board.dots import DotBoard
+from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import LensLattice, Optics, float_pair
 from lfpiv.report import markup
+from lfpiv.report.board_errors import board_part
 from lfpiv.report.dot_map import DotMap, dot_map, dot_outlines_px, rms_by
 from lfpiv.report.lens_map import LensMap, lattice_px, lens_map
 from lfpiv.report.markup import number
@@ -31,6 +34,7 @@ BINS = 50
 
 _ROWS = (
     ("error on held-out dots, σ_nor (Eq. 8) [pitch]", "sigma_nor_test", 4),
+    ("the same with the board as stated [pitch]", "sigma_nor_stated", 4),
     ("dots measured", "dots_found", 0),
     ("dots in the field", "dots_expected", 0),
     ("labels", "labels", 0),
@@ -68,12 +72,14 @@ def section(experiment: Experiment, calibration: Calibration, figures: Mapping[s
         markup.table(["camera", *figures], rows, caption="Figures of the calibration by camera"),
         markup.paragraph("A pitch is the distance between microlenses; errors in pitches lie on the microlens array."),
     ]
+    if calibration.board is not None:
+        parts.append(board_part(calibration.board))
     for setup in experiment.cameras:
         camera = calibration.cameras[setup.name]
         parts.append(f"<h3>{markup.escape(setup.name)}</h3>")
         parts.append(_lens_figure(experiment, setup, camera))
         found = dot_map(camera)
-        parts.append(_board_figure(experiment, setup, camera, found))
+        parts.append(_board_figure(experiment, setup, camera, found, calibration.board))
         if found is not None:
             parts.append(_mapping_figure(experiment, camera, found))
     return "\n".join(parts)
@@ -126,7 +132,13 @@ def _worst_corner(found: LensMap, shape: tuple[int, int], edge: int) -> tuple[tu
     return places[name][2:], name
 
 
-def _board_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedCamera, found: DotMap | None) -> str:
+def _board_figure(
+    experiment: Experiment,
+    setup: CameraSetup,
+    camera: CalibratedCamera,
+    found: DotMap | None,
+    errors: BoardErrors | None,
+) -> str:
     """Draw the first, middle and last plane by depth; tabulate all planes."""
     board = experiment.board
     per_plane = board.dots[0] * board.dots[1]
@@ -135,8 +147,11 @@ def _board_figure(experiment: Experiment, setup: CameraSetup, camera: Calibrated
     shown = []
     for plane in dict.fromkeys((order[0], order[len(order) // 2], order[-1])):
         depth = board.planes_mm[plane]
-        outlines = dot_outlines_px(camera.map, setup.optics, board.dots, board.spacing_mm, depth)
-        measured = np.isin(plane * per_plane + np.arange(per_plane), known)
+        numbers = plane * per_plane + np.arange(per_plane)
+        stated = DotBoard.from_settings(board)
+        points = stated.of_dots_mm(numbers) if errors is None else errors.points_mm(stated, numbers)
+        outlines = dot_outlines_px(camera.map, setup.optics, points)
+        measured = np.isin(numbers, known)
         photo = experiment.board_image(setup.name, int(plane))
         shown.append(board_photo(photo, outlines, measured, f"z = {markup.general(depth)} mm"))
     caption = (

@@ -68,9 +68,7 @@ def rms_by(key: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def dot_outlines_px(
     mapping: Callable[[np.ndarray, np.ndarray], np.ndarray],
     optics: Optics,
-    dots: tuple[int, int],
-    spacing_mm: float,
-    depth_mm: float,
+    points: np.ndarray,
 ) -> np.ndarray:
     """Trace the outline of each dot's light on the sensor, by the rays through the edge of the pupil (Eq. 9).
 
@@ -80,18 +78,14 @@ def dot_outlines_px(
         Maps points (n, 3) and pupil positions (n, 2) [mm] to the microlens array (n, 2) [mm].
     optics : Optics
         Nominal optics of the camera.
-    dots : (int, int)
-        Dots of the board along x and y.
-    spacing_mm, depth_mm : float
-        Spacing of the dots and z of the plane [mm].
+    points : ndarray, shape (dot, 3)
+        Positions of the dots [mm].
 
     Returns
     -------
     ndarray, shape (dot, point, 2)
         (column, row) [pixel].
     """
-    x, y = ((np.arange(n) - (n - 1) / 2) * spacing_mm for n in dots)
-    points = np.array([(a, b, depth_mm) for b in y for a in x])
     rays = int(np.clip(OUTLINE_POINTS // len(points), *RIM_POINTS))
     angle = np.linspace(0, 2 * np.pi, rays, endpoint=False)
     rim = optics.pupil_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)

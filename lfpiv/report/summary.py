@@ -18,6 +18,7 @@ class CameraFigures(_Figures):
     """Figures of a camera's calibration; None where the calibration has no such figure."""
 
     sigma_nor_test: float | None = None
+    sigma_nor_stated: float | None = None
     dots_found: int | None = None
     dots_expected: int | None = None
     labels: int | None = None

@@ -108,6 +108,7 @@ def build(
             "correlation": sum(figures.correlation_s for figures in pairs),
         },
         "calibration": reports,
+        "board": {} if calibrated.calibration.board is None else calibrated.calibration.board.to_json(),
         "weights": weights,
         "background": dict(contents.background),
         "pairs": [
@@ -161,6 +162,7 @@ def _warnings(
 def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
     """Return the warnings about the calibration, and about the position of the cameras relative to the volume."""
     found = [warning for camera in calibration.cameras.values() for warning in camera.warnings]
+    found += () if calibration.board is None else calibration.board.warnings
     found += [*outside_warnings(calibration, grid), *sight_warnings(calibration, grid)]
     return [*found, Warning(code=Code.ONE_CAMERA)] if len(calibration.cameras) == 1 else found
 

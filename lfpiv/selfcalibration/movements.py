@@ -145,9 +145,8 @@ def self_calibrate(
         if len(found) > ROUNDS or apart[-1] < CONVERGED_VOXEL * grid.voxel_mm:
             break
         movements = {name: movements[name].after(step) for name, step in steps.items()}
-        corrected = Calibration(
-            {name: calibration.cameras[name].moved(*move.affine) for name, move in movements.items()}
-        )
+        moved = {name: calibration.cameras[name].moved(*move.affine) for name, move in movements.items()}
+        corrected = replace(calibration, cameras=moved)
     return SelfCalibration(
         calibration=corrected,
         movements={name: replace(move, std=steps[name].std) for name, move in movements.items()},

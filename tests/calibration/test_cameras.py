@@ -34,6 +34,7 @@ MAPPING_AIM_PITCH = 0.006  # the project's aim for the mean mapping error, reach
 INTERIOR_VOXEL = 0.45  # the project's limit for the mean displacement error of interior vectors
 FINITE = 0.95  # the project's limit for the part of grid points with a finite vector
 CORRECTION_SHARE = 0.1  # difference of two samples of rays: voxel centres against the whole volume
+PLANE_MM = 0.01  # the error of one plane's depth, as one camera sees it
 ROUND_TRIP_MM = 1e-9  # rounding of a calibration read back
 
 
@@ -82,6 +83,9 @@ def test_a_calibration_read_back_is_the_same(rig, tmp_path):
     assert again.optics == camera.optics
     assert again.lattice == camera.lattice
     assert again.report == camera.report
+    board = lfpiv.load_calibration(tmp_path / "calibration.h5").board
+    assert board.to_json() == calibration.board.to_json()
+    assert board.corrected == () and board.warnings == ()  # the board is perfect
     assert again.gain.tobytes() == camera.gain.tobytes()
     image = np.full(camera.optics.sensor_shape, 40.0)
     assert again.decoder.background(image) == camera.decoder.background(image)
@@ -206,10 +210,18 @@ def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(r
     copy = experiment.board_image("only", 2).astype(np.uint16)
     with pytest.raises(lfpiv.InputError, match=r"plane_03\.tif.*found the same image as .*plane_02\.tif"):
         lfpiv.calibrate(spoiled(experiment, tmp_path / "data", {3: copy}))
-    camera = lfpiv.calibrate(some_planes(experiment, -0.8, -0.4, 0.1, 0.4, 0.8)).cameras["only"]
+    camera = lfpiv.calibrate(some_planes(experiment, -0.8, -0.4, 0.3, 0.4, 0.8)).cameras["only"]
     (text,) = (warning.sentence for warning in camera.warnings if warning.code is Code.PLANE_LEFT_OUT)
-    assert "25 of 25 dots of plane 2" in text and "z = 0.1 mm" in text and "plane_02.tif" in text
+    assert "25 of 25 dots of plane 2" in text and "z = 0.3 mm" in text and "plane_02.tif" in text
     assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8]) <= MAPPING_AIM_PITCH  # without these dots
+    found = lfpiv.calibrate(some_planes(experiment, -0.8, -0.4, 0.13, 0.4, 0.8))
+    (warning,) = found.board.warnings
+    assert warning.code is Code.PLANE_OFF and "plane 2 of the board" in warning.sentence
+    assert abs(found.board.depth_mm[2]) < PLANE_MM
+    camera = found.cameras["only"]
+    assert camera.warnings == () and camera.report.dots_rejected == 0
+    assert mean_error_pitch(camera, spec, [-1, -1, -0.8], [1, 1, 0.8]) <= MAPPING_PITCH
+    assert camera.report.sigma_nor_stated > 10 * camera.report.sigma_nor_test  # the stage's part and the lens's
 
 
 def test_few_dots_and_a_poor_mapping_are_warned_of(rig):

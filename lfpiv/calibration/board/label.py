@@ -32,6 +32,9 @@ _OUTLIER_LIGHT = 3.0  # a dot is at most this many times fainter or brighter tha
 _OUTLIER_SIGMA, _OUTLIER_PITCHES = 6.0, 0.15  # a dot is less than one of them off its expected position
 _LABELS = 37  # pupil points per dot
 _SEEN_PIXELS = 1.5  # a label lies at most this far from a pixel that saw the dot
+_PLANE_DOTS = 9  # least number of dots of a plane that gets its own displacement beside the smooth departure
+_PLANE_SIGMA = 5.0  # a plane is displaced if its median departure is this many standard errors
+_PLANE_WEIGHT = 1e-2  # scale of these terms: where both can describe a departure, the smooth one does
 _TUKEY = 4.685  # residual without weight in Tukey's biweight [standard deviations]
 _ROBUST_ROUNDS = 15
 
@@ -96,8 +99,8 @@ def _predict(fits: Sequence[DotFit | None], detection: Detection, board: DotBoar
     dots = _candidates(detection, board)
     wanted = board.of_dots_mm(dots)
     spread = np.stack([_spread(fit) for fit in sure])
-    smooth, scatter = _smooth(points, theta - _pose_terms(pose, points, radius), spread, wanted, board)
     floor = np.take(_FLOOR_PITCHES, _ORDER)[:, None] * pitch
+    smooth, scatter = _smooth(points, theta - _pose_terms(pose, points, radius), spread, wanted, board, floor[0, 0])
     expected = _pose_terms(pose, wanted, radius) + smooth
     return _Prediction(pose=pose, dot=dots, theta=expected, sigma=np.hypot(scatter, floor))
 
@@ -129,12 +132,13 @@ def _spread(fit: DotFit) -> np.ndarray:
 
 
 def _smooth(
-    points: np.ndarray, change: np.ndarray, spread: np.ndarray, wanted: np.ndarray, board: DotBoard
+    points: np.ndarray, change: np.ndarray, spread: np.ndarray, wanted: np.ndarray, board: DotBoard, floor_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit a robust polynomial in (x, y, z), at most cubic, to each coefficient of the ray models.
 
-    Return its values at `wanted`, (n, TERMS, 2), and their standard deviations: the scatter of the dots about it beyond
-    their own errors, and the polynomial's own error.
+    If planes do not stand where they are said to, each plane has a displacement and a tilt of its own beside it.
+    `floor_mm` is the departure of a plane that does not matter [mm]. Return its values at `wanted`, (n, TERMS, 2), and
+    their standard deviations: the scatter of the dots about it beyond their own errors, and the polynomial's own error.
     """
     limits = [min(3, board.dots[0] - 1), min(3, board.dots[1] - 1), min(3, len(np.unique(points[:, 2])) - 1)]
     powers = [p for p in itertools.product(range(4), repeat=3) if sum(p) <= 3 and np.all(np.array(p) <= limits)]
@@ -149,11 +153,43 @@ def _smooth(
         return np.stack([np.prod(scaled ** np.array(p), axis=1) for p in powers], axis=1)
 
     have, want = design(points), design(wanted)
+    displaced = _displaced_planes(points, have, change[:, 0], spread[:, 0], floor_mm)
+    have, want = (
+        np.hstack([terms, _plane_terms((where - centre) / half, where[:, 2], displaced)])
+        for terms, where in ((have, points), (want, wanted))
+    )
     values, sigma = np.empty((len(wanted), TERMS, 2)), np.empty((len(wanted), TERMS, 2))
     for term, axis in itertools.product(range(TERMS), range(2)):
         fitted = _robust_fit(have, want, change[:, term, axis], spread[:, term, axis] ** 2)
         values[:, term, axis], sigma[:, term, axis] = fitted
     return values, sigma
+
+
+def _displaced_planes(
+    points: np.ndarray, have: np.ndarray, chief: np.ndarray, spread: np.ndarray, floor_mm: float
+) -> np.ndarray:
+    """Return the depths of the planes that get their own terms: none unless a plane departs from the smooth fit."""
+    departure = np.empty_like(chief)
+    for axis in range(2):
+        departure[:, axis] = chief[:, axis] - _robust_fit(have, have, chief[:, axis], spread[:, axis] ** 2)[0]
+    depths, count = np.unique(points[:, 2], return_counts=True)
+    enough = depths[count >= _PLANE_DOTS]
+    for depth in enough:
+        here = departure[points[:, 2] == depth]
+        median = np.median(here, axis=0)
+        error = np.sqrt(np.pi / 2 / len(here)) * NORMAL_MAD * np.median(np.abs(here - median), axis=0)
+        if (np.abs(median) > np.maximum(floor_mm, _PLANE_SIGMA * error)).any():
+            return enough
+    return enough[:0]
+
+
+def _plane_terms(scaled: np.ndarray, depth: np.ndarray, planes: np.ndarray) -> np.ndarray:
+    """Return the columns 1, x, y of each of the planes, zero for dots of other planes, shape (n, 3 planes)."""
+    columns = np.hstack([np.ones((len(scaled), 1)), scaled[:, :2]])
+    terms: np.ndarray = (_PLANE_WEIGHT * columns[:, None] * (depth[:, None] == planes)[..., None]).reshape(
+        len(scaled), -1
+    )
+    return terms
 
 
 def _robust_fit(

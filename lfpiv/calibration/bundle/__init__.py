@@ -1,0 +1,1 @@
+"""Errors of the board, fitted jointly to the labels of all cameras."""
