@@ -171,8 +171,8 @@ def _agreement(weights: WeightFigures) -> str:
         )
         text += (
             f"{'; ' if text else ''}self-calibrated by {markup.count(len(corrected.pairs), 'pair')}: "
-            f"{number(corrected.disparity_before_voxel, 2)} voxel before, {number(corrected.disparity_voxel, 2)} after; "
-            f"{moved}"
+            f"{number(corrected.disparity_before_voxel, 2)} voxel before, "
+            f"{number(corrected.disparity_voxel, 2)} after; {moved}"
         )
     return text
 

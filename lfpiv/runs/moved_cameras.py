@@ -1,7 +1,7 @@
 """Cameras that moved since the board was recorded: warn about them, or correct the calibration.
 
-Both use the particle images of both frames of some pairs, without the light that stays in place. `check` measures how far
-apart the cameras show the same particles; `correct` fits the movements of the cameras to these disparities.
+Both use the particle images of both frames of some pairs, without the light that stays in place. `check` measures how
+far apart the cameras show the same particles; `correct` fits the movements of the cameras to these disparities.
 """
 
 from __future__ import annotations

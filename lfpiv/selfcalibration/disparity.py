@@ -1,10 +1,10 @@
 """Disparity: distance between the positions at which two cameras show the same particles, in parts of a volume.
 
 The volume reconstructed from the images of a single camera shows every particle, elongated along the camera's line of
-sight. The displacement at which the volumes of two cameras correlate best is their disparity. Across both lines of sight
-it is sharp. In the plane of the lines of sight it is not, so that only near lags are searched there. The roots of the
-intensities are correlated: few bright particles, or light that is no particle, would decide otherwise. Input: weights
-and particle images of some instants. Output: a `Disparity` per pair of cameras and part of the volume.
+sight. The displacement at which the volumes of two cameras correlate best is their disparity. Only its part across both
+lines of sight is used: in their plane the peak is so long that noise decides its place, and a movement there moves all
+particles alike. The roots of the intensities are correlated, or few bright particles would decide. Input: weights and
+particle images of some instants. Output: a `Disparity` per pair of cameras and part of the volume.
 """
 
 from __future__ import annotations
@@ -190,11 +190,13 @@ def slant(cameras: Sequence[CalibratedCamera], grid: Grid) -> np.ndarray:
 
 def _flattened(volume: np.ndarray) -> np.ndarray:
     """Return the roots of a volume, smoothed, less their local mean; beyond the volume nothing counts."""
-    roots, inside = np.sqrt(volume), np.ones_like(volume)
+    roots: np.ndarray = np.sqrt(volume)
+    inside = np.ones_like(volume)
 
     def mean(sigma: float) -> np.ndarray:
         smoothed: np.ndarray = gaussian_filter(roots, sigma, mode="constant")
-        return smoothed / gaussian_filter(inside, sigma, mode="constant")
+        smoothed /= gaussian_filter(inside, sigma, mode="constant")
+        return smoothed
 
     flattened: np.ndarray = mean(SMOOTHING_VOXEL) - mean(MEAN_VOXEL)
     return flattened

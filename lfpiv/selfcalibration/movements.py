@@ -136,18 +136,28 @@ class MovementFit:
             for number, (name, value) in enumerate(zip(self.cameras, self.values.reshape(-1, 6), strict=True))
         }
 
-    def significant_part(self, reach_mm: float) -> MovementFit:
-        """Return the part of the movements along independent directions that exceeds its standard errors.
+    def significant_directions(self, reach_mm: float) -> np.ndarray:
+        """Return the projection onto those movements that exceed their standard errors, shape (6 cameras, 6 cameras).
 
-        The directions are the principal axes of the covariance, rotations counted by the distance that they move a
-        point at `reach_mm` from the centre.
+        Movements are judged along the principal axes of the covariance, rotations counted by the distance that they
+        move a point at `reach_mm` from the centre.
         """
         scale = np.tile(np.repeat([1.0, reach_mm], 3), len(self.cameras))
         variance, axes = np.linalg.eigh(self.covariance * np.outer(scale, scale))
         along = axes.T @ (scale * self.values)
         kept = along**2 > SIGNIFICANT_SIGMA**2 * np.maximum(variance, 0)
         kept &= variance > LEAST_VARIANCE * variance[-1]  # the mean movement has none
-        return replace(self, values=axes @ np.where(kept, along, 0.0) / scale)
+        projection: np.ndarray = (axes[:, kept] @ axes[:, kept].T) * scale / scale[:, None]
+        return projection
+
+    def along(self, projection: np.ndarray) -> MovementFit:
+        """Return the part of the movements within a projection."""
+        return replace(self, values=projection @ self.values)
+
+    @property
+    def explained_mm(self) -> float:
+        """Observable distance of the cameras, with the part that errors make [mm]."""
+        return float(np.sqrt(self.values @ self.observed @ self.values))
 
 
 class Verdict(enum.Enum):
@@ -227,10 +237,12 @@ def self_calibrate(
                 "voxels of each other, found none: it moved by more, its images are of other instants, or show too few."
             )
         fits.append(fit_movements(found[-1], list(movements), grid))
-        now = fits[-1].separation
-        if len(found) > ROUNDS or not now.significant or now.mm < CONVERGED_VOXEL * grid.voxel_mm:
+        if number == 0:  # later rounds refine what is significant in the first one
+            shown = fits[0].significant_directions(reach_mm) if fits[0].separation.significant else 0 * fits[0].observed
+        step = fits[-1].along(shown)
+        if len(found) > ROUNDS or step.explained_mm < CONVERGED_VOXEL * grid.voxel_mm:
             break
-        steps = fits[-1].significant_part(reach_mm).movements
+        steps = step.movements
         movements = {name: movements[name].after(step) for name, step in steps.items()}
         corrected = Calibration(
             {name: calibration.cameras[name].moved(*move.affine) for name, move in movements.items()}
