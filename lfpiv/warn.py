@@ -57,6 +57,7 @@ class Code(enum.Enum):
     ONE_CAMERA = "one_camera"
     APART = "apart"
     NOTHING_IN_COMMON = "nothing_in_common"
+    NOT_SELF_CALIBRATED = "not_self_calibrated"
     # weights
     WEIGHTS_UNCHECKED = "weights_unchecked"
     WEIGHTS_DIFFER = "weights_differ"
@@ -174,6 +175,10 @@ SENTENCES: Mapping[Code, str] = {
     Code.NOTHING_IN_COMMON: (
         "{names} show no particles in common within {search} voxels: a camera moved by more, their images are of "
         "different instants, or show very few particles."
+    ),
+    Code.NOT_SELF_CALIBRATED: (
+        "self-calibration keeps the calibration of the board: {verdict}. Check the particle images, use more pairs "
+        "(self_calibration.pairs), or record the board again if a camera moved."
     ),
     Code.WEIGHTS_UNCHECKED: (
         "sees none of the voxels drawn at random to check its weights against counted rays: they are unchecked. "

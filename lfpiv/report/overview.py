@@ -161,7 +161,10 @@ def _agreement(weights: WeightFigures) -> str:
     if weights.disparity_voxel is not None:
         text = f"particles of pair {weights.disparity_pair} within {weights.disparity_voxel:.2f} voxel"
     corrected = weights.self_calibration
-    if corrected is not None:
+    if corrected is not None and corrected.verdict != "corrected":
+        pairs = markup.count(len(corrected.pairs), "pair")
+        text += f"{'; ' if text else ''}self-calibration by {pairs} changed nothing: {corrected.verdict}"
+    elif corrected is not None:
         moved = ", ".join(
             f"{name} by {1000 * float(np.linalg.norm(move.shift_mm)):.0f} µm and "
             f"{float(np.linalg.norm(move.rotation_deg)):.2f}°"
@@ -169,7 +172,8 @@ def _agreement(weights: WeightFigures) -> str:
         )
         text += (
             f"{'; ' if text else ''}self-calibrated by {markup.count(len(corrected.pairs), 'pair')}: "
-            f"{corrected.disparity_before_voxel:.2f} voxel before, {corrected.disparity_voxel:.2f} after; {moved}"
+            f"{number(corrected.disparity_before_voxel, 2)} voxel before, "
+            f"{number(corrected.disparity_voxel, 2)} after; {moved}"
         )
     return text
 

@@ -43,8 +43,9 @@ class SelfCalibration(_Figures):
     """Disparity between the cameras before and after self-calibration, and the corrections."""
 
     pairs: tuple[int, ...]
-    disparity_before_voxel: float
-    disparity_voxel: float
+    verdict: str = "corrected"
+    disparity_before_voxel: float | None
+    disparity_voxel: float | None
     movements: dict[str, Movement]
 
 

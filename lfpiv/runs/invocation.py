@@ -56,6 +56,7 @@ class WeightsFigures:
             stored["self_calibration"] = self.self_calibration.to_json()
         if self.disparity is not None:
             stored |= {"disparity_voxel": self.disparity.voxel, "disparity_pair": self.disparity.pair}
+            stored["disparity_std_voxel"] = self.disparity.std_voxel
         if self.method == "footprint":
             stored |= {"form": dict(self.forms), "cuts": dict(self.cuts)}
             stored["profiles_check_l2"] = {name: _rounded(errors) for name, errors in self.profile_errors.items()}

@@ -1,25 +1,25 @@
 """Cameras that moved since the board was recorded: warn about them, or correct the calibration.
 
-Both use the particle images of the first frame of some pairs. `check` measures how far apart the cameras show the same
-particles; `correct` fits the movements of the cameras to these disparities.
+Both use the particle images of both frames of some pairs, without the light that stays in place. `check` measures how
+far apart the cameras show the same particles; `correct` fits the movements of the cameras to these disparities.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lfpiv.lightfield.particle_signal import NOISE
+from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.progress import StepProgress
 from lfpiv.runs.frame_light import frame_light, read_darks
-from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, disparities, unlinked
-from lfpiv.selfcalibration.movements import SelfCalibration, explained_mm, fit_movements, self_calibrate
-from lfpiv.warn import Code, Warning, warn
+from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes, unlinked, without_still_light
+from lfpiv.selfcalibration.movements import Verdict, fit_movements, self_calibrate
+from lfpiv.warn import Code, Warning, name_pairs, warn
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -29,11 +29,17 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LARGE_VOXEL = 0.5
-"""Disparity of the cameras above which `check` warns [voxel]."""
+LARGE_VOXEL = 0.25
+"""Disparity of the cameras across their lines of sight above which `check` warns [voxel]."""
 
 TRIED = 3
-"""Largest number of pairs that `check` tries."""
+"""Largest number of pairs that `check` uses. One is enough if it shows clearly whether the disparity is large."""
+
+LEAST_FOR_NOTHING = 2
+"""Least number of pairs without common particles that a warning of it needs."""
+
+CLEAR = 2 * NOISE
+"""Structure of images above which cameras that show no common particles are warned of."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +68,22 @@ class SelfCalibrationFigures:
 
     pairs: Sequence[int]
     """Pairs whose images were used."""
-    corrections: int
-    disparity_before_voxel: float
-    disparity_voxel: float
-    movements: Mapping[str, MovementFigures]
-    """Camera -> its movement."""
+    verdict: str = Verdict.CORRECTED.value
+    """Text of a `Verdict`."""
+    corrections: int = 0
+    """Corrections that were tried."""
+    disparity_before_voxel: float | None = None
+    disparity_voxel: float | None = None
+    """Disparity after the last correction."""
+    movements: Mapping[str, MovementFigures] = field(default_factory=dict)
+    """Camera -> its movement; zero if the calibration of the board is kept."""
+
+    @property
+    def warnings(self) -> tuple[Warning, ...]:
+        """Warning that the calibration of the board is kept although cameras may have moved."""
+        if self.verdict in (Verdict.CORRECTED.value, Verdict.UNMOVED.value):
+            return ()
+        return (Warning(code=Code.NOT_SELF_CALIBRATED, figures={"verdict": self.verdict}),)
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that a file stores."""
@@ -84,28 +101,39 @@ class CameraDisparity:
     """Distance at which the cameras show the same particles."""
 
     voxel: float
+    std_voxel: float
+    """Standard error of `voxel`."""
     pair: int
-    """Pair that it was measured with."""
+    """First pair that it was measured with."""
 
 
 def correct(
     experiment: Experiment, calibration: Calibration, progress: StepProgress
-) -> tuple[SelfCalibration, SelfCalibrationFigures]:
+) -> tuple[Calibration, SelfCalibrationFigures]:
     """Correct a calibration by the pairs that the experiment names; return it with its figures.
 
-    Raises
-    ------
-    ValueError
-        If images cannot be used, or show too few particles to find the movements.
+    It stays the board's where the images do not show how cameras moved; the figures say why.
     """
-    pairs, darks, frame = experiment.self_calibration_pairs, read_darks(experiment), experiment.frames[0]
-    images = [frame_light(experiment, calibration.cameras, darks, pair, frame).images for pair in pairs]
-    found = self_calibrate(calibration, experiment.grid, images, progress=progress)
-    before, after = (apart / experiment.grid.voxel_mm for apart in (found.apart_mm[0], found.apart_mm[-1]))
-    corrections = len(found.apart_mm) - 1
-    log.info("self-calibration: cameras were %.2f voxel apart, now %.2f (%d corrections)", before, after, corrections)
-    return found, SelfCalibrationFigures(
-        pairs=pairs,
+    darks, used, images = read_darks(experiment), list[int](), list[dict[str, np.ndarray]]()
+    for pair in experiment.self_calibration_pairs:
+        try:
+            images += _moving_light(experiment, calibration.cameras, darks, pair)
+        except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
+            log.debug("self-calibration without pair %d: %s", pair, error)
+            continue
+        used.append(pair)
+    try:
+        found = self_calibrate(calibration, experiment.grid, images, progress=progress)
+    except ValueError as error:
+        log.debug("self-calibration: %s", error)
+        return calibration, SelfCalibrationFigures(pairs=used, verdict=Verdict.NOTHING_IN_COMMON.value)
+    before, after = (apart.mm / experiment.grid.voxel_mm for apart in (found.apart[0], found.apart[-1]))
+    corrections = len(found.apart) - 1
+    text = "self-calibration: cameras were %.2f voxel apart, now %.2f (%d corrections): %s"
+    log.info(text, before, after, corrections, found.verdict.value)
+    return found.calibration, SelfCalibrationFigures(
+        pairs=used,
+        verdict=found.verdict.value,
         corrections=corrections,
         disparity_before_voxel=round(before, 3),
         disparity_voxel=round(after, 3),
@@ -114,35 +142,64 @@ def correct(
 
 
 def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> CameraDisparity | None:
-    """Measure with the first usable pair how far apart the cameras show the same particles; warn if it is far.
+    """Measure how far apart the cameras show the same particles; warn if it is far.
 
-    Return None if there is one camera only, if no pair shows particles, or if the cameras show none in common. Warn in
-    the last case.
+    Uses one pair after another, `pairs` first, until the answer is clear. Return None if there is one camera only, if
+    no pair shows particles, or if the cameras show none in common. Warn in the last case if several pairs agree on it.
     """
     if len(weights.cameras) < 2 or weights.method != "footprint":
         return None
-    darks, grid = read_darks(experiment), experiment.grid
-    without_links = dict[int, list[str]]()
-    for pair in islice(pairs, TRIED):
+    darks, volumes, used = read_darks(experiment), CameraVolumes(weights), list[int]()
+    separation, lost, clear = None, list[str](), True
+    for pair in islice(dict.fromkeys([*pairs, *range(experiment.pairs)]), TRIED):
         try:
-            light = frame_light(experiment, weights.cameras, darks, pair, experiment.frames[0])
-            if min(light.structure.values()) < NOISE:
-                continue
-            found = disparities(weights, [light.images])
+            light = _moving_light(experiment, weights.cameras, darks, pair)
+            for images in light:
+                volumes.add(images)
         except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
             log.debug("disparity of the cameras in pair %d: %s", pair, error)
             continue
+        used.append(pair)
+        found = volumes.disparities()
         if lost := unlinked(found, weights.cameras):
-            without_links[pair] = lost
+            clear = clear and all(_shows_particles(images, weights.cameras) for images in light)
             continue
-        disparity = explained_mm(found, fit_movements(found, list(weights.cameras), grid), grid) / grid.voxel_mm
-        log.info("cameras show the particles of pair %d within %.2f voxel of each other", pair, disparity)
-        if disparity > LARGE_VOXEL:
-            warn(log, _apart(disparity, experiment, weights.cameras))
-        return CameraDisparity(voxel=round(disparity, 3), pair=pair)
-    if without_links:
-        warn(log, _nothing_in_common(without_links, len(weights.cameras)))
-    return None
+        separation = fit_movements(found, list(weights.cameras), experiment.grid).separation
+        if separation.differs_from(LARGE_VOXEL * experiment.grid.voxel_mm):
+            break
+    if separation is None or lost:
+        if clear and len(used) >= LEAST_FOR_NOTHING:
+            warn(log, _nothing_in_common(dict.fromkeys(used, lost), len(weights.cameras)))
+        return None
+    disparity, std = (length / experiment.grid.voxel_mm for length in (separation.mm, separation.std_mm))
+    text = "cameras show the particles of %s %.2f voxel apart (standard error %.2f)"
+    log.info(text, name_pairs(used), disparity, std)
+    if disparity > LARGE_VOXEL and separation.significant:
+        warn(log, _apart(disparity, experiment, weights.cameras))
+    return CameraDisparity(voxel=round(disparity, 3), std_voxel=round(std, 3), pair=used[0])
+
+
+def _moving_light(
+    experiment: Experiment, cameras: Mapping[str, CalibratedCamera], darks: Mapping[str, np.ndarray | None], pair: int
+) -> list[dict[str, np.ndarray]]:
+    """Return the images of both frames of a pair, camera name -> image, without the light that stays in place.
+
+    Raises
+    ------
+    InputError
+        If an image is missing or damaged.
+    ValueError
+        If an image shows no particles.
+    """
+    light = [frame_light(experiment, cameras, darks, pair, frame) for frame in experiment.frames]
+    if min(value for one in light for value in one.structure.values()) < NOISE:
+        raise ValueError("expected particles, found only noise")
+    return without_still_light([one.images for one in light])
+
+
+def _shows_particles(images: Mapping[str, np.ndarray], cameras: Mapping[str, CalibratedCamera]) -> bool:
+    """Return whether images without still light show particles clearly, in every camera."""
+    return all(seen_structure(images[name], camera.decoder) > CLEAR for name, camera in cameras.items())
 
 
 def _apart(disparity: float, experiment: Experiment, cameras: Mapping[str, CalibratedCamera]) -> Warning:

@@ -23,7 +23,7 @@ from lfpiv.results import netcdf, provenance
 from lfpiv.runs import memory, moved_cameras
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
-from lfpiv.warn import Code, Warning, collected
+from lfpiv.warn import Code, Warning, collected, warn
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
@@ -82,12 +82,9 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
     if marks is not None and marks.figures is not None and stamp.fits(marks):
         log.info("self-calibration: finished before with the same settings, kept")
         return _with_standing(load_calibration(path), calibration), SelfCalibrationFigures.from_json(marks.figures)
-    try:
-        corrected, figures = moved_cameras.correct(run.experiment, calibration, run.step("self-calibration"))
-    except ValueError as error:
-        raise InputError(f"{run.experiment.path}: self_calibration.pairs: {error}") from None
-    _write(corrected.calibration, path, {**stamp.attributes, "figures": json.dumps(figures.to_json())})
-    return corrected.calibration, figures
+    corrected, figures = moved_cameras.correct(run.experiment, calibration, run.step("self-calibration"))
+    _write(corrected, path, {**stamp.attributes, "figures": json.dumps(figures.to_json())})
+    return corrected, figures
 
 
 def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
@@ -106,6 +103,8 @@ def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tu
         log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
     start = time.perf_counter()
     with collected() as warnings:
+        for warning in self_calibration.warnings if self_calibration else ():
+            warn(log, warning)
         weights = build_weights(
             calibration,
             experiment.grid,

@@ -1,7 +1,9 @@
 """Disparity: distance between the positions at which two cameras show the same particles, in parts of a volume.
 
 The volume reconstructed from the images of a single camera shows every particle, elongated along the camera's line of
-sight. The displacement at which the volumes of two cameras correlate best is their disparity. Input: weights and
+sight. The displacement at which the volumes of two cameras correlate best is their disparity. Only its part across both
+lines of sight is used: in their plane the peak is so long that noise decides its place, and a movement there moves all
+particles alike. The roots of the intensities are correlated, or few bright particles would decide. Input: weights and
 particle images of some instants. Output: a `Disparity` per pair of cameras and part of the volume.
 """
 
@@ -14,22 +16,29 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.fft
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import convolve, gaussian_filter
 
-from lfpiv.progress import StepProgress
+from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 
 if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.geometry.grid import Grid
     from lfpiv.weights.operator import Weights
 
-ITERATIONS = 10
+ITERATIONS = 5
 """SMART iterations of the volume of a single camera."""
-SMOOTHING_VOXEL = 1.0
-"""Standard deviation of the Gaussian that smooths volumes before they are correlated [voxel]."""
+STILL = 1.25
+"""Multiple of the light that stays in place that is subtracted from images. Pulses of a laser differ in energy."""
+SMOOTHING_VOXEL, MEAN_VOXEL = 0.7, 4.0
+"""Standard deviations of the Gaussians that smooth the roots of a volume, and that make the local mean subtracted from
+them [voxel]."""
 SEARCH_VOXEL = 16
 """Largest disparity along each axis [voxel]."""
+SLANT_VOXEL = 4.0
+"""Largest disparity in the plane of both lines of sight [voxel]. Long particles correlate there over many lags, so that
+peaks farther away say nothing about the cameras."""
 MIDDLE_VOXEL = 128
 """Largest edge of the middle part of the volume, which is correlated first [voxel]."""
 NEAR_VOXEL = 4
@@ -39,8 +48,15 @@ WINDOW_VOXEL, MOST_WINDOWS = 12, 3
 """Least edge of the windows into which the volume is cut [voxel], and their largest number along an axis."""
 LEAST_OVERLAP = 0.6
 """Least share of a window that must lie within the other volume at a lag."""
-FIT_REACH = 2
+FIT_REACH = 1
 """Lags on either side of the highest one to which a peak's paraboloid is fitted."""
+AVERAGED, SLANT_STD, ACROSS_STD = 4, 2.0, 0.3
+"""Half edge of the lags over which coefficients are averaged, and standard deviations of their weight in the plane of
+the lines of sight and across it [voxel]."""
+FLATTEST = 1e-3
+"""Least curvature of a peak, as a share of the largest one."""
+NEARLY_PARALLEL = 0.3
+"""Singular value of two lines of sight below which they count as parallel: about 25 degrees between them."""
 SIGNIFICANT = 1.5
 """Least ratio of a peak to the highest coefficient with one volume mirrored, which is due to chance."""
 
@@ -55,7 +71,7 @@ class Disparity:
     shift_mm: np.ndarray
     """Position in the second camera's volume of a particle at 0 in the first camera's, shape (3,) [mm]."""
     sharpness: np.ndarray
-    """Curvature of the peak over its height, shape (3, 3) [1/mm^2]: small along the lines of sight, large across."""
+    """Curvature of the peak over its height, shape (3, 3) [1/mm^2]; 0 in the plane of both lines of sight."""
     peak: float
     """Correlation coefficient."""
     rival: float
@@ -76,45 +92,114 @@ class Disparity:
         return float(np.sqrt(shift_mm @ self.weight @ shift_mm))
 
 
-def disparities(
-    weights: Weights,
-    images: Sequence[Mapping[str, np.ndarray]],
-    progress: StepProgress | None = None,
-) -> tuple[Disparity, ...]:
-    """Measure the disparities of all pairs of cameras in the parts of a volume that have a clear peak.
+def without_still_light(instants: Sequence[Mapping[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
+    """Subtract from images the light that all instants have at the same pixels: reflections, hot pixels, stray light.
+
+    Particles that hardly move between the instants are subtracted, too.
+
+    Parameters
+    ----------
+    instants : sequence of dict
+        Particle images, camera name -> image (rows, columns) [counts], background removed. Two instants or more.
+
+    Returns
+    -------
+    list of dict
+        The images less `STILL` times the lowest positive count of each pixel.
+    """
+    still = {name: np.maximum(np.min([one[name] for one in instants], axis=0), 0) for name in instants[0]}
+    return [{name: image - np.float32(STILL) * still[name] for name, image in one.items()} for one in instants]
+
+
+class CameraVolumes:
+    """Volumes of single cameras, from which disparities are measured.
 
     Parameters
     ----------
     weights : Weights
         The operator of two or more cameras.
-    images : sequence of dict
-        Particle images of some instants, camera name -> image (rows, columns), background removed.
-    progress : callable, optional
-        Called with the finished fraction.
-
-    Returns
-    -------
-    tuple of Disparity
-        Empty if no two cameras show the same particles in any part of the volume.
     """
-    names, grid = list(weights.cameras), weights.grid
-    by_camera: dict[str, list[np.ndarray]] = {}
-    for number, name in enumerate(names):
-        solver, by_camera[name] = SmartSolver(weights.of_camera(name), SmartSettings(iterations=ITERATIONS)), []
-        for place, instant in enumerate(images):
+
+    def __init__(self, weights: Weights):
+        self.weights = weights
+        settings = SmartSettings(iterations=ITERATIONS)
+        self._solvers = {name: SmartSolver(weights.of_camera(name), settings) for name in weights.cameras}
+        self._volumes: dict[str, list[np.ndarray]] = {name: [] for name in weights.cameras}
+
+    def add(self, images: Mapping[str, np.ndarray], progress: StepProgress | None = None) -> None:
+        """Add one instant: particle images, camera name -> image (rows, columns) [counts], background removed."""
+        for number, (name, solver) in enumerate(self._solvers.items()):
             if progress is not None:
-                progress((number + place / len(images)) / len(names))
-            volume = solver.solve({name: instant[name]}).volume
-            by_camera[name].append(gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant"))
-    found = []
-    middle = tuple(slice((n - m) // 2, (n + m) // 2) for n in grid.shape for m in [min(n, MIDDLE_VOXEL)])
-    for pair in combinations(names, 2):
-        volumes = by_camera[pair[0]], by_camera[pair[1]]
-        in_middle = _disparity(volumes, middle, grid, pair)
-        if in_middle is not None:
-            parts = [_disparity(volumes, window, grid, pair, near_mm=in_middle.shift_mm) for window in _windows(grid)]
-            found += [part for part in parts if part is not None] or [in_middle]
-    return tuple(found)
+                progress(number / len(self._solvers))
+            self._volumes[name].append(_flattened(solver.solve({name: images[name]}).volume))
+
+    def disparities(self) -> tuple[Disparity, ...]:
+        """Measure the disparities of all pairs of cameras in the parts of the volume that have a clear peak.
+
+        Returns
+        -------
+        tuple of Disparity
+            Empty if no two cameras show the same particles in any part of the volume.
+        """
+        grid, found = self.weights.grid, list[Disparity]()
+        middle = tuple(slice((n - m) // 2, (n + m) // 2) for n in grid.shape for m in [min(n, MIDDLE_VOXEL)])
+        for pair in combinations(self.weights.cameras, 2):
+            volumes = self._volumes[pair[0]], self._volumes[pair[1]]
+            slanted = slant([self.weights.cameras[name] for name in pair], grid)
+            in_middle = _disparity(volumes, middle, grid, pair, slanted)
+            if in_middle is not None:
+                parts = [
+                    _disparity(volumes, window, grid, pair, slanted, near_mm=in_middle.shift_mm)
+                    for window in _windows(grid)
+                ]
+                found += [part for part in parts if part is not None] or [in_middle]
+        return tuple(found)
+
+
+def disparities(
+    weights: Weights,
+    images: Sequence[Mapping[str, np.ndarray]],
+    progress: StepProgress | None = None,
+) -> tuple[Disparity, ...]:
+    """Measure the disparities of all pairs of cameras by particle images of some instants.
+
+    Parameters are those of `CameraVolumes` and `CameraVolumes.add`; the result is that of `CameraVolumes.disparities`.
+    """
+    volumes = CameraVolumes(weights)
+    for number, instant in enumerate(images):
+        part = None if progress is None else part_of(progress, number / len(images), (number + 1) / len(images))
+        volumes.add(instant, part)
+    return volumes.disparities()
+
+
+def slant(cameras: Sequence[CalibratedCamera], grid: Grid) -> np.ndarray:
+    """Return the projection onto the plane of two cameras' lines of sight in the middle of a volume, shape (3, 3).
+
+    If the lines are nearly parallel, it is the projection onto their common direction.
+    """
+    step = grid.voxel_mm * np.vstack([np.eye(3), -np.eye(3)])
+    sights = []
+    for camera in cameras:
+        ends = camera.map(grid.centre_mm + step, np.zeros((6, 2)))
+        sights.append(np.linalg.svd((ends[:3] - ends[3:]).T)[2][-1])  # what leaves the place on the array as it is
+    _, size, directions = np.linalg.svd(np.array(sights))
+    plane = directions[:2][size > NEARLY_PARALLEL]
+    projection: np.ndarray = plane.T @ plane
+    return projection
+
+
+def _flattened(volume: np.ndarray) -> np.ndarray:
+    """Return the roots of a volume, smoothed, less their local mean; beyond the volume nothing counts."""
+    roots: np.ndarray = np.sqrt(volume)
+    inside = np.ones_like(volume)
+
+    def mean(sigma: float) -> np.ndarray:
+        smoothed: np.ndarray = gaussian_filter(roots, sigma, mode="constant")
+        smoothed /= gaussian_filter(inside, sigma, mode="constant")
+        return smoothed
+
+    flattened: np.ndarray = mean(SMOOTHING_VOXEL) - mean(MEAN_VOXEL)
+    return flattened
 
 
 def unlinked(found: Sequence[Disparity], cameras: Iterable[str]) -> list[str]:
@@ -138,44 +223,73 @@ def _disparity(
     window: tuple[slice, ...],
     grid: Grid,
     cameras: tuple[str, str],
+    slanted: np.ndarray,
     near_mm: np.ndarray | None = None,
 ) -> Disparity | None:
     """Measure the disparity of two cameras' volumes in a window; None if there is no clear peak.
 
-    `near_mm` limits the search to `NEAR_VOXEL` around another disparity.
+    `slanted` is from `slant`. `near_mm` limits the search to `NEAR_VOXEL` around another disparity.
     """
     first, second = volumes
-    coefficient = masked_correlation(first, second, window)
-    mirrored = masked_correlation(first, [volume[:, ::-1] for volume in second], _mirror(window, grid.shape[1]))
-    low, high = np.zeros(3, int), np.full(3, 2 * SEARCH_VOXEL)
+    centre, reach = np.zeros(3, int), SEARCH_VOXEL
     if near_mm is not None:
-        centre = np.rint(near_mm[::-1] / grid.voxel_mm).astype(int) + SEARCH_VOXEL
-        low, high = np.maximum(centre - NEAR_VOXEL, low), np.minimum(centre + NEAR_VOXEL, high)
-    searched = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
-    place = low + np.unravel_index(int(coefficient[searched].argmax()), coefficient[searched].shape)
-    peak, rival = float(coefficient[tuple(place)]), float(mirrored[searched].max())
-    if not peak >= SIGNIFICANT * rival or not ((place > low) & (place < high)).all():
+        centre, reach = np.rint(near_mm[::-1] / grid.voxel_mm).astype(int), NEAR_VOXEL + FIT_REACH
+    coefficient = masked_correlation(first, second, window, centre=centre, reach=reach)
+    mirrored_window = _mirror(window, grid.shape[1])
+    mirrored = masked_correlation(first, [volume[:, ::-1] for volume in second], mirrored_window, centre, reach)
+    coefficient, mirrored = (_along(values, slanted) for values in (coefficient, mirrored))
+    lags = np.indices(coefficient.shape).reshape(3, -1) - reach + centre[:, None]
+    searched = np.linalg.norm(slanted @ lags[::-1], axis=0) <= SLANT_VOXEL
+    searched &= (np.abs(lags - centre[:, None]) <= reach - FIT_REACH).all(0)
+    searched = searched.reshape(coefficient.shape)
+    place = np.unravel_index(int(np.where(searched, coefficient, -1).argmax()), coefficient.shape)
+    peak, rival = float(coefficient[place]), float(mirrored[searched].max())
+    if not peak >= SIGNIFICANT * rival:
         return None
-    middle = np.clip(place, FIT_REACH, 2 * SEARCH_VOXEL - FIT_REACH)
-    around = coefficient[tuple(slice(i - FIT_REACH, i + FIT_REACH + 1) for i in middle)]
-    steps = np.indices(around.shape).reshape(3, -1) - FIT_REACH
-    z, y, x = steps
-    design = np.stack([np.ones(steps.shape[1]), z, y, x, z * z, y * y, x * x, z * y, z * x, y * x], axis=1)
-    _, *slope, zz, yy, xx, zy, zx, yx = np.linalg.lstsq(design, around.ravel(), rcond=None)[0]
-    curvature = -np.array([[2 * xx, yx, zx], [yx, 2 * yy, zy], [zx, zy, 2 * zz]])  # order x, y, z from here on
-    if not np.linalg.eigvalsh(curvature)[0] > 0:
+    fitted = _peak(coefficient[tuple(slice(i - FIT_REACH, i + FIT_REACH + 1) for i in place)])
+    if fitted is None:
         return None
-    offset = np.linalg.solve(curvature, slope[::-1])
-    lag = middle[::-1] - SEARCH_VOXEL + np.clip(offset, -FIT_REACH, FIT_REACH)
+    offset, curvature = fitted
+    across = np.eye(3) - slanted
+    lag = np.array(place)[::-1] - reach + centre[::-1] + offset
     corner = [grid.axis_mm(axis)[part.start : part.stop] for axis, part in enumerate(window)]
     return Disparity(
         cameras=cameras,
         centre_mm=np.array([values.mean() for values in reversed(corner)]),
         shift_mm=lag * grid.voxel_mm,
-        sharpness=curvature / peak / grid.voxel_mm**2,
+        sharpness=across @ curvature @ across / peak / grid.voxel_mm**2,
         peak=peak,
         rival=rival,
     )
+
+
+def _along(coefficient: np.ndarray, slanted: np.ndarray) -> np.ndarray:
+    """Average coefficients in the plane of the lines of sight, over which a particle's peak extends."""
+    lags = np.indices((2 * AVERAGED + 1,) * 3)[::-1] - AVERAGED
+    inside, across = (np.einsum("ij,j...->i...", part, lags) for part in (slanted, np.eye(3) - slanted))
+    kernel = np.exp(-0.5 * (inside**2).sum(0) / SLANT_STD**2 - 0.5 * (across**2).sum(0) / ACROSS_STD**2)
+    averaged: np.ndarray = convolve(coefficient, kernel / kernel.sum(), mode="nearest")
+    return averaged
+
+
+def _peak(around: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Fit a paraboloid to coefficients around a peak; return its place and curvature (x, y, z), None without a peak.
+
+    In the plane of the lines of sight a peak may be a ridge. Its place there is limited to the fitted lags.
+    """
+    steps = np.indices(around.shape).reshape(3, -1) - FIT_REACH
+    z, y, x = steps
+    design = np.stack([np.ones(steps.shape[1]), z, y, x, z * z, y * y, x * x, z * y, z * x, y * x], axis=1)
+    _, *slope, zz, yy, xx, zy, zx, yx = np.linalg.lstsq(design, around.ravel(), rcond=None)[0]
+    curvature = -np.array([[2 * xx, yx, zx], [yx, 2 * yy, zy], [zx, zy, 2 * zz]])  # order x, y, z from here on
+    sizes, axes = np.linalg.eigh(curvature)
+    if not sizes[-1] > 0:
+        return None
+    sizes = np.maximum(sizes, FLATTEST * sizes[-1])
+    along = axes.T @ np.array(slope[::-1]) / sizes
+    if abs(along[-1]) > FIT_REACH:
+        return None
+    return axes @ np.clip(along, -FIT_REACH, FIT_REACH), axes * sizes @ axes.T
 
 
 def _mirror(window: tuple[slice, ...], edge: int) -> tuple[slice, ...]:
@@ -185,7 +299,11 @@ def _mirror(window: tuple[slice, ...], edge: int) -> tuple[slice, ...]:
 
 
 def masked_correlation(
-    first: Sequence[np.ndarray], second: Sequence[np.ndarray], window: tuple[slice, ...]
+    first: Sequence[np.ndarray],
+    second: Sequence[np.ndarray],
+    window: tuple[slice, ...],
+    centre: Sequence[int] | np.ndarray = (0, 0, 0),
+    reach: int = SEARCH_VOXEL,
 ) -> np.ndarray:
     """Correlate a window of volumes with other volumes at every lag: masked normalised cross-correlation [1]_.
 
@@ -197,28 +315,31 @@ def masked_correlation(
         Volumes of some instants. Their products are summed over the instants.
     window : tuple of slice
         Voxels of `first`.
+    centre : sequence of int
+        Middle one of the lags (z, y, x) [voxel].
+    reach : int
+        Largest distance from it along each axis [voxel].
 
     Returns
     -------
-    ndarray, shape (2 SEARCH_VOXEL + 1,) * 3
-        Correlation coefficients, lag -`SEARCH_VOXEL` first; 0 where less than `LEAST_OVERLAP` of the window counts.
+    ndarray, shape (2 reach + 1,) * 3
+        Correlation coefficients, lag `centre` - `reach` first; 0 where less than `LEAST_OVERLAP` of the window counts.
 
     References
     ----------
     .. [1] D. Padfield, "Masked object registration in the Fourier domain", IEEE Trans. Image Process. 21 (2012)
        2706-2718, doi:10.1109/TIP.2011.2181402.
     """
-    reach = SEARCH_VOXEL
     inner = tuple(part.stop - part.start for part in window)
     shape = [scipy.fft.next_fast_len(n + 2 * reach, real=True) for n in inner]
 
     def around(volume: np.ndarray) -> np.ndarray:
         out = np.zeros([n + 2 * reach for n in inner])
-        low = [max(part.start - reach, 0) for part in window]
-        high = [min(part.stop + reach, n) for part, n in zip(window, volume.shape, strict=True)]
-        at = [a - (part.start - reach) for a, part in zip(low, window, strict=True)]
-        to = tuple(slice(p, p + b - a) for p, a, b in zip(at, low, high, strict=True))
-        out[to] = volume[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        start = [part.start + lag - reach for part, lag in zip(window, centre, strict=True)]
+        low = [max(first, 0) for first in start]
+        high = [max(min(a + n, m), b) for a, n, m, b in zip(start, out.shape, volume.shape, low, strict=True)]
+        to = tuple(slice(b - a, c - a) for a, b, c in zip(start, low, high, strict=True))
+        out[to] = volume[tuple(slice(b, c) for b, c in zip(low, high, strict=True))]
         return out
 
     def spectrum(values: np.ndarray) -> np.ndarray:

@@ -2,8 +2,9 @@
 
 Input: a calibration, the grid, and particle images of some instants. Rigid movements, six numbers per camera, are
 fitted to the disparities of the cameras (`lfpiv.selfcalibration.disparity`). The mean movement of all cameras is set to
-zero: it cannot be distinguished from a moved volume. Output: the corrected calibration, the movements and their
-standard errors. Focused images allow triangulation instead; light-field images do not.
+zero: it cannot be distinguished from a moved volume. Only what exceeds its standard error clearly is corrected. Output:
+the corrected calibration, the movements and their standard errors. Focused images allow triangulation instead;
+light-field images do not.
 
 .. [1] B. Wieneke, "Volume self-calibration for 3D particle image velocimetry", Exp. Fluids 45 (2008) 549-556,
    doi:10.1007/s00348-008-0521-5.
@@ -11,6 +12,7 @@ standard errors. Focused images allow triangulation instead; light-field images 
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,15 +27,19 @@ from lfpiv.weights.operator import build_weights
 
 PRIOR_MM, PRIOR_RAD = 0.3, 0.02
 """Standard deviations of the prior: shift [mm] and rotation [rad]."""
-LEAST_STD_VOXEL, ASSUMED_STD_VOXEL = 0.02, 0.1
-"""Least standard deviation of a disparity in its sharpest direction, and the one assumed if too few are known
-[voxel]."""
+LEAST_STD_VOXEL, ASSUMED_STD_VOXEL, ASSUMED_WEIGHT = 0.02, 0.2, 3.0
+"""Least standard deviation of a disparity in its sharpest direction, the one assumed before it is measured [voxel], and
+the number of disparities that the assumption counts for."""
 CONVERGED_VOXEL = 0.05
 """Observable movement of the cameras against each other below which the self-calibration ends [voxel]."""
 ROUNDS = 4
 """Largest number of corrections."""
 FITS = 10
 """Number of reweighted solutions of a fit."""
+SIGNIFICANT_SIGMA = 3.0
+"""Least significant movement [standard errors]."""
+LEAST_VARIANCE = 1e-9
+"""Least variance of a movement of the cameras against each other, as a share of the largest one."""
 OUTLIER = 2.0
 """Residual at which a disparity's weight is a quarter, as a multiple of 1.5 times the median residual."""
 
@@ -79,19 +85,105 @@ class Movement:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Separation:
+    """Observable distance at which the cameras show the same particles, root mean square over the volume."""
+
+    mm: float
+    """Distance without the part that its own errors make [mm]."""
+    std_mm: float
+    """Standard error [mm]."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether the distance is more than `SIGNIFICANT_SIGMA` standard errors."""
+        return self.mm > SIGNIFICANT_SIGMA * self.std_mm
+
+    def differs_from(self, limit_mm: float) -> bool:
+        """Return whether the distance is clearly above or clearly below a limit."""
+        return abs(self.mm - limit_mm) > SIGNIFICANT_SIGMA * self.std_mm
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovementFit:
+    """Rigid movements of all cameras that explain disparities, from `fit_movements`."""
+
+    cameras: tuple[str, ...]
+    centre_mm: np.ndarray
+    """Centre of the volume, shape (3,) [mm]."""
+    values: np.ndarray
+    """Shift [mm] and rotation vector of each camera, shape (6 cameras,)."""
+    covariance: np.ndarray
+    """Covariance of `values`, those of all cameras against their mean."""
+    observed: np.ndarray
+    """Mean over the disparities of the matrix whose quadratic form with `values` is the squared observable distance."""
+
+    @property
+    def separation(self) -> Separation:
+        """Observable distance of the cameras that the movements explain."""
+        square = float(self.values @ self.observed @ self.values)
+        by_errors = float(np.trace(self.observed @ self.covariance))
+        slope = self.observed @ self.values
+        spread = float(slope @ self.covariance @ slope)
+        std = np.sqrt(spread / square) if square > by_errors else np.sqrt(by_errors)
+        return Separation(mm=float(np.sqrt(max(square - by_errors, 0.0))), std_mm=float(std))
+
+    @property
+    def movements(self) -> dict[str, Movement]:
+        """Camera name -> its movement."""
+        std = np.sqrt(np.diag(self.covariance)).reshape(-1, 6)
+        return {
+            name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=self.centre_mm, std=std[number])
+            for number, (name, value) in enumerate(zip(self.cameras, self.values.reshape(-1, 6), strict=True))
+        }
+
+    def significant_directions(self, reach_mm: float) -> np.ndarray:
+        """Return the projection onto those movements that exceed their standard errors, shape (6 cameras, 6 cameras).
+
+        Movements are judged along the principal axes of the covariance, rotations counted by the distance that they
+        move a point at `reach_mm` from the centre.
+        """
+        scale = np.tile(np.repeat([1.0, reach_mm], 3), len(self.cameras))
+        variance, axes = np.linalg.eigh(self.covariance * np.outer(scale, scale))
+        along = axes.T @ (scale * self.values)
+        kept = along**2 > SIGNIFICANT_SIGMA**2 * np.maximum(variance, 0)
+        kept &= variance > LEAST_VARIANCE * variance[-1]  # the mean movement has none
+        projection: np.ndarray = (axes[:, kept] @ axes[:, kept].T) * scale / scale[:, None]
+        return projection
+
+    def along(self, projection: np.ndarray) -> MovementFit:
+        """Return the part of the movements within a projection."""
+        return replace(self, values=projection @ self.values)
+
+    @property
+    def explained_mm(self) -> float:
+        """Observable distance of the cameras, with the part that errors make [mm]."""
+        return float(np.sqrt(self.values @ self.observed @ self.values))
+
+
+class Verdict(enum.Enum):
+    """Outcome of a self-calibration."""
+
+    UNMOVED = "cameras did not move"
+    CORRECTED = "corrected"
+    NOT_LOWERED = "no correction brings the cameras significantly nearer to each other"
+    NOTHING_IN_COMMON = "no images show the same particles in all cameras"
+
+
+@dataclass(frozen=True, kw_only=True)
 class SelfCalibration:
     """Corrected calibration, and the disparities before and after."""
 
     calibration: Calibration
-    """The corrected calibration."""
+    """The corrected calibration; the given one if the cameras did not move or no correction helps."""
     movements: dict[str, Movement]
     """Camera name -> its movement; the mean of all cameras is zero."""
+    verdict: Verdict
     before: tuple[Disparity, ...]
     """Disparities with the original calibration."""
     after: tuple[Disparity, ...]
-    """Disparities with the corrected calibration."""
-    apart_mm: tuple[float, ...]
-    """Root mean square of the explained disparities [mm], see `explained_mm`: before, and after each correction."""
+    """Disparities with the calibration of the result."""
+    apart: tuple[Separation, ...]
+    """Distances of the cameras: before, and after each correction."""
 
 
 def self_calibrate(
@@ -103,6 +195,9 @@ def self_calibrate(
 ) -> SelfCalibration:
     """Correct a calibration for movements of its cameras, using images of particles.
 
+    The calibration stays as it is if no movement is significant, or if no correction lowers the distance of the cameras
+    significantly.
+
     Parameters
     ----------
     calibration : Calibration
@@ -110,7 +205,8 @@ def self_calibrate(
     grid : Grid
         The volume.
     images : sequence of dict
-        Particle images of some instants, camera name -> image (rows, columns), background removed.
+        Particle images of some instants, camera name -> image (rows, columns), background removed; see
+        `lfpiv.selfcalibration.disparity.without_still_light`.
     progress : callable, optional
         Called with the finished fraction of the largest number of rounds.
 
@@ -128,9 +224,9 @@ def self_calibrate(
             f"calibration, images: expected two cameras or more and images, got {len(calibration.cameras)} cameras and "
             f"images of {len(images)} instants."
         )
-    corrected = calibration
-    movements = {name: Movement.none(grid) for name in calibration.cameras}
-    found, apart = [], list[float]()
+    corrected, still = calibration, {name: Movement.none(grid) for name in calibration.cameras}
+    movements, found, fits = still, list[tuple[Disparity, ...]](), list[MovementFit]()
+    reach_mm = float(np.linalg.norm(np.array(grid.shape)) * grid.voxel_mm / 4)
     for number in range(ROUNDS + 1):
         part = None if progress is None else part_of(progress, number / (ROUNDS + 1), (number + 1) / (ROUNDS + 1))
         found.append(disparities(build_weights(corrected, grid), images, part))
@@ -140,23 +236,41 @@ def self_calibrate(
                 f"images: expected particles that {' and '.join(lost)} and another camera show within {SEARCH_VOXEL} "
                 "voxels of each other, found none: it moved by more, its images are of other instants, or show too few."
             )
-        steps = fit_movements(found[-1], list(movements), grid)
-        apart.append(explained_mm(found[-1], steps, grid))
-        if len(found) > ROUNDS or apart[-1] < CONVERGED_VOXEL * grid.voxel_mm:
+        fits.append(fit_movements(found[-1], list(movements), grid))
+        if number == 0:  # later rounds refine what is significant in the first one
+            shown = fits[0].significant_directions(reach_mm) if fits[0].separation.significant else 0 * fits[0].observed
+        step = fits[-1].along(shown)
+        if len(found) > ROUNDS or step.explained_mm < CONVERGED_VOXEL * grid.voxel_mm:
             break
+        steps = step.movements
         movements = {name: movements[name].after(step) for name, step in steps.items()}
         moved = {name: calibration.cameras[name].moved(*move.affine) for name, move in movements.items()}
         corrected = replace(calibration, cameras=moved)
+    verdict = _verdict([fit.separation for fit in fits])
+    if verdict is not Verdict.CORRECTED:
+        corrected, movements = calibration, still
+    std = fits[-1].movements
     return SelfCalibration(
         calibration=corrected,
-        movements={name: replace(move, std=steps[name].std) for name, move in movements.items()},
+        movements={name: replace(move, std=std[name].std) for name, move in movements.items()},
+        verdict=verdict,
         before=found[0],
-        after=found[-1],
-        apart_mm=tuple(apart),
+        after=found[-1] if verdict is Verdict.CORRECTED else found[0],
+        apart=tuple(fit.separation for fit in fits),
     )
 
 
-def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid) -> dict[str, Movement]:
+def _verdict(apart: Sequence[Separation]) -> Verdict:
+    """Judge corrections by the distances of the cameras before and after each of them."""
+    if len(apart) == 1:
+        return Verdict.UNMOVED
+    before, after = apart[0], apart[-1]
+    error = np.hypot(before.std_mm, after.std_mm)
+    lowered = before.mm - after.mm > SIGNIFICANT_SIGMA * error and after.mm < before.mm / 2
+    return Verdict.CORRECTED if lowered else Verdict.NOT_LOWERED
+
+
+def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid) -> MovementFit:
     """Fit the rigid movements of cameras that explain disparities, by reweighted least squares.
 
     A disparity is the difference of two cameras' movements. Its weight is its `Disparity.weight` over the variance of
@@ -166,35 +280,33 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
     rows = [_row(one, cameras, grid) for one in found]
     count, least = len(cameras), LEAST_STD_VOXEL * grid.voxel_mm
     prior = np.diag(np.tile(np.repeat([PRIOR_MM**-2.0, PRIOR_RAD**-2.0], 3), count))
-    variance, trust = (ASSUMED_STD_VOXEL * grid.voxel_mm) ** 2, np.ones(len(found))
+    assumed = (ASSUMED_STD_VOXEL * grid.voxel_mm) ** 2
+    variance, trust = assumed, np.ones(len(found))
     for _ in range(FITS):  # each solution gives the variance, and the weights of outliers
-        information, pull = prior.copy(), np.zeros(6 * count)
+        information, pull = np.zeros_like(prior), np.zeros(6 * count)
         for one, row, part in zip(found, rows, trust / variance, strict=True):
             information += part * row.T @ one.weight @ row
             pull += part * row.T @ one.weight @ one.shift_mm
-        covariance = np.linalg.inv(information)
+        covariance = np.linalg.inv(information + prior)
         values = covariance @ pull
         residual = np.array(
             [one.observable_mm(one.shift_mm - row @ values) for one, row in zip(found, rows, strict=True)]
         )
         scale = max(1.5 * float(np.median(residual)), least)
         trust = (1 + (residual / (OUTLIER * scale)) ** 2) ** -2.0
-        free = 3 * trust.sum() - 6 * (count - 1)
-        if free > 0:
-            variance = max(float(trust @ residual**2) / free, least**2)
+        known = sum(part * float(np.trace(one.weight)) for one, part in zip(found, trust, strict=True))
+        fitted = float(np.trace(covariance @ information))  # movements that disparities determine, without the prior's
+        squares = float(trust @ residual**2) + ASSUMED_WEIGHT * assumed
+        variance = max(squares / (max(known - fitted, 0.0) + ASSUMED_WEIGHT), least**2)
     relative = np.kron(np.eye(count) - 1 / count, np.eye(6))  # the mean of all cameras is zero by definition
-    std = np.sqrt(np.diag(relative @ covariance @ relative.T)).reshape(-1, 6)
-    return {
-        name: Movement(shift_mm=value[:3], rotation_rad=value[3:], centre_mm=grid.centre_mm, std=std[number])
-        for number, (name, value) in enumerate(zip(cameras, values.reshape(-1, 6), strict=True))
-    }
-
-
-def explained_mm(found: Sequence[Disparity], movements: Mapping[str, Movement], grid: Grid) -> float:
-    """Return the root mean square of the observable disparities that movements explain [mm]."""
-    values = np.concatenate([np.append(move.shift_mm, move.rotation_rad) for move in movements.values()])
-    explained = [one.observable_mm(_row(one, list(movements), grid) @ values) for one in found]
-    return float(np.sqrt(np.mean(np.square(explained))))
+    observed = sum(row.T @ one.weight @ row for one, row in zip(found, rows, strict=True)) / len(found)
+    return MovementFit(
+        cameras=tuple(cameras),
+        centre_mm=grid.centre_mm,
+        values=values,
+        covariance=relative @ covariance @ relative.T,
+        observed=np.asarray(observed),
+    )
 
 
 def _row(disparity: Disparity, cameras: Sequence[str], grid: Grid) -> np.ndarray:
