@@ -118,15 +118,15 @@ class Equations:
     """Linear equations of one camera: departure from the thin lens = smooth terms + errors of the board + noise.
 
     Rows are the chief rays of all dots and their slopes along u and v. An error that the camera's labels of one plane
-    share has a column in `smooth` and a row of its own, which states that it is 0 within the noise of a dot, at least
-    within `PLANE_ERROR_PITCH`.
+    share, constant or linear in x or y, has a column in `smooth` and a row of its own. The row states that the error is
+    0 within the noise of a dot, at least within `PLANE_ERROR_PITCH`.
     """
 
-    smooth: np.ndarray  # (3d + 3 planes, terms + 3 planes)
-    effects: np.ndarray  # for s and t, (2, 3d + 3 planes, size)
-    departure: np.ndarray  # for s and t [mm], (2, 3d + 3 planes)
-    variance: np.ndarray  # variance of the rows, relative to that of their kind, (3d + 3 planes,)
-    kind: np.ndarray  # 0 for chief rays, 1 for slopes, 2 and 3 for the statements on them, (3d + 3 planes,)
+    smooth: np.ndarray  # (3d + 9 planes, terms + 9 planes)
+    effects: np.ndarray  # for s and t, (2, 3d + 9 planes, size)
+    departure: np.ndarray  # for s and t [mm], (2, 3d + 9 planes)
+    variance: np.ndarray  # variance of the rows, relative to that of their kind, (3d + 9 planes,)
+    kind: np.ndarray  # 0 for chief rays, 1 for slopes, 2 and 3 for the statements on them, (3d + 9 planes,)
     least_mm: float  # lower limit of the errors that a plane's labels share [mm]
 
     @classmethod
@@ -143,14 +143,17 @@ class Equations:
         moved = np.einsum("dkaj,djp->akdp", jacobian, effects.displacement(board, data.dot)).reshape(2, 3 * count, -1)
         departure = (data.rays - rays).transpose(2, 1, 0).reshape(2, -1) + moved @ values
         planes, plane = np.unique(data.dot // board.size, return_inverse=True)
-        stated = 3 * len(planes)
-        shared = np.kron(np.eye(3), np.eye(len(planes))[plane])
+        place = board.points_mm(0)[data.dot % board.size, :2]
+        trend = np.column_stack([np.ones(count), place / np.maximum(np.abs(place).max(0), 1e-9)])
+        of_plane = (trend[:, :, None] * np.eye(len(planes))[plane][:, None]).reshape(count, -1)
+        shared = np.kron(np.eye(3), of_plane)
+        stated = shared.shape[1]
         return cls(
             smooth=np.block([[smooth, shared], [np.zeros((stated, smooth.shape[1])), np.eye(stated)]]),
             effects=np.pad(moved, ((0, 0), (0, stated), (0, 0))),
             departure=np.pad(departure, ((0, 0), (0, stated))),
             variance=np.append(data.variance[:, [0, 1, 1]].T.ravel(), np.ones(stated)),
-            kind=np.repeat([0, 1, 2, 3], [count, 2 * count, len(planes), 2 * len(planes)]),
+            kind=np.repeat([0, 1, 2, 3], [count, 2 * count, stated // 3, 2 * stated // 3]),
             least_mm=PLANE_ERROR_PITCH * data.pitch_mm,
         )
 
