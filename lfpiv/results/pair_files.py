@@ -18,6 +18,7 @@ import xarray as xr
 from lfpiv import warn
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
+from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
 from lfpiv.results.provenance import Marks, PairStamps, Stamp
@@ -68,9 +69,11 @@ class PairFiles:
     stamps: PairStamps
 
     @classmethod
-    def of(cls, experiment: Experiment, calibration: str, folder: Folder, pair: int) -> PairFiles:
-        """Return the files of a pair, given the hash of the calibration's stamp."""
-        stamps = provenance.of_pair(experiment, calibration, pair)
+    def of(
+        cls, experiment: Experiment, calibration: str, folder: Folder, pair: int, guard: Layers = NO_LAYERS
+    ) -> PairFiles:
+        """Return the files of a pair, given the hash of the calibration's stamp and the guard layers."""
+        stamps = provenance.of_pair(experiment, calibration, pair, guard)
         volumes = (folder.volume(pair, 0), folder.volume(pair, 1))
         return cls(pair=pair, vectors=folder.vectors(pair), volumes=volumes, stamps=stamps)
 

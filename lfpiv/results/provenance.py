@@ -19,6 +19,7 @@ from typing import Any
 from lfpiv import files, warn
 from lfpiv.experiment.davis import split_frame
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.version import __version__
 from lfpiv.warn import Warning
 
@@ -139,14 +140,31 @@ def of_self_calibration(experiment: Experiment, calibration: str) -> Stamp | Non
     return Stamp({"calibration": calibration, "volume": volume, "self_calibration": _self_calibration(experiment)})
 
 
-def of_pair(experiment: Experiment, calibration: str, pair: int) -> PairStamps:
-    """Return the stamps of the volumes and of the vectors of a pair. `calibration` is the hash of its stamp."""
+def of_guard(experiment: Experiment, calibration: str, pairs: Sequence[int]) -> Stamp:
+    """Return the stamp of the guard layers measured with some pairs. `calibration` is the hash of a stamp."""
+    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    return Stamp(
+        {
+            "calibration": calibration,
+            "self_calibration": _self_calibration(experiment),
+            "volume": dataclasses.asdict(experiment.grid),
+            "images": _identity(paths, experiment.path.parent),
+        }
+    )
+
+
+def of_pair(experiment: Experiment, calibration: str, pair: int, guard: Layers = NO_LAYERS) -> PairStamps:
+    """Return the stamps of the volumes and of the vectors of a pair.
+
+    `calibration` is the hash of its stamp, `guard` the guard layers of the volumes.
+    """
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
     parts = {
         "calibration": calibration,
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
+        "guard": guard if guard != NO_LAYERS else None,
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},

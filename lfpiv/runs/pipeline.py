@@ -177,11 +177,12 @@ def _check(current: Run, todo: list[int], workers: int | None, scheduler: str | 
     planned = worker_plan.plan(len(todo), workers, current.device, gpus)
     pairs, failed = current.check_images(todo) if todo else ([], [])
     if pairs:
-        needed = 0 if all(map(current.has_volumes, pairs)) else memory.weights_bytes(current.experiment)
+        guarded = current.guarded_experiment
+        needed = 0 if all(map(current.has_volumes, pairs)) else memory.weights_bytes(guarded)
         if workers is None:
             planned = worker_plan.fit_installation(planned, current.device)
-            planned = worker_plan.fit_memory(planned, current.experiment, needed, current.device)
-        worker_plan.require_memory(current.experiment, needed, 1 if scheduler else planned.workers)
+            planned = worker_plan.fit_memory(planned, guarded, needed, current.device)
+        worker_plan.require_memory(guarded, needed, 1 if scheduler else planned.workers)
     if pairs and planned.workers > 1 and not scheduler:
         local_workers.start_preloading(planned.kind)
     return _Checked(pairs=pairs, failed=failed, workers=scheduler or planned)
@@ -197,7 +198,8 @@ def _process(current: Run, calibration: Calibration, checked: _Checked, keep_vol
     if not all(map(current.has_volumes, todo)):
         weights, figures = rig.build_weights(current, calibration, todo)
         if isinstance(workers, Plan):
-            workers = worker_plan.fit_memory(workers, current.experiment, weights.memory_bytes, current.device)
+            guarded = current.guarded_experiment
+            workers = worker_plan.fit_memory(workers, guarded, weights.memory_bytes, current.device)
     work = _work(current, weights, keep_volumes=keep_volumes)
     if isinstance(workers, Plan) and workers.workers == 1:
         return Invocation(outcomes=_sequential(current, work, todo), weights=figures)
@@ -218,6 +220,7 @@ def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors:
         experiment=current.experiment,
         folder=current.folder,
         calibration_hash=current.calibration_stamp.hash,
+        guard=current.guard_layers,
         weights=weights,
         darks={} if weights is None else read_darks(current.experiment),
         keep_volumes=keep_volumes,

@@ -19,7 +19,7 @@ from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.files import MIB, writing
 from lfpiv.results import netcdf, provenance
-from lfpiv.runs import memory, moved_cameras
+from lfpiv.runs import guard, memory, moved_cameras
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.warn import Code, Warning, collected
@@ -90,7 +90,7 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
 
 
 def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
-    """Self-calibrate if the experiment demands it, build the weights of the grid, and check that no camera moved.
+    """Self-calibrate if the experiment demands it, measure the light beyond the volume, build the weights, check cameras.
 
     `calibration` is the one from the board. The check uses the first pairs of `todo`.
     """
@@ -99,18 +99,22 @@ def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tu
 
     experiment, compute = run.experiment, run.experiment.compute
     calibration, self_calibration = self_calibrate(run, calibration)
+    found = guard.decide(run, calibration)
+    guarded = guard.with_guard(experiment, guard.layers(experiment, found))
     require_seen(experiment.path, calibration, experiment.grid)
     warn_outside(calibration, experiment.grid)
     if len(calibration.cameras) == 1:
         log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
+    for warning in guard.warnings(experiment, found):
+        log.warning("%s", warning.sentence)
     start = time.perf_counter()
     with collected() as warnings:
         weights = build_weights(
             calibration,
-            experiment.grid,
+            guarded.grid,
             compute.weights,
             form=compute.weights_form,
-            limit_bytes=memory.left_for_weights(experiment),
+            limit_bytes=memory.left_for_weights(guarded),
             progress=run.step("weights"),
         )
         _ = weights.camera_sums  # computed here, once for all pairs and workers

@@ -20,12 +20,14 @@ from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, check_pairs, read_experiment
 from lfpiv.files import writing
+from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.results import provenance
 from lfpiv.results.folder import Folder, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
-from lfpiv.runs import memory, pair_figures, summary
+from lfpiv.runs import guard, memory, pair_figures, summary
+from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Workers
 from lfpiv.runs.pair import Outcome
 from lfpiv.runs.summary import Contents, EarlierSummary
@@ -129,9 +131,24 @@ class Run:
         """Return the progress of one step of the run."""
         return lambda fraction: self.progress(name, fraction)
 
+    @property
+    def guard(self) -> Guard | None:
+        """Light beyond the volume and the guard layers that it demands; None before it was measured."""
+        return guard.read(self.experiment, self.calibration_stamp.hash, self.folder)
+
+    @property
+    def guard_layers(self) -> Layers:
+        """Guard layers of the volumes; none if they are yet to be measured."""
+        return guard.layers(self.experiment, self.guard if self.experiment.guard_mm == "auto" else None)
+
+    @property
+    def guarded_experiment(self) -> Experiment:
+        """The experiment with the grid that is reconstructed."""
+        return guard.with_guard(self.experiment, self.guard_layers)
+
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
-        return PairFiles.of(self.experiment, self.calibration_stamp.hash, self.folder, pair)
+        return PairFiles.of(self.experiment, self.calibration_stamp.hash, self.folder, pair, self.guard_layers)
 
     def has_volumes(self, pair: int) -> bool:
         """Return whether both volumes of a pair are in the folder and fit."""
@@ -221,7 +238,7 @@ class Run:
                 vectors[pair] = pair_figures.read_figures(found.vectors, marks)
             elif (both := found.fitting_volumes()) is not None:
                 volumes[pair] = both[0].warnings + both[1].warnings
-        return Contents(vectors=vectors, volumes=volumes)
+        return Contents(vectors=vectors, volumes=volumes, guard=self.guard)
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:
         """Return the time and the peak memory so far, in the form of the summary."""

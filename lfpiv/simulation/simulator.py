@@ -369,7 +369,7 @@ def _experiment_text(scene: Scene) -> str:
         "pairs": scene.particles.pairs,
         "frames": FRAMES,
     }
-    tables = {"board": board, "volume": scene.volume.model_dump(), "particles": particles}
+    tables = {"board": board, "volume": scene.volume.model_dump(exclude_unset=True), "particles": particles}
     for name in ("smart", "correlation", "network", "compute"):
         tables[name] = getattr(scene, name).model_dump(exclude_unset=True, exclude_none=True)
     for name, table in tables.items():
