@@ -43,8 +43,8 @@ FINE, WIDE = 0.7, 2.5
 """Standard deviations of the Gaussians between which fluctuations lie [cell]."""
 LEAST_LIT = 0.25
 """Least profile of a layer that counts as lit, relative to the mean of the volume."""
-SIGNIFICANT = 3.0
-"""Least light beyond a face [standard deviation of chance]."""
+SIGNIFICANT, CONFIRMED = 4.0, 2.5
+"""Least light beyond a face [standard deviation of chance], and beyond further faces once there is light beyond one."""
 LEAST_SEEN = 0.5
 """Least share of a layer that two cameras must see."""
 SEEN_RAYS = 0.9
@@ -53,8 +53,8 @@ LEAST_RESPONSE = 0.3
 """Least response of a pixel to white light that is used, relative to the median."""
 CLEAR = 4.0
 """Least covariance within the volume for a measurement [standard deviation of chance]."""
-SHIFT = 5
-"""Least shift at which chance is measured if only one pair of frames is known [cell]."""
+SHIFTS = (5, 11)
+"""Shifts of one camera's light at which chance is measured: the first, and the one after the last [cell]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ class FaceLight:
     guard_mm: float
     """Thickness of the guard layers that hold this light, as far as the cameras see and are calibrated [mm]."""
     farther: bool
-    """Whether the light may reach farther than it can be measured."""
+    """Whether the light may reach farther than it is measured. Where cameras see no farther, no light comes from there."""
     limit: str
     """What limits the measurement."""
 
@@ -113,12 +113,14 @@ def light_beyond(
         view = _View(camera, search.grid)
         fluctuations.append(np.stack([view.fluctuation(one[name]) for instants in pairs for one in instants]))
         seen.append(view.seen)
-    found = []
+    found = list[tuple[float, FaceLight]]()
     for axis in range(3):
         profile = _profile(fluctuations, seen, search, group, axis)
         if profile is not None:
             found += [face for side in (0, 1) if (face := _face(profile, search, axis, side)) is not None]
-    return tuple(found)
+    if not any(significance > SIGNIFICANT for significance, _ in found):
+        return ()
+    return tuple(face for significance, face in found if significance > CONFIRMED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,9 +221,9 @@ class _Profile:
     """Covariance of two cameras in the layers across one axis."""
 
     same: np.ndarray
-    """Of equal instants less that of different ones, shape (layer,)."""
+    """Of equal instants less what chance gives, shape (layer,)."""
     chance: np.ndarray
-    """Of different instants, shape (layer, sample)."""
+    """Deviations of products that only chance correlates from their mean, shape (layer, sample)."""
     groups: int
     """Number of independent groups of instants."""
     seen: np.ndarray
@@ -229,8 +231,7 @@ class _Profile:
 
     def deviation(self, layers: np.ndarray) -> float:
         """Return the standard deviation of the sum of `same` over layers if they hold no particles."""
-        samples = self.chance[layers].sum(0)
-        return float(samples.std() * np.sqrt(1 / self.groups + 1 / len(samples)))
+        return float(self.chance[layers].sum(0).std() / np.sqrt(self.groups))
 
 
 def _profile(
@@ -238,66 +239,60 @@ def _profile(
 ) -> _Profile | None:
     """Average the covariances of all pairs of cameras over the layers across an axis; None without a clear signal."""
     window = tuple(slice(None) if other == axis else search.inner(other) for other in range(3))
-    groups = len(np.unique(group))
-    same, chance, counts = 0.0, 0.0, 0.0
+
+    def layered(values: np.ndarray) -> np.ndarray:
+        """Return the part in the window, shape (layer, instant, cell)."""
+        moved = np.moveaxis(values[(slice(None), *window)], axis + 1, 0)
+        return moved.reshape(*moved.shape[:2], -1)
+
+    along = 3 if axis == 1 else 2  # shifts lie within the layers
+    shifts = [sign * lag for lag in range(*SHIFTS) for sign in (1, -1)]
+    different = group[:, None] != group[None, :]
+    parts = []
     for one, two in combinations(range(len(fluctuations)), 2):
-        both = np.moveaxis((seen[one] & seen[two])[window], axis, 0)
-        both = both.reshape(len(both), -1)
-        first, second = (
-            np.moveaxis(fluctuations[number][(slice(None), *window)], axis + 1, 0).reshape(len(both), len(group), -1)
-            for number in (one, two)
-        )
-        matrix = (first * both[:, None]) @ np.swapaxes(second, 1, 2)
-        same = same + np.einsum("lii->l", matrix) / len(group)
-        if groups > 1:
-            chance = chance + matrix[:, group[:, None] != group[None, :]]
-        else:
-            chance = chance + _shifted(fluctuations[one], fluctuations[two], both, window, axis)
-        counts = counts + both.sum(1)
-    covered = counts > LEAST_SEEN * both.shape[1]
+        both = layered((seen[one] & seen[two])[None].astype(np.float32))
+        first, second = layered(fluctuations[one]) * both, layered(fluctuations[two])
+        products_ = first @ np.swapaxes(second, 1, 2)
+        moved = [(first * layered(np.roll(fluctuations[two], shift, along))).sum(2) for shift in shifts]
+        shifted = np.stack(moved, axis=2)  # layer, instant, shift
+        others = products_[:, different] if different.any() else shifted.reshape(len(both), -1)
+        same = np.einsum("lii->l", products_) / len(group) - others.mean(1)
+        mean, free = shifted.mean(1 if len(group) > 1 else (1, 2), keepdims=True), max(len(group) - 1, 1)
+        chance = [others - others.mean(1, keepdims=True), (shifted - mean) * np.sqrt(len(group) / free)]
+        parts.append((same, np.hstack([each.reshape(len(both), -1) for each in chance]), both.sum((1, 2))))
+    same, chance, counts = (sum(part) for part in zip(*parts, strict=True))
+    covered = counts > LEAST_SEEN * len(parts) * both.shape[2]
     counts = np.maximum(counts, 1.0)
-    profile = _Profile(
-        same=same / counts - chance.mean(1) / counts, chance=chance / counts[:, None], groups=groups, seen=covered
-    )
+    groups = len(np.unique(group))
+    profile = _Profile(same=same / counts, chance=chance / counts[:, None], groups=groups, seen=covered)
     inside = np.arange(len(counts))[search.inner(axis)]
     clear = profile.same[inside].sum() > CLEAR * profile.deviation(inside)
     return profile if clear else None
 
 
-def _shifted(
-    first: np.ndarray, second: np.ndarray, both: np.ndarray, window: tuple[slice, ...], axis: int
-) -> np.ndarray:
-    """Return the products of one camera's fluctuations with the shifted ones of another, shape (layer, shift)."""
-    along = 2 if axis == 1 else 1  # a shift within the layers
-    n = first.shape[along + 1]
-    shifts = [sign * lag for lag in range(SHIFT, min(3 * SHIFT, n // 2)) for sign in (1, -1)] or [n // 2]
-    products = []
-    for shift in shifts:
-        product_ = (first * np.roll(second, shift, along + 1)).mean(0)[window]
-        products.append((np.moveaxis(product_, axis, 0).reshape(len(both), -1) * both).sum(1))
-    return np.stack(products, axis=1)
+def _face(profile: _Profile, search: _Search, axis: int, side: int) -> tuple[float, FaceLight] | None:
+    """Find how far light reaches beyond a face, and its significance; None if there is none.
 
-
-def _face(profile: _Profile, search: _Search, axis: int, side: int) -> FaceLight | None:
-    """Find how far light reaches beyond a face; None if there is no significant light."""
+    The layer next to the face is blurred by light from within, so light must reach the second one.
+    """
     inner, cell = search.inner(axis), search.grid.voxel_mm
     count = search.layers[axis][side]
     outside = inner.stop + np.arange(count) if side else inner.start - 1 - np.arange(count)
-    seen = np.logical_and.accumulate(profile.seen[outside])
-    outside = outside[seen]
-    if not len(outside):
+    outside = outside[np.logical_and.accumulate(profile.seen[outside])]
+    if len(outside) < 2:
         return None
     relative = profile.same / profile.same[inner].mean()
-    excess = np.cumsum(relative[outside] - LEAST_LIT)
-    lit = int(excess.argmax()) + 1
-    if not (excess[lit - 1] > 0 and profile.same[outside[:lit]].sum() > SIGNIFICANT * profile.deviation(outside[:lit])):
+    excess = np.cumsum(relative[outside[1:]] - LEAST_LIT)
+    lit = int(excess.argmax()) + 2
+    deviation = profile.deviation(outside[1:lit])
+    if not (excess[lit - 2] > 0 and deviation > 0):
         return None
-    return FaceLight(
+    return float(profile.same[outside[1:lit]].sum()) / deviation, FaceLight(
         axis=axis,
         side=side,
-        reach_mm=round(lit * cell, 6),
+        reach_mm=round(lit * cell, 3),
         share=round(float(relative[outside[:lit]].sum() / (inner.stop - inner.start)), 4),
-        guard_mm=round(min(lit + 1, len(outside)) * cell, 6),
-        farther=lit == len(outside),
-        limit="the end of what two cameras see" if len(outside) < count else search.limits[axis, side],
+        guard_mm=round(min(lit + 1, len(outside)) * cell, 3),
+        farther=lit == count,
+        limit=search.limits[axis, side],
     )

@@ -117,6 +117,7 @@ def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tu
             limit_bytes=memory.left_for_weights(guarded),
             progress=run.step("weights"),
         )
+        weights.volume = experiment.grid
         _ = weights.camera_sums  # computed here, once for all pairs and workers
         seconds = time.perf_counter() - start
         counted = compare_with_count(weights) if compute.weights == "footprint" else {}
