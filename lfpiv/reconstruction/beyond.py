@@ -1,7 +1,7 @@
 """Light beyond the volume: how far particles are lit beyond each face of a grid.
 
-Reconstructed intensity outside the volume proves nothing, because ghosts lie there too. But the images of two cameras by
-themselves show whether particles are there. From the sub-aperture images of one camera each point of a coarse padded
+Reconstructed intensity outside the volume proves nothing, because ghosts lie there too. But the images of two cameras
+by themselves show whether particles are there. From the sub-aperture images of one camera each point of a coarse padded
 grid gets the mean logarithm of the light that its rays meet. Where a particle is, both cameras show it, so their
 fluctuations are correlated. Ghosts are crossings of rays from different particles. They appear in the covariance of
 different instants as well, as do static light and the edges of the lit region, and this is subtracted. What is left,
@@ -43,7 +43,7 @@ FINE, WIDE = 0.7, 2.5
 """Standard deviations of the Gaussians between which fluctuations lie [cell]."""
 LEAST_LIT = 0.25
 """Least profile of a layer that counts as lit, relative to the mean of the volume."""
-SIGNIFICANT, CONFIRMED = 4.0, 2.5
+SIGNIFICANT, CONFIRMED = 3.4, 3.0
 """Least light beyond a face [standard deviation of chance], and beyond further faces once there is light beyond one."""
 LEAST_SEEN = 0.5
 """Least share of a layer that two cameras must see."""
@@ -72,7 +72,7 @@ class FaceLight:
     guard_mm: float
     """Thickness of the guard layers that hold this light, as far as the cameras see and are calibrated [mm]."""
     farther: bool
-    """Whether the light may reach farther than it is measured. Where cameras see no farther, no light comes from there."""
+    """Whether the light may reach farther than it is measured. What cameras do not see sends them no light."""
     limit: str
     """What limits the measurement."""
 
@@ -224,14 +224,13 @@ class _Profile:
     """Of equal instants less what chance gives, shape (layer,)."""
     chance: np.ndarray
     """Deviations of products that only chance correlates from their mean, shape (layer, sample)."""
-    groups: int
-    """Number of independent groups of instants."""
+    instants: int
     seen: np.ndarray
     """Whether two cameras see most of the layer, shape (layer,), bool."""
 
     def deviation(self, layers: np.ndarray) -> float:
         """Return the standard deviation of the sum of `same` over layers if they hold no particles."""
-        return float(self.chance[layers].sum(0).std() / np.sqrt(self.groups))
+        return float(self.chance[layers].sum(0).std() / np.sqrt(self.instants))
 
 
 def _profile(
@@ -263,8 +262,7 @@ def _profile(
     same, chance, counts = (sum(part) for part in zip(*parts, strict=True))
     covered = counts > LEAST_SEEN * len(parts) * both.shape[2]
     counts = np.maximum(counts, 1.0)
-    groups = len(np.unique(group))
-    profile = _Profile(same=same / counts, chance=chance / counts[:, None], groups=groups, seen=covered)
+    profile = _Profile(same=same / counts, chance=chance / counts[:, None], instants=len(group), seen=covered)
     inside = np.arange(len(counts))[search.inner(axis)]
     clear = profile.same[inside].sum() > CLEAR * profile.deviation(inside)
     return profile if clear else None

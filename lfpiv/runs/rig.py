@@ -90,7 +90,7 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
 
 
 def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
-    """Self-calibrate if the experiment demands it, measure the light beyond the volume, build the weights, check cameras.
+    """Self-calibrate if the experiment demands it, decide the guard layers, build the weights, check the cameras.
 
     `calibration` is the one from the board. The check uses the first pairs of `todo`.
     """

@@ -163,7 +163,7 @@ def _guard(experiment: Experiment, found: Guard | None) -> dict[str, Any]:
     used = guard.layers(experiment, found)
     thickness = [[round(count * experiment.grid.voxel_mm, 6) for count in pair] for pair in reversed(used)]
     light = {} if found is None else found.to_json()
-    return {"thickness_mm": thickness, "pairs": light.get("pairs", []), "faces": light.get("faces", [])}
+    return {"thickness_mm": thickness, "pairs": list(light.get("pairs", ())), "faces": list(light.get("faces", ()))}
 
 
 def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
