@@ -204,7 +204,8 @@ class _View:
         light = self._smooth(light) / np.maximum(self._weight, 1e-3)
         logarithm = np.log(np.maximum(light / max(float(light.mean()), 1e-9), 0.0) + DARK)
         mean = sum(self._at_cells(one, number) for number, one in enumerate(logarithm)) / len(logarithm)
-        return ndimage.gaussian_filter(mean, FINE) - ndimage.gaussian_filter(mean, WIDE)
+        fluctuation: np.ndarray = ndimage.gaussian_filter(mean, FINE) - ndimage.gaussian_filter(mean, WIDE)
+        return fluctuation
 
     def _smooth(self, values: np.ndarray) -> np.ndarray:
         size = (0.0, self._blur_lenses, self._blur_lenses)

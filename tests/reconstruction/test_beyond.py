@@ -12,7 +12,7 @@ HALF_MM = 0.3
 """Half the depth of the volume [mm]."""
 REACH_MM = 0.3
 """Distance by which the particles of a thick sheet reach beyond the upper face [mm]."""
-SHARE = 0.02
+SHARE = 0.004
 """Voxels that hold a particle."""
 PAIRS = 5
 VOLUME = Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.6, 1.6, 2 * HALF_MM), voxel_mm=0.05)
