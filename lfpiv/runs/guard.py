@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
     from lfpiv.experiment.experiment import Experiment
     from lfpiv.results.folder import Folder
-    from lfpiv.runs.run import Run
 
 log = logging.getLogger(__name__)
 
@@ -92,22 +91,25 @@ def with_guard(experiment: Experiment, guard: Layers) -> Experiment:
     return replace(experiment, grid=experiment.grid.padded(guard))
 
 
-def decide(run: Run, calibration: Calibration) -> Guard:
-    """Return the stored outcome, or measure the light beyond the volume and store the outcome."""
-    found = read(run.experiment, run.calibration_stamp.hash, run.folder)
+def decide(experiment: Experiment, folder: Folder, stamp_hash: str, calibration: Calibration) -> Guard:
+    """Return the stored outcome, or measure the light beyond the volume and store the outcome.
+
+    `stamp_hash` is the hash of the stamp of the board's calibration.
+    """
+    found = read(experiment, stamp_hash, folder)
     if found is not None:
         log.info("light beyond the volume: measured before, kept")
         return found
     start = time.perf_counter()
-    instants = dict(_instants(run.experiment, calibration))
-    faces = light_beyond(calibration, run.experiment.grid, list(instants.values())) if instants else ()
-    demanded = _demanded(run.experiment, faces)
-    allowed = _fitting(run.experiment, demanded)
+    instants = dict(_instants(experiment, calibration))
+    faces = light_beyond(calibration, experiment.grid, list(instants.values())) if instants else ()
+    demanded = _demanded(experiment, faces)
+    allowed = _fitting(experiment, demanded)
     guard = Guard(pairs=tuple(instants), faces=faces, layers=allowed, short=allowed != demanded)
     log.info("light beyond the volume: measured in %.1f s", time.perf_counter() - start)
-    stamp = provenance.of_guard(run.experiment, run.calibration_stamp.hash, guard.pairs)
-    with writing(run.folder.guard):
-        files.write_json({**stamp.attributes, "guard": guard.to_json()}, run.folder.guard)
+    stamp = provenance.of_guard(experiment, stamp_hash, guard.pairs)
+    with writing(folder.guard):
+        files.write_json({**stamp.attributes, "guard": guard.to_json()}, folder.guard)
     return guard
 
 

@@ -99,7 +99,7 @@ def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tu
 
     experiment, compute = run.experiment, run.experiment.compute
     calibration, self_calibration = self_calibrate(run, calibration)
-    found = guard.decide(run, calibration)
+    found = guard.decide(experiment, run.folder, run.calibration_stamp.hash, calibration)
     guarded = guard.with_guard(experiment, guard.layers(experiment, found))
     require_seen(experiment.path, calibration, experiment.grid)
     warn_outside(calibration, experiment.grid)
