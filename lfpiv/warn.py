@@ -55,6 +55,8 @@ class Code(enum.Enum):
     OUTSIDE_SIGHT = "outside_sight"
     SEEN_BY_ONE = "seen_by_one"
     ONE_CAMERA = "one_camera"
+    LIGHT_GUARDED = "light_guarded"
+    LIGHT_UNGUARDED = "light_unguarded"
     APART = "apart"
     NOTHING_IN_COMMON = "nothing_in_common"
     NOT_SELF_CALIBRATED = "not_self_calibrated"
@@ -168,6 +170,15 @@ SENTENCES: Mapping[Code, str] = {
         "about {share:percent} % of the volume is seen by fewer than two cameras; vectors there are not valid: {where}"
     ),
     Code.ONE_CAMERA: "one camera hardly resolves depth: do not rely on w, displacement_z and their validation",
+    Code.LIGHT_GUARDED: (
+        "particles are lit beyond the face {face} of the volume, up to {reach_mm:.2g} mm ({share:percent} % of the "
+        "volume's light): guard layers of {guard_mm:.2g} mm are reconstructed there and cut away"
+    ),
+    Code.LIGHT_UNGUARDED: (
+        "particles are lit beyond the face {face} of the volume, {reach_mm:.2g} mm or more ({share:percent} % of the "
+        "volume's light), farther than the guard layers of {guard_mm:.2g} mm: their light falls into the volume and "
+        "biases vectors near its faces; {reason}"
+    ),
     Code.APART: (
         "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: a camera moved since the board was "
         "recorded; {advice}."

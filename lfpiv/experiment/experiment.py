@@ -7,7 +7,7 @@ import string
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -69,6 +69,8 @@ class Experiment:
     cameras: tuple[CameraSetup, ...]
     board: Board
     grid: Grid
+    guard_mm: float | tuple[float, float, float] | Literal["auto"]
+    """Thickness of the guard layers beyond the grid's faces, one number or (x, y, z) [mm], or "auto"."""
     pairs: int
     frames: tuple[str, str]
     smart: Smart
@@ -199,6 +201,7 @@ def read_experiment(path: str | Path) -> Experiment:
         cameras=tuple(_camera(path, camera) for camera in table.camera),
         board=board,
         grid=grid,
+        guard_mm=table.volume.guard_mm,
         pairs=particles.pairs,
         frames=particles.frames,
         smart=table.smart,

@@ -219,6 +219,9 @@ class Volume(Table):
     """Size (x, y, z) of the volume, at least 4 voxels along each axis [mm]."""
     voxel_mm: Positive
     """Edge of a voxel [mm]."""
+    guard_mm: NonNegative | tuple[NonNegative, NonNegative, NonNegative] | Literal["auto"] = "auto"
+    """Thickness of the guard layers beyond the volume's faces, one number or (x, y, z), which are reconstructed and cut
+    away [mm]; "auto" measures in the particle images how far their light reaches, 0 reconstructs no guard layers."""
 
 
 class HalfSpace(Table):

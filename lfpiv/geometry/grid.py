@@ -10,6 +10,11 @@ import numpy as np
 AXES = ("z", "y", "x")
 """Names of a volume's axes, in order."""
 
+Layers = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
+"""Numbers of layers of voxels below and above a grid along z, y, x."""
+
+NO_LAYERS: Layers = ((0, 0), (0, 0), (0, 0))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
@@ -84,6 +89,53 @@ class Grid:
         """Return all voxel centres (x, y, z), in C order of the axes (z, y, x) [mm], shape (voxel, 3)."""
         z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in range(3)), indexing="ij")
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+
+    def padded(self, layers: Layers) -> Grid:
+        """Return the grid with layers of voxels added beyond its faces.
+
+        Parameters
+        ----------
+        layers : three (int, int)
+            Layers below and above the grid along z, y, x.
+
+        Raises
+        ------
+        ValueError
+            If a number of layers is not a whole number >= 0.
+
+        Examples
+        --------
+        >>> from lfpiv import Grid
+        >>> grid = Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.6, 0.4, 0.2), voxel_mm=0.1)
+        >>> guarded = grid.padded(grid.layers((0, 0, 0.3)))
+        >>> guarded.shape
+        (8, 4, 6)
+        >>> volume = np.ones(guarded.shape)
+        >>> volume[grid.within(guarded)].shape
+        (2, 4, 6)
+        """
+        flat = [count for pair in layers for count in pair]
+        whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in flat)
+        if not (len(layers) == 3 and len(flat) == 6 and whole):
+            raise ValueError(f"layers: expected (below, above) along z, y, x in whole numbers >= 0, got {layers}.")
+        z, y, x = (first - low * self.voxel_mm for first, (low, _) in zip(self.first_centre_mm, layers, strict=True))
+        nz, ny, nx = (n + low + high for n, (low, high) in zip(self.shape, layers, strict=True))
+        return Grid(shape=(nz, ny, nx), voxel_mm=self.voxel_mm, first_centre_mm=(z, y, x))
+
+    def layers(self, thickness_mm: float | tuple[float, float, float]) -> Layers:
+        """Return the whole layers of voxels that a thickness (x, y, z), or one of all faces, takes at least [mm]."""
+        x, y, z = thickness_mm if isinstance(thickness_mm, tuple) else (thickness_mm,) * 3
+        nz, ny, nx = (math.ceil(thickness / self.voxel_mm - 1e-6) for thickness in (z, y, x))
+        return (nz, nz), (ny, ny), (nx, nx)
+
+    def within(self, padded: Grid) -> tuple[slice, slice, slice]:
+        """Return the slices of a padded grid that are this grid's voxels, along z, y, x."""
+        first = [
+            round((own - other) / self.voxel_mm)
+            for own, other in zip(self.first_centre_mm, padded.first_centre_mm, strict=True)
+        ]
+        z, y, x = (slice(start, start + n) for start, n in zip(first, self.shape, strict=True))
+        return z, y, x
 
     @property
     def centre_mm(self) -> np.ndarray:

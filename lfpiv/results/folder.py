@@ -48,6 +48,11 @@ class Folder:
         return self.path / "background.h5"
 
     @property
+    def guard(self) -> Path:
+        """Guard layers that the particle images demand."""
+        return self.path / "guard.json"
+
+    @property
     def summary(self) -> Path:
         """Figures of the run as JSON."""
         return self.path / "summary.json"

@@ -18,6 +18,7 @@ import xarray as xr
 from lfpiv import warn
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
+from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
 from lfpiv.results.provenance import Marks, PairStamps, Stamp
@@ -69,10 +70,21 @@ class PairFiles:
 
     @classmethod
     def of(
-        cls, experiment: Experiment, calibration: str, folder: Folder, pair: int, background: str | None = None
+        cls,
+        experiment: Experiment,
+        calibration: str,
+        folder: Folder,
+        pair: int,
+        *,
+        background: str | None = None,
+        guard: Layers = NO_LAYERS,
     ) -> PairFiles:
-        """Return the files of a pair, given the hashes of the calibration's stamp and of the subtracted light."""
-        stamps = provenance.of_pair(experiment, calibration, pair, background)
+        """Return the files of a pair.
+
+        `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light. `guard`
+        has the guard layers of the volumes.
+        """
+        stamps = provenance.of_pair(experiment, calibration, pair, background=background, guard=guard)
         volumes = (folder.volume(pair, 0), folder.volume(pair, 1))
         return cls(pair=pair, vectors=folder.vectors(pair), volumes=volumes, stamps=stamps)
 

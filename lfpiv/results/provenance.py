@@ -21,6 +21,7 @@ import numpy as np
 from lfpiv import files, warn
 from lfpiv.experiment.davis import split_frame
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.version import __version__
 from lfpiv.warn import Warning
 
@@ -185,10 +186,35 @@ def of_self_calibration(experiment: Experiment, calibration: str, background: st
     return Stamp(parts | {"background": background})
 
 
-def of_pair(experiment: Experiment, calibration: str, pair: int, background: str | None = None) -> PairStamps:
+def of_guard(experiment: Experiment, calibration: str, pairs: Sequence[int], background: str | None = None) -> Stamp:
+    """Return the stamp of the guard layers measured with some pairs.
+
+    `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light.
+    """
+    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    return Stamp(
+        {
+            "calibration": calibration,
+            "self_calibration": _self_calibration(experiment),
+            "volume": dataclasses.asdict(experiment.grid),
+            "background": background,
+            "images": _identity(paths, experiment.path.parent),
+        }
+    )
+
+
+def of_pair(
+    experiment: Experiment,
+    calibration: str,
+    pair: int,
+    *,
+    background: str | None = None,
+    guard: Layers = NO_LAYERS,
+) -> PairStamps:
     """Return the stamps of the volumes and of the vectors of a pair.
 
-    `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images.
+    `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
+    the guard layers of the volumes.
     """
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
@@ -197,6 +223,7 @@ def of_pair(experiment: Experiment, calibration: str, pair: int, background: str
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
         "mask": _mask_hash(experiment.solid),
+        "guard": guard if guard != NO_LAYERS else None,
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},

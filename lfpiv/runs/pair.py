@@ -22,6 +22,8 @@ from lfpiv import warn
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.settings import Correlation
+from lfpiv.geometry.grid import Grid, Layers
+from lfpiv.geometry.volume import VIEWS
 from lfpiv.lightfield import image_checks
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.motion import Motion, PairSolver, unshared_quality
@@ -30,6 +32,7 @@ from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
 from lfpiv.runs import pair_figures
 from lfpiv.runs.frame_light import FrameLight, pair_light
+from lfpiv.runs.guard import with_guard
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.warn import FirstOfEachCode
 
@@ -66,6 +69,8 @@ class PairWork:
     experiment: Experiment
     folder: Folder
     calibration_hash: str
+    guard: Layers
+    """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
     weights: Weights | None
     """None if all volumes are in the folder."""
     darks: Mapping[str, np.ndarray | None]
@@ -115,11 +120,18 @@ class PairWork:
             SmartSettings(**smart.of_one_frame()),
             motion_passes=smart.motion_passes,
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
-            mask=self.experiment.solid,
+            mask=with_guard(self.experiment, self.guard).solid,
         )
 
     def _do(self, pair: int, progress: StepProgress) -> None:
-        files = PairFiles.of(self.experiment, self.calibration_hash, self.folder, pair, self.background)
+        files = PairFiles.of(
+            self.experiment,
+            self.calibration_hash,
+            self.folder,
+            pair,
+            background=self.background,
+            guard=self.guard,
+        )
         volumes = files.read_volumes()
         if volumes is None:
             volumes = self._reconstruct(files, part_of(progress, 0.0, RECONSTRUCTED))
@@ -138,7 +150,9 @@ class PairWork:
         light = pair_light(self.experiment, self.weights.cameras, self.darks, files.pair)
         self.log_first(warning.of_pair(files.pair) for frame in light for warning in frame.warnings)
         start = time.perf_counter()
-        volumes = _reconstruct_frames(self.solver, light, files.pair, progress)
+        guarded = _reconstruct_frames(self.solver, light, files.pair, progress)
+        grid, padded = self.experiment.grid, self.weights.grid
+        volumes = _without_guard(guarded[0], grid, padded), _without_guard(guarded[1], grid, padded)
         seconds = (time.perf_counter() - start) / 2
         first, second = (
             FrameRecord(
@@ -185,6 +199,20 @@ def _reconstruct_frames(
         log.info("pair %d: %s", pair, result.motion.value)
     first, second = result.to_dataarrays()
     return first, second
+
+
+def _without_guard(volume: xr.DataArray, grid: Grid, padded: Grid) -> xr.DataArray:
+    """Cut the guard layers off a volume."""
+    if padded == grid:
+        return volume
+    cut = volume[grid.within(padded)]
+    for name in volume.coords:
+        if cut.coords[name].ndim == 3:  # HDF5 and the kernels take contiguous arrays
+            cut = cut.assign_coords({name: cut.coords[name].copy(data=np.ascontiguousarray(cut.coords[name].values))})
+    cut = cut.copy(data=np.ascontiguousarray(cut.values))
+    if VIEWS in cut.coords and cut.coords[VIEWS].values.min() >= 2:
+        cut = cut.drop_vars(VIEWS)
+    return cut
 
 
 def _with_motion(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:

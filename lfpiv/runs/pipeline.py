@@ -15,15 +15,14 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
 from lfpiv.runs import background, dispatch, local_workers, memory, rig, worker, worker_plan
-from lfpiv.runs.background import Background
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, WeightsFigures, Workers
 from lfpiv.runs.pair import Outcome, PairWork
+from lfpiv.runs.rig import Prepared
 from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.camera import Calibration
     from lfpiv.weights.operator import Weights
 
 PAIRS = "image pairs"
@@ -85,11 +84,11 @@ def run(
         todo = current.unfinished(volumes=keep_volumes)
         checked = _check(current, todo.pairs, workers, scheduler)
         calibrated = rig.calibrate(current)
-        current, standing = _with_background(current, calibrated.calibration)
+        current, prepared = rig.prepare(current, calibrated.calibration)
         if (again := current.unfinished(volumes=keep_volumes, quiet=True)).pairs != todo.pairs:
             todo, checked = again, _check(current, again.pairs, workers, scheduler)
-        calibrated = replace(calibrated, calibration=standing.seen_by(calibrated.calibration))
-        done = _process(current, calibrated.calibration, checked, keep_volumes)
+        calibrated = replace(calibrated, calibration=prepared.board)
+        done = _process(current, prepared, checked, keep_volumes)
         return current.finish(calibrated, replace(done, reused=todo.reused), report=True)
 
 
@@ -118,12 +117,12 @@ def reconstruct(
         todo = current.unfinished(vectors=False, volumes=True)
         checked = _check(current, todo.pairs, 1, None)
         calibrated = rig.calibrate(current)
-        current, standing = _with_background(current, calibrated.calibration)
+        current, prepared = rig.prepare(current, calibrated.calibration)
         if (again := current.unfinished(vectors=False, volumes=True, quiet=True)).pairs != todo.pairs:
             todo, checked = again, _check(current, again.pairs, 1, None)
         done = Invocation(outcomes=checked.failed)
         if checked.pairs:
-            weights, figures = rig.build_weights(current, standing.seen_by(calibrated.calibration), checked.pairs)
+            weights, figures = rig.build_weights(current, prepared, checked.pairs)
             work = _work(current, weights, keep_volumes=True, vectors=False)
             done = Invocation(outcomes=_sequential(current, work, checked.pairs), weights=figures)
         return current.finish(calibrated, replace(done, reused=todo.reused), report=False)
@@ -189,17 +188,18 @@ def _check(current: Run, todo: list[int], workers: int | None, scheduler: str | 
     planned = worker_plan.plan(len(todo), workers, current.device, gpus)
     pairs, failed = current.check_images(todo) if todo else ([], [])
     if pairs:
-        needed = 0 if all(map(current.has_volumes, pairs)) else memory.weights_bytes(current.experiment)
+        guarded = current.guarded_experiment
+        needed = 0 if all(map(current.has_volumes, pairs)) else memory.weights_bytes(guarded)
         if workers is None:
             planned = worker_plan.fit_installation(planned, current.device)
-            planned = worker_plan.fit_memory(planned, current.experiment, needed, current.device)
-        worker_plan.require_memory(current.experiment, needed, 1 if scheduler else planned.workers)
+            planned = worker_plan.fit_memory(planned, guarded, needed, current.device)
+        worker_plan.require_memory(guarded, needed, 1 if scheduler else planned.workers)
     if pairs and planned.workers > 1 and not scheduler:
         local_workers.start_preloading(planned.kind)
     return _Checked(pairs=pairs, failed=failed, workers=scheduler or planned)
 
 
-def _process(current: Run, calibration: Calibration, checked: _Checked, keep_volumes: bool) -> Invocation:
+def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: bool) -> Invocation:
     """Do the pairs in this process or in several; the weights are built once for all of them."""
     todo, workers = checked.pairs, checked.workers
     if not todo:
@@ -207,9 +207,10 @@ def _process(current: Run, calibration: Calibration, checked: _Checked, keep_vol
     weights: Weights | None = None
     figures: WeightsFigures | None = None
     if not all(map(current.has_volumes, todo)):
-        weights, figures = rig.build_weights(current, calibration, todo)
+        weights, figures = rig.build_weights(current, prepared, todo)
         if isinstance(workers, Plan):
-            workers = worker_plan.fit_memory(workers, current.experiment, weights.memory_bytes, current.device)
+            guarded = current.guarded_experiment
+            workers = worker_plan.fit_memory(workers, guarded, weights.memory_bytes, current.device)
     work = _work(current, weights, keep_volumes=keep_volumes)
     if isinstance(workers, Plan) and workers.workers == 1:
         return Invocation(outcomes=_sequential(current, work, todo), weights=figures)
@@ -225,17 +226,12 @@ def _process(current: Run, calibration: Calibration, checked: _Checked, keep_vol
     return Invocation(outcomes=outcomes, weights=figures, workers=replace(used, peak_memory_mib=peak_mib or None))
 
 
-def _with_background(current: Run, calibration: Calibration) -> tuple[Run, Background]:
-    """Return the light that stands still in the images, and the run whose results depend on it."""
-    found = background.prepare(current, calibration)
-    return replace(current, background=found.content), found
-
-
 def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
     return PairWork(
         experiment=current.experiment,
         folder=current.folder,
         calibration_hash=current.calibration_stamp.hash,
+        guard=current.guard_layers,
         weights=weights,
         darks={} if weights is None else read_darks(current.experiment),
         keep_volumes=keep_volumes,

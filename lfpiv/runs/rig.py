@@ -5,12 +5,12 @@ Each step reuses the result in the output folder if it still fits the experiment
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import logging
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.files import MIB, writing
 from lfpiv.results import netcdf, provenance
-from lfpiv.runs import memory, moved_cameras
+from lfpiv.runs import background, guard, memory, moved_cameras
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.warn import Code, Warning, collected, warn
@@ -31,6 +31,18 @@ if TYPE_CHECKING:
     from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """Calibrations of a run that know what stands still in the images."""
+
+    board: Calibration
+    """From the board."""
+    calibration: Calibration
+    """Corrected for movements of the cameras, if the experiment demands it."""
+    self_calibration: SelfCalibrationFigures | None
+    """None without self-calibration."""
 
 
 def load_calibration(run: Run) -> Calibrated:
@@ -87,32 +99,46 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
     return corrected, figures
 
 
-def build_weights(run: Run, calibration: Calibration, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
-    """Self-calibrate if the experiment demands it, build the weights of the grid, and check that no camera moved.
+def prepare(run: Run, board: Calibration) -> tuple[Run, Prepared]:
+    """Make what all pairs depend on beside the settings: subtracted light, corrected cameras and guard layers.
 
-    `calibration` is the one from the board. The check uses the first pairs of `todo`.
+    `board` is the calibration from the board. Return also the run whose results depend on them.
     """
+    standing = background.prepare(run, board)
+    run = replace(run, background=standing.content)
+    board = standing.seen_by(board)
+    calibration, self_calibration = self_calibrate(run, board)
+    stamp = run.calibration_stamp.hash
+    run = replace(run, guard=guard.decide(run.experiment, run.folder, stamp, standing.content, calibration))
+    return run, Prepared(board=board, calibration=calibration, self_calibration=self_calibration)
+
+
+def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
+    """Build the weights and check the cameras by the first pairs of `todo`."""
     from lfpiv.calibration.coverage import require_seen, warn_outside
     from lfpiv.weights.operator import build_weights, compare_with_count
 
-    experiment, compute = run.experiment, run.experiment.compute
-    calibration, self_calibration = self_calibrate(run, calibration)
+    experiment, compute, guarded = run.experiment, run.experiment.compute, run.guarded_experiment
+    calibration, self_calibration = prepared.calibration, prepared.self_calibration
     require_seen(experiment.path, calibration, experiment.grid)
     warn_outside(calibration, experiment.grid)
     if len(calibration.cameras) == 1:
         log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
+    for warning in guard.warnings(experiment, run.guard):
+        log.warning("%s", warning.sentence)
     start = time.perf_counter()
     with collected() as warnings:
         for warning in self_calibration.warnings if self_calibration else ():
             warn(log, warning)
         weights = build_weights(
             calibration,
-            experiment.grid,
+            guarded.grid,
             compute.weights,
             form=compute.weights_form,
-            limit_bytes=memory.left_for_weights(experiment),
+            limit_bytes=memory.left_for_weights(guarded),
             progress=run.step("weights"),
         )
+        weights.volume = experiment.grid
         _ = weights.camera_sums  # computed here, once for all pairs and workers
         seconds = time.perf_counter() - start
         counted = compare_with_count(weights) if compute.weights == "footprint" else {}
@@ -141,7 +167,7 @@ def _with_standing(corrected: Calibration, calibration: Calibration) -> Calibrat
         name: camera if (standing := calibration.cameras[name].standing) is None else camera.with_standing(standing)
         for name, camera in corrected.cameras.items()
     }
-    return dataclasses.replace(corrected, cameras=cameras)
+    return replace(corrected, cameras=cameras)
 
 
 def _write(calibration: Calibration, path: Path, attributes: Mapping[str, Any]) -> None:

@@ -20,12 +20,14 @@ from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, check_pairs, read_experiment
 from lfpiv.files import writing
+from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.results import provenance
 from lfpiv.results.folder import Folder, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
-from lfpiv.runs import memory, pair_figures, summary
+from lfpiv.runs import guard, memory, pair_figures, summary
+from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Workers
 from lfpiv.runs.pair import Outcome
 from lfpiv.runs.summary import Contents, EarlierSummary
@@ -69,6 +71,8 @@ def open_run(
             except (RuntimeError, ValueError) as error:
                 raise InputError(str(error)) from None
             stack.enter_context(threadpool_limits(running.threads))
+            stamp = provenance.of_calibration(experiment)
+            subtracted = provenance.background_content(folder.background)
             yield Run(
                 experiment=experiment,
                 folder=folder,
@@ -78,9 +82,10 @@ def open_run(
                 device=running,
                 warnings=warnings,
                 start_s=start_s,
-                calibration_stamp=provenance.of_calibration(experiment),
+                calibration_stamp=stamp,
                 earlier=summary.read(folder.summary),
-                background=provenance.background_content(folder.background),
+                background=subtracted,
+                guard=guard.read(experiment, folder, stamp.hash, subtracted),
             )
     finally:
         for path in made:
@@ -127,14 +132,33 @@ class Run:
     earlier: EarlierSummary
     background: str | None = None
     """Hash of the light that is subtracted from the images; None if there is none."""
+    guard: Guard | None = None
+    """Light beyond the volume and the guard layers that it demands; None before it was measured."""
 
     def step(self, name: str) -> StepProgress:
         """Return the progress of one step of the run."""
         return lambda fraction: self.progress(name, fraction)
 
+    @property
+    def guard_layers(self) -> Layers:
+        """Guard layers of the volumes; none if they are yet to be measured."""
+        return guard.layers(self.experiment, self.guard if self.experiment.guard_mm == "auto" else None)
+
+    @property
+    def guarded_experiment(self) -> Experiment:
+        """The experiment with the grid that is reconstructed."""
+        return guard.with_guard(self.experiment, self.guard_layers)
+
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
-        return PairFiles.of(self.experiment, self.calibration_stamp.hash, self.folder, pair, self.background)
+        return PairFiles.of(
+            self.experiment,
+            self.calibration_stamp.hash,
+            self.folder,
+            pair,
+            background=self.background,
+            guard=self.guard_layers,
+        )
 
     def has_volumes(self, pair: int) -> bool:
         """Return whether both volumes of a pair are in the folder and fit."""
@@ -227,7 +251,13 @@ class Run:
         marks = provenance.read_marks(self.folder.background)
         found_light = {} if marks is None or marks.figures is None else marks.figures["cameras"]
         warnings = () if marks is None else marks.warnings
-        return Contents(vectors=vectors, volumes=volumes, background=found_light, background_warnings=warnings)
+        return Contents(
+            vectors=vectors,
+            volumes=volumes,
+            background=found_light,
+            background_warnings=warnings,
+            guard=self.guard,
+        )
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:
         """Return the time and the peak memory so far, in the form of the summary."""

@@ -19,6 +19,8 @@ from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
+from lfpiv.runs import guard
+from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.velocity.cross_correlation import Verdict
@@ -47,6 +49,8 @@ class Contents:
     """Camera -> figures of the light that stands still in its images."""
     background_warnings: tuple[Warning, ...] = ()
     """Warnings about light that stands still and is not subtracted."""
+    guard: Guard | None = None
+    """Light beyond the volume and guard layers; None if they were not measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +115,7 @@ def build(
         "board": {} if calibrated.calibration.board is None else calibrated.calibration.board.to_json(),
         "weights": weights,
         "background": dict(contents.background),
+        "guard": _guard(experiment, contents.guard),
         "pairs": [
             {"pair": pair, "file": f"pair_{pair:04d}.nc", **figures.to_json()}
             for pair, figures in contents.vectors.items()
@@ -147,6 +152,7 @@ def _warnings(
     images = {pair: figures.warnings for pair, figures in contents.vectors.items()} | dict(contents.volumes)
     found = [
         *rig_warnings(calibrated.calibration, experiment.grid),
+        *guard.warnings(experiment, contents.guard),
         *map(Warning.from_json, weights.get("warnings", ())),
         *contents.background_warnings,
         *image_warnings(images),
@@ -157,6 +163,14 @@ def _warnings(
     for warning in found:
         by_sentence.setdefault(warning.sentence, warning)
     return by_sentence
+
+
+def _guard(experiment: Experiment, found: Guard | None) -> dict[str, Any]:
+    """Return the guard layers (x, y, z; low and high) [mm] and the light beyond the volume."""
+    used = guard.layers(experiment, found)
+    thickness = [[round(count * experiment.grid.voxel_mm, 6) for count in pair] for pair in reversed(used)]
+    light = {} if found is None else found.to_json()
+    return {"thickness_mm": thickness, "pairs": list(light.get("pairs", ())), "faces": list(light.get("faces", ()))}
 
 
 def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:

@@ -259,7 +259,8 @@ def _experiment_text(scene: Scene) -> str:
         "pairs": scene.particles.pairs,
         "frames": FRAMES,
     }
-    tables = {"board": board, "volume": scene.volume.model_dump(), "particles": particles}
+    volume = {"centre_mm": scene.volume.centre_mm} | scene.volume.model_dump(exclude_unset=True)
+    tables = {"board": board, "volume": volume, "particles": particles}
     for name in ("smart", "correlation", "network", "compute"):
         tables[name] = getattr(scene, name).model_dump(exclude_unset=True, exclude_none=True)
     for name, table in tables.items():

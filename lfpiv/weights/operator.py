@@ -93,6 +93,8 @@ class Weights:
         self._choices = dict(choices or {})
         self._counted = dict(counted or {})
         self._camera_sums = camera_sums
+        self.volume = stored.grid
+        """Part of the grid that is kept, about which warnings are; without guard layers the whole."""
 
     def of_camera(self, name: str) -> Weights:
         """Return the weights of one of the cameras. They share memory with these."""
@@ -210,7 +212,7 @@ class Weights:
             for own, name in zip(sums, self.cameras, strict=True):
                 self.projector(name).back_project(self.gain(name), own)
             self._camera_sums = sums
-            warn_seen_by_one(self.views, self.grid, len(self.cameras))
+            warn_seen_by_one(self.views[self.volume.within(self.grid)], self.volume, len(self.cameras))
         return self._camera_sums
 
     @property

@@ -1,0 +1,202 @@
+"""Guard layers of a run: voxels beyond the volume's faces that are reconstructed and cut away.
+
+Light from beyond the volume reaches the same pixels as light from within. Without guard layers SMART puts it into the
+volume. `decide` measures once per output folder how far light reaches beyond each face, and stores the outcome. With
+``volume.guard_mm = "auto"`` the guard layers follow from it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lfpiv import files
+from lfpiv.errors import InputError
+from lfpiv.files import writing
+from lfpiv.geometry.grid import AXES, NO_LAYERS, Layers
+from lfpiv.lightfield.particle_signal import NOISE
+from lfpiv.reconstruction.beyond import FaceLight, light_beyond
+from lfpiv.results import provenance
+from lfpiv.results.provenance import Marks
+from lfpiv.runs import memory
+from lfpiv.runs.frame_light import pair_light, read_darks
+from lfpiv.warn import Code, Warning
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import Calibration
+    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.results.folder import Folder
+
+log = logging.getLogger(__name__)
+
+PAIRS, TRIED = 3, 9
+"""Largest number of pairs that the measurement uses, and that it tries."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Guard:
+    """Guard layers, and the light beyond the volume that they follow from."""
+
+    pairs: tuple[int, ...]
+    """Pairs that the light was measured with; empty if it could not be measured."""
+    faces: tuple[FaceLight, ...]
+    """Faces of the volume with light beyond them."""
+    layers: Layers
+    """Layers of voxels that "auto" demands."""
+    short: bool = False
+    """Whether the memory allows fewer layers than the light demands."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the form that a file stores."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, stored: dict[str, Any]) -> Guard:
+        """Read the form that a file stores."""
+        z, y, x = ((int(low), int(high)) for low, high in stored["layers"])
+        return cls(
+            pairs=tuple(stored["pairs"]),
+            faces=tuple(FaceLight(**face) for face in stored["faces"]),
+            layers=(z, y, x),
+            short=bool(stored["short"]),
+        )
+
+
+def read(experiment: Experiment, folder: Folder, calibration: str, background: str | None) -> Guard | None:
+    """Read the stored outcome; None if it is missing or does not fit.
+
+    `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light.
+    """
+    try:
+        stored = json.loads(folder.guard.read_text("utf-8"))
+        marks = Marks(settings_hash=stored["settings_hash"], depends_on=stored["depends_on"])
+        guard = Guard.from_json(stored["guard"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return guard if provenance.of_guard(experiment, calibration, guard.pairs, background).fits(marks) else None
+
+
+def layers(experiment: Experiment, guard: Guard | None) -> Layers:
+    """Return the guard layers of an experiment: those of its file, or the measured ones; none before `decide`."""
+    if experiment.guard_mm != "auto":
+        return experiment.grid.layers(experiment.guard_mm)
+    return NO_LAYERS if guard is None else guard.layers
+
+
+def with_guard(experiment: Experiment, guard: Layers) -> Experiment:
+    """Return the experiment with the padded grid, on which solids go on as they are at the faces."""
+    solid = None if experiment.solid is None else np.pad(experiment.solid, guard, mode="edge")
+    return replace(experiment, grid=experiment.grid.padded(guard), solid=solid)
+
+
+def decide(
+    experiment: Experiment, folder: Folder, stamp_hash: str, background: str | None, calibration: Calibration
+) -> Guard:
+    """Return the stored outcome, or measure the light beyond the volume and store the outcome.
+
+    `stamp_hash` is the hash of the stamp of the board's calibration, `background` that of the subtracted light.
+    """
+    found = read(experiment, folder, stamp_hash, background)
+    if found is not None:
+        log.info("light beyond the volume: measured before, kept")
+        return found
+    start = time.perf_counter()
+    instants = dict(_instants(experiment, calibration))
+    faces = light_beyond(calibration, experiment.grid, list(instants.values())) if instants else ()
+    demanded = _demanded(experiment, faces)
+    allowed = _fitting(experiment, demanded)
+    guard = Guard(pairs=tuple(instants), faces=faces, layers=allowed, short=allowed != demanded)
+    log.info("light beyond the volume: measured in %.1f s", time.perf_counter() - start)
+    stamp = provenance.of_guard(experiment, stamp_hash, guard.pairs, background)
+    with writing(folder.guard):
+        files.write_json({**stamp.attributes, "guard": guard.to_json()}, folder.guard)
+    return guard
+
+
+def warnings(experiment: Experiment, guard: Guard | None) -> list[Warning]:
+    """Return a warning for each face of the volume with light beyond it."""
+    if guard is None:
+        return []
+    found, voxel_mm, used = [], experiment.grid.voxel_mm, layers(experiment, guard)
+    for face in guard.faces:
+        guard_mm = used[face.axis][face.side] * voxel_mm
+        covered = guard_mm >= face.reach_mm - voxel_mm / 2 and not face.farther
+        figures = {
+            "face": _name(experiment, face),
+            "reach_mm": face.reach_mm,
+            "share": face.share,
+            "guard_mm": guard_mm,
+        }
+        if covered:
+            found.append(Warning(code=Code.LIGHT_GUARDED, figures=figures))
+        else:
+            figures["reason"] = _reason(experiment, guard, face)
+            found.append(Warning(code=Code.LIGHT_UNGUARDED, figures=figures))
+    return found
+
+
+def _instants(
+    experiment: Experiment, calibration: Calibration
+) -> Iterator[tuple[int, Sequence[dict[str, np.ndarray]]]]:
+    """Yield the images of both frames of some usable pairs, spread over the whole experiment."""
+    darks, used = read_darks(experiment), 0
+    for pair in _candidates(experiment.pairs):
+        try:
+            light = pair_light(experiment, calibration.cameras, darks, pair)
+        except InputError as error:  # a pair that cannot be used fails when it is reconstructed
+            log.debug("light beyond the volume in pair %d: %s", pair, error)
+            continue
+        if min(min(frame.structure.values()) for frame in light) < NOISE:
+            continue
+        yield pair, [dict(frame.images) for frame in light]
+        used += 1
+        if used == PAIRS:
+            return
+
+
+def _candidates(pairs: int) -> list[int]:
+    """Return the pairs to try: evenly spread ones first, then those at the middles of the gaps."""
+    spread = [(2 * number + 1) * pairs // (2 * count) for count in (PAIRS, TRIED) for number in range(count)]
+    return list(dict.fromkeys(spread))[:TRIED]
+
+
+def _demanded(experiment: Experiment, faces: Sequence[FaceLight]) -> Layers:
+    """Return whole layers of voxels that hold the light beyond the faces."""
+    counts = [[0, 0], [0, 0], [0, 0]]
+    for face in faces:
+        counts[face.axis][face.side] = round(face.guard_mm / experiment.grid.voxel_mm)
+    z, y, x = ((low, high) for low, high in counts)
+    return z, y, x
+
+
+def _fitting(experiment: Experiment, demanded: Layers) -> Layers:
+    """Return the layers that fit into the memory: the demanded ones, or all in proportion thinner."""
+    if demanded == NO_LAYERS:
+        return demanded
+    limit = memory.allowed_bytes(experiment)
+    for part in (1.0, 0.75, 0.5, 0.25):
+        z, y, x = ((int(low * part), int(high * part)) for low, high in demanded)
+        padded = with_guard(experiment, (z, y, x))
+        if memory.run_bytes(padded, memory.weights_bytes(padded), 1) <= limit:
+            return z, y, x
+    return NO_LAYERS
+
+
+def _name(experiment: Experiment, face: FaceLight) -> str:
+    grid = experiment.grid
+    edge = grid.axis_mm(face.axis)[-1 if face.side else 0] + (0.5 if face.side else -0.5) * grid.voxel_mm
+    return f"{AXES[face.axis]} = {round(edge, 6) + 0.0:g} mm"
+
+
+def _reason(experiment: Experiment, guard: Guard, face: FaceLight) -> str:
+    if experiment.guard_mm != "auto":
+        return 'raise volume.guard_mm, or set it to "auto"'
+    if guard.short:
+        return "thicker guard layers would not fit into the memory: raise compute.memory_gib or volume.voxel_mm"
+    return f"beyond that lies {face.limit}: make the sheet thinner or the volume larger"

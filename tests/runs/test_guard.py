@@ -1,0 +1,76 @@
+"""Guard layers of a run: decided once, stamped, told, and cut away."""
+
+import dataclasses
+import json
+
+import pytest
+
+from lfpiv.experiment.experiment import read_experiment
+from lfpiv.geometry.grid import NO_LAYERS
+from lfpiv.reconstruction.beyond import FaceLight
+from lfpiv.results import netcdf, provenance
+from lfpiv.results.folder import Folder
+from lfpiv.runs import guard, memory, pipeline
+from lfpiv.runs.guard import Guard
+from lfpiv.warn import Code
+
+FACE = FaceLight(axis=0, side=1, reach_mm=0.2, share=0.1, guard_mm=0.3, farther=False, limit="the end of the search")
+
+
+@pytest.fixture
+def experiment(small_run):
+    return read_experiment(small_run.experiment)
+
+
+def test_the_outcome_is_stored_and_fits_until_the_volume_changes(small_run, experiment, tmp_path):
+    folder = Folder(small_run.out)
+    stamp = provenance.of_calibration(experiment).hash
+    found = guard.read(experiment, stamp, folder)
+    assert found is not None and found.pairs and Guard.from_json(json.loads(json.dumps(found.to_json()))) == found
+    assert guard.read(experiment, "another calibration", folder) is None
+    moved = dataclasses.replace(experiment.grid, first_centre_mm=(0.0, 0.0, 0.0))
+    assert guard.read(dataclasses.replace(experiment, grid=moved), stamp, folder) is None
+    assert small_run.summary["guard"]["pairs"] == list(found.pairs)
+
+
+def test_results_with_guard_layers_are_others(experiment):
+    plain, guarded = (provenance.of_pair(experiment, "c", 0, one) for one in (NO_LAYERS, ((1, 2), (0, 0), (0, 0))))
+    marks = provenance.Marks(**plain.volumes.attributes)
+    assert guarded.volumes.changes(marks) == ["guard"] and plain.volumes.fits(marks)
+
+
+def test_a_warning_names_the_face_and_whether_layers_hold_the_light(experiment):
+    found = Guard(pairs=(0,), faces=(FACE,), layers=((0, 3), (0, 0), (0, 0)))
+    (handled,) = guard.warnings(experiment, found)
+    assert handled.code is Code.LIGHT_GUARDED and "z = 0.6 mm" in handled.sentence and "0.2 mm" in handled.sentence
+    (without,) = guard.warnings(dataclasses.replace(experiment, guard_mm=0.0), found)
+    assert without.code is Code.LIGHT_UNGUARDED and "volume.guard_mm" in without.sentence
+    (short,) = guard.warnings(experiment, dataclasses.replace(found, layers=NO_LAYERS, short=True))
+    assert short.code is Code.LIGHT_UNGUARDED and "memory" in short.sentence
+    farther = dataclasses.replace(found, faces=(dataclasses.replace(FACE, farther=True),))
+    assert guard.warnings(experiment, farther)[0].code is Code.LIGHT_UNGUARDED
+    assert guard.warnings(experiment, None) == []
+
+
+def test_estimates_of_memory_count_the_guard_layers(experiment):
+    padded = guard.with_guard(experiment, ((6, 6), (0, 0), (0, 0)))
+    assert padded.grid.shape[0] == experiment.grid.shape[0] + 12
+    assert memory.least_bytes(padded) > memory.least_bytes(experiment)
+    assert memory.weights_bytes(padded) > memory.weights_bytes(experiment)
+
+
+@pytest.mark.slow
+def test_the_volumes_are_those_of_the_experiment(small_run, tmp_path):
+    file = small_run.images(tmp_path / "data")
+    text = file.read_text()
+    file.write_text(text.replace("[volume]", "[volume]\nguard_mm = [0.0, 0.1, 0.2]"))
+    out = small_run.calibrated(tmp_path / "out")
+    summary = pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)
+    assert summary["guard"]["thickness_mm"] == [[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]
+    assert summary["weights"]["memory_mib"] > small_run.summary["weights"]["memory_mib"]
+    volume = netcdf.read_volume(out / "volumes" / "pair_0000_a.nc")
+    experiment = read_experiment(file)
+    assert volume.shape == experiment.grid.shape
+    assert volume.z.values[0] == pytest.approx(experiment.grid.axis_mm(0)[0])
+    again = pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)
+    assert "vectors of pair 0" in again["reused"]
