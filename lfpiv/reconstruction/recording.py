@@ -13,7 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.volume import is_finite
+from lfpiv.reconstruction.intensity_cap import typical_peak
 from lfpiv.weights.operator import Weights
 
 BRIGHTEST = 99.9
@@ -51,14 +53,28 @@ class Recording:
     """Part of the image's light in pixels that no voxel lights."""
 
 
+def checked_images(weights: Weights, images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the image of every camera as float32, shape (rows, columns).
+
+    Raises
+    ------
+    ValueError
+        If an image is missing, has the wrong shape or type, or is not finite.
+    """
+    if not isinstance(images, Mapping):
+        raise ValueError(f"images: expected a mapping from camera names to images, got {type(images).__name__}.")
+    return {name: _checked_image(images, name, camera.optics.sensor_shape) for name, camera in weights.cameras.items()}
+
+
 def record(
     weights: Weights,
     images: Mapping[str, np.ndarray],
     *,
     floor: float | Mapping[str, float] | None,
     floor_share: float,
+    intensity_cap: float = 0.0,
 ) -> dict[str, Recording]:
-    """Prepare the images of all cameras; arguments as of `lfpiv.reconstruct`.
+    """Prepare the images of all cameras, from `checked_images`; arguments as of `lfpiv.reconstruct`.
 
     Returns
     -------
@@ -68,12 +84,10 @@ def record(
     Raises
     ------
     ValueError
-        If an image or a floor is missing or out of its range, or an image holds no light where the volume is seen.
+        If a floor is missing or out of its range, or an image holds no light where the volume is seen.
     """
-    if not isinstance(images, Mapping):
-        raise ValueError(f"images: expected a mapping from camera names to images, got {type(images).__name__}.")
     given = _given_floors(floor, weights)
-    lit = {name: _LitPixels(weights, images, name) for name in weights.cameras}
+    lit = {name: _LitPixels(weights, images, name, intensity_cap) for name in weights.cameras}
     gains = _camera_gains(weights, lit)
     recordings = {}
     for name, seen in lit.items():
@@ -93,8 +107,8 @@ def record(
 class _LitPixels:
     """Counts of one camera's image in the pixels that voxels light, checked, and their figures."""
 
-    def __init__(self, weights: Weights, images: Mapping[str, np.ndarray], name: str):
-        image = _checked_image(images, name, weights.cameras[name].optics.sensor_shape)
+    def __init__(self, weights: Weights, images: Mapping[str, np.ndarray], name: str, intensity_cap: float):
+        image = images[name].reshape(-1)
         alive = np.asarray(weights.cameras[name].gain).reshape(-1) > 0
         if not (image[alive] > 0).any():
             raise ValueError(f"images[{name!r}]: expected some light, got no positive count; check the background.")
@@ -111,6 +125,12 @@ class _LitPixels:
         below = image[image < 0]
         self.noise = float(np.sqrt(np.mean(below**2))) if below.size else 0.0
         """Noise of the background: root mean square of the negative counts."""
+        whole = float(image[alive].sum(dtype=np.float64))
+        inside = float(self.counts.sum(dtype=np.float64))
+        self.outside = float(np.clip(1 - inside / whole, 0, 1)) if whole > 0 else 0.0
+        if intensity_cap > 0:
+            peak = self._typical_peak(weights.cameras[name].optics)
+            self.counts = np.minimum(self.counts, np.float32(intensity_cap * peak) * weights.gain(name)[self.pixels])
         above = self.counts[self.counts > NOISE_SIGMA * self.noise]
         above = above if above.size else self.counts[self.counts > 0]
         self.peak = float(np.percentile(above, BRIGHTEST, method="higher"))
@@ -119,13 +139,15 @@ class _LitPixels:
         positive = np.clip(self.counts, 0, self.peak)
         self.brightness = float(np.square(positive, dtype=np.float64).sum() / positive.sum(dtype=np.float64))
         """Mean count weighted by the counts. Dark and hot pixels have no weight."""
-        whole = float(image[alive].sum(dtype=np.float64))
-        inside = float(self.counts.sum(dtype=np.float64))
-        self.outside = float(np.clip(1 - inside / whole, 0, 1)) if whole > 0 else 0.0
+
+    def _typical_peak(self, optics: Optics) -> float:
+        lit = np.zeros(self.size, np.float32)
+        lit[self.pixels] = self.counts
+        return typical_peak(lit.reshape(optics.sensor_shape), optics.microimage_pitch_px, self.noise)
 
 
 def _checked_image(images: Mapping[str, np.ndarray], name: str, shape: tuple[int, int]) -> np.ndarray:
-    """Return a camera's image as float32, shape (pixel,), or raise ValueError."""
+    """Return a camera's image as float32, shape (rows, columns), or raise ValueError."""
     if name not in images:
         raise ValueError(f"images: camera {name!r} is missing; found {', '.join(map(str, images)) or 'none'}.")
     image = np.asarray(images[name])
@@ -133,7 +155,7 @@ def _checked_image(images: Mapping[str, np.ndarray], name: str, shape: tuple[int
         raise ValueError(f"images[{name!r}]: expected an array of counts, got {image.dtype}.")
     if image.shape != shape:
         raise ValueError(f"images[{name!r}]: expected shape {shape}, got {image.shape}.")
-    image = image.astype(np.float32, copy=False).reshape(-1)
+    image = image.astype(np.float32, copy=False)
     if not np.isfinite(image).all():
         raise ValueError(f"images[{name!r}]: expected finite counts, got NaN or infinity.")
     return image

@@ -47,6 +47,8 @@ class Reconstruction:
     """Part of an image's light in pixels that no voxel lights."""
     sieve_voxel: float
     """Standard deviation of the sieve that was used [voxel]."""
+    intensity_cap: float
+    """Limit of the counts that was used, as a multiple of the typical peak; 0 for none."""
     settings: SmartSettings
 
     @property
@@ -82,6 +84,7 @@ class Reconstruction:
             "iterations": self.iterations,
             "relaxation": settings.relaxation,
             "floor": list(self.floor.values()),
+            "intensity_cap": self.intensity_cap,
             "camera_gain": list(self.camera_gain.values()),
             "light_outside": list(self.light_outside.values()),
             "normalisation": settings.normalisation,

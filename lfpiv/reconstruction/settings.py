@@ -10,7 +10,7 @@ from lfpiv.geometry.volume import is_finite
 
 NORMALISATIONS = ("column", "paper")
 AUTO = "auto"
-"""Sieve that matches the size of the particles."""
+"""Sieve and intensity cap that suit the size of the particles."""
 FLOOR_SHARE = 0.1
 """Default of the least noise floor, as a share of an image's brightness."""
 
@@ -28,6 +28,7 @@ class SmartSettings:
     iterations: int = 10
     relaxation: float = 1.0
     floor_share: float = FLOOR_SHARE
+    intensity_cap: float | str = 0.0
     normalisation: str = "column"
     accelerate: bool = True
     smoothing_voxel: float = 0.0
@@ -43,8 +44,8 @@ class SmartSettings:
             raise ValueError(f"normalisation: expected one of {', '.join(NORMALISATIONS)}, got {self.normalisation!r}.")
         if not (is_finite(self.active_share) and 0 <= self.active_share < 1):
             raise ValueError(f"active_share: expected a number from 0 to below 1, got {self.active_share!r}.")
-        for name in ("floor_share", "smoothing_voxel", "sieve_voxel", "tolerance"):
-            value, choice = getattr(self, name), f' or "{AUTO}"' if name == "sieve_voxel" else ""
+        for name in ("floor_share", "intensity_cap", "smoothing_voxel", "sieve_voxel", "tolerance"):
+            value, choice = getattr(self, name), f' or "{AUTO}"' if name in ("sieve_voxel", "intensity_cap") else ""
             if choice and isinstance(value, str) and value == AUTO:
                 continue
             if not (is_finite(value) and value >= 0):

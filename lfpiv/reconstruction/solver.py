@@ -12,11 +12,12 @@ import xarray as xr
 
 from lfpiv.geometry.volume import checked_mask
 from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
+from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.particle_size import ParticleSizer
-from lfpiv.reconstruction.recording import Recording, record
+from lfpiv.reconstruction.recording import Recording, checked_images, record
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
-from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve, Smoothing
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations, Misfit, State, iterate
 from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
@@ -94,8 +95,10 @@ class SmartSolver:
         """
         settings, stored = self.settings, self.weights.stored
         count = settings.iterations if iterations is None else iterations
-        recordings = record(self.weights, images, floor=floor, floor_share=settings.floor_share)
+        images = checked_images(self.weights, images)
         sieve = Sieve(self._sieve_voxel(images), stored.shape)
+        cap = self._intensity_cap(sieve)
+        recordings = record(self.weights, images, floor=floor, floor_share=settings.floor_share, intensity_cap=cap)
         cameras = [self._equation(name, one) for name, one in recordings.items()]
         norm = _norm(cameras)
         equations = ImageEquations(cameras)
@@ -138,6 +141,7 @@ class SmartSolver:
             camera_gain={name: one.camera_gain for name, one in recordings.items()},
             light_outside={name: one.light_outside for name, one in recordings.items()},
             sieve_voxel=sieve.sigma_voxel,
+            intensity_cap=cap,
             settings=settings,
         )
 
@@ -148,6 +152,13 @@ class SmartSolver:
     def _sieve_voxel(self, images: Mapping[str, np.ndarray]) -> float:
         sieve = self.settings.sieve_voxel
         return self._particle_sizer.matching_sieve(images) if isinstance(sieve, str) else sieve
+
+    def _intensity_cap(self, sieve: Sieve) -> float:
+        cap = self.settings.intensity_cap
+        if not isinstance(cap, str):
+            return cap
+        points = self.settings.sieve_voxel == AUTO and sieve.sigma_voxel == 0
+        return POINT_CAP if points else CAP
 
     @cached_property
     def _particle_sizer(self) -> ParticleSizer:

@@ -20,6 +20,7 @@ def reconstruct(
     *,
     floor: float | Mapping[str, float] | None = None,
     floor_share: float = FLOOR_SHARE,
+    intensity_cap: float | str = 0.0,
     normalisation: str = "column",
     accelerate: bool = True,
     smoothing_voxel: float = 0.0,
@@ -64,6 +65,11 @@ def reconstruct(
         Least floor as a share of each image's brightness, sum I^2 / sum I, hot pixels left out. Particles smaller than
         a voxel light fewer pixels than the voxel; the floor keeps the dark pixels beside them from counting against it.
         0 takes `floor` as it is.
+    intensity_cap : float or "auto"
+        Upper limit of the counts as a multiple of the typical peak, the median over the lit microimages of each one's
+        brightest pixel; 0 for none. It makes particles of unlike brightness more alike between cameras and frames
+        (`lfpiv.reconstruction.intensity_cap`). "auto": 1 for particles that ``sieve_voxel = "auto"`` finds smaller than
+        voxels, otherwise 2, which cuts a hundredth of the light of equally bright particles.
     normalisation : {"column", "paper"}
         See above.
     accelerate : bool
@@ -114,6 +120,7 @@ def reconstruct(
         iterations=iterations,
         relaxation=relaxation,
         floor_share=floor_share,
+        intensity_cap=intensity_cap,
         normalisation=normalisation,
         accelerate=accelerate,
         smoothing_voxel=smoothing_voxel,

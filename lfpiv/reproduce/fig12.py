@@ -42,6 +42,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "relaxation": 1.0,
         "accelerate": False,
         "floor_share": 0.0,
+        "intensity_cap": 0.0,
         "tolerance": 0.0,
         "sieve_voxel": 0.0,
     },

@@ -60,7 +60,14 @@ class Choice:
         return replace(self, label="", correlation={}) != Choice(label="")
 
 
-PAPER_SMART = {"iterations": 10, "accelerate": False, "floor_share": 0.0, "tolerance": 0.0, "sieve_voxel": 0.0}
+PAPER_SMART = {
+    "iterations": 10,
+    "accelerate": False,
+    "floor_share": 0.0,
+    "intensity_cap": 0.0,
+    "tolerance": 0.0,
+    "sieve_voxel": 0.0,
+}
 OPEN = {
     "exponent": Choice(label="exponent as printed in Eq. 5, not by the column sum", smart={"normalisation": "paper"}),
     "noise_floor": Choice(label="floor: the measured noise only", smart={"floor_share": 0.0}),

@@ -1,0 +1,48 @@
+"""Intensity capping [1]_: particle images whose brightest pixels are limited, so that particles are more alike.
+
+A particle's brightness differs between cameras, because they see light scattered at different angles, and between
+particles. A volume has one brightness per particle. What a camera shows beyond it becomes ghosts along its lines of
+sight, and the brightest particles make the most. The limit is a multiple of the typical peak, the median over the lit
+microimages of each one's brightest pixel. A few bright particles do not change it.
+
+.. [1] U. Shavit, R. J. Lowe, J. V. Steinbuck, "Intensity capping: a simple method to improve cross-correlation PIV
+   results", Exp. Fluids 42 (2007) 225-240, doi:10.1007/s00348-006-0233-7.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+POINT_CAP = 1.0
+"""Limit for particles smaller than voxels, as a multiple of the typical peak. Their images have no shape to lose."""
+CAP = 2.0
+"""Limit for larger particles. It cuts a hundredth of the light of equally bright ones, and keeps their shape."""
+PEAK_SIGMA = 5.0
+"""Least brightest pixel of a lit microimage [standard deviation of the noise]. The noise of its pixels stays below."""
+
+
+def typical_peak(image: np.ndarray, microimage_px: float, noise: float) -> float:
+    """Return the median over lit microimages of their brightest pixel.
+
+    Squares as large as a microimage stand for the microimages.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        Counts without background; 0 in pixels that do not count.
+    microimage_px : float
+        Distance of the microimages [pixel].
+    noise : float
+        Standard deviation of the background [counts].
+
+    Returns
+    -------
+    float
+        Infinite if no square is lit.
+    """
+    edge = max(1, round(microimage_px))
+    rows, columns = (n // edge for n in image.shape)
+    squares = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge)
+    peaks = squares.max(axis=(1, 3))
+    peaks = peaks[peaks > PEAK_SIGMA * noise]
+    return float(np.median(peaks)) if peaks.size else np.inf

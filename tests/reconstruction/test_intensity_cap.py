@@ -1,0 +1,113 @@
+"""Intensity capping: the limit it takes from an image, and what it does to particles of unlike brightness."""
+
+import numpy as np
+import pytest
+from support.ideal_rig import two_cameras
+
+import lfpiv
+from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP, typical_peak
+from lfpiv.reconstruction.recording import record
+
+NOISE = 2.0  # [counts]
+PITCH_PX = 18.2
+TOLERANCE_F32 = 2e-4  # as in test_volume: float32 steps
+SEEDS = (3, 4, 5, 6)
+LEAST_GAIN = 0.03  # of Q, mean of the seeds, brightness log-normal by 1 in each camera; measured 0.054
+LARGEST_LOSS = 0.01  # of Q, mean of the seeds, equally bright particles; measured 0.005
+
+
+def spots(counts, seed=0):
+    """Image with a spot of 3 x 3 pixels of given counts in the middle of each of 20 x 20 squares, and noise."""
+    image = np.random.default_rng(seed).normal(0, NOISE, (20 * 18 + 5, 20 * 18 + 5)).astype(np.float32)
+    for number, count in enumerate(counts):
+        row, column = 18 * (number // 20) + 8, 18 * (number % 20) + 8
+        image[row : row + 3, column : column + 3] += count
+    return image
+
+
+def test_the_typical_peak_is_that_of_most_lit_microimages():
+    """Dark microimages do not count, and few bright particles or hot pixels do not change it."""
+    plain = spots([500.0] * 300)
+    assert typical_peak(plain, PITCH_PX, NOISE) == pytest.approx(500, abs=3 * NOISE)
+    bright = spots([500.0] * 280 + [50_000.0] * 20)
+    assert typical_peak(bright, PITCH_PX, NOISE) == pytest.approx(500, abs=3 * NOISE)
+    assert typical_peak(7 * plain, PITCH_PX, 7 * NOISE) == pytest.approx(7 * typical_peak(plain, PITCH_PX, NOISE))
+
+
+def test_noise_alone_has_no_typical_peak():
+    assert typical_peak(spots([]), PITCH_PX, NOISE) == np.inf
+
+
+@pytest.fixture(scope="module")
+def weights(device):
+    """All of a small volume, seen by two cameras in the middle of their sensors."""
+    return lfpiv.build_weights(
+        two_cameras(), lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.2, 1.2, 0.8), voxel_mm=0.1)
+    )
+
+
+def scene(weights, spread, seed, size=0.5):
+    """Truth with equally bright particles, and images whose particles have a brightness of their own per camera."""
+    grid, rng = weights.grid, np.random.default_rng(seed)
+    count = round(0.02 * grid.size)
+    place = np.array(grid.first_centre_mm)[::-1] + grid.voxel_mm * (rng.random((count, 3)) * grid.shape[::-1] - 0.5)
+    truth = 3e4 * lfpiv.metrics.truth_volume(place, None, grid, size).values
+    images = {}
+    for name in weights.cameras:
+        brightness = np.exp(spread * rng.standard_normal(count) - spread**2 / 2)
+        image = weights(3e4 * lfpiv.metrics.truth_volume(place, brightness, grid, size).values)[name]
+        images[name] = image + rng.normal(0, NOISE, image.shape).astype(np.float32)
+    return truth, images
+
+
+def quality(weights, images, truth, cap):
+    volume = lfpiv.reconstruct(weights, images, 20, intensity_cap=cap, tolerance=5e-4).values
+    return float((volume * truth).sum() / np.sqrt(np.square(volume).sum() * np.square(truth).sum()))
+
+
+def test_counts_are_limited_by_each_pixel_s_gain_and_dim_ones_stay(weights):
+    _, images = scene(weights, 1.0, 1)
+    before, after = (record(weights, images, floor=None, floor_share=0.1, intensity_cap=cap) for cap in (0.0, CAP))
+    for name, image in images.items():
+        pitch = weights.cameras[name].optics.microimage_pitch_px
+        peak = typical_peak(before[name].image.reshape(image.shape), pitch, NOISE)
+        assert before[name].image.max() > CAP * peak
+        expected = np.minimum(before[name].image, CAP * peak * weights.gain(name))
+        assert after[name].image == pytest.approx(expected, rel=0.02)  # the noise of the floor is measured
+        assert after[name].light_outside == before[name].light_outside
+        assert after[name].floor < before[name].floor
+
+
+def test_images_of_another_brightness_give_the_same_volume_in_their_counts(weights):
+    _, images = scene(weights, 1.0, 2)
+    keywords = {"iterations": 5, "intensity_cap": CAP}
+    plain, brighter = (
+        lfpiv.reconstruct(weights, {name: factor * image for name, image in images.items()}, **keywords).values
+        for factor in (1.0, 4.0)
+    )
+    assert np.abs(brighter / 4 - plain).max() < TOLERANCE_F32 * plain.max()
+
+
+@pytest.mark.slow
+def test_particles_of_unlike_brightness_are_found_better_and_equal_ones_as_well(weights):
+    change = {}
+    for spread in (1.0, 0.0):
+        scenes = [scene(weights, spread, seed) for seed in SEEDS]
+        quotients = [[quality(weights, images, truth, cap) for cap in (0.0, CAP)] for truth, images in scenes]
+        change[spread] = float(np.diff(quotients).mean())
+    assert change[1.0] > LEAST_GAIN
+    assert change[0.0] > -LARGEST_LOSS
+
+
+@pytest.mark.parametrize(("size", "sieve", "expected"), [(0.0, "auto", POINT_CAP), (0.9, "auto", CAP), (0.0, 0.0, CAP)])
+def test_the_cap_suits_the_particles_size_where_it_is_measured(weights, size, sieve, expected):
+    _, images = scene(weights, 0.0, 5, size)
+    assert lfpiv.reconstruct(weights, images, 0, intensity_cap="auto", sieve_voxel=sieve).intensity_cap == expected
+    assert lfpiv.reconstruct(weights, images, 0, sieve_voxel=sieve).intensity_cap == 0
+
+
+@pytest.mark.parametrize("cap", [-1.0, float("nan"), "2"])
+def test_a_cap_out_of_its_range_is_refused(weights, cap):
+    _, images = scene(weights, 0.0, 5)
+    with pytest.raises(ValueError, match="intensity_cap: expected a number >= 0"):
+        lfpiv.reconstruct(weights, images, 1, intensity_cap=cap)
