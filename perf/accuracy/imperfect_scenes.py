@@ -132,11 +132,8 @@ def rows(scale: str) -> dict[str, Row]:
         "edges": ("sharp", "gaussian"),
         "counts": 6000.0,
     }
-    dimmer = streak | {"counts": 2500.0}
-    light = {"lens_counts": 60.0, "ambient_counts": 10.0, "variation": 0.3}
-    pattern = {"gain_sd": 0.01, "column_sd_counts": 8.0, "dark_counts": 5.0, "dark_log_sd": 0.3, "hot_share": 1.5e-4}
     laser = {"power": (1.0, 0.9), "power_sd": 0.02}
-    stray = {"stray_light": light, "surface": dimmer, "sensor": pattern, "sheet": laser}
+    stray = other_light(streak, COUNTS) | {"sheet": laser}
     wall = {"kind": "half_space", "point_mm": (0.0, 0.0, 0.0), "normal": (-1.0, 0.0, 0.0)}
     solid = '[[volume.solid]]\nkind = "half_space"\npoint_mm = [0.0, 0.0, 0.0]\nnormal = [-1.0, 0.0, 0.0]\n'
     errors = {
@@ -154,12 +151,10 @@ def rows(scale: str) -> dict[str, Row]:
     everything = {
         "brightness": {"camera_log_sd": 0.7, "size_log_sd": 0.25},
         **gaussian,
-        "stray_light": light,
-        "surface": dimmer,
-        "sensor": pattern,
         "array": array,
         "board": {"errors": errors},
-        **dim(100.0),
+        **(dimmed := dim(100.0)),
+        **other_light(streak, dimmed["exposure"]["particle_counts"]),
     }
     return {
         "ideal": Row(label="ideal images"),
@@ -189,6 +184,21 @@ def rows(scale: str) -> dict[str, Row]:
         "all_series": Row(
             label="everything together in a series", tables=everything, second=moved, series=True, single=False
         ),
+    }
+
+
+def other_light(streak: Mapping[str, Any], counts: float) -> dict[str, Any]:
+    """Return stray light, a streak and a sensor's pattern, in proportion to the light of the particles."""
+    return {
+        "stray_light": {"lens_counts": 0.1 * counts, "ambient_counts": 0.02 * counts, "variation": 0.3},
+        "surface": dict(streak) | {"counts": 4.0 * counts},
+        "sensor": {
+            "gain_sd": 0.01,
+            "column_sd_counts": 0.013 * counts,
+            "dark_counts": 0.01 * counts,
+            "dark_log_sd": 0.3,
+            "hot_share": 1.5e-4,
+        },
     }
 
 
