@@ -78,9 +78,10 @@ def _explain(error: ValidationError, model: type[BaseModel], values: Mapping[str
 def _key(location: tuple[int | str, ...], values: Any) -> str:
     """Return the name of a location: ``camera 'cam1', f_number``, ``smart.iterations`` or ``volume.size_mm[2]``."""
     key = ""
-    for place, part in enumerate(location):
-        tag = isinstance(values, Mapping) and part not in values and place < len(location) - 1
-        if isinstance(part, str) and isinstance(values, Mapping) and not tag:
+    for part in location:
+        if isinstance(values, Mapping) and values.get("kind") == part and part not in values:
+            continue  # pydantic's tag for one form of a union, which is not a key of the file
+        if isinstance(part, str) and isinstance(values, Mapping):
             key += part if not key or key.endswith(", ") else f".{part}"
             values = values.get(part)
         elif isinstance(part, int) and isinstance(values, list):
