@@ -153,8 +153,8 @@ def correlate(
     missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
     first, second = (preprocess(volume, missing, intensity_power) for volume in (first, second))
     last, figures = correlate_passes(first, second, settings, seen=seen_by_two(volume_a, volume_b))
-    light = (np.maximum(volume, 0) ** (1 / intensity_power) for volume in (first, second))
-    standing = on_standing_light(*light, last.given.windows, last.field, last.valid)
+    one, other = (np.maximum(volume, 0) ** (1 / intensity_power) for volume in (first, second))
+    standing = on_standing_light(one, other, last.given.windows, last.field, last.valid)
     if standing.any():
         log.warning(
             "correlation: light brighter than particles stays in place in %d windows: their vectors are not valid",
