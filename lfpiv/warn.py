@@ -66,6 +66,7 @@ class Code(enum.Enum):
     COUNT_SLOW = "count_slow"
     # volumes and vectors
     DIVERGED = "diverged"
+    UNEXPLAINED = "unexplained"
     MOTION_LOST = "motion_lost"
     FEW_VALID = "few_valid"
     UNSEEDED = "unseeded"
@@ -202,6 +203,10 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.COUNT_SLOW: "counting rays for {voxels} voxels; 'footprint' is about a thousand times faster",
     Code.DIVERGED: "SMART: {verdict}",
+    Code.UNEXPLAINED: (
+        "the volumes explain little of the images' light (residual {residual:.2f}; 0.3 to 0.6 is usual): do not rely "
+        "on their vectors before the report shows why"
+    ),
     Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
     Code.UNSEEDED: (

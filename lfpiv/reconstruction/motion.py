@@ -34,6 +34,7 @@ from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
 from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings
+from lfpiv.velocity.systematic import image_residual, with_systematic
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.velocity.windows import Windows
 from lfpiv.weights.operator import Weights
@@ -245,13 +246,13 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     The volumes of `UNSHARED` have independent noise. Here they are deformed onto each other by the vectors'
     displacements, and the same statistics are taken of them in the same windows: s. Correlated once more, they show a
     displacement that differs from the vectors' by d: sharing corrected it, or a wrong motion biased it. The uncertainty
-    of each component is the larger one, ``max(s, |d|)``. Peak ratio and correlation are those of this correlation.
+    of each component is the larger one, ``max(s, |d|)``, and the systematic part of `lfpiv.velocity.systematic`. Peak
+    ratio and correlation are those of this correlation.
 
-    Without motion passes `correlate` states s, the random error: the scatter if the same flow were recorded again.
-    Ghosts move with the mean of the particles whose lines of sight cross in them [1]_. So they smooth the flow along
-    its gradients in the same way in both frames and in every pair, which no statistics of noise show. A uniform flow
-    has no such error. In the vortex ring of docs/accuracy.md it is larger than the random one. Motion passes reduce
-    both errors, and d shows the reduction.
+    The random error s is the scatter if the same flow were recorded again. Ghosts move with the mean of the particles
+    whose lines of sight cross in them [1]_. So they smooth the flow along its gradients in the same way in both frames
+    and in every pair, which no statistics of noise show. A uniform flow has no such error. The systematic part
+    estimates it. Motion passes reduce both errors, and d shows the reduction.
 
     Parameters
     ----------
@@ -297,8 +298,10 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     left = correlate_windows(first, second, window=window, step=step, search=search, symmetric=True)
     measured = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
     shown = motion.midway.window_means(windows) + left.displacement
+    valid = vectors["valid"].values
     deviation = np.maximum(scatter, np.abs(shown - measured))
-    deviation[~vectors["valid"].values] = np.nan
+    deviation[~valid] = np.nan
+    deviation = with_systematic(deviation, measured, valid, image_residual(*volumes))
     stated = {f"uncertainty_{axis}": deviation[..., k] for k, axis in enumerate("zyx")}
     stated["uncertainty"] = np.sqrt((deviation**2).sum(-1))
     stated["correlation"] = left.correlation

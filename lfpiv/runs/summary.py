@@ -36,6 +36,9 @@ SCHEMA_VERSION = 1
 CORRECTION_RAYS = 4000
 """Number of rays for the network's part in the mapping."""
 
+LARGE_RESIDUAL = 0.75
+"""Residual of a volume above which its vectors are doubtful. Clear images have 0.3 to 0.5, dim ones up to 0.6."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Contents:
@@ -192,6 +195,9 @@ def pair_warnings(pairs: Mapping[int, PairFigures]) -> list[Warning]:
     for pair, figures in pairs.items():
         if figures.stop is not None and SmartStop.DIVERGED.value in figures.stop.values():
             found.append(Warning(code=Code.DIVERGED, pairs=(pair,), figures={"verdict": SmartStop.DIVERGED.value}))
+        residual = max((history[-1] for history in (figures.residual or {}).values() if history), default=0.0)
+        if residual > LARGE_RESIDUAL:
+            found.append(Warning(code=Code.UNEXPLAINED, pairs=(pair,), figures={"residual": residual}))
         motion = figures.motion
         if motion is not None and not motion.followed:
             shares = motion.valid_fraction

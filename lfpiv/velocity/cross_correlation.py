@@ -21,6 +21,8 @@ from lfpiv.velocity.coverage import Voxels
 from lfpiv.velocity.multi_pass import Pass, correlate_passes, peak_ratio
 from lfpiv.velocity.seeding import unseeded_voxels
 from lfpiv.velocity.settings import CorrelationSettings, triple, windows_of
+from lfpiv.velocity.standing_light import on_standing_light
+from lfpiv.velocity.systematic import image_residual, with_systematic
 from lfpiv.velocity.volume_pair import (
     VoxelAxes,
     missing_smoothing,
@@ -40,6 +42,9 @@ GOOD_SHARE = 0.8
 """Smallest part of valid vectors of a good measurement."""
 POOR_SHARE = 0.3
 """Smallest part of valid vectors of a poor measurement. With less, the measurement has failed."""
+
+UNCERTAINTY_PARTS = "correlation statistics, and light that the volumes do not explain"
+"""What the stated standard deviations include."""
 
 Variable = tuple[tuple[str, ...], np.ndarray, dict[str, str]]
 """Dims, values and attributes of a variable."""
@@ -125,15 +130,17 @@ def correlate(
         where masked.
         ``valid``: true where the vector was measured and passed validation, false where it was replaced. If the volumes
         have the coordinate ``views``, vectors are also replaced where two cameras see less than three quarters of the
-        window. They are replaced where less than half of the window's fluid holds particles
+        window. So are vectors of windows in which light brighter than moving particles stays in place
+        (`lfpiv.velocity.standing_light`), and where less than half of the window's fluid holds particles
         (`lfpiv.velocity.seeding`).
         ``masked``: true where less than half of the window is fluid, so that nothing is measured; ``valid`` is false.
         ``fluid_share``: part of the window that is fluid. ``seeded_share``: part of this fluid that holds particles.
         ``peak_ratio``: highest correlation over the highest one more than two lags away.
         ``correlation``: coefficient at the peak.
-        ``uncertainty`` [voxel]: standard deviation of the displacement vector from the correlation statistics of [1]_,
-        the root of the summed variances of ``uncertainty_x``, ``_y``, ``_z``. NaN where the vector was replaced and
-        after a single pass.
+        ``uncertainty`` [voxel]: standard deviation of the displacement vector, the root of the summed variances of
+        ``uncertainty_x``, ``_y``, ``_z``. NaN where the vector was replaced and after a single pass. A variance is
+        that of the correlation statistics of [1]_, and for volumes with the attribute ``residual`` a systematic part
+        (`lfpiv.velocity.systematic`). Errors of the calibration and of ``dt_s`` are not included.
 
         Attributes: ``verdict``, from the vectors that can be measured; ``masked_fraction``, the part of all vectors
         that are masked; ``valid_fraction``, ``seen_fraction`` and ``measurable_fraction``, the parts of the others that
@@ -171,6 +178,14 @@ def correlate(
     missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
     first, second = (preprocess(volume, missing, intensity_power) for volume in (first, second))
     last, figures = correlate_passes(first, second, settings, voxels)
+    one, other = (np.maximum(volume, 0) ** (1 / intensity_power) for volume in (first, second))
+    standing = on_standing_light(one, other, last.given.windows, last.field, last.valid)
+    if standing.any():
+        log.warning(
+            "correlation: light brighter than particles stays in place in %d windows: their vectors are not valid",
+            standing.sum(),
+        )
+        last = last.without(standing)
     measurable = last.coverage.measurable
     share = float(last.valid[measurable].mean()) if measurable.any() else 0.0
     verdict = Verdict.GOOD if share >= GOOD_SHARE else Verdict.POOR if share >= POOR_SHARE else Verdict.FAILED
@@ -193,21 +208,22 @@ def correlate(
         "settings": settings.to_json(),
         "passes": json.dumps([asdict(one) for one in figures]),
     }
-    return xr.Dataset(_variables(last, axes, dt_s), _coordinates(last, axes), attributes)
+    deviation = with_systematic(last.deviation(), last.field, last.valid, image_residual(volume_a, volume_b))
+    return xr.Dataset(_variables(last, deviation, axes, dt_s), _coordinates(last, axes), attributes)
 
 
-def _variables(result: Pass, axes: VoxelAxes, dt_s: float) -> dict[str, Variable]:
+def _variables(result: Pass, deviation: np.ndarray, axes: VoxelAxes, dt_s: float) -> dict[str, Variable]:
     """Return displacement, velocity, uncertainty and quality of the last pass as variables over (z, y, x)."""
-    deviation, coverage = result.deviation(), result.coverage
+    coverage = result.coverage
     known = np.where(coverage.masked, np.nan, 1.0)
     fields: dict[str, tuple[np.ndarray, str, str]] = {}
     for k, (name, axis) in enumerate(zip("wvu", AXES, strict=True)):
         displacement, metres = result.field[..., k] * known, axes.spacing_mm[k] * 1e-3
         fields[name] = (displacement * metres / dt_s, "m/s", f"velocity along {axis}")
         fields[f"displacement_{axis}"] = (displacement, "voxel", f"displacement along {axis}, mean over the window")
-        text = f"standard deviation of the displacement along {axis}"
+        text = f"standard deviation of the displacement along {axis}: {UNCERTAINTY_PARTS}"
         fields[f"uncertainty_{axis}"] = (deviation[..., k], "voxel", text)
-    text = "standard deviation of the displacement vector, correlation statistics"
+    text = f"standard deviation of the displacement vector: {UNCERTAINTY_PARTS}"
     fields["uncertainty"] = (np.sqrt((deviation**2).sum(-1)), "voxel", text)
     text = "highest correlation over the highest more than two lags away"
     fields["peak_ratio"] = (peak_ratio(result.peaks) * known, "1", text)

@@ -7,7 +7,7 @@ windows, and validates the peaks. Fields are displacements averaged over a windo
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -115,6 +115,11 @@ class Pass:
         if self.valid.any():
             return self.field
         return np.zeros_like(self.field) if self.given.predicted is None else self.given.predicted
+
+    def without(self, rejected: np.ndarray) -> Pass:
+        """Return the pass with some vectors replaced by predictions from their neighbours, flags (z, y, x)."""
+        valid = self.valid & ~rejected
+        return replace(self, field=validation.fill(self.field, valid), valid=valid)
 
     def deviation(self) -> np.ndarray:
         """Return the standard deviation of the displacement, shape (z, y, x, 3) [voxel].

@@ -1,0 +1,63 @@
+"""Vectors that standing light spoils: a reflection that both volumes show at the same place pulls them to zero.
+
+Such vectors agree with each other, so the median test does not reject them. Particles at rest are told from standing
+light by their brightness: a window of them is as bright as one of particles that move.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lfpiv.velocity.windows import Windows
+
+MOVING_VOXEL = 1.0
+"""Least displacement of vectors that moving particles made [voxel]."""
+BRIGHTER = 1.5
+"""Least light of a window that stays in place, as a multiple of the median light of windows in which particles move."""
+LEAST_MOVING = 0.25
+"""Least share of vectors that must move for their light to be a measure."""
+
+_TINY = float(np.finfo(np.float32).tiny)
+
+
+def on_standing_light(
+    first: np.ndarray, second: np.ndarray, windows: Windows, field: np.ndarray, valid: np.ndarray
+) -> np.ndarray:
+    """Return the vectors whose windows hold more standing light than particles.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (z, y, x), float32
+        Intensities of both volumes, without background, not deformed. Each is taken relative to its mean.
+    windows : Windows
+        Windows of the vectors.
+    field : ndarray, shape (z, y, x, 3)
+        Displacement [voxel].
+    valid : ndarray of bool, shape (z, y, x)
+        Vectors that were measured.
+
+    Returns
+    -------
+    ndarray of bool, shape (z, y, x)
+        True where at least `BRIGHTER` times the light of moving particles stays in place. False everywhere if less than
+        `LEAST_MOVING` of the vectors move.
+    """
+    speed = np.linalg.norm(field, axis=-1)
+    moving = valid & (speed >= MOVING_VOXEL)
+    none = np.zeros(valid.shape, bool)
+    if not valid.any() or moving.sum() < LEAST_MOVING * valid.sum():
+        return none
+    one, other = (np.maximum(volume, 0) / max(float(np.maximum(volume, 0).mean()), _TINY) for volume in (first, second))
+    staying = _means(np.minimum(one, other), windows)
+    typical = float(np.median(_means((one + other) / 2, windows)[moving]))
+    bright: np.ndarray = staying >= BRIGHTER * typical
+    return valid & bright if typical > 0 else none
+
+
+def _means(volume: np.ndarray, windows: Windows) -> np.ndarray:
+    """Return the means of a volume over windows, shape (z, y, x)."""
+    means = volume.astype(float)
+    for axis, (edge, start) in enumerate(zip(windows.window, windows.first_voxels, strict=True)):
+        below = np.insert(means.cumsum(axis), 0, 0, axis)
+        means = (below.take(start + edge, axis) - below.take(start, axis)) / edge
+    return means

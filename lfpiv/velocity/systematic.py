@@ -1,0 +1,63 @@
+"""Systematic part of the uncertainty of vectors, from the light that volumes do not explain.
+
+Correlation statistics show what differs between two volumes. Ghosts, particles of unlike brightness in the cameras and
+light from beyond the volume move alike in both, so that part of the error does not show. The residual of the images
+measures how much of a volume is wrong. The same wrong light makes the random part, so one systematic part follows its
+typical size. Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_, so another one
+follows the distance of a vector from the mean of the volume.
+
+References
+----------
+.. [1] G. E. Elsinga, J. Westerweel, F. Scarano, M. Novara, "On the velocity of ghost particles and the bias errors in
+   Tomographic-PIV", Exp. Fluids 50 (2011) 825-838, doi:10.1007/s00348-010-0930-0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+RANDOM_SHARE = 2.45
+"""Systematic standard deviation over the median random one, at a residual of 1."""
+DAMPING = 0.05
+"""Share by which ghosts pull a vector towards the mean of the volume."""
+
+
+def image_residual(*volumes: xr.DataArray | np.ndarray) -> float:
+    """Return the largest final residual of volumes, ||I - P|| / ||I||; 0 if one does not state it.
+
+    Volumes of `lfpiv.reconstruct` have it as the attribute ``residual``, one value per iteration.
+    """
+    stated = [volume.attrs.get("residual") if isinstance(volume, xr.DataArray) else None for volume in volumes]
+    return max(0.0 if values is None else float(np.atleast_1d(values)[-1]) for values in stated)
+
+
+def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, residual: float) -> np.ndarray:
+    """Add the systematic part to standard deviations of displacements.
+
+    With the random standard deviation s of a component, its median over the valid vectors s', the displacement d, its
+    mean over the valid vectors d' and the residual r, it is ``sqrt(s^2 + (2.45 r s')^2 + (0.05 (d - d'))^2)``.
+
+    Parameters
+    ----------
+    random : ndarray, shape (z, y, x, 3)
+        Standard deviation from the correlation statistics [voxel]; NaN where a vector was replaced.
+    field : ndarray, shape (z, y, x, 3)
+        Displacement [voxel].
+    valid : ndarray of bool, shape (z, y, x)
+        Vectors that were measured.
+    residual : float
+        From `image_residual`; 0 adds nothing.
+
+    Returns
+    -------
+    ndarray, shape (z, y, x, 3)
+        Standard deviation [voxel]; NaN where `random` is.
+    """
+    known = np.isfinite(random).all(-1) & valid
+    if residual == 0 or not known.any():
+        return random
+    typical, mean = np.median(random[known], axis=0), field[known].mean(axis=0)
+    systematic = (residual * RANDOM_SHARE * typical) ** 2 + (DAMPING * (field - mean)) ** 2
+    whole: np.ndarray = np.sqrt(random**2 + systematic)
+    return whole
