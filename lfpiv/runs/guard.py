@@ -68,18 +68,14 @@ class Guard:
         )
 
 
-def read(experiment: Experiment, folder: Folder, calibration: str, background: str | None) -> Guard | None:
-    """Read the stored outcome; None if it is missing or does not fit.
-
-    `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light.
-    """
+def read(folder: Folder) -> tuple[Guard, Marks] | None:
+    """Read the stored outcome, whether it fits or not, and its marks; None if there is none."""
     try:
         stored = json.loads(folder.guard.read_text("utf-8"))
         marks = Marks(settings_hash=stored["settings_hash"], depends_on=stored["depends_on"])
-        guard = Guard.from_json(stored["guard"])
+        return Guard.from_json(stored["guard"]), marks
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return guard if provenance.of_guard(experiment, calibration, guard.pairs, background).fits(marks) else None
 
 
 def layers(experiment: Experiment, guard: Guard | None) -> Layers:
@@ -102,10 +98,11 @@ def decide(
 
     `stamp_hash` is the hash of the stamp of the board's calibration, `background` that of the subtracted light.
     """
-    found = read(experiment, folder, stamp_hash, background)
-    if found is not None:
-        log.info("light beyond the volume: measured before, kept")
-        return found
+    if (found := read(folder)) is not None:
+        known, marks = found
+        if provenance.of_guard(experiment, stamp_hash, known.pairs, background).fits(marks):
+            log.info("light beyond the volume: measured before, kept")
+            return known
     start = time.perf_counter()
     instants = dict(_instants(experiment, calibration))
     faces = light_beyond(calibration, experiment.grid, list(instants.values())) if instants else ()

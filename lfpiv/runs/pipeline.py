@@ -84,9 +84,10 @@ def run(
         todo = current.unfinished(volumes=keep_volumes)
         checked = _check(current, todo.pairs, workers, scheduler)
         calibrated = rig.calibrate(current)
-        current, prepared = rig.prepare(current, calibrated.calibration)
-        if (again := current.unfinished(volumes=keep_volumes, quiet=True)).pairs != todo.pairs:
-            todo, checked = again, _check(current, again.pairs, workers, scheduler)
+        before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
+        if not current.has_light_of(before):
+            todo = current.unfinished(volumes=keep_volumes, quiet=True)
+            checked = _check(current, todo.pairs, workers, scheduler)
         calibrated = replace(calibrated, calibration=prepared.board)
         done = _process(current, prepared, checked, keep_volumes)
         return current.finish(calibrated, replace(done, reused=todo.reused), report=True)
@@ -117,9 +118,10 @@ def reconstruct(
         todo = current.unfinished(vectors=False, volumes=True)
         checked = _check(current, todo.pairs, 1, None)
         calibrated = rig.calibrate(current)
-        current, prepared = rig.prepare(current, calibrated.calibration)
-        if (again := current.unfinished(vectors=False, volumes=True, quiet=True)).pairs != todo.pairs:
-            todo, checked = again, _check(current, again.pairs, 1, None)
+        before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
+        if not current.has_light_of(before):
+            todo = current.unfinished(vectors=False, volumes=True, quiet=True)
+            checked = _check(current, todo.pairs, 1, None)
         done = Invocation(outcomes=checked.failed)
         if checked.pairs:
             weights, figures = rig.build_weights(current, prepared, checked.pairs)

@@ -71,8 +71,6 @@ def open_run(
             except (RuntimeError, ValueError) as error:
                 raise InputError(str(error)) from None
             stack.enter_context(threadpool_limits(running.threads))
-            stamp = provenance.of_calibration(experiment)
-            subtracted = provenance.background_content(folder.background)
             yield Run(
                 experiment=experiment,
                 folder=folder,
@@ -82,10 +80,10 @@ def open_run(
                 device=running,
                 warnings=warnings,
                 start_s=start_s,
-                calibration_stamp=stamp,
+                calibration_stamp=provenance.of_calibration(experiment),
                 earlier=summary.read(folder.summary),
-                background=subtracted,
-                guard=guard.read(experiment, folder, stamp.hash, subtracted),
+                background=provenance.background_content(folder.background),
+                guard=None if (measured := guard.read(folder)) is None else measured[0],
             )
     finally:
         for path in made:
@@ -143,6 +141,10 @@ class Run:
     def guard_layers(self) -> Layers:
         """Guard layers of the volumes; none if they are yet to be measured."""
         return guard.layers(self.experiment, self.guard if self.experiment.guard_mm == "auto" else None)
+
+    def has_light_of(self, other: Run) -> bool:
+        """Return whether the volumes of both runs have the same subtracted light and the same guard layers."""
+        return self.background == other.background and self.guard_layers == other.guard_layers
 
     @property
     def guarded_experiment(self) -> Experiment:

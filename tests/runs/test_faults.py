@@ -67,7 +67,10 @@ def finished(out):
 def whole(out):
     """Whether nothing is in a folder but finished results."""
     left = {path.name for path in out.rglob("*") if path.is_file() and path.suffix != ".nc"}
-    return left <= {"calibration.h5", "summary.json", "report.html"} and not (out / ".shared").exists()
+    return (
+        left <= {"background.h5", "calibration.h5", "guard.json", "summary.json", "report.html"}
+        and not (out / ".shared").exists()
+    )
 
 
 @pytest.fixture

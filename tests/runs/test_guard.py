@@ -23,18 +23,23 @@ def experiment(small_run):
 
 
 def test_the_outcome_is_stored_and_fits_until_the_volume_changes(small_run, experiment, tmp_path):
-    folder = Folder(small_run.out)
     stamp = provenance.of_calibration(experiment).hash
-    found = guard.read(experiment, stamp, folder)
-    assert found is not None and found.pairs and Guard.from_json(json.loads(json.dumps(found.to_json()))) == found
-    assert guard.read(experiment, "another calibration", folder) is None
+    found, marks = guard.read(Folder(small_run.out))
+    assert found.pairs and Guard.from_json(json.loads(json.dumps(found.to_json()))) == found
     moved = dataclasses.replace(experiment.grid, first_centre_mm=(0.0, 0.0, 0.0))
-    assert guard.read(dataclasses.replace(experiment, grid=moved), stamp, folder) is None
+
+    def fits(experiment, stamp, background=None):
+        return provenance.of_guard(experiment, stamp, found.pairs, background).fits(marks)
+
+    assert fits(experiment, stamp) and not fits(experiment, "another calibration")
+    assert not fits(experiment, stamp, "other light") and not fits(dataclasses.replace(experiment, grid=moved), stamp)
     assert small_run.summary["guard"]["pairs"] == list(found.pairs)
 
 
 def test_results_with_guard_layers_are_others(experiment):
-    plain, guarded = (provenance.of_pair(experiment, "c", 0, one) for one in (NO_LAYERS, ((1, 2), (0, 0), (0, 0))))
+    plain, guarded = (
+        provenance.of_pair(experiment, "c", 0, guard=one) for one in (NO_LAYERS, ((1, 2), (0, 0), (0, 0)))
+    )
     marks = provenance.Marks(**plain.volumes.attributes)
     assert guarded.volumes.changes(marks) == ["guard"] and plain.volumes.fits(marks)
 
