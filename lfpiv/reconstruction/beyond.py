@@ -43,7 +43,7 @@ FINE, WIDE = 0.7, 2.5
 """Standard deviations of the Gaussians between which fluctuations lie [cell]."""
 LEAST_LIT = 0.25
 """Least profile of a layer that counts as lit, relative to the mean of the volume."""
-SIGNIFICANT, CONFIRMED = 3.4, 3.0
+SIGNIFICANT, CONFIRMED = 3.8, 3.0
 """Least light beyond a face [standard deviation of chance], and beyond further faces once there is light beyond one."""
 LEAST_SEEN = 0.5
 """Least share of a layer that two cameras must see."""

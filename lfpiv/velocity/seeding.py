@@ -1,7 +1,7 @@
 """Part of a volume that holds no particles, found from the light of both volumes.
 
-The mean light about a place, taken over many particles, is compared with that where most of the light is. A place
-counts as empty only if it is nearly dark: the edge of a light sheet is dimmer than its middle, not empty. Ghost
+The mean light about a place, taken over many particles, is compared with that where most of the moving light is, so
+that a reflection that outshines the particles does not make their places dark. A place counts as empty only if it is nearly dark: the edge of a light sheet is dimmer than its middle, not empty. Ghost
 particles beside the seeded region have some percent of its light.
 """
 
@@ -16,7 +16,7 @@ from scipy import ndimage
 PARTICLES = 64
 """Number of particles over which light is averaged. At a corner of the volume an eighth of them is left."""
 DARK = 0.05
-"""Largest mean light of an empty place, as a share of that where most of the light is."""
+"""Largest mean light of an empty place, as a share of that where most of the moving light is."""
 EDGE = 1.645
 """Distance from a straight edge at which a Gaussian mean falls to `DARK`, as a multiple of its standard deviation."""
 BRIGHT = 95
@@ -52,16 +52,17 @@ def unseeded_voxels(volumes: Sequence[np.ndarray], without: np.ndarray | None = 
             return None
         limit = np.percentile(peaks, BRIGHT)
         peaks = np.minimum(peaks, limit).astype(float)
-        lights.append(np.minimum(light, limit))
+        lights.append(np.minimum(light, limit).astype(np.float32))
         counts.append(float(peaks.sum() ** 2 / np.square(peaks).sum()))  # particles of equal light
     extent = float(usable[1:-1, 1:-1, 1:-1].sum())  # where peaks are
     sigma = _averaging(extent, min(counts))
     cell = max(1, int(sigma / CELLS))
     binned, room = [_binned(light, cell) for light in lights], _binned(usable, cell)
-    level = _level(binned, room, sigma / cell)
+    moving = _binned(_moving(lights), cell)
+    level = _level(binned, moving, room, sigma / cell)
     filled = float((level * room).sum() ** 2 / (level**2 * room).sum() / room.sum())
     sigma = _averaging(extent * filled, min(counts))  # particles are closer where they do not fill the volume
-    core = (_level(binned, room, sigma / cell) < DARK) & (room > 0)
+    core = (_level(binned, moving, room, sigma / cell) < DARK) & (room > 0)
     if not core.any():
         return None
     empty = ndimage.distance_transform_edt(~core) <= EDGE * sigma / cell
@@ -93,13 +94,20 @@ def _averaging(extent: float, count: float) -> float:
     return float(np.cbrt(PARTICLES * extent / count)) / math.sqrt(4 * math.pi)
 
 
-def _level(lights: Sequence[np.ndarray], room: np.ndarray, sigma: float) -> np.ndarray:
-    """Return the mean light about each cell relative to that where most of the light is, averaged over the volumes."""
+def _moving(lights: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the difference of both volumes, each relative to its sum; their mean if they are equal."""
+    one, other = (light / max(float(light.sum(dtype=np.float64)), np.finfo(np.float32).tiny) for light in lights)
+    difference: np.ndarray = np.abs(one - other)
+    return difference if difference.any() else one
+
+
+def _level(lights: Sequence[np.ndarray], moving: np.ndarray, room: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the mean light about each cell relative to that where most of the moving light is, mean of the volumes."""
     share = np.maximum(ndimage.gaussian_filter(room, sigma, mode="nearest"), np.finfo(np.float32).tiny)
     level = np.zeros_like(room)
     for light in lights:
         mean = ndimage.gaussian_filter(light, sigma, mode="nearest") / share
-        level += mean / ((mean * light).sum() / light.sum()) / len(lights)
+        level += mean / ((mean * moving).sum() / moving.sum()) / len(lights)
     return level
 
 
