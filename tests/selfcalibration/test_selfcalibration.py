@@ -30,8 +30,9 @@ AGREE_VOXEL = 0.5
 """Disparity of cameras that did not move, as 120 particles tell it."""
 KNOCK_MM = 0.12
 """How far the right camera moves along y: more than a voxel."""
-FALSE_ALARMS = 0.03
-"""Share of data sets of mere errors that may look like a movement: three standard errors of up to six numbers."""
+FALSE_ALARMS = 0.06
+"""Share of data sets of mere errors that may look like a movement. Three standard errors that were estimated with 24
+degrees of freedom are exceeded in 0.6 % of cases, by one of six numbers in 3.7 %; 200 data sets show that to 1.3 %."""
 SMALL_TURN = 0.03
 """Sine of the angles by which the cameras are misaligned."""
 GRID = Grid(shape=(12, 20, 24), voxel_mm=0.1, first_centre_mm=(-0.55, -0.95, 0.05))
@@ -276,7 +277,7 @@ def test_errors_of_disparities_are_no_movement(noise):
 
 def test_light_that_stays_in_place_is_left_out():
     rng = np.random.default_rng(10)
-    still = rng.uniform(0, 1000, (20, 30)).astype(np.float32)
+    still = rng.uniform(0, 500, (20, 30)).astype(np.float32)
     moving = np.zeros((2, 20, 30), np.float32)
     moving[0, 5, 6] = moving[1, 8, 9] = 300
     instants = [{"left": still * energy + own} for energy, own in zip((1.0, 0.9), moving, strict=True)]
