@@ -1,8 +1,9 @@
 """Part of a volume that holds no particles, found from the light of both volumes.
 
 The mean light about a place, taken over many particles, is compared with that where most of the moving light is, so
-that a reflection that outshines the particles does not make their places dark. A place counts as empty only if it is nearly dark: the edge of a light sheet is dimmer than its middle, not empty. Ghost
-particles beside the seeded region have some percent of its light.
+that a reflection that outshines the particles does not make their places dark. A place counts as empty only if it is
+nearly dark: the edge of a light sheet is dimmer than its middle, not empty. Ghost particles beside the seeded region
+have some percent of its light.
 """
 
 from __future__ import annotations
@@ -107,8 +108,15 @@ def _level(lights: Sequence[np.ndarray], moving: np.ndarray, room: np.ndarray, s
     level = np.zeros_like(room)
     for light in lights:
         mean = ndimage.gaussian_filter(light, sigma, mode="nearest") / share
-        level += mean / ((mean * moving).sum() / moving.sum()) / len(lights)
+        level += mean / _weighted_median(mean, moving) / len(lights)
     return level
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """Return the value below which half of the weight lies."""
+    order = np.argsort(values, axis=None)
+    below = np.cumsum(weights.ravel()[order])
+    return float(values.ravel()[order[np.searchsorted(below, below[-1] / 2)]])
 
 
 def _binned(values: np.ndarray, cell: int) -> np.ndarray:
