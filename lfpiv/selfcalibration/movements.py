@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.stats
 from scipy.spatial.transform import Rotation
 
 from lfpiv.calibration.camera import Calibration
@@ -36,8 +37,8 @@ ROUNDS = 4
 """Largest number of corrections."""
 FITS = 10
 """Number of reweighted solutions of a fit."""
-SIGNIFICANT_SIGMA = 3.0
-"""Least significant movement [standard errors]."""
+CHANCE = 0.00135
+"""Probability of an insignificant movement: that of three standard errors if these were known exactly."""
 LEAST_VARIANCE = 1e-9
 """Least variance of a movement of the cameras against each other, as a share of the largest one."""
 OUTLIER = 2.0
@@ -92,15 +93,17 @@ class Separation:
     """Distance without the part that its own errors make [mm]."""
     std_mm: float
     """Standard error [mm]."""
+    sigmas: float
+    """Least significant distance [standard errors]: 3, and more if they were estimated from few disparities."""
 
     @property
     def significant(self) -> bool:
-        """Whether the distance is more than `SIGNIFICANT_SIGMA` standard errors."""
-        return self.mm > SIGNIFICANT_SIGMA * self.std_mm
+        """Whether errors of the disparities hardly explain the distance."""
+        return self.mm > self.sigmas * self.std_mm
 
     def differs_from(self, limit_mm: float) -> bool:
         """Return whether the distance is clearly above or clearly below a limit."""
-        return abs(self.mm - limit_mm) > SIGNIFICANT_SIGMA * self.std_mm
+        return abs(self.mm - limit_mm) > self.sigmas * self.std_mm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +119,8 @@ class MovementFit:
     """Covariance of `values`, those of all cameras against their mean."""
     observed: np.ndarray
     """Mean over the disparities of the matrix whose quadratic form with `values` is the squared observable distance."""
+    freedom: float
+    """Degrees of freedom of the covariance's scale."""
 
     @property
     def separation(self) -> Separation:
@@ -125,7 +130,12 @@ class MovementFit:
         slope = self.observed @ self.values
         spread = float(slope @ self.covariance @ slope)
         std = np.sqrt(spread / square) if square > by_errors else np.sqrt(by_errors)
-        return Separation(mm=float(np.sqrt(max(square - by_errors, 0.0))), std_mm=float(std))
+        return Separation(mm=float(np.sqrt(max(square - by_errors, 0.0))), std_mm=float(std), sigmas=self.sigmas)
+
+    @property
+    def sigmas(self) -> float:
+        """Least significant movement [standard errors]."""
+        return float(scipy.stats.t.isf(CHANCE, self.freedom))
 
     @property
     def movements(self) -> dict[str, Movement]:
@@ -145,7 +155,7 @@ class MovementFit:
         scale = np.tile(np.repeat([1.0, reach_mm], 3), len(self.cameras))
         variance, axes = np.linalg.eigh(self.covariance * np.outer(scale, scale))
         along = axes.T @ (scale * self.values)
-        kept = along**2 > SIGNIFICANT_SIGMA**2 * np.maximum(variance, 0)
+        kept = along**2 > self.sigmas**2 * np.maximum(variance, 0)
         kept &= variance > LEAST_VARIANCE * variance[-1]  # the mean movement has none
         projection: np.ndarray = (axes[:, kept] @ axes[:, kept].T) * scale / scale[:, None]
         return projection
@@ -267,7 +277,7 @@ def _verdict(apart: Sequence[Separation]) -> Verdict:
         return Verdict.UNMOVED
     before, after = apart[0], apart[-1]
     error = np.hypot(before.std_mm, after.std_mm)
-    lowered = before.mm - after.mm > SIGNIFICANT_SIGMA * error and after.mm < before.mm / 2
+    lowered = before.mm - after.mm > before.sigmas * error and after.mm < before.mm / 2
     return Verdict.CORRECTED if lowered else Verdict.NOT_LOWERED
 
 
@@ -298,7 +308,8 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
         known = sum(part * float(np.trace(one.weight)) for one, part in zip(found, trust, strict=True))
         fitted = float(np.trace(covariance @ information))  # movements that disparities determine, without the prior's
         squares = float(trust @ residual**2) + ASSUMED_WEIGHT * assumed
-        variance = max(squares / (max(known - fitted, 0.0) + ASSUMED_WEIGHT), least**2)
+        freedom = max(known - fitted, 0.0) + ASSUMED_WEIGHT
+        variance = max(squares / freedom, least**2)
     relative = np.kron(np.eye(count) - 1 / count, np.eye(6))  # the mean of all cameras is zero by definition
     observed = sum(row.T @ one.weight @ row for one, row in zip(found, rows, strict=True)) / len(found)
     return MovementFit(
@@ -307,6 +318,7 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
         values=values,
         covariance=relative @ covariance @ relative.T,
         observed=np.asarray(observed),
+        freedom=freedom,
     )
 
 
