@@ -2,11 +2,13 @@
 
 import json
 import logging
+from dataclasses import replace
 
 import pytest
 
 from lfpiv.runs import summary
 from lfpiv.runs.pair_figures import PairFigures, Spread
+from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import SENTENCES, Code, FirstOfEachCode, Warning, collected, gather, warn
 
 
@@ -70,6 +72,17 @@ def test_many_pairs_with_the_same_trouble_are_one_line():
     assert found.sentence.startswith("left, frame a, pairs 0, 1, 2, 3, 4 and 995 more: 10 to 20 % of the bright pixels")
     (few,) = summary.pair_warnings({pair: figures("look", 0.01 * pair) for pair in (3, 5)})
     assert few.sentence == "pairs 3, 5: 3 to 5 % of the vectors are valid; look"
+
+
+def test_volumes_that_explain_little_are_named():
+    good = Verdict.GOOD.value
+    last = {1: 0.5, 2: 0.8, 4: 0.9}
+    pairs = {
+        pair: replace(figures(good, 1.0), residual={"a": [0.95, 0.4], "b": [0.99, end]}) for pair, end in last.items()
+    }
+    (found,) = summary.pair_warnings(pairs)
+    assert found.code is Code.UNEXPLAINED and found.sentence.startswith("pairs 2, 4: the volumes explain little")
+    assert "residual 0.80 to 0.90;" in found.sentence
 
 
 def figures(verdict, valid_fraction):
