@@ -22,9 +22,9 @@ from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LensLattice, Optics, float_pair
-from lfpiv.lightfield.background import StandingLight
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.microimage_layout import microimages_of
+from lfpiv.lightfield.standing_light import StandingLight
 from lfpiv.warn import Warning
 from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.weights.microimages import Microimages

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from lfpiv.lightfield.decoder import CORE_COVERAGE, LightFieldDecoder
-from lfpiv.warn import Code, Warning
+from lfpiv.lightfield.standing_light import LEAST_RATIO_PIXELS, POWER_RANGE, StandingLight, mode, nothing
 
 CHANCE = 99.99
 """Percentile of the shifted images' minimum above which a pixel's light stands."""
@@ -26,12 +26,6 @@ NOISE_SIGMA = 3.0
 """Least count of a pixel that is counted among those brighter than chance, and least stray light [noise]."""
 LEAST_STANDING = 0.005
 """Share of an image's light below which compact standing light is left alone: chance reaches a fifth of it."""
-LEAST_RATIO_PIXELS = 500
-"""Least number of bright pixels that give the brightness of the standing light in an image."""
-POWER_RANGE = (0.5, 2.0)
-"""Accepted brightness of the standing light in an image, relative to the estimate."""
-LARGE_REMAINS = 3.0
-"""Light left after subtraction where light stands, relative to other lit places, above which a warning is due."""
 STANDS_EVERYWHERE = 0.6
 """Share of the lit parts of a sensor above which light that stands is that of particles at rest."""
 
@@ -44,11 +38,9 @@ _TILE_PITCHES = 6.0  # edge of the tiles of smooth stray light
 _TILE_NEIGHBOURS = 5  # tiles along each axis whose median removes compact reflections from the stray light
 _COPIES = np.array([(3.0, 0.0), (0.0, 3.0)])  # shifts of the copies that tell stray light from particles [lens]
 _UNEVEN = 0.15  # accepted relative decrease of stray light over such a shift
-_DARK_PERCENTILE = 50.0  # percentile below which a pixel of an image of particles counts as dark
 _BLOCK_ROWS = 64  # rows whose median is taken at once
 _LEAST_GAIN = 0.2  # least gain of a pixel that counts
 _LEAST_TILE_PIXELS = 300  # least number of pixels of a tile
-_BRIGHT = 50.0  # percentile of the standing light above which pixels tell its brightness
 _UNLIKE = 0.3  # relative difference of the frames' standing light that counts as unlike
 _UNLIKE_SHARE = 0.15  # share of unlike pixels above which the frames have backgrounds of their own
 _MANY_MICROIMAGES = 20.0  # least area of saturated pixels that no particle lights [squares of a pitch]
@@ -57,107 +49,6 @@ _FEW = 0.03  # least share of the pixels of a lit tile
 _STUCK_PIXELS = 0.01  # number of pixels that repeat their count in all images by chance
 _SHIFT_PITCHES = 24.0  # largest shift of an image along each axis
 _GOLDEN = (0.7548776662466927, 0.5698402909980532)  # steps of an even sequence in the plane
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class StandingLight:
-    """Light of a camera that stands still, for both frames."""
-
-    light: tuple[np.ndarray, np.ndarray]
-    """Standing light of the first and of the second frame above the dark level [counts], shape (rows, columns)."""
-    unusable: np.ndarray
-    """Pixels that standing light saturates, or that never change, bool."""
-    found: bool
-    """Whether any light stands; without, `light` is 0."""
-    region: np.ndarray
-    """Pixels whose light stands, without smooth stray light, bool."""
-    stray: float
-    """Smooth stray light, median over the sensor [counts]."""
-    ratio: float | None
-    """Brightness of the second frame's standing light relative to the first's; None if the frames differ."""
-    share: float = 0.0
-    """Light in `pixels` as a share of all light of an image; 0 for a background image."""
-    at_rest: bool = False
-    """Whether light stands nearly everywhere, as that of particles at rest, and is therefore not taken."""
-
-    @property
-    def pixels(self) -> np.ndarray:
-        """Pixels with light that stands, or unusable ones: no particle alone saturates them, bool."""
-        either: np.ndarray = self.region | self.unusable
-        return either
-
-    @property
-    def figures(self) -> dict[str, object]:
-        """Fields that are no arrays."""
-        return {"found": self.found, "stray": self.stray, "ratio": self.ratio, "share": self.share}
-
-    @property
-    def place(self) -> str:
-        """Columns and rows of the sensor between which the largest area of standing light lies; empty for none."""
-        areas, count = ndimage.label(self.pixels, np.ones((3, 3)))
-        if not count:
-            return ""
-        largest = 1 + int(np.argmax(np.bincount(areas.ravel())[1:]))
-        rows, columns = ndimage.find_objects(areas)[largest - 1]
-        return f"columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1}"
-
-    def remains(self, first: np.ndarray, second: np.ndarray) -> float:
-        """Return the light left in both frames where light stands, relative to that of other lit places.
-
-        Parameters
-        ----------
-        first, second : ndarray, shape (rows, columns)
-            Frames after `subtract` [counts].
-        """
-        both = np.minimum(first, second)
-        inside, outside = self.region & ~self.unusable, ~self.pixels
-        if np.count_nonzero(inside) < LEAST_RATIO_PIXELS or not outside.any():
-            return 0.0
-        usual = both[outside]
-        usual = usual[usual > np.percentile(usual, _DARK_PERCENTILE)]
-        return float(both[inside].mean() / usual.mean()) if usual.mean() > 0 else 0.0
-
-    def subtract(self, light: np.ndarray, noise: float, frame: int) -> tuple[np.ndarray, float]:
-        """Subtract the standing light from an image at the brightness that it has there.
-
-        Parameters
-        ----------
-        light : ndarray, shape (rows, columns), float32
-            Image without its dark level [counts].
-        noise : float
-            Its noise [counts].
-        frame : int
-            0 or 1.
-
-        Returns
-        -------
-        light : ndarray
-            Image of the particles; unusable pixels are 0.
-        noise : float
-            Noise, of the subtracted light too [counts].
-        """
-        standing = self.light[frame]
-        power = self.power(light, frame)
-        left = light - np.float32(power) * standing
-        left[self.unusable] = 0
-        part = self.region & ~self.unusable
-        below = left[part & (left < 0)]
-        if below.size:  # photon noise of the subtracted light
-            share = np.count_nonzero(part) / part.size
-            noise = float(np.sqrt((1 - share) * noise**2 + share * np.mean(below**2, dtype=float)))
-        return left, noise
-
-    def power(self, light: np.ndarray, frame: int) -> float:
-        """Return the brightness of the standing light in an image relative to the estimate; 1 where it is too dim."""
-        standing = self.light[frame]
-        usable = self.region & ~self.unusable
-        if np.count_nonzero(usable) < LEAST_RATIO_PIXELS:
-            return 1.0
-        bright = usable & (standing > np.percentile(standing[usable], _BRIGHT))
-        if not bright.any():
-            return 1.0
-        found = mode(light[bright] / standing[bright])
-        return found if POWER_RANGE[0] < found < POWER_RANGE[1] else 1.0
 
 
 @dataclass(eq=False)
@@ -205,13 +96,6 @@ class Series:
         self.light += (float(light.sum(dtype=float)) - self.light) / (self.count + 1)
         self.noise += (noise - self.noise) / (self.count + 1)
         self.count += 1
-
-
-def nothing(decoder: LightFieldDecoder) -> StandingLight:
-    """Return no standing light."""
-    none = np.zeros(decoder.gain.shape, bool)
-    dark = np.zeros(decoder.gain.shape, np.float32)
-    return StandingLight(light=(dark, dark), unusable=none, found=False, region=none, stray=0.0, ratio=None)
 
 
 def recorded_light(images: Sequence[tuple[np.ndarray, float, np.ndarray]], decoder: LightFieldDecoder) -> StandingLight:
@@ -387,17 +271,6 @@ def _unusable(first: Series, second: Series) -> np.ndarray:
     return unusable
 
 
-def remains_warnings(standing: StandingLight, first: np.ndarray, second: np.ndarray, camera: str) -> list[Warning]:
-    """Warn of light left in both frames of a camera where standing light was subtracted."""
-    if not standing.remains(first, second) > LARGE_REMAINS:
-        return []
-    left = np.minimum(first, second).sum(where=standing.region, dtype=float)
-    share = float(np.clip(left / max(float(first.sum(dtype=float)), 1e-9), 0, 1))
-    remedy = "what was subtracted does not fit this pair; record a background image (camera.background_image)"
-    figures = {"place": standing.place, "share": share, "remedy": remedy}
-    return [Warning(code=Code.STANDING, subject=camera, figures=figures)]
-
-
 def _extended(often: np.ndarray, series: Series) -> np.ndarray:
     """Return those pixels that lie together in areas of many microimages; none where they lie all over the sensor."""
     if _spread(often, series) > STANDS_EVERYWHERE:
@@ -446,15 +319,3 @@ def least_of_normal(count: int) -> float:
     from scipy.special import ndtri
 
     return float(ndtri((1 - 0.375) / (count + 0.25)))
-
-
-def mode(values: np.ndarray) -> float:
-    """Return the half-sample mode: the place where values lie closest, which a tail on one side hardly moves."""
-    values = np.sort(np.asarray(values, float))
-    while len(values) > 3:
-        half = (len(values) + 1) // 2
-        widths = values[half - 1 :] - values[: len(values) - half + 1]
-        narrowest = np.flatnonzero(widths == widths.min())
-        first = int(narrowest[len(narrowest) // 2])
-        values = values[first : first + half]
-    return float(values.mean())

@@ -14,7 +14,7 @@ from lfpiv.report.svg import colour_bar, new_panel, style, to_svg
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
-    from lfpiv.lightfield.background import StandingLight
+    from lfpiv.lightfield.standing_light import StandingLight
 
 LARGEST_PX = 600
 """Largest edge of a picture in the page [pixel]; larger ones are the brightest pixels of squares."""

@@ -22,7 +22,8 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
 from lfpiv.lightfield import background, image_checks
-from lfpiv.lightfield.background import Series, StandingLight
+from lfpiv.lightfield.background import Series
+from lfpiv.lightfield.standing_light import StandingLight, nothing
 from lfpiv.progress import StepProgress
 from lfpiv.results import provenance
 from lfpiv.results.provenance import Marks, Stamp
@@ -155,7 +156,7 @@ def _of_series(
     everywhere = experiment.background == "minimum"
     first, second, kept = _read_series(experiment, camera, dark, pairs, keep=median)
     if not first.count:
-        return background.nothing(camera.decoder)
+        return nothing(camera.decoder)
     if median:
         found = background.median_light(first, second, kept)
     else:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.lightfield import image_checks
-from lfpiv.lightfield.background import remains_warnings
 from lfpiv.lightfield.particle_signal import seen_structure
+from lfpiv.lightfield.standing_light import remains_warnings
 from lfpiv.warn import Warning
 
 if TYPE_CHECKING:

@@ -7,8 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from support import ideal_rig
 
-from lfpiv.lightfield.background import LARGE_REMAINS, Series, mode, recorded_light, remains_warnings, standing_light
+from lfpiv.lightfield.background import Series, median_light, recorded_light, standing_light
 from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.standing_light import LARGE_REMAINS, mode, remains_warnings
 from lfpiv.warn import Code
 
 NOISE = 3.0  # counts
@@ -81,6 +82,21 @@ def test_a_reflection_is_found_where_it_is(decoder, pairs):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("estimate", ["minimum", "median"])
+def test_the_minimum_and_the_median_of_sparse_particles_are_the_reflection(decoder, estimate):
+    """Both take every pixel, brighter than chance or not; few particles overlap in half of nine images."""
+    standing, found, images = streak(decoder), (Series(decoder, 0), Series(decoder, 1)), ([], [])
+    for pair in range(9):
+        for frame, one in enumerate(found):
+            image = record(particles(decoder, [pair, frame], count=40) + standing, [9, pair, frame])
+            one.add(image, NOISE, image >= SATURATION)
+            images[frame].append(image)
+    light = median_light(*found, images) if estimate == "median" else standing_light(*found, everywhere=True)
+    for frame in light.light:
+        assert np.sqrt(np.mean((frame - standing) ** 2)) < SHARE_LEFT * np.sqrt(np.mean(standing**2))
+    assert not light.unusable.any()
+
+
 def test_frames_lit_by_unlike_lasers_have_backgrounds_of_their_own(decoder):
     one, other = series(decoder, streak(decoder), 8)
     moved = Series(decoder, 1)

@@ -109,7 +109,7 @@ def test_two_ways_to_a_background_are_refused(small_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_minimum_and_a_background_image_agree_with_the_truth(small_run, tmp_path):
+def test_with_a_background_image_the_vectors_are_true(small_run, tmp_path):
     experiment, streaks = lit(small_run, tmp_path / "data")
     text = experiment.read_text()
     for name in streaks:
