@@ -39,6 +39,10 @@ FITS = 10
 """Number of reweighted solutions of a fit."""
 CHANCE = 0.00135
 """Probability of an insignificant movement: that of three standard errors if these were known exactly."""
+MOST_SIGMAS = 5.0
+"""Largest limit of an insignificant movement [standard errors]: part of the variance is assumed, not estimated."""
+LOWERED_SIGMAS = 3.0
+"""Least decrease of a significant distance by which a correction counts [standard errors]."""
 LEAST_VARIANCE = 1e-9
 """Least variance of a movement of the cameras against each other, as a share of the largest one."""
 OUTLIER = 2.0
@@ -135,7 +139,7 @@ class MovementFit:
     @property
     def sigmas(self) -> float:
         """Least significant movement [standard errors]."""
-        return float(scipy.stats.t.isf(CHANCE, self.freedom))
+        return min(float(scipy.stats.t.isf(CHANCE, self.freedom)), MOST_SIGMAS)
 
     @property
     def movements(self) -> dict[str, Movement]:
@@ -276,7 +280,7 @@ def _verdict(apart: Sequence[Separation]) -> Verdict:
         return Verdict.UNMOVED
     before, after = apart[0], apart[-1]
     error = np.hypot(before.std_mm, after.std_mm)
-    lowered = before.mm - after.mm > before.sigmas * error and after.mm < before.mm / 2
+    lowered = before.mm - after.mm > LOWERED_SIGMAS * error and after.mm < before.mm / 2
     return Verdict.CORRECTED if lowered else Verdict.NOT_LOWERED
 
 
