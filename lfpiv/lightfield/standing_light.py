@@ -16,6 +16,8 @@ POWER_RANGE = (0.5, 2.0)
 """Accepted brightness of the standing light in an image, relative to the estimate."""
 LARGE_REMAINS = 3.0
 """Light left after subtraction where light stands, relative to other lit places, above which a warning is due."""
+LEAST_REMAINS = 0.02
+"""Least share of an image's light that such light has. Less of it hardly matters and may be that of bright particles."""
 
 _DARK_PERCENTILE = 50.0  # percentile below which a pixel of an image of particles counts as dark
 _BRIGHT = 50.0  # percentile of the standing light above which pixels tell its brightness
@@ -131,10 +133,10 @@ def nothing(decoder: LightFieldDecoder) -> StandingLight:
 
 def remains_warnings(standing: StandingLight, first: np.ndarray, second: np.ndarray, camera: str) -> list[Warning]:
     """Warn of light left in both frames of a camera where standing light was subtracted."""
-    if not standing.remains(first, second) > LARGE_REMAINS:
-        return []
     left = np.minimum(first, second).sum(where=standing.region, dtype=float)
     share = float(np.clip(left / max(float(first.sum(dtype=float)), 1e-9), 0, 1))
+    if share < LEAST_REMAINS or standing.remains(first, second) <= LARGE_REMAINS:
+        return []
     remedy = "what was subtracted does not fit this pair; record a background image (camera.background_image)"
     figures = {"place": standing.place, "share": share, "remedy": remedy}
     return [Warning(code=Code.STANDING, subject=camera, figures=figures)]
