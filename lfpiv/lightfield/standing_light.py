@@ -17,7 +17,7 @@ POWER_RANGE = (0.5, 2.0)
 LARGE_REMAINS = 3.0
 """Light left after subtraction where light stands, relative to other lit places, above which a warning is due."""
 LEAST_REMAINS = 0.02
-"""Least share of an image's light that such light has. Less of it hardly matters and may be that of bright particles."""
+"""Least share of an image's light that such light has. Less hardly matters and may be that of bright particles."""
 
 _DARK_PERCENTILE = 50.0  # percentile below which a pixel of an image of particles counts as dark
 _BRIGHT = 50.0  # percentile of the standing light above which pixels tell its brightness
