@@ -197,14 +197,38 @@ def widest_spread(camera: RenderCamera, normal: np.ndarray, level_mm: float, see
     return 1.3 * float(np.linalg.norm(np.array(hits[1:]) - hits[0], axis=-1).max())
 
 
+def pixel_samples(count: int, seed: int) -> np.ndarray:
+    """Return well-spread rays of a pixel: scrambled Sobol points.
+
+    Parameters
+    ----------
+    count : int
+        Rays, rounded up to a power of two.
+    seed : int
+        Seed of the scrambling.
+
+    Returns
+    -------
+    ndarray, shape (ray, 4), float32
+        Position in the pixel (2) and in the lens's cell (2), from -1/2 to 1/2.
+    """
+    bits = max(0, math.ceil(math.log2(count)))
+    table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(seed)).random_base2(bits)
+    return (table - 0.5).astype(np.float32)
+
+
+def lens_reach(camera: RenderCamera) -> int:
+    """Return the number of lenses to each side whose light can reach a pixel.
+
+    A lens k steps away lies at least (k cos 30 - 0.58) pitch from a point nearest to its own lens.
+    """
+    ratio = camera.pupil_radius_mm * camera.sensor_per_pupil / camera.pitch_mm
+    return max(1, math.ceil((ratio + 0.6) / 0.866) - 1)
+
+
 def _collect(camera: RenderCamera, samples: int, seed: int, board: tuple | None) -> np.ndarray:
     """Return the image of a board, or of uniform light if there is none."""
     runtime.device()
-    bits = max(0, math.ceil(math.log2(samples)))
-    table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(seed)).random_base2(bits)
-    ratio = camera.pupil_radius_mm * camera.sensor_per_pupil / camera.pitch_mm
-    # a lens k steps away lies at least (k cos 30 - 0.58) pitch from a point nearest to its own lens
-    reach = max(1, math.ceil((ratio + 0.6) / 0.866) - 1)
     image = np.empty(camera.sensor_shape, np.float32)
     widest = 0.0
     if board is not None and not camera.ideal:
@@ -212,10 +236,10 @@ def _collect(camera: RenderCamera, samples: int, seed: int, board: tuple | None)
         level = normal @ (camera.rotation @ (np.array([0, 0, board[0]]) - camera.offset_mm))
         widest = widest_spread(camera, normal, level, seed)
     _collect_pixels(
-        (table - 0.5).astype(np.float32),
+        pixel_samples(samples, seed),
         *camera.arguments(),
         Vector(*np.asarray(camera.offset_mm, float)),
-        reach,
+        lens_reach(camera),
         Board(*(board or (0.0,) * 7)),
         widest,
         board is not None,

@@ -1,15 +1,12 @@
 """Taichi: plenoptic images of bright patches of a plane, by rays traced backward from each pixel as in ``collect``."""
 
-import math
-
 import numpy as np
 import taichi as ti
-from scipy.stats import qmc
 
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
 from lfpiv_kernels.rendering import array_faults, real_optics
-from lfpiv_kernels.rendering.collect import widest_spread
+from lfpiv_kernels.rendering.collect import lens_reach, pixel_samples, widest_spread
 from lfpiv_kernels.rendering.render import Optics, RenderCamera
 
 Patch = ti.types.vector(14, ti.f32)
@@ -169,19 +166,15 @@ def render_patch(
         Light relative to a fully lit pixel of a lens of gain 1 looking at radiance 1, the patch's largest.
     """
     runtime.device()
-    bits = max(0, math.ceil(math.log2(samples)))
-    table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(seed)).random_base2(bits)
-    ratio = camera.pupil_radius_mm * camera.sensor_per_pupil / camera.pitch_mm
-    reach = max(1, math.ceil((ratio + 0.6) / 0.866) - 1)  # as in `collect`
     rotation = np.asarray(camera.rotation, float)
     centre = rotation @ (np.asarray(centre_mm, float) - camera.offset_mm)
     along, across = np.asarray(axes, float) @ rotation.T
     level = float(np.cross(along, across) @ centre)
     image = np.empty(camera.sensor_shape, np.float32)
     _collect_patch(
-        (table - 0.5).astype(np.float32),
+        pixel_samples(samples, seed),
         *camera.arguments()[1:],
-        reach,
+        lens_reach(camera),
         Patch(*centre, *along, *across, *map(float, half_mm), *map(float, gaussian), level),
         widest_spread(camera, np.cross(along, across), level, seed),
         camera.ideal,
