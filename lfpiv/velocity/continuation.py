@@ -46,12 +46,12 @@ def fluid_centroids(fluid: np.ndarray, windows: Windows) -> np.ndarray:
 
     `fluid` is true for voxels with fluid, shape (z, y, x). The result is 0 for windows without fluid.
     """
-    share = windows.shares(fluid)
+    share = windows.means(fluid)
     offsets = np.zeros((*windows.count, 3))
     for axis, centres in enumerate(windows.centres):
         along = [1, 1, 1]
         along[axis] = -1
-        moment = windows.shares(fluid * np.arange(fluid.shape[axis]).reshape(along))
+        moment = windows.means(fluid * np.arange(fluid.shape[axis]).reshape(along))
         middle = np.divide(moment, share, out=np.zeros_like(share), where=share > 0)
         offsets[..., axis] = np.where(share > 0, middle - centres.reshape(along), 0)
     return offsets
@@ -118,7 +118,7 @@ def continued(
     windows : Windows
         The grid.
     """
-    share, result = windows.shares(fluid), field.copy()
+    share, result = windows.means(fluid), field.copy()
     offsets = fluid_centroids(fluid, windows)
     partial = valid & (share < 1)
     steps = fit_neighbours(field - predicted, valid, offsets, windows, partial)

@@ -55,11 +55,11 @@ class Voxels:
         fluid than a window of the last pass can hold.
         """
         everywhere = np.ones(windows.count)
-        fluid = everywhere if self.solid is None else windows.shares(~self.solid)
+        fluid = everywhere if self.solid is None else windows.means(~self.solid)
         seeded = everywhere
         if self.unseeded is not None:
             empty = self.unseeded & ~self.solid if self.solid is not None else self.unseeded
-            seeded = 1 - np.divide(windows.shares(empty), fluid, out=np.zeros_like(fluid), where=fluid > 0)
+            seeded = 1 - np.divide(windows.means(empty), fluid, out=np.zeros_like(fluid), where=fluid > 0)
         least = min(LEAST_FLUID, math.prod(last) / math.prod(windows.window))
         return Coverage(
             fluid_share=fluid,
@@ -75,7 +75,7 @@ class Voxels:
             return np.ones(windows.count, bool)
         if self.solid is None:
             return seen_windows(self.seen, windows)
-        enough: np.ndarray = windows.shares(self.seen & ~self.solid) >= LEAST_SEEN * fluid - ROUNDING
+        enough: np.ndarray = windows.means(self.seen & ~self.solid) >= LEAST_SEEN * fluid - ROUNDING
         return enough
 
 

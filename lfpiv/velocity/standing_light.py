@@ -48,16 +48,7 @@ def on_standing_light(
     if not valid.any() or moving.sum() < LEAST_MOVING * valid.sum():
         return none
     one, other = (np.maximum(volume, 0) / max(float(np.maximum(volume, 0).mean()), _TINY) for volume in (first, second))
-    staying = _means(np.minimum(one, other), windows)
-    typical = float(np.median(_means((one + other) / 2, windows)[moving]))
+    staying = windows.means(np.minimum(one, other))
+    typical = float(np.median(windows.means((one + other) / 2)[moving]))
     bright: np.ndarray = staying >= BRIGHTER * typical
     return valid & bright if typical > 0 else none
-
-
-def _means(volume: np.ndarray, windows: Windows) -> np.ndarray:
-    """Return the means of a volume over windows, shape (z, y, x)."""
-    means = volume.astype(float)
-    for axis, (edge, start) in enumerate(zip(windows.window, windows.first_voxels, strict=True)):
-        below = np.insert(means.cumsum(axis), 0, 0, axis)
-        means = (below.take(start + edge, axis) - below.take(start, axis)) / edge
-    return means

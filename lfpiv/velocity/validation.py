@@ -105,7 +105,7 @@ def seen_windows(seen: np.ndarray, windows: Windows) -> np.ndarray:
 
     `seen` is true where two cameras see the voxel, shape (z, y, x).
     """
-    return windows.shares(seen) >= LEAST_SEEN * (1 - 1e-9)  # the shares have rounding errors
+    return windows.means(seen) >= LEAST_SEEN * (1 - 1e-9)  # the shares have rounding errors
 
 
 def _agrees(field: np.ndarray, prediction: Prediction, search: tuple[float, float, float]) -> np.ndarray:

@@ -29,13 +29,13 @@ class Windows:
         origin, count = window_grid(shape, window, step)
         return cls(window=window, origin=origin, step=step, count=count)
 
-    def shares(self, flags: np.ndarray) -> np.ndarray:
-        """Return the share of each window's voxels that are flagged, shape (z, y, x); `flags` has the volume's."""
-        share = flags.astype(float)
+    def means(self, values: np.ndarray) -> np.ndarray:
+        """Return the mean over each window, shape (z, y, x); of flags the share. `values` has the volume's shape."""
+        mean = values.astype(float)
         for axis, (edge, start) in enumerate(zip(self.window, self.first_voxels, strict=True)):
-            below = np.insert(share.cumsum(axis), 0, 0, axis)
-            share = (below.take(start + edge, axis) - below.take(start, axis)) / edge
-        return share
+            below = np.insert(mean.cumsum(axis), 0, 0, axis)
+            mean = (below.take(start + edge, axis) - below.take(start, axis)) / edge
+        return mean
 
     @property
     def centres(self) -> list[np.ndarray]:

@@ -73,7 +73,7 @@ def test_masked_vectors_are_told_from_replaced_ones():
     solid = mask_of(oblique)
     result = correlate(wall_pair(uniform(0, 1, 0), oblique), mask=solid)
     windows = Windows.covering(SHAPE, (WINDOW,) * 3, (WINDOW // 2,) * 3)
-    share = windows.shares(~solid)
+    share = windows.means(~solid)
     assert {True, False} == set((share < LEAST_FLUID).ravel().tolist())
     np.testing.assert_array_equal(result["masked"].values, share < LEAST_FLUID - 1e-9)
     np.testing.assert_allclose(result["fluid_share"].values, share, atol=1e-6)
