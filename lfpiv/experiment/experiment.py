@@ -141,7 +141,11 @@ class Experiment:
     @property
     def self_calibration_pairs(self) -> list[int]:
         """Pairs used by the self-calibration, evenly spread over all."""
-        count = min(self.self_calibration.pairs, self.pairs)
+        return self.spread_pairs(self.self_calibration.pairs)
+
+    def spread_pairs(self, count: int) -> list[int]:
+        """Return `count` pairs, evenly spread over all, or all pairs if there are no more."""
+        count = min(count, self.pairs)
         return [(2 * number + 1) * self.pairs // (2 * count) for number in range(count)]
 
     def pair_paths(self, pair: int) -> list[Path]:

@@ -95,8 +95,7 @@ def _images_lost(stamp: Stamp, marks: Marks) -> bool:
 def series(experiment: Experiment) -> list[int]:
     """Return the pairs from which the standing light is estimated, evenly spread over all."""
     longest = {"median": MEDIAN_PAIRS, "none": WARNING_PAIRS}.get(experiment.background, LONGEST_SERIES)
-    count = min(longest, experiment.pairs)
-    return [(2 * number + 1) * experiment.pairs // (2 * count) for number in range(count)]
+    return experiment.spread_pairs(longest)
 
 
 def estimate(

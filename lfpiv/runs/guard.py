@@ -143,7 +143,7 @@ def _instants(
 ) -> Iterator[tuple[int, Sequence[dict[str, np.ndarray]]]]:
     """Yield the images of both frames of some usable pairs, spread over the whole experiment."""
     darks, used = read_darks(experiment), 0
-    for pair in _candidates(experiment.pairs):
+    for pair in dict.fromkeys(experiment.spread_pairs(PAIRS) + experiment.spread_pairs(TRIED)):
         try:
             light = pair_light(experiment, calibration.cameras, darks, pair)
         except InputError as error:  # a pair that cannot be used fails when it is reconstructed
@@ -155,12 +155,6 @@ def _instants(
         used += 1
         if used == PAIRS:
             return
-
-
-def _candidates(pairs: int) -> list[int]:
-    """Return the pairs to try: evenly spread ones first, then those at the middles of the gaps."""
-    spread = [(2 * number + 1) * pairs // (2 * count) for count in (PAIRS, TRIED) for number in range(count)]
-    return list(dict.fromkeys(spread))[:TRIED]
 
 
 def _demanded(experiment: Experiment, faces: Sequence[FaceLight]) -> Layers:
