@@ -58,6 +58,38 @@ def _real_distance(s, t, u, v, so, si, rotation, offset, board, plates: ti.templ
     return _to_nearest_dot(rotation.transpose() @ hit + offset, board)
 
 
+@ti.func
+def ray_of_pixel(
+    samples: ti.template(),
+    n,
+    x,
+    y,
+    regular_centre,
+    middle,
+    lattice,
+    scale,
+    pixel,
+    drifting: ti.template(),
+    hexagonal: ti.template(),
+):
+    """Return where a ray of the pixel at (x, y) meets the array and the pupil: s, t, u, v [mm].
+
+    `regular_centre` is the lens's centre before the drift of the pitch, `middle` the real one. It has eleven parameters
+    because they are numbers of one ray and of the camera, which Taichi inlines.
+    """
+    px, py = x + samples[n, 0] * pixel, y + samples[n, 1] * pixel
+    p, q = samples[n, 2], samples[n, 3]  # a cell of the lattice: same area, same centre
+    s = regular_centre[0] + p * lattice[2] + q * lattice[4]
+    t = regular_centre[1] + p * lattice[3] + q * lattice[5]
+    if ti.static(hexagonal):  # fold the corners of the rhombus into the lens's own hexagon
+        own = nearest_lens(lattice, s, t, True)
+        folded = lens_centre(lattice, own[0], own[1])
+        s, t = s - folded[0] + regular_centre[0], t - folded[1] + regular_centre[1]
+    if ti.static(drifting):
+        s, t = s + middle[0] - regular_centre[0], t + middle[1] - regular_centre[1]
+    return ti.Vector([s, t, s - (px - middle[0]) / scale, t - (py - middle[1]) / scale])
+
+
 @ti.kernel
 def _collect_pixels(
     # in
@@ -131,17 +163,9 @@ def _collect_pixels(
                 if distance > inner or not even or ti.static(clipped):
                     seen = 0.0
                     for n in range(count):
-                        px, py = x + samples[n, 0] * pixel, y + samples[n, 1] * pixel
-                        p, q = samples[n, 2], samples[n, 3]  # a cell of the lattice: same area, same centre
-                        s = regular_centre[0] + p * lattice[2] + q * lattice[4]
-                        t = regular_centre[1] + p * lattice[3] + q * lattice[5]
-                        if ti.static(hexagonal):  # fold the corners of the rhombus into the lens's own hexagon
-                            own = nearest_lens(lattice, s, t, True)
-                            folded = lens_centre(lattice, own[0], own[1])
-                            s, t = s - folded[0] + regular_centre[0], t - folded[1] + regular_centre[1]
-                        if ti.static(drifting):
-                            s, t = s + middle[0] - regular_centre[0], t + middle[1] - regular_centre[1]
-                        u, v = s - (px - middle[0]) / scale, t - (py - middle[1]) / scale
+                        s, t, u, v = ray_of_pixel(
+                            samples, n, x, y, regular_centre, middle, lattice, scale, pixel, drifting, hexagonal
+                        )
                         open_ = u * u + v * v < radius * radius
                         if ti.static(clipped):
                             open_ = open_ and array_faults.passes(s, t, u, v, radius, faults)

@@ -6,7 +6,7 @@ import taichi as ti
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
 from lfpiv_kernels.rendering import array_faults, real_optics
-from lfpiv_kernels.rendering.collect import lens_reach, pixel_samples, widest_spread
+from lfpiv_kernels.rendering.collect import lens_reach, pixel_samples, ray_of_pixel, widest_spread
 from lfpiv_kernels.rendering.render import Optics, RenderCamera
 
 Patch = ti.types.vector(14, ti.f32)
@@ -110,16 +110,9 @@ def _collect_patch(
                 if far[0] < dark[0] and far[1] < dark[1]:
                     rays = count
                 for n in range(rays):
-                    px, py = x + samples[n, 0] * pixel, y + samples[n, 1] * pixel
-                    p, q = samples[n, 2], samples[n, 3]
-                    s = regular_centre[0] + p * lattice[2] + q * lattice[4]
-                    t = regular_centre[1] + p * lattice[3] + q * lattice[5]
-                    if ti.static(hexagonal):
-                        own = nearest_lens(lattice, s, t, True)
-                        folded = lens_centre(lattice, own[0], own[1])
-                        s, t = s - folded[0] + regular_centre[0], t - folded[1] + regular_centre[1]
-                    s, t = s + middle[0] - regular_centre[0], t + middle[1] - regular_centre[1]
-                    u, v = s - (px - middle[0]) / scale, t - (py - middle[1]) / scale
+                    s, t, u, v = ray_of_pixel(
+                        samples, n, x, y, regular_centre, middle, lattice, scale, pixel, drifting, hexagonal
+                    )
                     open_ = u * u + v * v < radius * radius
                     if ti.static(clipped):
                         open_ = open_ and array_faults.passes(s, t, u, v, radius, faults)
