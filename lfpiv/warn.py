@@ -93,7 +93,7 @@ SENTENCES: Mapping[Code, str] = {
         "{parts:.0f} of 9 parts of the sensor are {ratio:g} times or more as bright in one frame as in the other; "
         "check the laser's pulses and the shutter"
     ),
-    Code.STANDING: ("light stands still at {place}, {share:percent} % of all light there is in the images: {remedy}"),
+    Code.STANDING: "light stands still at {place}; it is {share:percent} % of an image's light: {remedy}",
     Code.DIM: (
         "particles hardly rise above the noise (light of near pixels correlates by {structure:.2f}; clear images "
         "give 0.2 or more): displacements are biased towards zero. More light, more particles or larger windows help"
