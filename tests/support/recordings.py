@@ -1,6 +1,6 @@
 """Write recordings in the cameras' own formats, from their published layouts.
 
-The layouts are those of Vision Research ("Cine File Format"), Photron (the text header of ``.cih`` and the XML header of
+The layouts are those of Vision Research ("Cine File Format"), Photron (the text header of ``.cih``, the XML header of
 ``.cihx``) and PCO (appendix "Image file formats" of the cameras' manuals). No reader of the package is used here.
 """
 
