@@ -63,6 +63,8 @@ MOST_DOTS = 10**6
 """Largest number of dots of a board in all its planes."""
 MOST_SOLIDS = 1000
 """Largest number of solids, walls, surfaces or windows."""
+MOST_VOXELS = 10**11
+"""Largest number of voxels of a volume, guard layers included. A run of as many needs some 10 TB of memory."""
 MOST_STEPS = 10**6
 """Largest number of iterations or epochs."""
 MOST_PASSES = 32
