@@ -35,7 +35,7 @@ SHOWN_NAME = 60
 """Most characters of a key, a name or a value in a message."""
 
 _PART = r"""(?:(?<![\w-])[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*"""
-_DOTTED = re.compile(f"(?:{_PART}){{{2 * DEEPEST}}}")
+_DOTTED = re.compile(f"(?:{_PART}){{{DEEPEST}}}")
 """A key of very many parts, for which the parser takes quadratic time."""
 
 _UNITS = {"mm": " mm", "um": " um", "s": " s", "deg": " degrees", "px": " pixels", "gib": " GiB", "voxel": " voxels"}

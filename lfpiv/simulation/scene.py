@@ -216,7 +216,7 @@ class Scene(Table):
     def _known_flow(cls, table: Any) -> Any:
         if isinstance(table, Mapping):
             kind = table.get("kind")
-            if kind not in KINDS:
+            if not isinstance(kind, str) or kind not in KINDS:
                 raise ValueError(f"a flow with kind = {' or '.join(map(repr, KINDS))}")
             known = KINDS[kind].model_fields
             unknown = [key for key in table if key not in known]
