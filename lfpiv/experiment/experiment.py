@@ -35,6 +35,7 @@ from lfpiv.experiment.settings import (
 from lfpiv.experiment.toml import read_toml
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 
 DECODED_PIXELS = 100_000_000
 """Largest number of pixels of particle images that are decoded before the work starts [pixel]."""
@@ -53,8 +54,9 @@ class CameraSetup:
     name: str
     optics: Optics
     """Nominal optics; ``sensor_shape`` is that of the white image."""
-    nominal_angle_deg: float
-    """Angle about y [degree]; it numbers the board's dots and enters the thin-lens mapping, never the network."""
+    orientation: Orientation | None
+    """Nominal orientation; it numbers the board's dots and enters the thin-lens mapping, never the network. None where
+    the board's mark does."""
     image_flip: str
     """Mirroring of the camera's images, reversed on reading."""
     white_path: Path
@@ -63,6 +65,11 @@ class CameraSetup:
     """Path pattern of the background image, relative to the experiment file, or None."""
     raw: RawImages | None = None
     """Layout of the camera's files without a header, or None."""
+
+    @property
+    def nominal_angle_deg(self) -> float | None:
+        """Nominal angle about y [degree], None where no orientation is stated."""
+        return None if self.orientation is None else self.orientation.yaw_deg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,6 +232,8 @@ def read_experiment(path: str | Path) -> Experiment:
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
+    for one in table.camera:
+        _require_orientation(path, one)
     board, particles = table.board, table.particles
     check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
     _check_particle_pattern(path, particles, names)
@@ -259,8 +268,9 @@ def read_experiment(path: str | Path) -> Experiment:
         background=particles.background,
     )
     for camera in experiment.cameras:
-        nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)
-        nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.nominal_angle_deg)
+        if camera.orientation is not None:
+            nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
+            nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
     return replace(experiment, solid=solid_voxels(path, table.volume, grid))
 
@@ -307,6 +317,14 @@ def _check_particle_pattern(path: Path, particles: Particles, cameras: Sequence[
     else:
         fields |= {"pair": range(particles.count), "frame": particles.frames}
     check_pattern(path, "particles.images", particles.images, fields)
+
+
+def _require_orientation(path: Path, camera: CameraTable) -> None:
+    if camera.orientation is None:
+        raise InputError(
+            f"{path}: camera {camera.name!r}: expected nominal_angle_deg, its angle about y, or nominal_direction, a "
+            "vector from the origin towards it, found neither. Add one."
+        )
 
 
 def _check_background(path: Path, camera: CameraTable, particles: Particles) -> None:
@@ -383,7 +401,7 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
     return CameraSetup(
         name=table.name,
         optics=optics,
-        nominal_angle_deg=table.nominal_angle_deg,
+        orientation=table.orientation,
         image_flip=table.image_flip,
         white_path=white_path,
         dark_path=None if table.dark_image is None else path.parent / table.dark_image,

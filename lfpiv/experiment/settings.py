@@ -32,6 +32,7 @@ from lfpiv.experiment.bounds import (
     Thickness,
 )
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 
 SMALLEST_WINDOW = 4
 """Smallest edge of an interrogation window that holds a correlation peak [voxel]."""
@@ -169,11 +170,31 @@ class NominalCamera(Table):
     """Pixel pitch of the sensor [um]."""
     microlens_layout: Literal["square", "hexagonal"] = "square"
     """Arrangement of the microlenses."""
-    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
+    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)] | None = None
     """Angle of the camera about y, correct to about 10. It numbers the board's dots and never enters the mapping
-    [degree]."""
+    [degree]. Alternative to `nominal_direction`."""
+    nominal_direction: Direction | None = None
+    """Vector (x, y, z) from the origin towards the camera, of any length, correct to about 10 degrees. Rows of the
+    picture are normal to the world's y axis; a camera straight above or below has x along its rows."""
+    nominal_roll_deg: Annotated[float, Field(strict=True, ge=-180, le=180)] = 0.0
+    """Rotation of the camera about its viewing axis, clockwise as seen from behind the camera [degree]."""
     image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirroring of the camera's images."""
+
+    @model_validator(mode="after")
+    def _one_orientation(self) -> NominalCamera:
+        if self.nominal_angle_deg is not None and self.nominal_direction is not None:
+            raise ValueError("either nominal_angle_deg or nominal_direction")
+        return self
+
+    @property
+    def orientation(self) -> Orientation | None:
+        """Nominal orientation, or None where none is stated."""
+        if self.nominal_direction is not None:
+            return Orientation.from_direction(self.nominal_direction, self.nominal_roll_deg)
+        if self.nominal_angle_deg is not None:
+            return Orientation(self.nominal_angle_deg, 0.0, self.nominal_roll_deg)
+        return None
 
     def optics_of(self, sensor_shape: tuple[int, int]) -> Optics:
         """Return the nominal optics with a sensor of (rows, columns) pixels."""

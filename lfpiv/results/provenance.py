@@ -20,7 +20,7 @@ import numpy as np
 
 from lfpiv import files, warn
 from lfpiv.experiment import images
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.version import __version__
@@ -124,10 +124,18 @@ def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
     return warn.from_text(attributes.get("warnings", attributes.get("findings", "[]")))
 
 
+def _orientation(camera: CameraSetup) -> float | list[float] | None:
+    """Return the nominal angle about y [degree], yaw, pitch and roll if there is more to state, None if nothing is."""
+    stated = camera.orientation
+    if stated is None or not (stated.pitch_deg or stated.roll_deg):
+        return None if stated is None else stated.yaw_deg
+    return [stated.yaw_deg, stated.pitch_deg, stated.roll_deg]
+
+
 def of_calibration(experiment: Experiment) -> Stamp:
     """Return the stamp of the calibration."""
     cameras = {
-        camera.name: [dataclasses.asdict(camera.optics), camera.nominal_angle_deg, camera.image_flip]
+        camera.name: [dataclasses.asdict(camera.optics), _orientation(camera), camera.image_flip]
         + ([camera.raw.model_dump()] if camera.raw else [])
         for camera in experiment.cameras
     }
