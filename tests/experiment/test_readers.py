@@ -355,6 +355,9 @@ def test_an_experiment_of_recordings_opens(tiny_experiment):
     for name in shapes:
         write_cine(folder / f"{name}.cine", particles[name])
         write_stack(folder / f"board_{name}.tif", boards[name])
+    dark = rng.integers(0, 20, (2, *shapes["right"]), np.uint16)
+    with h5py.File(folder / "run.h5", "w") as file:
+        file["dark/images"] = dark
     (folder / "white.raw").write_bytes(boards["left"][2].tobytes())
     text = tiny_experiment.read_text("utf-8")
     for old, new in {
@@ -362,6 +365,7 @@ def test_an_experiment_of_recordings_opens(tiny_experiment):
         "particles/{camera}/{pair:04d}{frame}.tif": "{camera}.cine#{image}",
         "white/right.tif": "board_right.tif#2",
         "white/left.tif": "white.raw",
+        "dark/right.tif": "run.h5#dark/images[1]",
         "nominal_angle_deg = 30.0": 'nominal_angle_deg = 30.0\n[camera.raw]\nshape = [48, 64]\ndtype = "uint16"\n',
     }.items():
         assert text.count(old) == 1
@@ -372,6 +376,7 @@ def test_an_experiment_of_recordings_opens(tiny_experiment):
     experiment = open_experiment(tiny_experiment)
     np.testing.assert_array_equal(experiment.white("left"), boards["left"][2])
     np.testing.assert_array_equal(experiment.white("right"), boards["right"][2])
+    np.testing.assert_array_equal(experiment.dark("right"), dark[1])
     np.testing.assert_array_equal(experiment.board_image("right", 1), boards["right"][1])
     np.testing.assert_array_equal(experiment.particle_image("left", 1, "b"), particles["left"][3])
     before = provenance.of_calibration(experiment)
