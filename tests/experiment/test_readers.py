@@ -2,6 +2,7 @@
 
 import os
 import socket
+import struct
 import sys
 import threading
 import time
@@ -73,6 +74,18 @@ def test_pages_of_a_tiff_are_numbered(tmp_path, frames, options):
     require_numbered(tmp_path / "stack.TIF", frames)
 
 
+def test_images_behind_the_only_directory_of_a_stack_of_imagej_are_numbered(tmp_path, frames):
+    """ImageJ writes so where the stack is larger than 4 GiB."""
+    tifffile.imwrite(tmp_path / "stack.tif", frames, imagej=True, truncate=True)
+    with tifffile.TiffFile(tmp_path / "stack.tif") as tiff:
+        assert len(tiff.pages) == 1
+    require_numbered(tmp_path / "stack.tif", frames)
+    whole = (tmp_path / "stack.tif").read_bytes()
+    (tmp_path / "stack.tif").write_bytes(whole[:-1])
+    np.testing.assert_array_equal(read(tmp_path / "stack.tif", f"#{COUNT - 2}"), frames[-2])
+    refuse(tmp_path / "stack.tif", f"#{COUNT - 1}", "truncated or damaged")
+
+
 @pytest.mark.parametrize(
     ("options", "dtype"),
     [
@@ -93,6 +106,20 @@ def test_images_of_a_cine_are_numbered_from_the_first_one_stored(tmp_path, frame
         np.testing.assert_array_equal(read(tmp_path / "run.cine", f"#{number}"), frame)
     if columns == COLUMNS:
         require_numbered(tmp_path / "run.cine", cut)
+
+
+def test_a_cine_needs_no_setup_and_no_times(tmp_path, frames):
+    count, rows, columns = frames.shape
+    images_at = 44 + 40 + 8 * count
+    size = 8 + 2 * rows * columns
+    data = struct.pack("<2sHHHiIiI", b"CI", 44, 2, 1, 0, count, 0, count)
+    data += struct.pack("<IIIQ", 44, 84, 84, 0)
+    data += struct.pack("<IiiHHIIiiII", 40, columns, rows, 1, 16, 0, size - 8, 0, 0, 0, 0)
+    data += struct.pack(f"<{count}q", *(images_at + number * size for number in range(count)))
+    for frame in frames:
+        data += struct.pack("<II", 8, size - 8) + frame[::-1].tobytes()
+    (tmp_path / "run.cine").write_bytes(data)
+    require_numbered(tmp_path / "run.cine", frames)
 
 
 def test_packed_10_bit_codes_become_linear_counts(tmp_path):
