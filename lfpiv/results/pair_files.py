@@ -6,8 +6,7 @@ figures and warnings of their images.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,12 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import warn
+from lfpiv.errors import DamagedFile
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
-from lfpiv.geometry.grid import NO_LAYERS, Layers
-from lfpiv.results import netcdf, provenance
+from lfpiv.geometry.grid import NO_LAYERS, Grid, Layers
+from lfpiv.records import read_json, validate
+from lfpiv.results import finished, netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
 from lfpiv.results.provenance import Marks, PairStamps, Stamp
 from lfpiv.warn import Warning
@@ -67,6 +68,10 @@ class PairFiles:
     volumes: tuple[Path, Path]
     """Volumes of the first and of the second frame."""
     stamps: PairStamps
+    grid: Grid | None = None
+    """Voxels of the volumes; None if files are not compared with them."""
+    frames: Sequence[str | None] = (None, None)
+    """Names of the frames; None where an instant is of two pairs."""
 
     @classmethod
     def of(
@@ -86,7 +91,9 @@ class PairFiles:
         """
         stamps = provenance.of_pair(experiment, calibration, pair, background=background, guard=guard)
         volumes = (folder.volume(pair, 0), folder.volume(pair, 1))
-        return cls(pair=pair, vectors=folder.vectors(pair), volumes=volumes, stamps=stamps)
+        frames = (None, None) if experiment.series else experiment.frames
+        vectors, grid = folder.vectors(pair), experiment.grid
+        return cls(pair=pair, vectors=vectors, volumes=volumes, stamps=stamps, grid=grid, frames=frames)
 
     def _wanted(self, vectors: bool, volumes: bool) -> Iterator[tuple[Path, Stamp]]:
         if vectors:
@@ -94,10 +101,16 @@ class PairFiles:
         if volumes:
             yield from ((path, self.stamps.volumes) for path in self.volumes)
 
+    def _marks(self, path: Path) -> Marks | None:
+        """Return the marks of one of the files; None if it is missing or cannot be used."""
+        if path == self.vectors:
+            return finished.vectors_marks(path, self.grid)
+        return finished.volume_marks(path, self.grid, self.frames[self.volumes.index(path)])
+
     def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:
         """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""
         for path, stamp in self._wanted(vectors, volumes):
-            marks = provenance.read_marks(path)
+            marks = self._marks(path)
             changes = [] if marks is None else stamp.changes(marks)
             if changes or marks is None:
                 return changes
@@ -105,12 +118,12 @@ class PairFiles:
 
     def fitting_vectors(self) -> Marks | None:
         """Return the marks of the vectors; None if they are missing or do not fit."""
-        marks = provenance.read_marks(self.vectors)
+        marks = self._marks(self.vectors)
         return marks if self.stamps.vectors.fits(marks) else None
 
     def fitting_volumes(self) -> tuple[Marks, ...] | None:
         """Return the marks of both volumes; None if one is missing or does not fit."""
-        marks = tuple(found for path in self.volumes if (found := provenance.read_marks(path)) is not None)
+        marks = tuple(found for path in self.volumes if (found := self._marks(path)) is not None)
         return marks if len(marks) == 2 and all(map(self.stamps.volumes.fits, marks)) else None
 
     def retire_outdated(self) -> Iterator[tuple[Path, Path]]:
@@ -126,8 +139,12 @@ class PairFiles:
         """Read both volumes and their records; None if one is missing or does not fit."""
         if self.fitting_volumes() is None:
             return None
-        first, second = (netcdf.read_volume(path) for path in self.volumes)
-        a, b = (_read_record(volume, path) for volume, path in zip((first, second), self.volumes, strict=True))
+        try:
+            first, second = (netcdf.read_volume(path, grid=self.grid) for path in self.volumes)
+            a, b = (_read_record(volume, path) for volume, path in zip((first, second), self.volumes, strict=True))
+        except DamagedFile as error:
+            provenance.reject(Path(error.path), error.reason)
+            return None
         return PairVolumes(volumes=(first, second), records=(a, b))
 
     def write_volumes(self, pair: PairVolumes) -> None:
@@ -155,14 +172,15 @@ class PairFiles:
 
 def _read_record(volume: xr.DataArray, path: Path) -> FrameRecord:
     stored = netcdf.read_attributes(path)
-    structure = {}
-    if "structure" in volume.attrs:
-        cameras = volume.attrs["cameras"]
-        names = json.loads(cameras) if isinstance(cameras, str) else cameras
-        structure = dict(zip(names, np.atleast_1d(volume.attrs["structure"]).tolist(), strict=True))
-    return FrameRecord(
-        frame=str(stored["frame"]),
-        structure=structure,
-        warnings=provenance.stored_warnings(stored),
-        seconds=float(stored["seconds"]),
-    )
+    try:
+        cameras = volume.attrs.get("cameras", [])
+        names = read_json(cameras) if isinstance(cameras, str) else cameras
+        values = np.atleast_1d(volume.attrs.get("structure", [])).tolist()
+        return FrameRecord(
+            frame=validate(str, stored.get("frame")),
+            structure=validate(dict[str, float], dict(zip(names, values, strict=True)) if values else {}),
+            warnings=provenance.stored_warnings(stored),
+            seconds=validate(float, stored.get("seconds")),
+        )
+    except (ValueError, TypeError) as error:
+        raise DamagedFile(path, f"its attributes have another form: {error}") from None

@@ -163,12 +163,13 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
     Raises
     ------
     InputError
-        If the folder holds no calibration that fits the experiment.
+        If the folder holds no calibration that fits the experiment, or a file in it is damaged.
     """
     with open_run(experiment, out, None, None, writes_results=False) as current:
         calibrated = rig.load_calibration(current)
+        current.require_whole()
         if current.background is not None:
-            standing = background.load(current.folder.background)
+            standing = background.load(current.folder.background, calibrated.calibration)
             calibrated = replace(calibrated, calibration=standing.seen_by(calibrated.calibration))
         return current.finish(calibrated, Invocation(), report=True)
 

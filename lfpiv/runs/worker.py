@@ -182,7 +182,7 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
     if task.weights is not None:
         calibration = load_calibration(work.folder.calibration)
         if work.background is not None:
-            calibration = background.load(work.folder.background).seen_by(calibration)
+            calibration = background.load(work.folder.background, calibration).seen_by(calibration)
         cameras = calibration.cameras
         weights = open_weights(shared / _WEIGHTS, cameras, task.weights)
         work = dataclasses.replace(work, weights=weights, darks=read_darks(work.experiment))
