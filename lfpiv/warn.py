@@ -147,8 +147,8 @@ SENTENCES: Mapping[Code, str] = {
         "it. Check that place in board.planes_mm, and the stage."
     ),
     Code.TURNED: (
-        "the board's dots show the camera {turn_deg:.0f} degrees away from nominal_angle_deg = {nominal_deg:g}. Are "
-        "its pictures turned by 90 degrees? Then x and y are exchanged."
+        "the board's dots show the camera turned by {turn_deg:.0f} degrees from where it is stated to be, {nominal}. "
+        "Are its pictures turned by 90 degrees? Then x and y are exchanged; otherwise check its nominal orientation."
     ),
     Code.MAGNIFIED: (
         "the board's dots are magnified {magnification:.3f} times, not {stated:g} times as stated. Check "
