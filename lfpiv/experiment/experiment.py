@@ -378,6 +378,11 @@ def _check_background(path: Path, camera: CameraTable, particles: Particles) -> 
     """Refuse a pattern with unknown fields, and an image that `particles.background` would not use."""
     key = f"camera {camera.name!r}, background_image"
     assert camera.background_image is not None
+    if particles.series is not None and "{frame" in camera.background_image:
+        raise InputError(
+            f"{path}: {key}: expected no {{frame}}, because one laser lights all instants of a time series, found "
+            f"{camera.background_image!r}."
+        )
     check_pattern(path, key, camera.background_image, {"frame": particles.frames[:1]})
     if particles.background in ("minimum", "median"):
         raise InputError(

@@ -170,6 +170,7 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
             "pairs": experiment.pairs,
             "volume_shape": list(experiment.grid.shape),
             "voxel_mm": experiment.grid.voxel_mm,
+            **({} if experiment.series is None else {"series": experiment.series.model_dump()}),
         },
         "settings": {
             name: getattr(experiment, name).model_dump() for name in ("smart", "correlation", "network", "compute")
