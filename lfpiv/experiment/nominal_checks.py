@@ -21,8 +21,13 @@ FIELDS_AWAY = 1.5
 """Distance of a volume from the edge of the field above which it is refused [fields of view]."""
 LARGEST_BOARD = 4.0
 """Largest size of a board, along x or y, relative to the part that a camera may see."""
+FEWEST_LENSES_APART = 0.5
+"""Least distance of dots as an oblique camera sees them [microlens]. Two are needed; this little is never enough."""
+
 STEEPEST_COSINE = 0.17
-"""Cosine of the steepest angle at which a camera may see a board, 80 degrees."""
+"""Cosine of the steepest angle at which a camera sees a board well, 80 degrees."""
+ALONG_COSINE = 0.087
+"""Cosine of the angle above which a camera looks along a board, 85 degrees."""
 
 
 def field_mm(optics: Optics) -> np.ndarray:
@@ -67,14 +72,28 @@ def require_board(path: Path, board: Board, name: str, optics: Optics, orientati
     Raises
     ------
     InputError
-        If the dots are less than a microlens apart, or the board is more than `LARGEST_BOARD` times as large as the
-        part of it that the camera may see.
+        If the camera looks along the board's planes, the dots cannot be told apart as it sees them, or the board is
+        more than `LARGEST_BOARD` times as large as the part of it that the camera may see.
     """
     lens_mm = optics.microlens_pitch_mm / abs(optics.magnification)
     if board.spacing_mm < lens_mm * (1 - 1e-9):
         raise InputError(
             f"{path}: board.spacing_mm: expected dots at least one microlens apart, {lens_mm:g} mm on the board for "
             f"camera {name!r}, found {board.spacing_mm:g} mm. Use a coarser board, or check the unit."
+        )
+    oblique = abs(float(orientation.rotation[2, 2]))
+    if oblique < ALONG_COSINE:
+        raise InputError(
+            f"{path}: camera {name!r}: expected a camera that sees the board's planes at no more than "
+            f"{np.degrees(np.arccos(STEEPEST_COSINE)):.0f} degrees from their normal, the z axis, found one "
+            f"{orientation}, at {np.degrees(np.arccos(oblique)):.0f} degrees. Turn the board towards all cameras: z is "
+            "its normal."
+        )
+    if board.spacing_mm * oblique < FEWEST_LENSES_APART * lens_mm:
+        raise InputError(
+            f"{path}: board.spacing_mm: expected dots about two microlenses apart as camera {name!r} sees them, found "
+            f"{board.spacing_mm * oblique:.3g} mm where a microlens covers {lens_mm:g} mm: it sees the board at "
+            f"{np.degrees(np.arccos(oblique)):.0f} degrees from its normal. Use a coarser board."
         )
     across, cosines, along = np.linalg.svd(orientation.rotation[:2, :2])  # of the board's axes to the picture's
     widened = np.abs(along.T @ np.diag(1 / np.maximum(cosines, STEEPEST_COSINE)) @ across.T)

@@ -17,8 +17,12 @@ Number = Annotated[float, Field(strict=True)]
 Positive = Annotated[float, Field(strict=True, gt=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 NonNegative = Annotated[float, Field(strict=True, ge=0)]
+NonNegativeInt = Annotated[int, Field(strict=True, ge=0)]
 Flag = Annotated[bool, Field(strict=True)]
 Point = tuple[Number, Number, Number]
+
+TURNS = 8
+"""Turns and mirrors of a square grid."""
 
 SMALLEST_WINDOW = 4
 """Smallest edge of an interrogation window that holds a correlation peak [voxel]."""
@@ -208,6 +212,19 @@ class CameraTable(NominalCamera):
     series of image pairs shows what stands still."""
 
 
+def _turned(places: tuple[tuple[int, int], ...]) -> list[list[tuple[int, int]]]:
+    """Return places on a square grid in its eight turns and mirrors."""
+    signs = [(a, b) for a in (1, -1) for b in (1, -1)]
+    both = (places, [(row, column) for column, row in places])
+    return [[(a * column, b * row) for column, row in some] for some in both for a, b in signs]
+
+
+def _from_corner(places: list[tuple[int, int]]) -> frozenset[tuple[int, int]]:
+    """Return places counted from the corner of the rectangle around them."""
+    left, low = (min(place[axis] for place in places) for axis in (0, 1))
+    return frozenset((column - left, row - low) for column, row in places)
+
+
 class NominalBoard(Table):
     """Keys of ``[board]``, in experiments and in scenes of the simulator."""
 
@@ -219,6 +236,22 @@ class NominalBoard(Table):
     """Diameter of a dot, less than their distance [mm]."""
     planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
     """Depth z of each plane, all different [mm]."""
+    mark: tuple[tuple[NonNegativeInt, NonNegativeInt], ...] = ()
+    """Places (column, row) without a dot, counted from 0 along x and y: a mark that names the dots, so that cameras
+    need no nominal orientation. No turn or mirror of the grid may carry it over into itself; three places suffice."""
+
+    @field_validator("mark")
+    @classmethod
+    def _tells_turns(cls, mark: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+        if mark and len(set(map(_from_corner, _turned(mark)))) < TURNS:
+            raise ValueError("places that no turn or mirror of the grid carries over into themselves")
+        return mark
+
+    @model_validator(mode="after")
+    def _mark_on_board(self) -> NominalBoard:
+        if any(column >= self.dots[0] or row >= self.dots[1] for column, row in self.mark):
+            raise ValueError("a mark of places on the board: column below dots[0], row below dots[1]")
+        return self
 
     @model_validator(mode="after")
     def _dots_apart(self) -> NominalBoard:
