@@ -248,7 +248,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
         {
             "version": __version__,
             "camera": cameras,
-            "board": experiment.board.model_dump(),
+            "board": experiment.board.model_dump(exclude=None if experiment.board.mark else {"mark"}),
             "network": experiment.network.model_dump(),
             "images": content_hash(experiment.calibration_images()),
         }
