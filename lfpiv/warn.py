@@ -10,6 +10,7 @@ import contextlib
 import enum
 import json
 import logging
+import math
 import string
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
@@ -286,7 +287,8 @@ class Warning:
             values = ", ".join(f"{name} = {value}" for name, value in found.figures.items())
             text = f"{found.code} ({values})" if values else found.code
             return cls(code=Code.OTHER, subject=found.subject, figures={"text": text}, pairs=found.pairs)
-        warning = cls(code=Code(found.code), subject=found.subject, figures=found.figures, pairs=found.pairs)
+        figures = {name: math.nan if value is None else value for name, value in found.figures.items()}
+        warning = cls(code=Code(found.code), subject=found.subject, figures=figures, pairs=found.pairs)
         try:
             _ = warning.sentence
         except (KeyError, ValueError, TypeError, IndexError, AttributeError) as error:
