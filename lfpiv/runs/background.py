@@ -85,7 +85,7 @@ def prepare(run: Run, calibration: Calibration) -> Background:
             found = None
     if found is None:
         found = estimate(experiment, calibration.cameras, pairs, run.step("background"))
-        _write(found, path, stamp.attributes)
+        write(found, path, stamp.attributes)
     for warning in found.warnings:
         warn(log, warning)
     return found
@@ -126,7 +126,7 @@ def estimate(
     warnings = tuple(_warnings(experiment, standing, len(pairs)))
     if experiment.background == "none":
         return Background(figures=figures, warnings=warnings)
-    return Background(standing, _digest(standing), figures, warnings)
+    return Background(standing, content_hash(standing), figures, warnings)
 
 
 def _figures(light: StandingLight) -> dict[str, Any]:
@@ -239,7 +239,8 @@ def _without_dark(
     return image - np.float32(level), noise, image_checks.saturated_pixels(raw)
 
 
-def _digest(standing: Mapping[str, StandingLight]) -> str | None:
+def content_hash(standing: Mapping[str, StandingLight]) -> str | None:
+    """Return the hash of the light of all cameras; None where nothing is subtracted."""
     if not standing:
         return None
     digest = hashlib.blake2b(digest_size=8)
@@ -287,7 +288,7 @@ def load(path: Path, calibration: Calibration) -> Background:
                 for name, camera in calibration.cameras.items()
                 if name in file
             }
-            if _digest(found) != figures.content:
+            if content_hash(found) != figures.content:
                 raise DamagedFile(path, "its light is not that of its figures")
     except FileNotFoundError:
         raise InputError(f"{path}: expected a stored background, found no such file. Run `lfpiv run`.") from None
@@ -308,7 +309,8 @@ def _read_light(group: h5py.Group, shape: tuple[int, int]) -> StandingLight:
     )
 
 
-def _write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
+def write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
+    """Write a background with the attributes of its stamp, atomically."""
     import h5py
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
