@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment import bounds, images, nominal_checks
 from lfpiv.experiment.mask import solid_voxels
 from lfpiv.experiment.patterns import check_length, check_pattern
+from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.experiment.settings import (
     SMALLEST_WINDOW,
     Board,
@@ -26,6 +27,7 @@ from lfpiv.experiment.settings import (
     ExperimentVolume,
     Network,
     Particles,
+    RawImages,
     SelfCalibration,
     Series,
     Smart,
@@ -33,6 +35,7 @@ from lfpiv.experiment.settings import (
 from lfpiv.experiment.toml import read_toml
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 
 DECODED_PIXELS = 100_000_000
 """Largest number of pixels of particle images that are decoded before the work starts [pixel]."""
@@ -51,14 +54,31 @@ class CameraSetup:
     name: str
     optics: Optics
     """Nominal optics; ``sensor_shape`` is that of the white image."""
-    nominal_angle_deg: float
-    """Angle about y [degree]; it numbers the board's dots and enters the thin-lens mapping, never the network."""
+    orientation: Orientation | None
+    """Nominal orientation; it numbers the board's dots and enters the thin-lens mapping, never the network. None where
+    the board's mark does."""
     image_flip: str
     """Mirroring of the camera's images, reversed on reading."""
     white_path: Path
     dark_path: Path | None
     background: str | None = None
     """Path pattern of the background image, relative to the experiment file, or None."""
+    raw: RawImages | None = None
+    """Layout of the camera's files without a header, or None."""
+
+    @property
+    def nominal_angle_deg(self) -> float | None:
+        """Nominal angle about y [degree], None where no orientation is stated."""
+        return None if self.orientation is None else self.orientation.yaw_deg
+
+
+class Frame(NamedTuple):
+    """One exposure of all cameras: a frame of a pair, or an instant of a series."""
+
+    number: int
+    """Number of the pair, or of the instant."""
+    name: str
+    """Name of the frame in its pair; an instant of a series has that of the first frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +122,36 @@ class Experiment:
         """Return the number of the instant of a series at which a frame of a pair was recorded."""
         assert self.series is not None
         return pair + self.series.step * self.frames.index(frame)
+
+    def pair_frames(self, pair: int) -> tuple[Frame, Frame]:
+        """Return both frames of a pair. An instant of a series is the same frame in both its pairs."""
+        first, second = self.frames
+        if self.series is None:
+            return Frame(pair, first), Frame(pair, second)
+        return Frame(pair, first), Frame(pair + self.series.step, first)
+
+    def instant_s(self, instant: int) -> float:
+        """Return the time of an instant of a series after the first one [s]."""
+        assert self.series is not None
+        return (instant - self.series.first) * self.dt_s / self.series.step
+
+    def name_of(self, pair: int) -> str:
+        """Return "pair" or, in a series, "instant" with the number, for messages."""
+        return f"{self.noun} {pair}"
+
+    @property
+    def noun(self) -> str:
+        """What results are numbered by: "pair" or "instant"."""
+        return "pair" if self.series is None else "instant"
+
+    def disjoint(self, pairs: Iterable[int]) -> Iterator[int]:
+        """Yield the pairs that share no image with one yielded before."""
+        seen = set[Frame]()
+        for pair in pairs:
+            frames = self.pair_frames(pair)
+            if seen.isdisjoint(frames):
+                seen.update(frames)
+                yield pair
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
@@ -162,8 +212,13 @@ class Experiment:
 
     def calibration_paths(self) -> list[Path]:
         """Return the paths of all images that the calibration reads, in a fixed order."""
-        paths = [path for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
-        return paths + [self.board_path(c.name, p) for c in self.cameras for p in range(len(self.board.planes_mm))]
+        return [image.path for image in self.calibration_images()]
+
+    def calibration_images(self) -> list[ImagePath]:
+        """Return all images that the calibration reads, in a fixed order."""
+        found = [split(path, c.raw) for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
+        planes = range(len(self.board.planes_mm))
+        return found + [split(self.board_path(c.name, plane), c.raw) for c in self.cameras for plane in planes]
 
     @property
     def self_calibration_pairs(self) -> list[int]:
@@ -171,13 +226,21 @@ class Experiment:
         return self.spread_pairs(self.self_calibration.pairs)
 
     def spread_pairs(self, count: int) -> list[int]:
-        """Return `count` pairs, evenly spread over all, or all pairs if there are no more."""
+        """Return `count` pairs, evenly spread over all, or all if there are no more; none shares an image with another.
+
+        Pairs of a short series overlap. Then these are fewer.
+        """
         count = min(count, self.pairs)
-        return [self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count)]
+        spread = (self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count))
+        return list(self.disjoint(spread))
 
     def pair_paths(self, pair: int) -> list[Path]:
         """Return the paths of all images of one pair, in a fixed order."""
-        return [self.particle_path(camera.name, pair, frame) for frame in self.frames for camera in self.cameras]
+        return [path for frame in self.pair_frames(pair) for path in self.frame_paths(frame)]
+
+    def frame_paths(self, frame: Frame) -> list[Path]:
+        """Return the paths of the images of one frame, in the order of the cameras."""
+        return [self.particle_path(camera.name, *frame) for camera in self.cameras]
 
 
 def open_experiment(path: str | Path) -> Experiment:
@@ -216,6 +279,8 @@ def read_experiment(path: str | Path) -> Experiment:
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
+    for one in table.camera:
+        _require_orientation(path, one)
     board, particles = table.board, table.particles
     check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
     _check_particle_pattern(path, particles, names)
@@ -250,8 +315,9 @@ def read_experiment(path: str | Path) -> Experiment:
         background=particles.background,
     )
     for camera in experiment.cameras:
-        nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)
-        nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.nominal_angle_deg)
+        if camera.orientation is not None:
+            nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
+            nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
     return replace(experiment, solid=solid_voxels(path, table.volume, grid))
 
@@ -298,6 +364,14 @@ def _check_particle_pattern(path: Path, particles: Particles, cameras: Sequence[
     else:
         fields |= {"pair": range(particles.count), "frame": particles.frames}
     check_pattern(path, "particles.images", particles.images, fields)
+
+
+def _require_orientation(path: Path, camera: CameraTable) -> None:
+    if camera.orientation is None:
+        raise InputError(
+            f"{path}: camera {camera.name!r}: expected nominal_angle_deg, its angle about y, or nominal_direction, a "
+            "vector from the origin towards it, found neither. Add one."
+        )
 
 
 def _check_background(path: Path, camera: CameraTable, particles: Particles) -> None:
@@ -368,25 +442,26 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
         if (image := getattr(table, name)) is not None:
             check_length(path, f"{key}, {name}", image)
     white_path = path.parent / table.white_image
-    shape = _white_shape(white_path, f"white_image of camera {table.name!r}")
+    shape = _white_shape(white_path, f"white_image of camera {table.name!r}", table.raw)
     optics = table.optics_of(shape)
     nominal_checks.require_microimages(path, table.name, optics)
     return CameraSetup(
         name=table.name,
         optics=optics,
-        nominal_angle_deg=table.nominal_angle_deg,
+        orientation=table.orientation,
         image_flip=table.image_flip,
         white_path=white_path,
         dark_path=None if table.dark_image is None else path.parent / table.dark_image,
         background=table.background_image,
+        raw=table.raw,
     )
 
 
-def _white_shape(path: Path, label: str) -> tuple[int, int]:
-    header = images.read_header(path, label)
+def _white_shape(path: Path, label: str, raw: RawImages | None) -> tuple[int, int]:
+    header = images.read_header(path, label, raw)
     if header is not None:
         return header.shape
-    rows, columns = images.read_image(path, label).shape
+    rows, columns = images.read_image(path, label, raw=raw).shape
     return rows, columns
 
 
@@ -418,7 +493,7 @@ def _check_calibration_images(experiment: Experiment) -> None:
 
 def _read(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
     """Read an image of a camera and reverse its mirroring; refuse another shape than the white image's."""
-    image = images.read_image(path, label, flip=camera.image_flip)
+    image = images.read_image(path, label, flip=camera.image_flip, raw=camera.raw)
     _require_shape(image.shape, path, label, camera)
     return image
 
@@ -428,7 +503,7 @@ def _check_shape(path: Path, label: str, camera: CameraSetup) -> None:
 
     A DaVis image must exist; its content is checked when it is decoded.
     """
-    header = images.read_header(path, label)
+    header = images.read_header(path, label, camera.raw)
     if header is not None:
         _require_shape(header.shape, path, label, camera)
 

@@ -15,6 +15,7 @@ from lfpiv.experiment import bounds
 from lfpiv.experiment.settings import Board
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 
 ANGLE_ERROR_DEG = 10.0
 """Largest error of a nominal angle that a calibration tolerates [degree]."""
@@ -37,7 +38,7 @@ def field_mm(optics: Optics) -> np.ndarray:
     return np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / abs(optics.magnification)
 
 
-def require_volume(path: Path, grid: Grid, name: str, optics: Optics, angle_deg: float) -> None:
+def require_volume(path: Path, grid: Grid, name: str, optics: Optics, orientation: Orientation) -> None:
     """Refuse a volume that a nominal camera certainly does not see.
 
     Raises
@@ -46,10 +47,8 @@ def require_volume(path: Path, grid: Grid, name: str, optics: Optics, angle_deg:
         If the volume lies behind the camera's main lens, or several fields of view away from the field.
     """
     low, high = (np.array([grid.axis_mm(axis)[end] for axis in (2, 1, 0)]) for end in (0, -1))
-    alpha = np.radians(angle_deg)
-    turn = np.array([[np.cos(alpha), 0, -np.sin(alpha)], [0, 1, 0], [np.sin(alpha), 0, np.cos(alpha)]])
     centre = (low + high) / 2
-    x, y, depth = turn @ centre
+    x, y, depth = orientation.rotation @ centre
     if depth >= optics.object_distance_mm:
         raise InputError(
             f"{path}: volume.centre_mm: expected a volume in front of camera {name!r}, whose main lens is "
@@ -70,7 +69,7 @@ def require_volume(path: Path, grid: Grid, name: str, optics: Optics, angle_deg:
         )
 
 
-def require_board(path: Path, board: Board, name: str, optics: Optics, angle_deg: float) -> None:
+def require_board(path: Path, board: Board, name: str, optics: Optics, orientation: Orientation) -> None:
     """Refuse a board whose dots a nominal camera certainly cannot resolve, or that is far larger than its field.
 
     Raises
@@ -85,16 +84,18 @@ def require_board(path: Path, board: Board, name: str, optics: Optics, angle_deg
             f"{path}: board.spacing_mm: expected dots at least one microlens apart, {lens_mm:g} mm on the board for "
             f"camera {name!r}, found {board.spacing_mm:g} mm. Use a coarser board, or check the unit."
         )
-    depth = max(board.planes_mm, key=lambda z: z * np.cos(np.radians(angle_deg)))
-    if depth * np.cos(np.radians(angle_deg)) >= optics.object_distance_mm:
+    towards = float(orientation.rotation[2, 2])
+    depth = max(board.planes_mm, key=lambda z: z * towards)
+    if depth * towards >= optics.object_distance_mm:
         raise InputError(
             f"{path}: board.planes_mm: expected planes in front of camera {name!r}, whose main lens is "
             f"{optics.object_distance_mm:g} mm from the origin, found one at z = {depth:g} mm, behind the lens. Depths "
             "are millimetres from where the cameras' axes meet."
         )
-    cosine = max(abs(np.cos(np.radians(angle_deg))), STEEPEST_COSINE)
+    across, cosines, along = np.linalg.svd(orientation.rotation[:2, :2])  # of the board's axes to the picture's
+    widened = np.abs(along.T @ np.diag(1 / np.maximum(cosines, STEEPEST_COSINE)) @ across.T)
     deepest = max(abs(depth) for depth in board.planes_mm)
-    seen = field_mm(optics) / [cosine, 1] + 2 * deepest * np.array([1 / cosine, 1])
+    seen = widened @ (field_mm(optics) + 2 * deepest)
     size = (np.array(board.dots) - 1) * board.spacing_mm
     if (size > LARGEST_BOARD * seen).any():
         wide, tall = (max(2, int(length / board.spacing_mm)) for length in field_mm(optics))

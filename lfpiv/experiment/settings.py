@@ -32,6 +32,7 @@ from lfpiv.experiment.bounds import (
     Thickness,
 )
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 
 SMALLEST_WINDOW = 4
 """Smallest edge of an interrogation window that holds a correlation peak [voxel]."""
@@ -169,11 +170,31 @@ class NominalCamera(Table):
     """Pixel pitch of the sensor [um]."""
     microlens_layout: Literal["square", "hexagonal"] = "square"
     """Arrangement of the microlenses."""
-    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)]
+    nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)] | None = None
     """Angle of the camera about y, correct to about 10. It numbers the board's dots and never enters the mapping
-    [degree]."""
+    [degree]. Alternative to `nominal_direction`."""
+    nominal_direction: Direction | None = None
+    """Vector (x, y, z) from the origin towards the camera, of any length, correct to about 10 degrees. Rows of the
+    picture are normal to the world's y axis; a camera straight above or below has x along its rows."""
+    nominal_roll_deg: Annotated[float, Field(strict=True, ge=-180, le=180)] = 0.0
+    """Rotation of the camera about its viewing axis, clockwise as seen from behind the camera [degree]."""
     image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirroring of the camera's images."""
+
+    @model_validator(mode="after")
+    def _one_orientation(self) -> NominalCamera:
+        if self.nominal_angle_deg is not None and self.nominal_direction is not None:
+            raise ValueError("either nominal_angle_deg or nominal_direction")
+        return self
+
+    @property
+    def orientation(self) -> Orientation | None:
+        """Nominal orientation, or None where none is stated."""
+        if self.nominal_direction is not None:
+            return Orientation.from_direction(self.nominal_direction, self.nominal_roll_deg)
+        if self.nominal_angle_deg is not None:
+            return Orientation(self.nominal_angle_deg, 0.0, self.nominal_roll_deg)
+        return None
 
     def optics_of(self, sensor_shape: tuple[int, int]) -> Optics:
         """Return the nominal optics with a sensor of (rows, columns) pixels."""
@@ -189,6 +210,24 @@ class NominalCamera(Table):
         )
 
 
+Pixels = Annotated[int, Field(strict=True, ge=1, le=100_000)]
+
+
+class RawImages(Table):
+    """Table ``[camera.raw]``: layout of the camera's files without a header, ``.raw`` and ``.bin``."""
+
+    shape: tuple[Pixels, Pixels]
+    """Number of rows and columns of an image [pixel]."""
+    dtype: Literal["uint8", "uint16", "uint32", "int16", "int32", "float32", "float64"]
+    """Type of a stored pixel."""
+    byte_order: Literal["little", "big"] = "little"
+    """Order of the bytes of a pixel, least first or last."""
+    header_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**62)] = 0
+    """Length of the file's header [byte]."""
+    frame_header_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
+    """Length of what stands before the pixels of each image [byte]."""
+
+
 class CameraTable(NominalCamera):
     """Table ``[[camera]]``: nominal optics and calibration images of one camera."""
 
@@ -199,6 +238,8 @@ class CameraTable(NominalCamera):
     background_image: PathText | None = None
     """Path, optionally with ``{frame}``, of an image of the scene lit by the laser, without particles; absent: the
     series of image pairs shows what stands still."""
+    raw: RawImages | None = None
+    """Layout of the camera's files without a header; absent: it has none."""
 
 
 Dots = Annotated[int, Field(strict=True, ge=2, le=bounds.MOST_DOTS_ACROSS)]

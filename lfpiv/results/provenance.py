@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from lfpiv import files, warn
-from lfpiv.experiment.davis import split_frame
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment import images
+from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.version import __version__
 from lfpiv.warn import Warning
@@ -90,7 +91,8 @@ class Stamp:
 class PairStamps:
     """Stamps of the results of one pair."""
 
-    volumes: Stamp
+    volumes: tuple[Stamp, Stamp]
+    """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
     vectors: Stamp
 
 
@@ -123,10 +125,19 @@ def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
     return warn.from_text(attributes.get("warnings", attributes.get("findings", "[]")))
 
 
+def _orientation(camera: CameraSetup) -> float | list[float] | None:
+    """Return the nominal angle about y [degree], yaw, pitch and roll if there is more to state, None if nothing is."""
+    stated = camera.orientation
+    if stated is None or not (stated.pitch_deg or stated.roll_deg):
+        return None if stated is None else stated.yaw_deg
+    return [stated.yaw_deg, stated.pitch_deg, stated.roll_deg]
+
+
 def of_calibration(experiment: Experiment) -> Stamp:
     """Return the stamp of the calibration."""
     cameras = {
-        camera.name: [dataclasses.asdict(camera.optics), camera.nominal_angle_deg, camera.image_flip]
+        camera.name: [dataclasses.asdict(camera.optics), _orientation(camera), camera.image_flip]
+        + ([camera.raw.model_dump()] if camera.raw else [])
         for camera in experiment.cameras
     }
     return Stamp(
@@ -135,7 +146,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
             "camera": cameras,
             "board": experiment.board.model_dump(),
             "network": experiment.network.model_dump(),
-            "images": content_hash(experiment.calibration_paths()),
+            "images": content_hash(experiment.calibration_images()),
         }
     )
 
@@ -153,11 +164,9 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
     """
     recorded = {camera.name: camera.background for camera in experiment.cameras}
     paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    frames = experiment.frames if experiment.series is None else experiment.frames[:1]
     images = [
-        path
-        for name in recorded
-        for frame in experiment.frames
-        if (path := experiment.background_path(name, frame)) is not None
+        path for name in recorded for frame in frames if (path := experiment.background_path(name, frame)) is not None
     ]
     return Stamp(
         {
@@ -171,7 +180,7 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
 
 
 def _existing(paths: Iterable[Path]) -> list[Path]:
-    return [path for path in paths if split_frame(path)[0].is_file()]
+    return [path for path in paths if split(path).file.is_file()]
 
 
 def of_self_calibration(experiment: Experiment, calibration: str, background: str | None = None) -> Stamp | None:
@@ -216,9 +225,28 @@ def of_pair(
     `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
     the guard layers of the volumes.
     """
+    parts, start = _of_light(experiment, calibration, background, guard), experiment.path.parent
+    of_pair = parts | {"images": _identity(experiment.pair_paths(pair), start)}
+    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    if experiment.series is None:
+        volumes = Stamp(of_pair)
+        return PairStamps(volumes=(volumes, volumes), vectors=Stamp(of_pair | of_vectors))
+    first, second = (
+        Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
+        for instant in experiment.pair_frames(pair)
+    )
+    of_vectors["step"] = experiment.series.step
+    return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
+
+
+def _of_light(experiment: Experiment, calibration: str, background: str | None, guard: Layers) -> dict[str, Any]:
+    """Return the parts of the stamp of volumes; the identity of the images is None and to be filled in."""
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
-    parts = {
+    particles: dict[str, Any] = {"images": experiment.particle_images}
+    if experiment.series is None:
+        particles["frames"] = list(experiment.frames)
+    return {
         "calibration": calibration,
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
@@ -227,20 +255,10 @@ def of_pair(
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
-        "particles": _recorded(experiment),
-        "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
+        "particles": particles,
+        "images": None,
         "background": background,
     }
-    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
-    return PairStamps(volumes=Stamp(parts), vectors=Stamp(parts | of_vectors))
-
-
-def _recorded(experiment: Experiment) -> dict[str, Any]:
-    """Return the pattern of the particle images, and what tells the two images of a pair apart."""
-    images = {"images": experiment.particle_images}
-    if experiment.series is None:
-        return images | {"frames": list(experiment.frames)}
-    return images | {"step": experiment.series.step}
 
 
 def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
@@ -258,21 +276,24 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
 def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
     """Return path from `start`, size and time of the last change of images; None if one is missing."""
     try:
-        found = [(path, split_frame(path)[0].stat()) for path in paths]
+        found = [(path, split(path).file.stat()) for path in paths]
     except OSError:
         return None
     return [[os.path.relpath(path, start), status.st_size, status.st_mtime_ns] for path, status in found]
 
 
-def content_hash(paths: Iterable[Path]) -> str:
-    """Hash the bytes of several images, in order, and the frame's number if it is named."""
+def content_hash(sources: Iterable[ImagePath]) -> str:
+    """Hash several images, in order: the bytes of whole files, the grey values of parts of files."""
     digest = hashlib.blake2b(digest_size=16)
-    for path in paths:
-        image, frame = split_frame(path)
-        with image.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-        digest.update(b"end of file" + frame.encode())
+    for source in sources:
+        if source.part:
+            grey = images.read_image(source.path, "part of a file", raw=source.raw)
+            digest.update(repr(grey.shape).encode() + grey.tobytes())
+        else:
+            with source.file.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+        digest.update(b"end of file" + source.part.encode())
     return digest.hexdigest()
 
 
