@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import bounds, images, nominal_checks
@@ -84,6 +85,8 @@ class Frame(NamedTuple):
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """An experiment with checked settings and images. Made by `open_experiment`."""
+
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True, extra="forbid")  # workers get it as JSON
 
     path: Path
     name: str
