@@ -4,8 +4,8 @@ import os
 import socket
 import struct
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
@@ -13,7 +13,7 @@ import imagecodecs
 import numpy as np
 import pytest
 import tifffile
-from support.recordings import write_b16, write_cine, write_mraw
+from support.recordings import pack_12, write_b16, write_cine, write_mraw
 
 from lfpiv import InputError
 from lfpiv.experiment import images
@@ -72,6 +72,16 @@ def require_numbered(path, frames, **settings):
 def test_pages_of_a_tiff_are_numbered(tmp_path, frames, options):
     write_stack(tmp_path / "stack.TIF", frames, **options)
     require_numbered(tmp_path / "stack.TIF", frames)
+
+
+def test_pages_of_packed_12_bits_are_read(tmp_path, frames):
+    packed = np.frombuffer(pack_12(frames[0]), np.uint8).reshape(ROWS, -1)
+    tifffile.imwrite(tmp_path / "one.tif", packed, metadata=None, photometric="minisblack")
+    with tifffile.TiffFile(tmp_path / "one.tif", mode="r+b") as tiff:
+        tags = tiff.pages.first.tags
+        tags["ImageWidth"].overwrite(COLUMNS)
+        tags["BitsPerSample"].overwrite(12)
+    np.testing.assert_array_equal(read(tmp_path / "one.tif"), frames[0])
 
 
 def test_images_behind_the_only_directory_of_a_stack_of_imagej_are_numbered(tmp_path, frames):
@@ -195,17 +205,19 @@ def test_hdf5_files_with_several_datasets_of_images_need_a_name(tmp_path, frames
     refuse(tmp_path / "run.h5", "#1", r"2 datasets of images \(left, right\); name one behind the file")
     with h5py.File(tmp_path / "none.h5", "w") as file:
         file["times"] = [1.0]
-    refuse(tmp_path / "none.h5", "#1", "no dataset of images")
+    refuse(tmp_path / "none.h5", "#1", "no datasets of images")
 
 
 def test_hdf5_pixels_of_other_files_are_refused(tmp_path, frames):
     """Neither links nor storage leave the file, and sizes beyond what is stored are not believed."""
     frames.tofile(tmp_path / "elsewhere.bin")
+    os.mkfifo(tmp_path / "pipe.h5")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["images"] = frames
     with h5py.File(tmp_path / "run.h5", "w") as file:
         file["link"] = h5py.ExternalLink("other.h5", "images")
         file["detour"] = h5py.SoftLink("/link")
+        file["pipe"] = h5py.ExternalLink("pipe.h5", "images")
         file["turn"], file["round"] = h5py.SoftLink("/round"), h5py.SoftLink("/turn")
         file["dangling"] = h5py.SoftLink("/nowhere")
         outside = [(tmp_path / "elsewhere.bin", 0, frames.nbytes)]
@@ -221,6 +233,7 @@ def test_hdf5_pixels_of_other_files_are_refused(tmp_path, frames):
     for name, words in {
         "link": "a link into another file",
         "detour": "a link into another file",
+        "pipe": "a link into another file",
         "turn": "links on the way",
         "dangling": "no dataset",
         "outside": "pixels are in another file",
@@ -341,19 +354,13 @@ def test_threads_read_from_one_file(tmp_path, frames, suffix):
         with h5py.File(path, "w") as file:
             file["images"] = many
     settled(path)
-    wrong = []
 
     def work(seed):
-        for number in np.random.default_rng(seed).permutation(len(many)):
-            if not np.array_equal(read(path, f"#{number}"), many[number]):
-                wrong.append(number)
+        numbers = np.random.default_rng(seed).permutation(len(many))
+        return sum(np.array_equal(read(path, f"#{number}"), many[number]) for number in numbers)
 
-    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(timeout=60)
-    assert not wrong and not any(thread.is_alive() for thread in threads)
+    with ThreadPoolExecutor(6) as threads:
+        assert list(threads.map(work, range(6))) == [len(many)] * 6
 
 
 def test_a_mark_counts_only_behind_the_suffix_of_an_image(tmp_path):

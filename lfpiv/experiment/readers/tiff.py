@@ -109,7 +109,7 @@ class TiffStack(Stack):
         """Return the number of images behind the only page, as ImageJ's description of it says."""
         page = self._page(0)
         images = re.search(r"^images=(\d{1,12})$", page.description, re.MULTILINE)
-        if not page.description.startswith("ImageJ=") or images is None or page.compression != 1:
+        if not page.description.startswith("ImageJ=") or images is None or not page.is_contiguous:
             return 0
         return max(int(images[1]) - 1, 0)
 
@@ -130,9 +130,9 @@ class TiffStack(Stack):
         if end == 0 or end > self._size:
             raise ValueError(f"pixel data end at byte {end}, the file at byte {self._size}")
         rows, columns = page.shape
-        stored, pixels = sum(page.databytecounts), rows * columns * page.dtype.itemsize
+        stored, strips = sum(page.databytecounts), len(page.databytecounts)
         require_plausible((rows, columns), page.dtype.itemsize, stored)
-        strips = len(page.databytecounts)
+        pixels = rows * ((columns * page.bitspersample + 7) // 8)  # rows begin at whole bytes
         if page.compression == 1 and not page.is_tiled and not pixels <= stored <= pixels + STRIP_FILL * strips:
             raise ValueError(f"{stored} bytes of pixels where its directory declares {rows} x {columns} {page.dtype}")
         return Header((int(rows), int(columns)), str(page.dtype))
