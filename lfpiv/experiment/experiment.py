@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import bounds, images, nominal_checks
@@ -84,6 +85,8 @@ class Frame(NamedTuple):
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """An experiment with checked settings and images. Made by `open_experiment`."""
+
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True, extra="forbid")  # workers get it as JSON
 
     path: Path
     name: str
@@ -280,7 +283,8 @@ def read_experiment(path: str | Path) -> Experiment:
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
     for one in table.camera:
-        _require_orientation(path, one)
+        if not table.board.mark:
+            _require_orientation(path, one)
     board, particles = table.board, table.particles
     check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
     _check_particle_pattern(path, particles, names)
@@ -370,7 +374,7 @@ def _require_orientation(path: Path, camera: CameraTable) -> None:
     if camera.orientation is None:
         raise InputError(
             f"{path}: camera {camera.name!r}: expected nominal_angle_deg, its angle about y, or nominal_direction, a "
-            "vector from the origin towards it, found neither. Add one."
+            "vector from the origin towards it, found neither. Add one, or use a board with a mark (board.mark)."
         )
 
 
