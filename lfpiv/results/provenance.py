@@ -23,7 +23,7 @@ import numpy as np
 from lfpiv import files, hdf5, warn
 from lfpiv.errors import DamagedFile
 from lfpiv.experiment import images
-from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
 from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.records import RecordError, read_json, read_object, validate

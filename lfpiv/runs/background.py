@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 LARGE_SHARE = 0.02
 """Share of an image's light that stands still and is not subtracted, above which a warning is due."""
 LONGEST_SERIES = 32
-"""Largest number of pairs, evenly spread, from which the standing light is estimated."""
+"""Largest number of pairs, evenly spread, from which the standing light is estimated; of instants twice as many."""
 MEDIAN_PAIRS = 7
 """The same for a median, which holds both frames of all pairs in memory."""
 WARNING_PAIRS = 4
