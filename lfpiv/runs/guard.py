@@ -8,9 +8,8 @@ volume. `decide` measures once per output folder how far light reaches beyond ea
 from __future__ import annotations
 
 import logging
-import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -38,8 +37,6 @@ log = logging.getLogger(__name__)
 
 PAIRS, TRIED = 3, 9
 """Largest number of pairs that the measurement uses, and that it tries."""
-SAME = 20
-"""Steps of a series within which particles are taken to stay in the volume and near their places."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +131,7 @@ def decide(
             return known
     start = time.perf_counter()
     instants = dict(_instants(experiment, calibration))
-    faces = light_beyond(calibration, experiment.grid, _groups(experiment, instants)) if instants else ()
+    faces = light_beyond(calibration, experiment.grid, list(instants.values())) if instants else ()
     demanded = _demanded(experiment, faces)
     allowed = _fitting(experiment, demanded)
     guard = Guard(pairs=tuple(instants), faces=faces, layers=allowed, short=allowed != demanded)
@@ -185,21 +182,6 @@ def _instants(
         used += 1
         if used == PAIRS:
             return
-
-
-def _groups(
-    experiment: Experiment, instants: Mapping[int, Sequence[dict[str, np.ndarray]]]
-) -> list[list[dict[str, np.ndarray]]]:
-    """Return the images in groups that show the same particles: of a pair, or of `SAME` steps of a series."""
-    groups, last = list[list[dict[str, np.ndarray]]](), -math.inf
-    for pair, images in sorted(instants.items()):
-        near = experiment.series is not None and pair - last < SAME * experiment.series.step
-        if near:
-            groups[-1] += images
-        else:
-            groups.append(list(images))
-        last = pair
-    return groups
 
 
 def _demanded(experiment: Experiment, faces: Sequence[FaceLight]) -> Layers:
