@@ -151,8 +151,8 @@ SENTENCES: Mapping[Code, str] = {
         "it. Check that place in board.planes_mm, and the stage."
     ),
     Code.TURNED: (
-        "the board's dots show the camera {turn_deg:.0f} degrees away from nominal_angle_deg = {nominal_deg:g}. Are "
-        "its pictures turned by 90 degrees? Then x and y are exchanged."
+        "the board's dots show the camera turned by {turn_deg:.0f} degrees from where it is stated to be, {nominal}. "
+        "Are its pictures turned by 90 degrees? Then x and y are exchanged; otherwise check its nominal orientation."
     ),
     Code.MAGNIFIED: (
         "the board's dots are magnified {magnification:.3f} times, not {stated:g} times as stated. Check "
@@ -251,23 +251,30 @@ class Warning:
     """Numbers and names that the sentence shows."""
     pairs: tuple[int, ...] = ()
     """Numbers of the pairs it concerns; empty where it concerns no pair in particular."""
+    instants: tuple[int, ...] = ()
+    """Numbers of the instants of a series that it concerns, in place of pairs."""
 
     @property
     def sentence(self) -> str:
         """Sentence for people: subject, pairs and text."""
-        heads = [part for part in (self.subject, name_pairs(self.pairs)) if part]
+        heads = [part for part in (self.subject, name_pairs(self.pairs), name_pairs(self.instants, "instant")) if part]
         text = _Words().vformat(SENTENCES[self.code], (), self.figures)
         return f"{', '.join(heads)}: {text}" if heads else text
 
     def of_pair(self, pair: int) -> Warning:
-        """Return the same warning about one pair."""
-        return replace(self, pairs=(pair,))
+        """Return the same warning about one pair; one about instants stays as it is."""
+        return self if self.instants else replace(self, pairs=(pair,))
+
+    def by_instant(self) -> Warning:
+        """Return the same warning with its pairs named by their first instants, for a series."""
+        return replace(self, pairs=(), instants=self.pairs) if self.pairs else self
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that a file stores."""
         figures = {name: asdict(value) if isinstance(value, Span) else value for name, value in self.figures.items()}
         stored = {"code": self.code.value, "subject": self.subject, "figures": figures}
-        return stored | {"pairs": list(self.pairs)} if self.pairs else stored
+        numbers = {"pairs": list(self.pairs), "instants": list(self.instants)}
+        return stored | {name: found for name, found in numbers.items() if found}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
@@ -283,12 +290,13 @@ class Warning:
         if isinstance(stored, Mapping) and "what" in stored:
             return _of_finding(records.validate(_Finding, stored))
         found = records.validate(_Stored, stored)
+        numbers = {"pairs": found.pairs, "instants": found.instants}
         if found.code not in {known.value for known in Code}:
             values = ", ".join(f"{name} = {value}" for name, value in found.figures.items())
             text = f"{found.code} ({values})" if values else found.code
-            return cls(code=Code.OTHER, subject=found.subject, figures={"text": text}, pairs=found.pairs)
+            return cls(code=Code.OTHER, subject=found.subject, figures={"text": text}, **numbers)
         figures = {name: math.nan if value is None else value for name, value in found.figures.items()}
-        warning = cls(code=Code(found.code), subject=found.subject, figures=figures, pairs=found.pairs)
+        warning = cls(code=Code(found.code), subject=found.subject, figures=figures, **numbers)
         try:
             _ = warning.sentence
         except (KeyError, ValueError, TypeError, IndexError, AttributeError) as error:
@@ -312,6 +320,7 @@ class _Stored:
     subject: str
     figures: Mapping[str, Span | int | float | str | bool | Sequence[int | float | str] | None]
     pairs: tuple[int, ...] = ()
+    instants: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -393,16 +402,17 @@ def _merged(group: Sequence[Warning]) -> Warning:
         numbers = [number for number in values if isinstance(number, (int, float))]
         figures[name] = Span(min(numbers), max(numbers)) if len(numbers) == len(group) > 1 else value
     pairs = dict.fromkeys(pair for warning in group for pair in warning.pairs)
-    return replace(first, figures=figures, pairs=tuple(pairs))
+    instants = sorted({instant for warning in group for instant in warning.instants})
+    return replace(first, figures=figures, pairs=tuple(pairs), instants=tuple(instants))
 
 
-def name_pairs(pairs: Sequence[int]) -> str:
-    """Name the first pairs and count the others; empty for none."""
+def name_pairs(pairs: Sequence[int], noun: str = "pair") -> str:
+    """Name the first pairs, or what else the noun says, and count the others; empty for none."""
     if not pairs:
         return ""
     names = ", ".join(map(str, pairs[:NAMED_PAIRS]))
     more = f" and {len(pairs) - NAMED_PAIRS} more" if len(pairs) > NAMED_PAIRS else ""
-    return f"pair{'s' if len(pairs) > 1 else ''} {names}{more}"
+    return f"{noun}{'s' if len(pairs) > 1 else ''} {names}{more}"
 
 
 _collected: ContextVar[list[Warning] | None] = ContextVar("collected", default=None)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import bounds, images, nominal_checks
@@ -35,6 +36,7 @@ from lfpiv.experiment.settings import (
 from lfpiv.experiment.toml import read_toml
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 
 DECODED_PIXELS = 100_000_000
 """Largest number of pixels of particle images that are decoded before the work starts [pixel]."""
@@ -53,8 +55,9 @@ class CameraSetup:
     name: str
     optics: Optics
     """Nominal optics; ``sensor_shape`` is that of the white image."""
-    nominal_angle_deg: float
-    """Angle about y [degree]; it numbers the board's dots and enters the thin-lens mapping, never the network."""
+    orientation: Orientation | None
+    """Nominal orientation; it numbers the board's dots and enters the thin-lens mapping, never the network. None where
+    the board's mark does."""
     image_flip: str
     """Mirroring of the camera's images, reversed on reading."""
     white_path: Path
@@ -64,10 +67,26 @@ class CameraSetup:
     raw: RawImages | None = None
     """Layout of the camera's files without a header, or None."""
 
+    @property
+    def nominal_angle_deg(self) -> float | None:
+        """Nominal angle about y [degree], None where no orientation is stated."""
+        return None if self.orientation is None else self.orientation.yaw_deg
+
+
+class Frame(NamedTuple):
+    """One exposure of all cameras: a frame of a pair, or an instant of a series."""
+
+    number: int
+    """Number of the pair, or of the instant."""
+    name: str
+    """Name of the frame in its pair; an instant of a series has that of the first frame."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """An experiment with checked settings and images. Made by `open_experiment`."""
+
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True, extra="forbid")  # workers get it as JSON
 
     path: Path
     name: str
@@ -106,6 +125,36 @@ class Experiment:
         """Return the number of the instant of a series at which a frame of a pair was recorded."""
         assert self.series is not None
         return pair + self.series.step * self.frames.index(frame)
+
+    def pair_frames(self, pair: int) -> tuple[Frame, Frame]:
+        """Return both frames of a pair. An instant of a series is the same frame in both its pairs."""
+        first, second = self.frames
+        if self.series is None:
+            return Frame(pair, first), Frame(pair, second)
+        return Frame(pair, first), Frame(pair + self.series.step, first)
+
+    def instant_s(self, instant: int) -> float:
+        """Return the time of an instant of a series after the first one [s]."""
+        assert self.series is not None
+        return (instant - self.series.first) * self.dt_s / self.series.step
+
+    def name_of(self, pair: int) -> str:
+        """Return "pair" or, in a series, "instant" with the number, for messages."""
+        return f"{self.noun} {pair}"
+
+    @property
+    def noun(self) -> str:
+        """What results are numbered by: "pair" or "instant"."""
+        return "pair" if self.series is None else "instant"
+
+    def disjoint(self, pairs: Iterable[int]) -> Iterator[int]:
+        """Yield the pairs that share no image with one yielded before."""
+        seen = set[Frame]()
+        for pair in pairs:
+            frames = self.pair_frames(pair)
+            if seen.isdisjoint(frames):
+                seen.update(frames)
+                yield pair
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
@@ -180,13 +229,21 @@ class Experiment:
         return self.spread_pairs(self.self_calibration.pairs)
 
     def spread_pairs(self, count: int) -> list[int]:
-        """Return `count` pairs, evenly spread over all, or all pairs if there are no more."""
+        """Return `count` pairs, evenly spread over all, or all if there are no more; none shares an image with another.
+
+        Pairs of a short series overlap. Then these are fewer.
+        """
         count = min(count, self.pairs)
-        return [self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count)]
+        spread = (self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count))
+        return list(self.disjoint(spread))
 
     def pair_paths(self, pair: int) -> list[Path]:
         """Return the paths of all images of one pair, in a fixed order."""
-        return [self.particle_path(camera.name, pair, frame) for frame in self.frames for camera in self.cameras]
+        return [path for frame in self.pair_frames(pair) for path in self.frame_paths(frame)]
+
+    def frame_paths(self, frame: Frame) -> list[Path]:
+        """Return the paths of the images of one frame, in the order of the cameras."""
+        return [self.particle_path(camera.name, *frame) for camera in self.cameras]
 
 
 def open_experiment(path: str | Path) -> Experiment:
@@ -225,6 +282,9 @@ def read_experiment(path: str | Path) -> Experiment:
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
+    for one in table.camera:
+        if not table.board.mark:
+            _require_orientation(path, one)
     board, particles = table.board, table.particles
     check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
     _check_particle_pattern(path, particles, names)
@@ -259,8 +319,9 @@ def read_experiment(path: str | Path) -> Experiment:
         background=particles.background,
     )
     for camera in experiment.cameras:
-        nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.nominal_angle_deg)
-        nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.nominal_angle_deg)
+        if camera.orientation is not None:
+            nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
+            nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
     return replace(experiment, solid=solid_voxels(path, table.volume, grid))
 
@@ -309,10 +370,23 @@ def _check_particle_pattern(path: Path, particles: Particles, cameras: Sequence[
     check_pattern(path, "particles.images", particles.images, fields)
 
 
+def _require_orientation(path: Path, camera: CameraTable) -> None:
+    if camera.orientation is None:
+        raise InputError(
+            f"{path}: camera {camera.name!r}: expected nominal_angle_deg, its angle about y, or nominal_direction, a "
+            "vector from the origin towards it, found neither. Add one, or use a board with a mark (board.mark)."
+        )
+
+
 def _check_background(path: Path, camera: CameraTable, particles: Particles) -> None:
     """Refuse a pattern with unknown fields, and an image that `particles.background` would not use."""
     key = f"camera {camera.name!r}, background_image"
     assert camera.background_image is not None
+    if particles.series is not None and "{frame" in camera.background_image:
+        raise InputError(
+            f"{path}: {key}: expected no {{frame}}, because one laser lights all instants of a time series, found "
+            f"{camera.background_image!r}."
+        )
     check_pattern(path, key, camera.background_image, {"frame": particles.frames[:1]})
     if particles.background in ("minimum", "median"):
         raise InputError(
@@ -383,7 +457,7 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
     return CameraSetup(
         name=table.name,
         optics=optics,
-        nominal_angle_deg=table.nominal_angle_deg,
+        orientation=table.orientation,
         image_flip=table.image_flip,
         white_path=white_path,
         dark_path=None if table.dark_image is None else path.parent / table.dark_image,

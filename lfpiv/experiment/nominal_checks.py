@@ -15,6 +15,7 @@ from lfpiv.experiment import bounds
 from lfpiv.experiment.settings import Board
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 
 ANGLE_ERROR_DEG = 10.0
 """Largest error of a nominal angle that a calibration tolerates [degree]."""
@@ -28,8 +29,13 @@ FEWEST_LENSES = 3
 """Least number of microlenses along each axis of a sensor; fewer are a wrong pitch or pixel size."""
 LARGEST_BOARD = 4.0
 """Largest size of a board, along x or y, relative to the part that a camera may see."""
+FEWEST_LENSES_APART = 0.5
+"""Least distance of dots as an oblique camera sees them [microlens]. Two are needed; this little is never enough."""
+
 STEEPEST_COSINE = 0.17
-"""Cosine of the steepest angle at which a camera may see a board, 80 degrees."""
+"""Cosine of the steepest angle at which a camera sees a board well, 80 degrees."""
+ALONG_COSINE = 0.087
+"""Cosine of the angle above which a camera looks along a board, 85 degrees."""
 
 
 def field_mm(optics: Optics) -> np.ndarray:
@@ -37,7 +43,7 @@ def field_mm(optics: Optics) -> np.ndarray:
     return np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / abs(optics.magnification)
 
 
-def require_volume(path: Path, grid: Grid, name: str, optics: Optics, angle_deg: float) -> None:
+def require_volume(path: Path, grid: Grid, name: str, optics: Optics, orientation: Orientation) -> None:
     """Refuse a volume that a nominal camera certainly does not see.
 
     Raises
@@ -46,10 +52,8 @@ def require_volume(path: Path, grid: Grid, name: str, optics: Optics, angle_deg:
         If the volume lies behind the camera's main lens, or several fields of view away from the field.
     """
     low, high = (np.array([grid.axis_mm(axis)[end] for axis in (2, 1, 0)]) for end in (0, -1))
-    alpha = np.radians(angle_deg)
-    turn = np.array([[np.cos(alpha), 0, -np.sin(alpha)], [0, 1, 0], [np.sin(alpha), 0, np.cos(alpha)]])
     centre = (low + high) / 2
-    x, y, depth = turn @ centre
+    x, y, depth = orientation.rotation @ centre
     if depth >= optics.object_distance_mm:
         raise InputError(
             f"{path}: volume.centre_mm: expected a volume in front of camera {name!r}, whose main lens is "
@@ -70,14 +74,15 @@ def require_volume(path: Path, grid: Grid, name: str, optics: Optics, angle_deg:
         )
 
 
-def require_board(path: Path, board: Board, name: str, optics: Optics, angle_deg: float) -> None:
+def require_board(path: Path, board: Board, name: str, optics: Optics, orientation: Orientation) -> None:
     """Refuse a board whose dots a nominal camera certainly cannot resolve, or that is far larger than its field.
 
     Raises
     ------
     InputError
-        If the dots are less than a microlens apart, the board is more than `LARGEST_BOARD` times as large as the part
-        of it that the camera may see, a plane is behind the lens, or there are more than `bounds.MOST_DOTS` dots.
+        If the camera looks along the board's planes, the dots cannot be told apart as it sees them, the board is more
+        than `LARGEST_BOARD` times as large as the part of it that the camera may see, a plane is behind the lens, or
+        there are more than `bounds.MOST_DOTS` dots.
     """
     lens_mm = optics.microlens_pitch_mm / abs(optics.magnification)
     if board.spacing_mm < lens_mm * (1 - 1e-9):
@@ -85,16 +90,32 @@ def require_board(path: Path, board: Board, name: str, optics: Optics, angle_deg
             f"{path}: board.spacing_mm: expected dots at least one microlens apart, {lens_mm:g} mm on the board for "
             f"camera {name!r}, found {board.spacing_mm:g} mm. Use a coarser board, or check the unit."
         )
-    depth = max(board.planes_mm, key=lambda z: z * np.cos(np.radians(angle_deg)))
-    if depth * np.cos(np.radians(angle_deg)) >= optics.object_distance_mm:
+    towards = float(orientation.rotation[2, 2])
+    depth = max(board.planes_mm, key=lambda z: z * towards)
+    if depth * towards >= optics.object_distance_mm:
         raise InputError(
             f"{path}: board.planes_mm: expected planes in front of camera {name!r}, whose main lens is "
             f"{optics.object_distance_mm:g} mm from the origin, found one at z = {depth:g} mm, behind the lens. Depths "
             "are millimetres from where the cameras' axes meet."
         )
-    cosine = max(abs(np.cos(np.radians(angle_deg))), STEEPEST_COSINE)
+    oblique = abs(float(orientation.rotation[2, 2]))
+    if oblique < ALONG_COSINE:
+        raise InputError(
+            f"{path}: camera {name!r}: expected a camera that sees the board's planes at no more than "
+            f"{np.degrees(np.arccos(STEEPEST_COSINE)):.0f} degrees from their normal, the z axis, found one "
+            f"{orientation}, at {np.degrees(np.arccos(oblique)):.0f} degrees. Turn the board towards all cameras: z is "
+            "its normal."
+        )
+    if board.spacing_mm * oblique < FEWEST_LENSES_APART * lens_mm:
+        raise InputError(
+            f"{path}: board.spacing_mm: expected dots about two microlenses apart as camera {name!r} sees them, found "
+            f"{board.spacing_mm * oblique:.3g} mm where a microlens covers {lens_mm:g} mm: it sees the board at "
+            f"{np.degrees(np.arccos(oblique)):.0f} degrees from its normal. Use a coarser board."
+        )
+    across, cosines, along = np.linalg.svd(orientation.rotation[:2, :2])  # of the board's axes to the picture's
+    widened = np.abs(along.T @ np.diag(1 / np.maximum(cosines, STEEPEST_COSINE)) @ across.T)
     deepest = max(abs(depth) for depth in board.planes_mm)
-    seen = field_mm(optics) / [cosine, 1] + 2 * deepest * np.array([1 / cosine, 1])
+    seen = widened @ (field_mm(optics) + 2 * deepest)
     size = (np.array(board.dots) - 1) * board.spacing_mm
     if (size > LARGEST_BOARD * seen).any():
         wide, tall = (max(2, int(length / board.spacing_mm)) for length in field_mm(optics))

@@ -23,7 +23,7 @@ import numpy as np
 from lfpiv import files, hdf5, warn
 from lfpiv.errors import DamagedFile
 from lfpiv.experiment import images
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.records import RecordError, read_json, read_object, validate
@@ -101,7 +101,8 @@ class Stamp:
 class PairStamps:
     """Stamps of the results of one pair."""
 
-    volumes: Stamp
+    volumes: tuple[Stamp, Stamp]
+    """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
     vectors: Stamp
 
 
@@ -228,10 +229,18 @@ def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
     return warn.from_list(read_json(attributes.get("warnings", attributes.get("findings", "[]"))))
 
 
+def _orientation(camera: CameraSetup) -> float | list[float] | None:
+    """Return the nominal angle about y [degree], yaw, pitch and roll if there is more to state, None if nothing is."""
+    stated = camera.orientation
+    if stated is None or not (stated.pitch_deg or stated.roll_deg):
+        return None if stated is None else stated.yaw_deg
+    return [stated.yaw_deg, stated.pitch_deg, stated.roll_deg]
+
+
 def of_calibration(experiment: Experiment) -> Stamp:
     """Return the stamp of the calibration."""
     cameras = {
-        camera.name: [dataclasses.asdict(camera.optics), camera.nominal_angle_deg, camera.image_flip]
+        camera.name: [dataclasses.asdict(camera.optics), _orientation(camera), camera.image_flip]
         + ([camera.raw.model_dump()] if camera.raw else [])
         for camera in experiment.cameras
     }
@@ -239,7 +248,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
         {
             "version": __version__,
             "camera": cameras,
-            "board": experiment.board.model_dump(),
+            "board": experiment.board.model_dump(exclude=None if experiment.board.mark else {"mark"}),
             "network": experiment.network.model_dump(),
             "images": content_hash(experiment.calibration_images()),
         }
@@ -262,7 +271,7 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
     images = [
         path
         for name in recorded
-        for frame in experiment.frames
+        for frame in lit_frames(experiment)
         if (path := experiment.background_path(name, frame)) is not None
     ]
     return Stamp(
@@ -274,6 +283,11 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
             "images": _identity(_existing(paths), experiment.path.parent) if None in recorded.values() else None,
         }
     )
+
+
+def lit_frames(experiment: Experiment) -> tuple[str, ...]:
+    """Return the names of the frames that lasers of their own light; one laser lights all instants of a series."""
+    return experiment.frames if experiment.series is None else experiment.frames[:1]
 
 
 def _existing(paths: Iterable[Path]) -> list[Path]:
@@ -322,9 +336,28 @@ def of_pair(
     `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
     the guard layers of the volumes.
     """
+    parts, start = _of_light(experiment, calibration, background, guard), experiment.path.parent
+    of_pair = parts | {"images": _identity(experiment.pair_paths(pair), start)}
+    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    if experiment.series is None:
+        volumes = Stamp(of_pair)
+        return PairStamps(volumes=(volumes, volumes), vectors=Stamp(of_pair | of_vectors))
+    first, second = (
+        Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
+        for instant in experiment.pair_frames(pair)
+    )
+    of_vectors["step"] = experiment.series.step
+    return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
+
+
+def _of_light(experiment: Experiment, calibration: str, background: str | None, guard: Layers) -> dict[str, Any]:
+    """Return the parts of the stamp of volumes; the identity of the images is None and to be filled in."""
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
-    parts = {
+    particles: dict[str, Any] = {"images": experiment.particle_images}
+    if experiment.series is None:
+        particles["frames"] = list(experiment.frames)
+    return {
         "calibration": calibration,
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
@@ -333,20 +366,10 @@ def of_pair(
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
-        "particles": _recorded(experiment),
-        "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
+        "particles": particles,
+        "images": None,
         "background": background,
     }
-    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
-    return PairStamps(volumes=Stamp(parts), vectors=Stamp(parts | of_vectors))
-
-
-def _recorded(experiment: Experiment) -> dict[str, Any]:
-    """Return the pattern of the particle images, and what tells the two images of a pair apart."""
-    images = {"images": experiment.particle_images}
-    if experiment.series is None:
-        return images | {"frames": list(experiment.frames)}
-    return images | {"step": experiment.series.step}
 
 
 def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:

@@ -188,6 +188,7 @@ def _nominal_cameras(experiment: Experiment) -> Calibration:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.calibration.thin_lens_model import thin_lens_model
     from lfpiv.geometry.optics import LensLattice
+    from lfpiv.geometry.orientation import Orientation
 
     cameras = {}
     for setup in experiment.cameras:
@@ -198,6 +199,6 @@ def _nominal_cameras(experiment: Experiment) -> Calibration:
             optics=setup.optics,
             lattice=LensLattice(origin_mm=(0.0, 0.0), basis_mm=((pitch, 0.0), second), layout=setup.optics.layout),
             decoder=None,  # type: ignore[arg-type]  # made from images
-            baseline=thin_lens_model(setup.optics, setup.nominal_angle_deg),
+            baseline=thin_lens_model(setup.optics, setup.orientation or Orientation(0.0)),
         )
     return Calibration(cameras)

@@ -87,6 +87,13 @@ def _require_cameras(calibration: Calibration, experiment: Experiment, path: Pat
         raise DamagedFile(path, "its cameras are not those of the experiment", "Calibrate again")
 
 
+def with_standing_light(run: Run, calibration: Calibration) -> Calibration:
+    """Return a calibration with the standing light in the folder, if the results of the run depend on one."""
+    if run.background is None:
+        return calibration
+    return background.load(run.folder.background, calibration).seen_by(calibration)
+
+
 def calibrate(run: Run) -> Calibrated:
     """Calibrate the cameras and write the calibration, unless the folder holds one that fits the experiment."""
     from lfpiv.calibration.cameras import calibrate

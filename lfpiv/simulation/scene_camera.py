@@ -12,6 +12,7 @@ from lfpiv.experiment import bounds
 from lfpiv.experiment.bounds import Angle, Coordinate, Direction, Flag, Length, Point, Thickness
 from lfpiv.experiment.settings import NominalCamera, Table
 from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.geometry.orientation import Orientation, camera_rotation
 from lfpiv.simulation.sensor import Sensor
 from lfpiv_kernels.rendering import real_optics
 
@@ -112,7 +113,7 @@ class Moved(Table):
     shift_mm: Point = (0.0, 0.0, 0.0)
     """Shift of the point in focus at the sensor's centre (x, y, z) [mm]."""
     yaw_deg: Angle = 0.0
-    """Increase of the camera's angle about y [degree]."""
+    """Increase of the camera's angle about y, or with `nominal_direction` about its own y axis [degree]."""
     pitch_deg: Angle = 0.0
     """Increase of the rotation about the camera's x axis [degree]."""
     roll_deg: Angle = 0.0
@@ -127,11 +128,12 @@ class SceneCamera(NominalCamera):
     sensor_height_px: Side
     """Rows of the sensor."""
     true_yaw_deg: Angle | None = None
-    """True camera angle about y [degree]; absent: the nominal one."""
+    """True camera angle about y, or with `nominal_direction` the departure from it, about the camera's y axis [degree];
+    absent: as stated."""
     true_pitch_deg: Angle = 0.0
     """Right-handed rotation about the camera's x axis, after the yaw [degree]."""
     true_roll_deg: Angle = 0.0
-    """Right-handed rotation about the camera's z axis, after the pitch [degree]."""
+    """Right-handed rotation about the camera's z axis, after the pitch, beside `nominal_roll_deg` [degree]."""
     true_offset_mm: Point = (0.0, 0.0, 0.0)
     """World point in focus at the sensor's centre (x, y, z) [mm], through the windows if there are any."""
     true_array_roll_deg: Angle = 0.0
@@ -158,6 +160,12 @@ class SceneCamera(NominalCamera):
     """Sensor of this camera; absent: the scene's."""
     moved: Moved | None = None
     """Movement of this camera between board and particles."""
+
+    @model_validator(mode="after")
+    def _is_placed(self) -> SceneCamera:
+        if self.nominal_angle_deg is None and self.nominal_direction is None:
+            raise ValueError("nominal_angle_deg or nominal_direction")
+        return self
 
     @model_validator(mode="after")
     def _windows_face_the_camera(self) -> SceneCamera:
@@ -192,12 +200,11 @@ class SceneCamera(NominalCamera):
         """The camera where it stood when the particles were recorded."""
         if self.moved is None:
             return self
-        yaw = self.nominal_angle_deg if self.true_yaw_deg is None else self.true_yaw_deg
         offset = tuple(a + b for a, b in zip(self.true_offset_mm, self.moved.shift_mm, strict=True))
         return self.model_copy(
             update={
                 "true_offset_mm": offset,
-                "true_yaw_deg": yaw + self.moved.yaw_deg,
+                "true_yaw_deg": self._yaw_deg + self.moved.yaw_deg,
                 "true_pitch_deg": self.true_pitch_deg + self.moved.pitch_deg,
                 "true_roll_deg": self.true_roll_deg + self.moved.roll_deg,
                 "moved": None,
@@ -210,16 +217,20 @@ class SceneCamera(NominalCamera):
         return self.optics_of((self.sensor_height_px, self.sensor_width_px))
 
     @property
+    def _yaw_deg(self) -> float:
+        """True angle about y, or the departure from a nominal direction [degree]."""
+        return (self.nominal_angle_deg or 0.0) if self.true_yaw_deg is None else self.true_yaw_deg
+
+    @property
     def rotation(self) -> np.ndarray:
-        """Rotation from world to camera, Rz Rx Ry with Ry the rotation of Eqs. 1-3, shape (3, 3)."""
-        yaw = self.nominal_angle_deg if self.true_yaw_deg is None else self.true_yaw_deg
-        (cy, sy), (cx, sx), (cz, sz) = (
-            (np.cos(angle), np.sin(angle)) for angle in np.radians([yaw, self.true_pitch_deg, self.true_roll_deg])
-        )
-        about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
-        about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-        about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        rotation: np.ndarray = about_z @ about_x @ about_y
+        """Rotation from world to camera, shape (3, 3).
+
+        It is Rz Rx Ry with Ry the rotation of Eqs. 1-3, after the rotation to the nominal direction if one is stated.
+        """
+        roll = self.nominal_roll_deg + self.true_roll_deg
+        rotation = camera_rotation(*np.radians([self._yaw_deg, self.true_pitch_deg, roll]))
+        if self.nominal_direction is not None:
+            rotation = rotation @ Orientation.from_direction(self.nominal_direction).rotation
         return rotation
 
     @property
