@@ -69,3 +69,17 @@ class ClusterError(RuntimeError):
 
     Results that were finished before are complete. The command line exits with status 1.
     """
+
+
+class DamagedFile(InputError):
+    """A stored result that cannot be relied on; the message names the file and the reason.
+
+    A run makes the result again. What only reads results ends with this error.
+    """
+
+    def __init__(self, path: object, reason: str, remedy: str = "Remove it and run again"):
+        self.path, self.reason, self.remedy = str(path), " ".join(reason.split())[:300], remedy
+        super().__init__(f"{self.path}: expected a finished file, found a damaged one ({self.reason}). {remedy}.")
+
+    def __reduce__(self) -> tuple[type[DamagedFile], tuple[str, str, str]]:
+        return type(self), (self.path, self.reason, self.remedy)

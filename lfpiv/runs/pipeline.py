@@ -169,10 +169,11 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
     Raises
     ------
     InputError
-        If the folder holds no calibration that fits the experiment.
+        If the folder holds no calibration that fits the experiment, or a file in it is damaged.
     """
     with open_run(experiment, out, None, None, writes_results=False) as current:
         calibrated = rig.load_calibration(current)
+        current.require_whole()
         calibrated = replace(calibrated, calibration=rig.with_standing_light(current, calibrated.calibration))
         return current.finish(calibrated, Invocation(), report=True)
 

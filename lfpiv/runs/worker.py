@@ -109,7 +109,7 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
     if task.weights is not None or work.experiment.series is not None:
         calibration = load_calibration(work.folder.calibration)
         if work.background is not None:
-            calibration = background.load(work.folder.background).seen_by(calibration)
+            calibration = background.load(work.folder.background, calibration).seen_by(calibration)
         work = dataclasses.replace(work, cameras=calibration.cameras, darks=read_darks(work.experiment))
     if task.weights is not None:
         work = dataclasses.replace(work, weights=open_weights(shared / WEIGHTS, work.cameras, task.weights))
