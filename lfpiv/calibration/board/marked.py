@@ -33,7 +33,7 @@ from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 
 _FIRST_PLANES = 3  # planes that are searched for a lattice without a nominal orientation
-_LEAST_SHARE = 0.9  # least share of blobs on a lattice, relative to the best candidate; harmonics have less
+_LEAST_FILLED = 0.9  # least filling of a lattice, relative to the best candidate's; a harmonic has half of it
 _CLEAR = 1.1  # least ratio of contrasts that shows on which side of the board the camera is
 _OTHER_SIDE = np.diag([-1.0, 1.0, -1.0])  # the same picture of the plane z = 0, with depth and one axis reversed
 
@@ -101,10 +101,11 @@ def _plan(signals: Signals, decoder: LightFieldDecoder, search: DotBoard) -> tup
         for plan in plans_without_pose(signals, decoder, search, plane):
             start = lattice_of_plane(rectify(signal, plan, search.planes_mm[plane]), search, plan, plane)
             if start.regular and len(start.points_mm) >= FEWEST_DOTS:
-                tried.append((plan, start))
+                sites = in_field(plan, search.points_mm(plane), decoder.optics).sum()
+                tried.append((start.share * len(start.points_mm) / max(sites, 1), start.score, plan))
         if tried:
-            least = _LEAST_SHARE * max(start.share for _, start in tried)
-            return max((one for one in tried if one[1].share >= least), key=lambda one: one[1].score)[0], plane
+            least = _LEAST_FILLED * max(filled for filled, _, _ in tried)
+            return max((one for one in tried if one[0] >= least), key=lambda one: one[1])[2], plane
     raise InputError(
         f"board: expected a lattice of dots {search.spacing_mm:g} mm apart, found none. Check that these are board "
         "images and the board's numbers, or state nominal_direction."
