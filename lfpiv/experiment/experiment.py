@@ -24,6 +24,7 @@ from lfpiv.experiment.settings import (
     Network,
     Particles,
     SelfCalibration,
+    Series,
     Smart,
     Volume,
 )
@@ -65,14 +66,16 @@ class Experiment:
     path: Path
     name: str
     dt_s: float
-    """Time between the two frames of a pair [s]."""
+    """Time between the two frames of a pair, or between instants k and k + step of a series [s]."""
     cameras: tuple[CameraSetup, ...]
     board: Board
     grid: Grid
     guard_mm: float | tuple[float, float, float] | Literal["auto"]
     """Thickness of the guard layers beyond the grid's faces, one number or (x, y, z) [mm], or "auto"."""
     pairs: int
+    """Number of pairs; the last `step` instants of a series are the first of no pair."""
     frames: tuple[str, str]
+    """Names of the two frames of a pair."""
     smart: Smart
     correlation: Correlation
     network: Network
@@ -84,6 +87,19 @@ class Experiment:
     """True for voxels without fluid, shape (z, y, x); None without a mask."""
     background: str = "none"
     """Estimate of the light that stands still: "auto", "none", "minimum" or "median"."""
+    series: Series | None = None
+    """The time series; None for image pairs."""
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of all pairs, in a series those of their first instants."""
+        first = 0 if self.series is None else self.series.first
+        return range(first, first + self.pairs)
+
+    def instant(self, pair: int, frame: str) -> int:
+        """Return the number of the instant of a series at which a frame of a pair was recorded."""
+        assert self.series is not None
+        return pair + self.series.step * self.frames.index(frame)
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
@@ -110,7 +126,7 @@ class Experiment:
 
     def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
         """Return a particle image [counts], float32 (rows, columns); raise InputError if it has no contrast."""
-        label, path = _particle_label(name, pair, frame), self.particle_path(name, pair, frame)
+        label, path = self.particle_label(name, pair, frame), self.particle_path(name, pair, frame)
         image = _read(path, label, self.camera(name))
         images.require_contrast(image, path, label)
         return image
@@ -131,7 +147,16 @@ class Experiment:
 
     def particle_path(self, name: str, pair: int, frame: str) -> Path:
         """Return the path of a particle image."""
-        return self.path.parent / self.particle_images.format(camera=name, pair=pair, frame=frame)
+        if self.series is not None:
+            fields: dict[str, Any] = {"instant": self.instant(pair, frame)}
+        else:
+            fields = {"pair": pair, "frame": frame, "image": 2 * pair + self.frames.index(frame)}
+        return self.path.parent / self.particle_images.format(camera=name, **fields)
+
+    def particle_label(self, name: str, pair: int, frame: str) -> str:
+        """Return key, camera and number of a particle image, for messages."""
+        number = f"pair {pair}, frame {frame!r}" if self.series is None else f"instant {self.instant(pair, frame)}"
+        return f"particles.images, camera {name!r}, {number}"
 
     def calibration_paths(self) -> list[Path]:
         """Return the paths of all images that the calibration reads, in a fixed order."""
@@ -146,7 +171,7 @@ class Experiment:
     def spread_pairs(self, count: int) -> list[int]:
         """Return `count` pairs, evenly spread over all, or all pairs if there are no more."""
         count = min(count, self.pairs)
-        return [(2 * number + 1) * self.pairs // (2 * count) for number in range(count)]
+        return [self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count)]
 
     def pair_paths(self, pair: int) -> list[Path]:
         """Return the paths of all images of one pair, in a fixed order."""
@@ -176,7 +201,7 @@ def open_experiment(path: str | Path) -> Experiment:
         if a nominal camera certainly sees nothing of the volume.
     """
     experiment = read_experiment(path)
-    for _, reason in check_pairs(experiment, range(experiment.pairs)):
+    for _, reason in check_pairs(experiment, experiment.numbers):
         raise InputError(reason)
     return experiment
 
@@ -191,11 +216,16 @@ def read_experiment(path: str | Path) -> Experiment:
         raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
     board, particles = table.board, table.particles
     _check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
-    fields = {"camera": names, "pair": range(particles.pairs), "frame": particles.frames}
-    _check_pattern(path, "particles.images", particles.images, fields)
+    _check_particle_pattern(path, particles, names)
     for one in table.camera:
         if one.background_image is not None:
             _check_background(path, one, particles)
+    series = particles.series
+    if series is not None and table.smart.motion_passes:
+        raise InputError(
+            f"{path}: smart.motion_passes: expected 0 for a time series, where each instant is reconstructed once and "
+            f"used in two pairs, found {table.smart.motion_passes}. Set it to 0."
+        )
     grid = _grid(path, table.volume)
     _check_windows(path, table.correlation, grid)
     experiment = Experiment(
@@ -206,8 +236,9 @@ def read_experiment(path: str | Path) -> Experiment:
         board=board,
         grid=grid,
         guard_mm=table.volume.guard_mm,
-        pairs=particles.pairs,
+        pairs=particles.count,
         frames=particles.frames,
+        series=series,
         smart=table.smart,
         self_calibration=table.self_calibration,
         correlation=table.correlation,
@@ -246,7 +277,7 @@ def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[
         try:
             for camera in experiment.cameras:
                 for frame in experiment.frames:
-                    label = _particle_label(camera.name, pair, frame)
+                    label = experiment.particle_label(camera.name, pair, frame)
                     _check_shape(experiment.particle_path(camera.name, pair, frame), label, camera)
             decoded += 2 * sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
             if number == 0 or decoded <= DECODED_PIXELS:
@@ -273,6 +304,17 @@ def _check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any]
             raise InputError(
                 f"{path}: {key}: expected {{{name}}} in the path, since there are {len(values)}, found {pattern!r}."
             )
+
+
+def _check_particle_pattern(path: Path, particles: Particles, cameras: Sequence[str]) -> None:
+    fields: dict[str, Sequence[Any]] = {"camera": cameras}
+    if (series := particles.series) is not None:
+        fields["instant"] = series.numbers
+    elif "{image" in particles.images:
+        fields["image"] = range(2 * particles.count)
+    else:
+        fields |= {"pair": range(particles.count), "frame": particles.frames}
+    _check_pattern(path, "particles.images", particles.images, fields)
 
 
 def _check_background(path: Path, camera: CameraTable, particles: Particles) -> None:
@@ -399,7 +441,3 @@ def _require_shape(shape: tuple[int, ...], path: Path, label: str, camera: Camer
 
 def _board_label(camera: str, plane: int) -> str:
     return f"board.images, camera {camera!r}, plane {plane}"
-
-
-def _particle_label(camera: str, pair: int, frame: str) -> str:
-    return f"particles.images, camera {camera!r}, pair {pair}, frame {frame!r}"

@@ -263,13 +263,37 @@ class ExperimentVolume(Volume):
     """Solids in the volume, each a table."""
 
 
+class Series(Table):
+    """Instants of a time series, each an image of every camera."""
+
+    instants: Annotated[int, Field(strict=True, ge=2)]
+    """Number of recorded instants."""
+    first: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Number of the first instant."""
+    step: Count = 1
+    """Vectors of instant k are measured from instants k and k + step."""
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of all instants."""
+        return range(self.first, self.first + self.instants)
+
+
 class Particles(Table):
-    """Table ``[particles]``: the image pairs."""
+    """Table ``[particles]``: the image pairs, or the time series."""
 
     images: Annotated[str, Field(min_length=1)]
-    """Path of the particle images with ``{camera}``, ``{pair}`` and ``{frame}``; pairs count from 0."""
-    pairs: Count
-    """Number of image pairs."""
+    """Path of the particle images: with ``{camera}``, ``{pair}`` and ``{frame}`` for pairs, which count from 0, or
+    ``{image}``, which is 2 pair for the first and 2 pair + 1 for the second frame; with ``{camera}`` and ``{instant}``
+    for a time series."""
+    pairs: Count | None = None
+    """Number of image pairs; absent for a time series."""
+    instants: Annotated[int, Field(strict=True, ge=2)] | None = None
+    """Number of instants of a time series, each of which is the second image of one pair and the first of another."""
+    first: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Number of the first instant of a time series."""
+    step: Count = 1
+    """Distance of the two instants that are correlated in a time series, ``dt_s`` apart: k and k + step."""
     frames: tuple[Annotated[str, Field(min_length=1)], Annotated[str, Field(min_length=1)]] = ("a", "b")
     """Text for ``{frame}`` in the first and second image of a pair."""
     background: Literal["auto", "none", "minimum", "median"] = "auto"
@@ -283,6 +307,30 @@ class Particles(Table):
             raise ValueError("two different frame names")
         return frames
 
+    @model_validator(mode="after")
+    def _pairs_or_series(self) -> Particles:
+        if (self.pairs is None) == (self.instants is None):
+            raise ValueError("either pairs or instants")
+        if self.instants is None and {"first", "step"} & self.model_fields_set:
+            raise ValueError("first and step only with instants")
+        if self.instants is not None and "frames" in self.model_fields_set:
+            raise ValueError("frames only with pairs; an instant has one image of each camera")
+        if self.instants is not None and self.instants <= self.step:
+            raise ValueError("more instants than step")
+        return self
+
+    @property
+    def count(self) -> int:
+        """Number of pairs; the last `step` instants of a series are the first of no pair."""
+        return self.pairs if self.pairs is not None else (self.instants or 0) - self.step
+
+    @property
+    def series(self) -> Series | None:
+        """The time series; None for image pairs."""
+        if self.instants is None:
+            return None
+        return Series(instants=self.instants, first=self.first, step=self.step)
+
 
 class ExperimentTable(Table):
     """The whole experiment file."""
@@ -290,7 +338,7 @@ class ExperimentTable(Table):
     name: Annotated[str, Field(min_length=1)]
     """Name of the experiment, title of its report."""
     dt_s: Positive
-    """Time between the two frames of a pair [s]."""
+    """Time between the two frames of a pair, or between instants k and k + step of a time series [s]."""
     camera: Annotated[tuple[CameraTable, ...], Field(min_length=1)]
     board: Board
     volume: ExperimentVolume

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.settings import Series
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,8 @@ class Folder:
     """Paths of the files of a run."""
 
     path: Path
+    series: Series | None = None
+    """The time series whose results are here; None for image pairs."""
 
     @property
     def calibration(self) -> Path:
@@ -73,12 +76,16 @@ class Folder:
         return self.path / ".shared"
 
     def vectors(self, pair: int) -> Path:
-        """Return the path of one pair's vectors."""
-        return self.path / "vectors" / f"pair_{pair:04d}.nc"
+        """Return the path of one pair's vectors; in a series it has the number of the pair's first instant."""
+        name = f"pair_{pair:04d}" if self.series is None else f"instant_{pair:06d}"
+        return self.path / "vectors" / f"{name}.nc"
 
     def volume(self, pair: int, frame: int) -> Path:
-        """Return the path of a pair's volume of frame 0 or 1."""
-        return self.path / "volumes" / f"pair_{pair:04d}_{FRAME_NAMES[frame]}.nc"
+        """Return the path of a pair's volume of frame 0 or 1; two pairs of a series share an instant's volume."""
+        name = f"pair_{pair:04d}_{FRAME_NAMES[frame]}"
+        if self.series is not None:
+            name = f"instant_{pair + frame * self.series.step:06d}"
+        return self.path / "volumes" / f"{name}.nc"
 
     def sweep(self) -> None:
         """Remove half-written and shared files of a run that was killed. The caller must hold the lock."""

@@ -227,12 +227,20 @@ def of_pair(
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
-        "particles": {"images": experiment.particle_images, "frames": list(experiment.frames)},
+        "particles": _recorded(experiment),
         "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
         "background": background,
     }
     of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
     return PairStamps(volumes=Stamp(parts), vectors=Stamp(parts | of_vectors))
+
+
+def _recorded(experiment: Experiment) -> dict[str, Any]:
+    """Return the pattern of the particle images, and what tells the two images of a pair apart."""
+    images = {"images": experiment.particle_images}
+    if experiment.series is None:
+        return images | {"frames": list(experiment.frames)}
+    return images | {"step": experiment.series.step}
 
 
 def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:

@@ -151,7 +151,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
         return None
     darks, volumes, used = read_darks(experiment), CameraVolumes(weights), list[int]()
     separation, lost, clear = None, list[str](), True
-    for pair in islice(dict.fromkeys([*pairs, *range(experiment.pairs)]), TRIED):
+    for pair in islice(dict.fromkeys([*pairs, *experiment.numbers]), TRIED):
         try:
             light = _moving_light(experiment, weights.cameras, darks, pair)
             for images in light:

@@ -54,7 +54,7 @@ def open_run(
     start_s = time.perf_counter()
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
-    folder = Folder(Path(out))
+    folder = Folder(Path(out), experiment.series)
     numbers = _select(experiment, pairs)
     memory.require(memory.least_bytes(experiment), experiment, "volumes of")
     made = make_writable(folder.path)
@@ -92,11 +92,12 @@ def open_run(
 
 
 def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> range:
-    first, after = (0, None) if pairs is None else pairs
-    after = experiment.pairs if after is None else after
-    if not 0 <= first < after <= experiment.pairs:
+    known = experiment.numbers
+    first, after = (None, None) if pairs is None else pairs
+    first, after = first or known.start, known.stop if after is None else after
+    if not known.start <= first < after <= known.stop:
         raise InputError(
-            f"pairs: expected A:B with 0 <= A < B <= {experiment.pairs}, the pairs of the experiment, "
+            f"pairs: expected A:B with {known.start} <= A < B <= {known.stop}, the pairs of the experiment, "
             f"found {first}:{after}."
         )
     return range(first, after)
@@ -194,7 +195,7 @@ class Run:
             If the first pair cannot be used and no finished pair shows that the experiment file is right.
         """
         bad = dict(check_pairs(self.experiment, [pair for pair in todo if not self.has_volumes(pair)]))
-        if bad and todo[0] in bad and not any(map(self._is_finished, range(self.experiment.pairs))):
+        if bad and todo[0] in bad and not any(map(self._is_finished, self.experiment.numbers)):
             others = f" To do the pairs after it, use --pairs {todo[0] + 1}:." if len(bad) < len(todo) else ""
             raise InputError(bad[todo[0]] + others)
         if len(bad) == len(todo):
@@ -244,7 +245,7 @@ class Run:
     def _contents(self) -> Contents:
         """Read the figures of all finished pairs of the experiment, from the attributes of their files."""
         vectors, volumes = {}, {}
-        for pair in range(self.experiment.pairs):
+        for pair in self.experiment.numbers:
             found = self.files(pair)
             if (marks := found.fitting_vectors()) is not None:
                 vectors[pair] = pair_figures.read_figures(found.vectors, marks)

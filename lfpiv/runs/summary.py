@@ -19,6 +19,7 @@ from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
+from lfpiv.results.folder import Folder
 from lfpiv.runs import guard
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation
@@ -100,7 +101,7 @@ def build(
     reports = {name: _report(camera, experiment.grid) for name, camera in calibrated.calibration.cameras.items()}
     weights = done.weights.to_json() if done.weights else dict(earlier.weights)
     warnings = _warnings(experiment, calibrated, contents, done, weights)
-    pairs = contents.vectors.values()
+    pairs, names = contents.vectors.values(), Folder(Path(), experiment.series)
     return {
         "schema_version": SCHEMA_VERSION,
         **_settings(experiment),
@@ -120,7 +121,7 @@ def build(
         "background": dict(contents.background),
         "guard": _guard(experiment, contents.guard),
         "pairs": [
-            {"pair": pair, "file": f"pair_{pair:04d}.nc", **figures.to_json()}
+            {"pair": pair, "file": names.vectors(pair).name, **figures.to_json()}
             for pair, figures in contents.vectors.items()
         ],
         "failed": _failures(experiment, contents, done, earlier),
@@ -220,7 +221,7 @@ def _failures(
     entries += [
         {"pair": pair, "reason": reason, "earlier": True}
         for pair, reason in earlier.failed.items()
-        if pair < experiment.pairs and pair not in tried_or_finished
+        if pair in experiment.numbers and pair not in tried_or_finished
     ]
     return sorted(entries, key=lambda entry: entry["pair"])
 

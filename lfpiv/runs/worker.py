@@ -23,7 +23,6 @@ from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
 from lfpiv.progress import StepProgress
-from lfpiv.results.folder import Folder
 from lfpiv.runs import background, memory
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.pair import CORRELATED, Outcome, PairWork
@@ -90,7 +89,7 @@ def share(work: PairWork, device: str, threads: int | None) -> Path:
         work=dataclasses.replace(
             work,
             experiment=_absolute(work.experiment),
-            folder=Folder(work.folder.path.absolute()),
+            folder=dataclasses.replace(work.folder, path=work.folder.path.absolute()),
             weights=None,
             darks={},
         ),
