@@ -56,7 +56,8 @@ class Sheet(Table):
     """Table ``[sheet]``: the light sheet of the two pulses.
 
     A list of two values states first and second pulse; one value holds for both. In a time series the two pulses take
-    turns, the first one at the first instant. The sheet lights particles only. Bright surfaces and stray light through the lens follow the pulses' power.
+    turns, the first one at the first instant. The sheet lights particles only. Bright surfaces and stray light through
+    the lens follow the pulses' power.
     """
 
     profile: Literal["even", "top_hat", "gaussian"] = "even"

@@ -27,7 +27,8 @@ MIDPOINTS = 5
 """Iterations that find the point midway between two instants of a tracer file."""
 
 
-class SeriesInstant(NamedTuple):
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SeriesInstant:
     """Particles that emit light at one instant of a series."""
 
     index: np.ndarray
@@ -47,7 +48,7 @@ class SeriesInstant(NamedTuple):
     """Light of each particle in each camera, relative to the mean, shape (camera, particle)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _State:
     """Particles that are followed at one instant."""
 
@@ -98,7 +99,7 @@ def place_series(scene: Scene) -> list[SeriesInstant]:
 def _instant(scene: Scene, number: int, states: list[_State], traits: _Traits) -> SeriesInstant:
     """Return what emits light at one instant."""
     state = states[number]
-    lit = state.lit & ~scene.solid(state.position_mm)
+    lit = np.logical_and(state.lit, ~scene.solid(state.position_mm))
     if not lit.any():
         raise InputError(
             f"particles: expected particles at every instant, found none at instant {number}: none in the volume, or "
@@ -110,13 +111,22 @@ def _instant(scene: Scene, number: int, states: list[_State], traits: _Traits) -
         displacement = states[later].position_mm[np.searchsorted(states[later].index, index)] - position
     intensity = traits.intensity[index]
     rng = np.random.default_rng([scene.seed, 33, number])
-    light = pulse_light(scene.sheet, intensity * traits.camera_factor[:, index], position, number % 2, rng)
-    return SeriesInstant(index, position, displacement, intensity, traits.diameter[index], *light)
+    in_cameras = intensity * traits.camera_factor[:, index]
+    power, brightness = pulse_light(scene.sheet, in_cameras, position, number % 2, rng)
+    return SeriesInstant(
+        index=index,
+        position_mm=position,
+        displacement_mm=displacement,
+        intensity=intensity,
+        diameter=traits.diameter[index],
+        power=power,
+        brightness=brightness,
+    )
 
 
 def _inside(scene: Scene, position_mm: np.ndarray) -> np.ndarray:
     """Return which points (n, 3) are in the seeded region, shape (n,)."""
-    inside: np.ndarray = (np.abs(position_mm - scene.volume.centre_mm) <= seeded_size_mm(scene) / 2).all(1)
+    inside: np.ndarray = np.all(np.abs(position_mm - scene.volume.centre_mm) <= seeded_size_mm(scene) / 2, axis=1)
     return inside
 
 
@@ -171,7 +181,8 @@ def _draw_traits(scene: Scene, count: int, instant: int) -> _Traits:
 def _drawn(scene: Scene, count: int, instant: int) -> np.ndarray:
     """Draw points in the seeded region, shape (count, 3) [mm]."""
     rng = np.random.default_rng([scene.seed, 31, instant])
-    return np.asarray(scene.volume.centre_mm) + rng.uniform(-0.5, 0.5, (count, 3)) * seeded_size_mm(scene)
+    drawn: np.ndarray = scene.volume.centre_mm + rng.uniform(-0.5, 0.5, (count, 3)) * seeded_size_mm(scene)
+    return drawn
 
 
 def _motion(scene: Scene) -> Callable[[np.ndarray, int, int], np.ndarray]:
@@ -193,7 +204,8 @@ def _motion(scene: Scene) -> Callable[[np.ndarray, int, int], np.ndarray]:
             if isinstance(turbulence, TurbulentFlow):
                 moved = moved + turbulence.fluctuation(middle) / step
             middle = position + sense * moved / 2
-        return position + sense * moved
+        end: np.ndarray = position + sense * moved
+        return end
 
     return unsteady
 

@@ -22,6 +22,7 @@ last instants do not have.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +37,14 @@ from lfpiv.simulation.sensor import SensorPattern
 from lfpiv.simulation.series import SeriesInstant
 
 
-def write_scene(scene: Scene, placed: list[LitParticles] | list[SeriesInstant], folder: Path) -> None:
+def write_scene(scene: Scene, placed: Sequence[LitParticles | SeriesInstant], folder: Path) -> None:
     """Write the scene, its particles, its board and its walls.
 
     Parameters
     ----------
     scene : Scene
         The scene.
-    placed : list of LitParticles or list of SeriesInstant
+    placed : sequence of LitParticles or SeriesInstant
         Particles of each pair, or of each instant of a series.
     folder : Path
         Existing folder.
@@ -58,14 +59,14 @@ def write_scene(scene: Scene, placed: list[LitParticles] | list[SeriesInstant], 
         np.savez_compressed(folder / "walls.npz", **_walls(scene))
 
 
-def _particles(scene: Scene, placed: list[LitParticles] | list[SeriesInstant]) -> dict[str, Any]:
+def _particles(scene: Scene, placed: Sequence[LitParticles | SeriesInstant]) -> dict[str, Any]:
     """Return the arrays of the particles."""
     arrays: dict[str, Any] = {}
     for number, one in enumerate(placed):
-        if isinstance(one, LitParticles):
-            arrays |= _pair_arrays(scene, number, one)
-        else:
+        if isinstance(one, SeriesInstant):
             arrays |= _instant_arrays(scene, scene.particles.first + number, one)
+        else:
+            arrays |= _pair_arrays(scene, number, one)
     return arrays
 
 
