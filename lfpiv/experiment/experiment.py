@@ -14,6 +14,7 @@ import numpy as np
 from lfpiv.errors import InputError
 from lfpiv.experiment import images, nominal_checks
 from lfpiv.experiment.mask import solid_voxels
+from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.experiment.settings import (
     SMALLEST_WINDOW,
     Board,
@@ -23,6 +24,7 @@ from lfpiv.experiment.settings import (
     ExperimentTable,
     Network,
     Particles,
+    RawImages,
     SelfCalibration,
     Series,
     Smart,
@@ -57,6 +59,8 @@ class CameraSetup:
     dark_path: Path | None
     background: str | None = None
     """Path pattern of the background image, relative to the experiment file, or None."""
+    raw: RawImages | None = None
+    """Layout of the camera's files without a header, or None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,8 +164,13 @@ class Experiment:
 
     def calibration_paths(self) -> list[Path]:
         """Return the paths of all images that the calibration reads, in a fixed order."""
-        paths = [path for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
-        return paths + [self.board_path(c.name, p) for c in self.cameras for p in range(len(self.board.planes_mm))]
+        return [image.path for image in self.calibration_images()]
+
+    def calibration_images(self) -> list[ImagePath]:
+        """Return all images that the calibration reads, in a fixed order."""
+        found = [split(path, c.raw) for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
+        planes = range(len(self.board.planes_mm))
+        return found + [split(self.board_path(c.name, plane), c.raw) for c in self.cameras for plane in planes]
 
     @property
     def self_calibration_pairs(self) -> list[int]:
@@ -354,7 +363,7 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
 
 def _camera(path: Path, table: CameraTable) -> CameraSetup:
     white_path = path.parent / table.white_image
-    shape = _white_shape(white_path, f"white_image of camera {table.name!r}")
+    shape = _white_shape(white_path, f"white_image of camera {table.name!r}", table.raw)
     optics = table.optics_of(shape)
     if table.microlens_focal_length_mm > MICROLENS_SHARE * optics.image_distance_mm:
         raise InputError(
@@ -377,14 +386,15 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
         white_path=white_path,
         dark_path=None if table.dark_image is None else path.parent / table.dark_image,
         background=table.background_image,
+        raw=table.raw,
     )
 
 
-def _white_shape(path: Path, label: str) -> tuple[int, int]:
-    header = images.read_header(path, label)
+def _white_shape(path: Path, label: str, raw: RawImages | None) -> tuple[int, int]:
+    header = images.read_header(path, label, raw)
     if header is not None:
         return header.shape
-    rows, columns = images.read_image(path, label).shape
+    rows, columns = images.read_image(path, label, raw=raw).shape
     return rows, columns
 
 
@@ -416,7 +426,7 @@ def _check_calibration_images(experiment: Experiment) -> None:
 
 def _read(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
     """Read an image of a camera and reverse its mirroring; refuse another shape than the white image's."""
-    image = images.read_image(path, label, flip=camera.image_flip)
+    image = images.read_image(path, label, flip=camera.image_flip, raw=camera.raw)
     _require_shape(image.shape, path, label, camera)
     return image
 
@@ -426,7 +436,7 @@ def _check_shape(path: Path, label: str, camera: CameraSetup) -> None:
 
     A DaVis image must exist; its content is checked when it is decoded.
     """
-    header = images.read_header(path, label)
+    header = images.read_header(path, label, camera.raw)
     if header is not None:
         _require_shape(header.shape, path, label, camera)
 

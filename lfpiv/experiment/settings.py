@@ -168,6 +168,24 @@ class NominalCamera(Table):
         )
 
 
+Pixels = Annotated[int, Field(strict=True, ge=1, le=100_000)]
+
+
+class RawImages(Table):
+    """Table ``[camera.raw]``: layout of the camera's files without a header, ``.raw`` and ``.bin``."""
+
+    shape: tuple[Pixels, Pixels]
+    """Number of rows and columns of an image [pixel]."""
+    dtype: Literal["uint8", "uint16", "uint32", "int16", "int32", "float32", "float64"]
+    """Type of a stored pixel."""
+    byte_order: Literal["little", "big"] = "little"
+    """Order of the bytes of a pixel, least first or last."""
+    header_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**62)] = 0
+    """Length of the file's header [byte]."""
+    frame_header_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
+    """Length of what stands before the pixels of each image [byte]."""
+
+
 class CameraTable(NominalCamera):
     """Table ``[[camera]]``: nominal optics and calibration images of one camera."""
 
@@ -178,6 +196,8 @@ class CameraTable(NominalCamera):
     background_image: Annotated[str, Field(min_length=1)] | None = None
     """Path, optionally with ``{frame}``, of an image of the scene lit by the laser, without particles; absent: the
     series of image pairs shows what stands still."""
+    raw: RawImages | None = None
+    """Layout of the camera's files without a header; absent: it has none."""
 
 
 class NominalBoard(Table):

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from lfpiv import files, warn
-from lfpiv.experiment.davis import split_frame
+from lfpiv.experiment import images
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.version import __version__
 from lfpiv.warn import Warning
@@ -127,6 +128,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
     """Return the stamp of the calibration."""
     cameras = {
         camera.name: [dataclasses.asdict(camera.optics), camera.nominal_angle_deg, camera.image_flip]
+        + ([camera.raw.model_dump()] if camera.raw else [])
         for camera in experiment.cameras
     }
     return Stamp(
@@ -135,7 +137,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
             "camera": cameras,
             "board": experiment.board.model_dump(),
             "network": experiment.network.model_dump(),
-            "images": content_hash(experiment.calibration_paths()),
+            "images": content_hash(experiment.calibration_images()),
         }
     )
 
@@ -171,7 +173,7 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
 
 
 def _existing(paths: Iterable[Path]) -> list[Path]:
-    return [path for path in paths if split_frame(path)[0].is_file()]
+    return [path for path in paths if split(path).file.is_file()]
 
 
 def of_self_calibration(experiment: Experiment, calibration: str, background: str | None = None) -> Stamp | None:
@@ -258,21 +260,24 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
 def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
     """Return path from `start`, size and time of the last change of images; None if one is missing."""
     try:
-        found = [(path, split_frame(path)[0].stat()) for path in paths]
+        found = [(path, split(path).file.stat()) for path in paths]
     except OSError:
         return None
     return [[os.path.relpath(path, start), status.st_size, status.st_mtime_ns] for path, status in found]
 
 
-def content_hash(paths: Iterable[Path]) -> str:
-    """Hash the bytes of several images, in order, and the frame's number if it is named."""
+def content_hash(sources: Iterable[ImagePath]) -> str:
+    """Hash several images, in order: the bytes of whole files, the grey values of parts of files."""
     digest = hashlib.blake2b(digest_size=16)
-    for path in paths:
-        image, frame = split_frame(path)
-        with image.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-        digest.update(b"end of file" + frame.encode())
+    for source in sources:
+        if source.part:
+            grey = images.read_image(source.path, "part of a file", raw=source.raw)
+            digest.update(repr(grey.shape).encode() + grey.tobytes())
+        else:
+            with source.file.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+        digest.update(b"end of file" + source.part.encode())
     return digest.hexdigest()
 
 
