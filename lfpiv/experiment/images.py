@@ -49,8 +49,8 @@ def read_header(path: Path, label: str, raw: RawImages | None = None) -> Header 
     Raises
     ------
     InputError
-        If the file is missing, no regular file, truncated or unreadable, or if the path names in it something other than
-        one single-channel image of real numbers.
+        If the file is missing, no regular file, truncated or unreadable, or if the path names something other than one
+        single-channel image of real numbers.
     """
     place, image = f"{path} ({label})", split(path, raw)
     with _naming(place):

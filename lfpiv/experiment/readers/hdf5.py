@@ -1,9 +1,9 @@
 """Read images from HDF5 datasets.
 
-The text behind ``#`` names a dataset, an image in it, or both: ``run.h5#images[12]`` or ``run.h5#images/12`` is image 12
-of a dataset of three dimensions (image, row, column), ``run.h5#images/00012`` a dataset of two dimensions, ``run.h5#12``
-image 12 of the file's only dataset of images. What stands in other files is refused: external links and storage, and
-virtual datasets.
+The text behind ``#`` names a dataset, an image in it, or both: ``run.h5#images[12]`` or ``run.h5#images/12`` is image
+12 of a dataset of three dimensions (image, row, column), ``run.h5#images/00012`` a dataset of two dimensions,
+``run.h5#12`` image 12 of the file's only dataset of images. What stands in other files is refused: external links and
+storage, and virtual datasets.
 """
 
 from __future__ import annotations
@@ -60,22 +60,18 @@ class Hdf5Images:
     @staticmethod
     def _number(dataset: h5py.Dataset, number: int | None) -> int | None:
         """Return the number of the image in a dataset; refuse a dataset of other than images."""
-        shape = dataset.shape or ()
-        if len(shape) not in (2, 3):
-            raise NotOneImage(
-                f"a dataset {dataset.name} of shape {shape}; expected (image, row, column) or (row, column)"
-            )
+        shape: tuple[int, ...] = dataset.shape or ()
+        name = dataset.name.lstrip("/")
         if len(shape) == 2:
             if number is not None:
-                raise NotOneImage(f"one image in the dataset {dataset.name}; name it without a number")
+                raise NotOneImage(f"one image in the dataset {name}; name it without a number")
             return None
+        if len(shape) != 3:
+            raise NotOneImage(f"a dataset {name} of shape {shape}, not (image, row, column) or (row, column)")
         if number is None and shape[0] != 1:
-            name = dataset.name.lstrip("/")
             raise NotOneImage(f"{shape[0]} images; name one behind the file: #{name}[0] to #{name}[{shape[0] - 1}]")
         if (number or 0) >= shape[0]:
-            raise NotOneImage(
-                f"{shape[0]} images in the dataset {dataset.name}, none of number {number}; they count from 0"
-            )
+            raise NotOneImage(f"{shape[0]} images in the dataset {name}, none of number {number}; they count from 0")
         return number or 0
 
     def _dataset(self, name: str) -> h5py.Dataset | None:
