@@ -247,23 +247,30 @@ class Warning:
     """Numbers and names that the sentence shows."""
     pairs: tuple[int, ...] = ()
     """Numbers of the pairs it concerns; empty where it concerns no pair in particular."""
+    instants: tuple[int, ...] = ()
+    """Numbers of the instants of a series that it concerns, in place of pairs."""
 
     @property
     def sentence(self) -> str:
         """Sentence for people: subject, pairs and text."""
-        heads = [part for part in (self.subject, name_pairs(self.pairs)) if part]
+        heads = [part for part in (self.subject, name_pairs(self.pairs), name_pairs(self.instants, "instant")) if part]
         text = _Words().vformat(SENTENCES[self.code], (), self.figures)
         return f"{', '.join(heads)}: {text}" if heads else text
 
     def of_pair(self, pair: int) -> Warning:
-        """Return the same warning about one pair."""
-        return replace(self, pairs=(pair,))
+        """Return the same warning about one pair; one about instants stays as it is."""
+        return self if self.instants else replace(self, pairs=(pair,))
+
+    def by_instant(self) -> Warning:
+        """Return the same warning with its pairs named by their first instants, for a series."""
+        return replace(self, pairs=(), instants=self.pairs) if self.pairs else self
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that a file stores."""
         figures = {name: asdict(value) if isinstance(value, Span) else value for name, value in self.figures.items()}
         stored = {"code": self.code.value, "subject": self.subject, "figures": figures}
-        return stored | {"pairs": list(self.pairs)} if self.pairs else stored
+        numbers = {"pairs": list(self.pairs), "instants": list(self.instants)}
+        return stored | {name: found for name, found in numbers.items() if found}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
@@ -276,15 +283,16 @@ class Warning:
             if stored["what"] == Code.UNEVEN.value:
                 figures["ratio"] = 4.0  # the limit of version 0.1.0
             return cls(code=Code(stored["what"]), subject=subject, figures=figures)
-        code, pairs = stored["code"], tuple(stored.get("pairs", ()))
+        code = stored["code"]
+        numbers = {name: tuple(stored.get(name, ())) for name in ("pairs", "instants")}
         if code not in {known.value for known in Code}:
             values = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
             text = f"{code} ({values})" if values else str(code)
-            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text}, pairs=pairs)
+            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text}, **numbers)
         figures = {
             name: Span(**value) if isinstance(value, dict) else value for name, value in stored["figures"].items()
         }
-        return cls(code=Code(code), subject=stored["subject"], figures=figures, pairs=pairs)
+        return cls(code=Code(code), subject=stored["subject"], figures=figures, **numbers)
 
 
 @dataclass(frozen=True)
@@ -335,16 +343,17 @@ def _merged(group: Sequence[Warning]) -> Warning:
         numbers = [number for number in values if isinstance(number, (int, float))]
         figures[name] = Span(min(numbers), max(numbers)) if len(numbers) == len(group) > 1 else value
     pairs = dict.fromkeys(pair for warning in group for pair in warning.pairs)
-    return replace(first, figures=figures, pairs=tuple(pairs))
+    instants = sorted({instant for warning in group for instant in warning.instants})
+    return replace(first, figures=figures, pairs=tuple(pairs), instants=tuple(instants))
 
 
-def name_pairs(pairs: Sequence[int]) -> str:
-    """Name the first pairs and count the others; empty for none."""
+def name_pairs(pairs: Sequence[int], noun: str = "pair") -> str:
+    """Name the first pairs, or what else the noun says, and count the others; empty for none."""
     if not pairs:
         return ""
     names = ", ".join(map(str, pairs[:NAMED_PAIRS]))
     more = f" and {len(pairs) - NAMED_PAIRS} more" if len(pairs) > NAMED_PAIRS else ""
-    return f"pair{'s' if len(pairs) > 1 else ''} {names}{more}"
+    return f"{noun}{'s' if len(pairs) > 1 else ''} {names}{more}"
 
 
 _collected: ContextVar[list[Warning] | None] = ContextVar("collected", default=None)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import string
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -63,6 +63,15 @@ class CameraSetup:
     """Layout of the camera's files without a header, or None."""
 
 
+class Frame(NamedTuple):
+    """One exposure of all cameras: a frame of a pair, or an instant of a series."""
+
+    number: int
+    """Number of the pair, or of the instant."""
+    name: str
+    """Name of the frame in its pair; an instant of a series has that of the first frame."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """An experiment with checked settings and images. Made by `open_experiment`."""
@@ -104,6 +113,36 @@ class Experiment:
         """Return the number of the instant of a series at which a frame of a pair was recorded."""
         assert self.series is not None
         return pair + self.series.step * self.frames.index(frame)
+
+    def pair_frames(self, pair: int) -> tuple[Frame, Frame]:
+        """Return both frames of a pair. An instant of a series is the same frame in both its pairs."""
+        first, second = self.frames
+        if self.series is None:
+            return Frame(pair, first), Frame(pair, second)
+        return Frame(pair, first), Frame(pair + self.series.step, first)
+
+    def instant_s(self, instant: int) -> float:
+        """Return the time of an instant of a series after the first one [s]."""
+        assert self.series is not None
+        return (instant - self.series.first) * self.dt_s / self.series.step
+
+    def name_of(self, pair: int) -> str:
+        """Return "pair" or, in a series, "instant" with the number, for messages."""
+        return f"{self.noun} {pair}"
+
+    @property
+    def noun(self) -> str:
+        """What results are numbered by: "pair" or "instant"."""
+        return "pair" if self.series is None else "instant"
+
+    def disjoint(self, pairs: Iterable[int]) -> Iterator[int]:
+        """Yield the pairs that share no image with one yielded before."""
+        seen = set[Frame]()
+        for pair in pairs:
+            frames = self.pair_frames(pair)
+            if seen.isdisjoint(frames):
+                seen.update(frames)
+                yield pair
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
@@ -178,13 +217,21 @@ class Experiment:
         return self.spread_pairs(self.self_calibration.pairs)
 
     def spread_pairs(self, count: int) -> list[int]:
-        """Return `count` pairs, evenly spread over all, or all pairs if there are no more."""
+        """Return `count` pairs, evenly spread over all, or all if there are no more; none shares an image with another.
+
+        Pairs of a short series overlap. Then these are fewer.
+        """
         count = min(count, self.pairs)
-        return [self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count)]
+        spread = (self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count))
+        return list(self.disjoint(spread))
 
     def pair_paths(self, pair: int) -> list[Path]:
         """Return the paths of all images of one pair, in a fixed order."""
-        return [self.particle_path(camera.name, pair, frame) for frame in self.frames for camera in self.cameras]
+        return [path for frame in self.pair_frames(pair) for path in self.frame_paths(frame)]
+
+    def frame_paths(self, frame: Frame) -> list[Path]:
+        """Return the paths of the images of one frame, in the order of the cameras."""
+        return [self.particle_path(camera.name, *frame) for camera in self.cameras]
 
 
 def open_experiment(path: str | Path) -> Experiment:

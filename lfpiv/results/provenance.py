@@ -91,7 +91,8 @@ class Stamp:
 class PairStamps:
     """Stamps of the results of one pair."""
 
-    volumes: Stamp
+    volumes: tuple[Stamp, Stamp]
+    """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
     vectors: Stamp
 
 
@@ -155,11 +156,9 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
     """
     recorded = {camera.name: camera.background for camera in experiment.cameras}
     paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    frames = experiment.frames if experiment.series is None else experiment.frames[:1]
     images = [
-        path
-        for name in recorded
-        for frame in experiment.frames
-        if (path := experiment.background_path(name, frame)) is not None
+        path for name in recorded for frame in frames if (path := experiment.background_path(name, frame)) is not None
     ]
     return Stamp(
         {
@@ -218,9 +217,28 @@ def of_pair(
     `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
     the guard layers of the volumes.
     """
+    parts, start = _of_light(experiment, calibration, background, guard), experiment.path.parent
+    of_pair = parts | {"images": _identity(experiment.pair_paths(pair), start)}
+    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    if experiment.series is None:
+        volumes = Stamp(of_pair)
+        return PairStamps(volumes=(volumes, volumes), vectors=Stamp(of_pair | of_vectors))
+    first, second = (
+        Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
+        for instant in experiment.pair_frames(pair)
+    )
+    of_vectors["step"] = experiment.series.step
+    return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
+
+
+def _of_light(experiment: Experiment, calibration: str, background: str | None, guard: Layers) -> dict[str, Any]:
+    """Return the parts of the stamp of volumes; the identity of the images is None and to be filled in."""
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
-    parts = {
+    particles: dict[str, Any] = {"images": experiment.particle_images}
+    if experiment.series is None:
+        particles["frames"] = list(experiment.frames)
+    return {
         "calibration": calibration,
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
@@ -229,20 +247,10 @@ def of_pair(
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
-        "particles": _recorded(experiment),
-        "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
+        "particles": particles,
+        "images": None,
         "background": background,
     }
-    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
-    return PairStamps(volumes=Stamp(parts), vectors=Stamp(parts | of_vectors))
-
-
-def _recorded(experiment: Experiment) -> dict[str, Any]:
-    """Return the pattern of the particle images, and what tells the two images of a pair apart."""
-    images = {"images": experiment.particle_images}
-    if experiment.series is None:
-        return images | {"frames": list(experiment.frames)}
-    return images | {"step": experiment.series.step}
 
 
 def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:

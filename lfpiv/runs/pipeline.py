@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import background, dispatch, local_workers, memory, rig, worker, worker_plan
+from lfpiv.runs import dispatch, local_workers, memory, rig, worker, worker_plan
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, WeightsFigures, Workers
 from lfpiv.runs.pair import Outcome, PairWork
@@ -23,10 +23,13 @@ from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
+    from lfpiv.calibration.camera import Calibration
     from lfpiv.weights.operator import Weights
 
 PAIRS = "image pairs"
 """Name of the step that works on pairs, for progress."""
+INSTANTS = "instants"
+"""The same for a time series."""
 
 
 def run(
@@ -149,11 +152,14 @@ def correlate(
         calibrated = rig.load_calibration(current)
         todo = current.unfinished()
         if todo.pairs and not any(map(current.has_volumes, todo.pairs)):
+            first = todo.pairs[0]
             raise InputError(
-                f"{current.folder.volume(todo.pairs[0], 0)}: expected the two volumes of pair {todo.pairs[0]} made "
-                "with the present settings, found none. Run `lfpiv reconstruct` first."
+                f"{current.folder.volume(first, 0)}: expected the two volumes of {current.experiment.name_of(first)} "
+                "made with the present settings, found none. Run `lfpiv reconstruct` first."
             )
-        outcomes = _sequential(current, _work(current, None, keep_volumes=False), todo.pairs)
+        calibration = rig.with_standing_light(current, calibrated.calibration)
+        work = _work(current, None, keep_volumes=False, calibration=calibration)
+        outcomes = _sequential(current, work, todo.pairs)
         return current.finish(calibrated, Invocation(outcomes=outcomes, reused=todo.reused), report=False)
 
 
@@ -167,9 +173,7 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
     """
     with open_run(experiment, out, None, None, writes_results=False) as current:
         calibrated = rig.load_calibration(current)
-        if current.background is not None:
-            standing = background.load(current.folder.background)
-            calibrated = replace(calibrated, calibration=standing.seen_by(calibrated.calibration))
+        calibrated = replace(calibrated, calibration=rig.with_standing_light(current, calibrated.calibration))
         return current.finish(calibrated, Invocation(), report=True)
 
 
@@ -213,7 +217,7 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
         if isinstance(workers, Plan):
             guarded = current.guarded_experiment
             workers = worker_plan.fit_memory(workers, guarded, weights.memory_bytes, current.device)
-    work = _work(current, weights, keep_volumes=keep_volumes)
+    work = _work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration)
     if isinstance(workers, Plan) and workers.workers == 1:
         return Invocation(outcomes=_sequential(current, work, todo), weights=figures)
     if isinstance(workers, Plan):
@@ -223,19 +227,37 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     device = current.device.kind if isinstance(workers, Plan) else current.device_request
     shared = worker.share(work, device, used.threads)
     del work, weights  # the workers map them from files; the memory may not have room for both
-    outcomes = _collect(current, dispatch.parallel(shared, todo, workers, current.step(PAIRS)))
+    outcomes = _collect(
+        current, dispatch.parallel(shared, current.experiment, todo, workers, current.step(_step_name(current)))
+    )
     peak_mib = max(outcome.peak_memory_mib for outcome in outcomes)
     return Invocation(outcomes=outcomes, weights=figures, workers=replace(used, peak_memory_mib=peak_mib or None))
 
 
-def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
+def _step_name(current: Run) -> str:
+    return PAIRS if current.experiment.series is None else INSTANTS
+
+
+def _work(
+    current: Run,
+    weights: Weights | None,
+    *,
+    keep_volumes: bool,
+    vectors: bool = True,
+    calibration: Calibration | None = None,
+) -> PairWork:
+    """Return the work on pairs. A series takes its cameras from `calibration` if there are no weights."""
+    cameras = {} if calibration is None or current.experiment.series is None else calibration.cameras
+    if weights is not None:
+        cameras = weights.cameras
     return PairWork(
         experiment=current.experiment,
         folder=current.folder,
         calibration_hash=current.calibration_stamp.hash,
         guard=current.guard_layers,
         weights=weights,
-        darks={} if weights is None else read_darks(current.experiment),
+        cameras=cameras,
+        darks=read_darks(current.experiment) if cameras else {},
         keep_volumes=keep_volumes,
         background=current.background,
         vectors=vectors,
@@ -243,12 +265,12 @@ def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors:
 
 
 def _sequential(current: Run, work: PairWork, todo: Sequence[int]) -> list[Outcome]:
-    return _collect(current, dispatch.sequential(work, todo, current.step(PAIRS))) if todo else []
+    return _collect(current, dispatch.sequential(work, todo, current.step(_step_name(current)))) if todo else []
 
 
 def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> list[Outcome]:
     """Record the outcomes of all pairs as they arrive."""
     with contextlib.closing(outcomes):  # ends the workers if the run is interrupted
         found = [current.record(outcome) for outcome in outcomes]
-    current.progress(PAIRS, 1.0)
+    current.progress(_step_name(current), 1.0)
     return found

@@ -66,6 +66,13 @@ def load_calibration(run: Run) -> Calibrated:
     return Calibrated(calibration=load_calibration(path), seconds=seconds, reused=True)
 
 
+def with_standing_light(run: Run, calibration: Calibration) -> Calibration:
+    """Return a calibration with the standing light in the folder, if the results of the run depend on one."""
+    if run.background is None:
+        return calibration
+    return background.load(run.folder.background).seen_by(calibration)
+
+
 def calibrate(run: Run) -> Calibrated:
     """Calibrate the cameras and write the calibration, unless the folder holds one that fits the experiment."""
     from lfpiv.calibration.cameras import calibrate

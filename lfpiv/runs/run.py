@@ -177,12 +177,13 @@ class Run:
         todo = sorted(pair for pairs in changed.values() for pair in pairs)
         finished = sorted({*self.numbers}.difference(todo))
         if finished and not quiet:
-            log.info("%d of %d pairs: finished before with the same settings, kept", len(finished), len(self.numbers))
+            text = "%d of %d %ss: finished before with the same settings, kept"
+            log.info(text, len(finished), len(self.numbers), self.experiment.noun)
         for reason, pairs in changed.items():
             if reason and not quiet:
-                log.info("%s changed: %s made again", reason, name_pairs(pairs))
+                log.info("%s changed: %s made again", reason, name_pairs(pairs, self.experiment.noun))
         kind = "vectors" if vectors else "volumes"
-        return Todo(todo, tuple(f"{kind} of pair {pair}" for pair in finished))
+        return Todo(todo, tuple(f"{kind} of {self.experiment.name_of(pair)}" for pair in finished))
 
     def check_images(self, todo: Sequence[int]) -> tuple[list[int], list[Outcome]]:
         """Log pairs whose images cannot be used; return the pairs to do, and outcomes if none can be done.
@@ -196,14 +197,16 @@ class Run:
         """
         bad = dict(check_pairs(self.experiment, [pair for pair in todo if not self.has_volumes(pair)]))
         if bad and todo[0] in bad and not any(map(self._is_finished, self.experiment.numbers)):
-            others = f" To do the pairs after it, use --pairs {todo[0] + 1}:." if len(bad) < len(todo) else ""
+            noun = self.experiment.noun
+            others = f" To do the {noun}s after it, use --pairs {todo[0] + 1}:." if len(bad) < len(todo) else ""
             raise InputError(bad[todo[0]] + others)
         if len(bad) == len(todo):
             return [], [self.record(Outcome(pair=pair, reason=reason)) for pair, reason in bad.items()]
         for reason in list(bad.values())[:NAMED_PAIRS]:
-            log.error("%s The other pairs will be done.", reason)
+            log.error("%s The other %ss will be done.", reason, self.experiment.noun)
         if len(bad) > NAMED_PAIRS:
-            log.error("%d pairs have images that cannot be used: %s", len(bad), name_pairs(list(bad)))
+            names = name_pairs(list(bad), self.experiment.noun)
+            log.error("%d %ss have images that cannot be used: %s", len(bad), self.experiment.noun, names)
         return list(todo), []
 
     def _is_finished(self, pair: int) -> bool:
@@ -212,8 +215,10 @@ class Run:
 
     def record(self, outcome: Outcome) -> Outcome:
         """Log the failure of a pair, rename its results from earlier images, and return the outcome."""
+        if outcome.died and self.files(outcome.pair).fitting_vectors() is not None:
+            return replace(outcome, reason="")  # its worker died after it
         if outcome.reason:
-            log.error("pair %d failed and is left out: %s", outcome.pair, outcome.reason)
+            log.error("%s failed and is left out: %s", self.experiment.name_of(outcome.pair), outcome.reason)
             for path, aside in self.files(outcome.pair).retire_outdated():
                 log.warning("%s: made of other images than there are now; renamed %s", path, aside.name)
         return outcome

@@ -164,7 +164,7 @@ def _warnings(
         *done.warnings,
     ]
     by_sentence: dict[str, Warning] = {}
-    for warning in found:
+    for warning in found if experiment.series is None else (warning.by_instant() for warning in found):
         by_sentence.setdefault(warning.sentence, warning)
     return by_sentence
 

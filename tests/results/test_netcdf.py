@@ -8,7 +8,7 @@ import xarray as xr
 
 from lfpiv.errors import InputError
 from lfpiv.results import netcdf, provenance
-from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
+from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes, VolumeFile
 from lfpiv.warn import Code, Warning
 
 
@@ -82,13 +82,14 @@ def test_what_is_known_of_the_images_travels_with_the_volumes(tmp_path):
         one.attrs |= {"camera_gain": [1.0, 0.4], "light_outside": [0.25, values[1]]}
         structure = dict(zip(("left", "right"), values, strict=True))
         doubt = Warning(code=Code.SATURATED, subject=f"left, frame {frame}", figures={"share": 0.1})
-        records.append(FrameRecord(frame=frame, structure=structure, warnings=(doubt,), seconds=2.0))
-    pair = PairVolumes(volumes=tuple(volumes), records=tuple(records))
-    stamps = provenance.PairStamps(volumes=provenance.Stamp({"volume": 1}), vectors=provenance.Stamp({}))
-    paths = (tmp_path / "a.nc", tmp_path / "b.nc")
-    files = PairFiles(pair=0, vectors=tmp_path / "pair.nc", volumes=paths, stamps=stamps)
-    files.write_volumes(pair)
-    stored = files.read_volumes()
+        record = FrameRecord(structure=structure, warnings=(doubt,), seconds=2.0)
+        records.append(FrameVolume(volume=one, record=record))
+    pair, stored = PairVolumes(frames=tuple(records)), []
+    for name, found in zip("ab", pair.frames, strict=True):
+        file = VolumeFile(frame=(0, name), path=tmp_path / name, stamp=provenance.Stamp({"volume": 1}), origin={})
+        file.write(found)
+        stored.append(file.read())
+    stored = PairVolumes(frames=tuple(stored))
     assert stored.records == pair.records
     condensed = stored.condensed()
     assert condensed["structure"].sel(frame="a", camera="right") == 0.01
