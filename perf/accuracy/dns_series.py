@@ -32,11 +32,11 @@ TITLE = "Time series of a turbulent flow"
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "dns-tracers" / "rayleigh_benard_series.npz"
 """Tracers in Rayleigh-Benard convection: 20,000 at 12 instants, in the unit cube."""
-CUBE_MM = 8.0
+CUBE_MM = 10.0
 """Edge to which the cube is scaled."""
 INSTANTS = {"small": 12, "paper": 12}
-STEP = 3
-"""Instants between the two that are correlated; tracers move by 1.5 voxel on average, 4.4 at most."""
+STEP = 4
+"""Instants between the two that are correlated."""
 VOXEL_MM = imperfect_scenes.VOXEL_MM
 GOALS = {"within": 90.0, "bad": 1.0}
 """Goals as those of the case `imperfections`."""
