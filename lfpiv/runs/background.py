@@ -21,7 +21,7 @@ from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
-from lfpiv.lightfield import background, image_checks
+from lfpiv.lightfield import background, decorrelation, image_checks
 from lfpiv.lightfield.background import Series
 from lfpiv.lightfield.standing_light import StandingLight, nothing
 from lfpiv.progress import StepProgress
@@ -153,7 +153,13 @@ def _of_series(
     """Estimate the standing light of one camera from pairs; those that cannot be used are left out."""
     median = experiment.background == "median"
     everywhere = experiment.background == "minimum"
-    first, second, kept = _read_series(experiment, camera, dark, pairs, keep=median)
+    chance = experiment.series is not None and not (median or everywhere)
+    apart = _independent_after(experiment, camera, dark, pairs) if chance else 1
+    if apart is None:
+        text = "particles move too little within the series to tell their light from light that stands"
+        log.info("background of %s: %s, nothing is subtracted", camera.name, text)
+        return nothing(camera.decoder)
+    first, second, kept = _read_series(experiment, camera, dark, pairs, apart, keep=median)
     if not first.count:
         return nothing(camera.decoder)
     if median:
@@ -161,10 +167,34 @@ def _of_series(
     else:
         found = background.standing_light(first, second, everywhere=everywhere)
         if found.region.any():  # again, with the images at equal power of the laser
-            first, second, _ = _read_series(experiment, camera, dark, pairs, estimate=found)
+            first, second, _ = _read_series(experiment, camera, dark, pairs, apart, estimate=found)
             found = background.standing_light(first, second, everywhere=everywhere)
     _log_series(camera.name, found, first.count)
     return found
+
+
+def _independent_after(
+    experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, pairs: list[int]
+) -> int | None:
+    """Return the number of instants after which particles are elsewhere; None where the series does not show it."""
+    ends = {pair: _light(experiment, camera, dark, pair) for pair in (pairs[0], pairs[-1])}
+    overlaps: dict[int, list[float]] = {}
+    for pair in pairs:
+        light = _light(experiment, camera, dark, pair)
+        for end, other in ends.items():
+            if pair != end and light is not None and other is not None:
+                overlaps.setdefault(abs(pair - end), []).append(decorrelation.overlap(light, other))
+    lags = sorted(overlaps)
+    return decorrelation.independent_after(lags, [float(np.mean(overlaps[lag])) for lag in lags])
+
+
+def _light(experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, pair: int) -> np.ndarray | None:
+    """Return the light of the first image of a pair; None if it cannot be used."""
+    try:
+        image = experiment.particle_image(camera.name, pair, experiment.frames[0])
+    except InputError:
+        return None
+    return _without_dark(image, dark, camera)[0]
 
 
 def _read_series(
@@ -172,13 +202,15 @@ def _read_series(
     camera: CalibratedCamera,
     dark: np.ndarray | None,
     pairs: list[int],
+    apart: int,
     *,
     keep: bool = False,
     estimate: StandingLight | None = None,
 ) -> tuple[Series, Series, tuple[list[np.ndarray], list[np.ndarray]]]:
     """Read the images of one camera; return the series of both frames, and with `keep` all light.
 
-    An `estimate` gives the power of the laser in each image, by which it is divided.
+    Images of a time series are independent when they are `apart` instants apart. An `estimate` gives the power of the
+    laser in each image, by which it is divided.
     """
     series = Series(camera.decoder, 0), Series(camera.decoder, 1)
     kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
@@ -189,9 +221,12 @@ def _read_series(
             log.debug("background of %s: pair %d is left out: %s", camera.name, pair, error)
             continue
         for number, image in enumerate(images):
+            shift = None
+            if experiment.series is not None:
+                shift = 2 * (experiment.instant(pair, experiment.frames[number]) // apart)
             light, noise, saturated = _without_dark(image, dark, camera)
             power = 1.0 if estimate is None else estimate.power(light, number)
-            series[number].add(light / np.float32(power), noise / power, saturated)
+            series[number].add(light / np.float32(power), noise / power, saturated, shift)
             if keep:
                 kept[number].append(light)
     return *series, kept

@@ -32,7 +32,7 @@ TITLE = "Time series of a turbulent flow"
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "dns-tracers" / "rayleigh_benard_series.npz"
 """Tracers in Rayleigh-Benard convection: 20,000 at 12 instants, in the unit cube."""
-CUBE_MM = 10.0
+CUBE_MM = 8.0
 """Edge to which the cube is scaled."""
 INSTANTS = {"small": 12, "paper": 12}
 STEP = 4
