@@ -10,11 +10,15 @@ import contextlib
 import enum
 import json
 import logging
+import math
 import string
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
+
+from lfpiv import records
+from lfpiv.records import RecordError
 
 NAMED_PAIRS = 5
 """Largest number of pairs that a sentence names one by one."""
@@ -147,8 +151,8 @@ SENTENCES: Mapping[Code, str] = {
         "it. Check that place in board.planes_mm, and the stage."
     ),
     Code.TURNED: (
-        "the board's dots show the camera {turn_deg:.0f} degrees away from nominal_angle_deg = {nominal_deg:g}. Are "
-        "its pictures turned by 90 degrees? Then x and y are exchanged."
+        "the board's dots show the camera turned by {turn_deg:.0f} degrees from where it is stated to be, {nominal}. "
+        "Are its pictures turned by 90 degrees? Then x and y are exchanged; otherwise check its nominal orientation."
     ),
     Code.MAGNIFIED: (
         "the board's dots are magnified {magnification:.3f} times, not {stated:g} times as stated. Check "
@@ -274,25 +278,30 @@ class Warning:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
-        """Read the form that a file stores; sentences and findings of version 0.1.0 too."""
+        """Read the form that a file stores; sentences and findings of version 0.1.0 too.
+
+        Raises
+        ------
+        RecordError
+            If it has none of these forms, or its figures do not fit its sentence.
+        """
         if isinstance(stored, str):
             return cls(code=Code.OTHER, figures={"text": stored})
-        if "what" in stored:
-            subject = stored["camera"] + (f", frame {stored['frame']}" if stored["frame"] else "")
-            figures = {_FINDING_FIGURES[stored["what"]]: stored["value"]}
-            if stored["what"] == Code.UNEVEN.value:
-                figures["ratio"] = 4.0  # the limit of version 0.1.0
-            return cls(code=Code(stored["what"]), subject=subject, figures=figures)
-        code = stored["code"]
-        numbers = {name: tuple(stored.get(name, ())) for name in ("pairs", "instants")}
-        if code not in {known.value for known in Code}:
-            values = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
-            text = f"{code} ({values})" if values else str(code)
-            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text}, **numbers)
-        figures = {
-            name: Span(**value) if isinstance(value, dict) else value for name, value in stored["figures"].items()
-        }
-        return cls(code=Code(code), subject=stored["subject"], figures=figures, **numbers)
+        if isinstance(stored, Mapping) and "what" in stored:
+            return _of_finding(records.validate(_Finding, stored))
+        found = records.validate(_Stored, stored)
+        numbers = {"pairs": found.pairs, "instants": found.instants}
+        if found.code not in {known.value for known in Code}:
+            values = ", ".join(f"{name} = {value}" for name, value in found.figures.items())
+            text = f"{found.code} ({values})" if values else found.code
+            return cls(code=Code.OTHER, subject=found.subject, figures={"text": text}, **numbers)
+        figures = {name: math.nan if value is None else value for name, value in found.figures.items()}
+        warning = cls(code=Code(found.code), subject=found.subject, figures=figures, **numbers)
+        try:
+            _ = warning.sentence
+        except (KeyError, ValueError, TypeError, IndexError, AttributeError) as error:
+            raise RecordError(f"figures of the warning {found.code!r} do not fit it ({error})") from None
+        return warning
 
 
 @dataclass(frozen=True)
@@ -301,6 +310,37 @@ class Span:
 
     low: float
     high: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """A warning as files store it."""
+
+    code: str
+    subject: str
+    figures: Mapping[str, Span | int | float | str | bool | Sequence[int | float | str] | None]
+    pairs: tuple[int, ...] = ()
+    instants: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Finding:
+    """A warning as files of version 0.1.0 store it."""
+
+    what: str
+    camera: str
+    frame: str
+    value: float
+
+
+def _of_finding(found: _Finding) -> Warning:
+    if found.what not in _FINDING_FIGURES:
+        raise RecordError(f"unknown finding {found.what!r}")
+    figures = {_FINDING_FIGURES[found.what]: found.value}
+    if found.what == Code.UNEVEN.value:
+        figures["ratio"] = 4.0  # the limit of version 0.1.0
+    subject = found.camera + (f", frame {found.frame}" if found.frame else "")
+    return Warning(code=Code(found.what), subject=subject, figures=figures)
 
 
 class _Words(string.Formatter):
@@ -321,8 +361,27 @@ def to_text(warnings: Iterable[Warning]) -> str:
 
 
 def from_text(text: str) -> tuple[Warning, ...]:
-    """Read the JSON text that an attribute of a file stores."""
-    return tuple(Warning.from_json(stored) for stored in json.loads(text))
+    """Read the JSON text that an attribute of a file stores.
+
+    Raises
+    ------
+    RecordError
+        If it is no list of warnings.
+    """
+    return from_list(records.read_json(text))
+
+
+def from_list(stored: Any) -> tuple[Warning, ...]:
+    """Read the list of warnings that a record holds.
+
+    Raises
+    ------
+    RecordError
+        If it is no list of warnings.
+    """
+    if not isinstance(stored, list):
+        raise RecordError("expected a list of warnings")
+    return tuple(map(Warning.from_json, stored))
 
 
 def gather(warnings: Iterable[Warning]) -> list[Warning]:

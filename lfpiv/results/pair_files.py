@@ -7,7 +7,6 @@ warnings of their images.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,10 +16,12 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import warn
+from lfpiv.errors import DamagedFile
 from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
-from lfpiv.geometry.grid import NO_LAYERS, Layers
-from lfpiv.results import netcdf, provenance
+from lfpiv.geometry.grid import NO_LAYERS, Grid, Layers
+from lfpiv.records import read_json, validate
+from lfpiv.results import finished, netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
 from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.warn import Warning
@@ -88,20 +89,28 @@ class VolumeFile:
     stamp: Stamp
     origin: Mapping[str, Any]
     """Attributes that say of what the volume is: pair and frame, or instant and time."""
+    grid: Grid | None = None
+    """Voxels of the volume; None if the file is not compared with them."""
+
+    def marks(self) -> Marks | None:
+        """Return the marks of the file; None if it is missing or cannot be used."""
+        return finished.volume_marks(self.path, self.grid, self.origin.get("frame"))
 
     def fitting(self) -> Marks | None:
         """Return the marks of the file; None if it is missing or does not fit."""
-        marks = provenance.read_marks(self.path)
+        marks = self.marks()
         return marks if self.stamp.fits(marks) else None
 
     def read(self) -> FrameVolume | None:
-        """Read the volume and its record; None if the file is missing or does not fit."""
-        return None if self.fitting() is None else self.load()
-
-    def load(self) -> FrameVolume:
-        """Read the volume and its record from a file that fits."""
-        volume = netcdf.read_volume(self.path)
-        return FrameVolume(volume=volume, record=_read_record(volume, self.path))
+        """Read the volume and its record; None if the file is missing, damaged, or does not fit."""
+        if self.fitting() is None:
+            return None
+        try:
+            volume = netcdf.read_volume(self.path, grid=self.grid)
+            return FrameVolume(volume=volume, record=_read_record(volume, self.path))
+        except DamagedFile as error:
+            provenance.reject(Path(error.path), error.reason)
+            return None
 
     def write(self, found: FrameVolume) -> None:
         """Write the volume with its record, atomically."""
@@ -134,6 +143,8 @@ class PairFiles:
     """Volumes of the first and of the second frame."""
     origin: Mapping[str, Any]
     """Attributes that say of what the vectors are: the pair, or instant, step and time."""
+    grid: Grid | None = None
+    """Voxels of the volumes; None if files are not compared with them."""
 
     @classmethod
     def of(
@@ -159,11 +170,19 @@ class PairFiles:
                 path=folder.volume(pair, number),
                 stamp=stamps.volumes[number],
                 origin=_origin(experiment, frames[number]),
+                grid=experiment.grid,
             )
             for number in (0, 1)
         )
         origin = {"pair": pair} if experiment.series is None else _instant(experiment, pair)
-        return cls(pair=pair, vectors=folder.vectors(pair), stamp=stamps.vectors, frames=(first, second), origin=origin)
+        return cls(
+            pair=pair,
+            vectors=folder.vectors(pair),
+            stamp=stamps.vectors,
+            frames=(first, second),
+            origin=origin,
+            grid=experiment.grid,
+        )
 
     def _wanted(self, vectors: bool, volumes: bool) -> Iterator[tuple[Path, Stamp]]:
         if vectors:
@@ -171,10 +190,16 @@ class PairFiles:
         if volumes:
             yield from ((frame.path, frame.stamp) for frame in self.frames)
 
+    def _marks(self, path: Path) -> Marks | None:
+        """Return the marks of one of the files; None if it is missing or cannot be used."""
+        if path == self.vectors:
+            return finished.vectors_marks(path, self.grid)
+        return next(frame.marks() for frame in self.frames if frame.path == path)
+
     def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:
         """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""
         for path, stamp in self._wanted(vectors, volumes):
-            marks = provenance.read_marks(path)
+            marks = self._marks(path)
             changes = [] if marks is None else stamp.changes(marks)
             if changes or marks is None:
                 return changes
@@ -182,7 +207,7 @@ class PairFiles:
 
     def fitting_vectors(self) -> Marks | None:
         """Return the marks of the vectors; None if they are missing or do not fit."""
-        marks = provenance.read_marks(self.vectors)
+        marks = self._marks(self.vectors)
         return marks if self.stamp.fits(marks) else None
 
     def fitting_volumes(self) -> tuple[Marks, ...] | None:
@@ -194,8 +219,8 @@ class PairFiles:
         """Read both volumes and their records; None if one is missing or does not fit."""
         if self.fitting_volumes() is None:
             return None
-        first, second = self.frames
-        return first.load(), second.load()
+        first, second = (frame.read() for frame in self.frames)
+        return None if first is None or second is None else (first, second)
 
     def retire_outdated(self) -> Iterator[tuple[Path, Path]]:
         """Rename the results whose images changed; yield old and new paths."""
@@ -228,13 +253,14 @@ def _instant(experiment: Experiment, instant: int) -> dict[str, Any]:
 
 def _read_record(volume: xr.DataArray, path: Path) -> FrameRecord:
     stored = netcdf.read_attributes(path)
-    structure = {}
-    if "structure" in volume.attrs:
-        cameras = volume.attrs["cameras"]
-        names = json.loads(cameras) if isinstance(cameras, str) else cameras
-        structure = dict(zip(names, np.atleast_1d(volume.attrs["structure"]).tolist(), strict=True))
-    return FrameRecord(
-        structure=structure,
-        warnings=provenance.stored_warnings(stored),
-        seconds=float(stored["seconds"]),
-    )
+    try:
+        cameras = volume.attrs.get("cameras", [])
+        names = read_json(cameras) if isinstance(cameras, str) else cameras
+        values = np.atleast_1d(volume.attrs.get("structure", [])).tolist()
+        return FrameRecord(
+            structure=validate(dict[str, float], dict(zip(names, values, strict=True)) if values else {}),
+            warnings=provenance.stored_warnings(stored),
+            seconds=validate(float, stored.get("seconds")),
+        )
+    except (ValueError, TypeError) as error:
+        raise DamagedFile(path, f"its attributes have another form: {error}") from None

@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from lfpiv import hdf5
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import AXES
-from lfpiv.results import netcdf
+from lfpiv.records import read_object
+from lfpiv.results import finished, netcdf, provenance
 
 CHUNK_BYTES = 8 << 20
 """Largest size of a dask chunk, which holds one variable of at least one pair [byte]."""
@@ -32,7 +33,8 @@ _NAME = re.compile(r"pair_(\d+)\.nc")
 def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = None) -> xr.Dataset:
     """Open the vectors of all finished pairs in the folder of a run.
 
-    This reads only attributes and axes of each file, in about a millisecond. With dask installed, the variables
+    This reads only attributes and axes of each file, in about a millisecond. A file is verified (docs/conventions.md)
+    when its values are read for the first time. With dask installed, the variables
     are dask arrays with chunks along pair. Without dask, values are read from the files when they are used. No file
     stays open.
 
@@ -129,17 +131,14 @@ class _Signature:
 
 def _read_signature(path: Path) -> _Signature:
     """Read the signature of a file without its values."""
-    try:
-        with h5py.File(path, "r") as file:
-            version = int(np.ravel(file.attrs.get("schema_version", 0))[0])
-            attributes = {key: file.attrs[key] for key in COMMON if key in file.attrs}
-            depends_on = json.loads(file.attrs.get("depends_on", "{}"))
-            axes = {axis: file[axis][...] for axis in AXES}
-            names = set(file) - {*AXES, netcdf.RECONSTRUCTION}
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(_unreadable(path, error)) from None
+    with hdf5.glanced(path) as file:
+        netcdf.require_schema(file.attrs.get("schema_version", 0), path)
+        provenance.require_name(path, file.attrs)
+        attributes = {key: file.attrs[key] for key in COMMON if key in file.attrs}
+        depends_on = read_object(file.attrs.get("depends_on", "{}"))
+        axes = {axis: file[axis][...] for axis in AXES}
+        names = set(file) - {*AXES, netcdf.RECONSTRUCTION}
     attributes |= {key: json.dumps(value, sort_keys=True) for key, value in depends_on.items() if key != "images"}
-    netcdf.require_schema(version, path)
     return _Signature(path=path, attributes=attributes, axes=axes, names=names)
 
 
@@ -162,11 +161,6 @@ def _unequal(signature: _Signature, reference: _Signature, found: str) -> InputE
         f"{signature.path}: expected vectors made as those of {reference.path}, found {found}. "
         "Run `lfpiv run` on all pairs again, or choose pairs that belong together."
     )
-
-
-def _unreadable(path: Path, error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return f"{path}: expected the vectors of a pair, found a damaged file ({text}). Remove it and run again."
 
 
 def _difference(key: str, expected: Any, found: Any) -> str:
@@ -202,11 +196,9 @@ class _Stack(BackendArray):
 
     def _pair(self, number: int, where: tuple[Any, ...]) -> np.ndarray:
         path = self.paths[number]
-        try:
-            with h5py.File(path, "r") as file:
-                values = file[self.name][...]
-        except (OSError, KeyError) as error:
-            raise InputError(_unreadable(Path(path), error)) from None
+        finished.require_vectors(Path(path))
+        with hdf5.opened(path) as file:
+            values = file[self.name][...]
         if values.shape != self.shape[1:]:
             raise InputError(f"{path}: expected {self.name} of shape {self.shape[1:]}, found {values.shape}.")
         return np.asarray(_part(values, where), self.dtype)

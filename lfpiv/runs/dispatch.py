@@ -62,7 +62,7 @@ def parallel(
     Parameters
     ----------
     shared : Path
-        Folder with everything that the workers need, from `worker.share`.
+        Folder with everything that the workers need, from `task.write_task`.
     experiment : Experiment
     todo : sequence of int
         Pairs to do.

@@ -16,6 +16,7 @@ import numpy as np
 
 from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.progress import StepProgress
+from lfpiv.records import validate
 from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes, unlinked, without_still_light
 from lfpiv.selfcalibration.movements import Verdict, fit_movements, self_calibrate
@@ -91,9 +92,14 @@ class SelfCalibrationFigures:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> SelfCalibrationFigures:
-        """Read the form that a file stores."""
-        movements = {name: MovementFigures(**one) for name, one in stored["movements"].items()}
-        return cls(**{**stored, "movements": movements})
+        """Read the form that a file stores.
+
+        Raises
+        ------
+        RecordError
+            If it has another form.
+        """
+        return validate(cls, stored)
 
 
 @dataclass(frozen=True, kw_only=True)

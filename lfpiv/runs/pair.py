@@ -228,7 +228,9 @@ class PairWork:
             found = self.solver.smart.solve(light.images, floor=light.noise, progress=progress)
         except ValueError as error:
             raise InputError(f"instant {instant}: {error}") from error
-        return self._frame_volume(found.to_dataarray(), light, time.perf_counter() - start)
+        seconds = time.perf_counter() - start
+        log.info("instant %d: reconstructed in %.1f s", instant, seconds)
+        return self._frame_volume(found.to_dataarray(), light, seconds)
 
     def _frame_volume(self, guarded: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
         """Return a volume without its guard layers, with its record."""

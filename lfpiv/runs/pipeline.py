@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import dispatch, local_workers, memory, rig, worker, worker_plan
+from lfpiv.runs import dispatch, local_workers, memory, rig, task, worker_plan
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, WeightsFigures, Workers
 from lfpiv.runs.pair import Outcome, PairWork
@@ -169,10 +169,11 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
     Raises
     ------
     InputError
-        If the folder holds no calibration that fits the experiment.
+        If the folder holds no calibration that fits the experiment, or a file in it is damaged.
     """
     with open_run(experiment, out, None, None, writes_results=False) as current:
         calibrated = rig.load_calibration(current)
+        current.require_whole()
         calibrated = replace(calibrated, calibration=rig.with_standing_light(current, calibrated.calibration))
         return current.finish(calibrated, Invocation(), report=True)
 
@@ -225,7 +226,7 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     else:
         used = Workers(count=None, threads=current.experiment.compute.threads)
     device = current.device.kind if isinstance(workers, Plan) else current.device_request
-    shared = worker.share(work, device, used.threads)
+    shared = task.write_task(work, device, used.threads)
     del work, weights  # the workers map them from files; the memory may not have room for both
     outcomes = _collect(
         current, dispatch.parallel(shared, current.experiment, todo, workers, current.step(_step_name(current)))

@@ -22,7 +22,7 @@ from lfpiv.experiment.experiment import Experiment, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import provenance
+from lfpiv.results import finished, provenance
 from lfpiv.results.folder import Folder, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
@@ -213,6 +213,16 @@ class Run:
         found = self.files(pair)
         return found.fitting_vectors() is not None or found.fitting_volumes() is not None
 
+    def require_whole(self) -> None:
+        """Verify the results that a report shows, where they cannot be made again.
+
+        Raises
+        ------
+        InputError
+            If a file is damaged, or is another one's copy.
+        """
+        finished.require([self.folder.background, *map(self.folder.vectors, self.experiment.numbers)])
+
     def record(self, outcome: Outcome) -> Outcome:
         """Log the failure of a pair, rename its results from earlier images, and return the outcome."""
         if outcome.died and self.files(outcome.pair).fitting_vectors() is not None:
@@ -256,13 +266,11 @@ class Run:
                 vectors[pair] = pair_figures.read_figures(found.vectors, marks)
             elif (both := found.fitting_volumes()) is not None:
                 volumes[pair] = both[0].warnings + both[1].warnings
-        marks = provenance.read_marks(self.folder.background)
-        found_light = {} if marks is None or marks.figures is None else marks.figures["cameras"]
-        warnings = () if marks is None else marks.warnings
+        light, warnings = provenance.background_figures(self.folder.background)
         return Contents(
             vectors=vectors,
             volumes=volumes,
-            background=found_light,
+            background=light,
             background_warnings=warnings,
             guard=self.guard,
         )

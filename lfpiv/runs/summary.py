@@ -6,7 +6,7 @@ the file, with equal warnings about several pairs merged into one.
 
 from __future__ import annotations
 
-import json
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,18 +19,22 @@ from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
+from lfpiv.records import RecordError, read_object, read_text, validate
 from lfpiv.results.folder import Folder
 from lfpiv.runs import guard
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation
+from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.velocity.cross_correlation import Verdict
-from lfpiv.warn import Code, Warning, gather
+from lfpiv.warn import Code, Warning, from_list, gather
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.geometry.grid import Grid
     from lfpiv_kernels.runtime import Device
+
+log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
 
@@ -69,19 +73,60 @@ class EarlierSummary:
     peak_memory_mib: float | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Failure:
+    """A pair that failed, as the summary stores it."""
+
+    pair: int
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Weights:
+    """Figures of the weights, as the summary stores them."""
+
+    method: str = ""
+    memory_mib: float = 0.0
+    form: dict[str, str] = field(default_factory=dict)
+    cuts: dict[str, list[int]] = field(default_factory=dict)
+    profiles_check_l2: dict[str, list[float | None]] = field(default_factory=dict)
+    count_check_l2: list[float] = field(default_factory=list)
+    disparity_pair: int | None = None
+    disparity_voxel: float | None = None
+    self_calibration: SelfCalibrationFigures | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """Entries of the summary that a later invocation reads."""
+
+    weights: dict[str, Any] = field(default_factory=dict)
+    timings_s: dict[str, float | None] = field(default_factory=dict)
+    failed: list[_Failure] = field(default_factory=list)
+    peak_memory_mib: float | None = None
+
+
 def read(path: Path) -> EarlierSummary:
     """Read an earlier summary; an empty one if the file is missing, damaged or of another schema."""
     try:
-        found = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError):
+        found = read_object(read_text(path))
+        if found.get("schema_version") != SCHEMA_VERSION:
+            raise RecordError(
+                f"expected schema version {SCHEMA_VERSION}, found {str(found.get('schema_version'))[:40]}"
+            )
+        known = validate(_Stored, found)
+        validate(_Weights, known.weights)
+        from_list(known.weights.get("warnings", []))
+    except FileNotFoundError:
         return EarlierSummary()
-    if not isinstance(found, dict) or found.get("schema_version") != SCHEMA_VERSION:
+    except RecordError as error:
+        log.warning("%s: damaged or of another version, written anew: %s", path, error)
         return EarlierSummary()
     return EarlierSummary(
-        weights=found.get("weights", {}),
-        weights_s=float(found.get("timings_s", {}).get("weights") or 0.0),
-        failed={entry["pair"]: entry["reason"] for entry in found.get("failed", ())},
-        peak_memory_mib=found.get("peak_memory_mib"),
+        weights=known.weights,
+        weights_s=known.timings_s.get("weights") or 0.0,
+        failed={failure.pair: failure.reason for failure in known.failed},
+        peak_memory_mib=known.peak_memory_mib,
     )
 
 
@@ -142,6 +187,7 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
             "pairs": experiment.pairs,
             "volume_shape": list(experiment.grid.shape),
             "voxel_mm": experiment.grid.voxel_mm,
+            **({} if experiment.series is None else {"series": experiment.series.model_dump()}),
         },
         "settings": {
             name: getattr(experiment, name).model_dump() for name in ("smart", "correlation", "network", "compute")

@@ -10,20 +10,20 @@ import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_serializer, model_validator
 from pydantic_core.core_schema import SerializerFunctionWrapHandler
 
-from lfpiv.experiment.settings import (
-    Compute,
-    Correlation,
-    Count,
+from lfpiv.experiment import bounds
+from lfpiv.experiment.bounds import (
     Flag,
-    Network,
-    NominalBoard,
+    Interval,
+    Length,
+    Name,
     NonNegative,
     Point,
     Positive,
-    Smart,
-    Table,
-    Volume,
+    Rays,
+    Seed,
+    Thickness,
 )
+from lfpiv.experiment.settings import Compute, Correlation, Network, NominalBoard, Smart, Table, Volume
 from lfpiv.experiment.toml import read_toml
 from lfpiv.simulation.board_errors import BoardErrors
 from lfpiv.simulation.flows import KINDS, Flow, Tracers
@@ -58,11 +58,20 @@ class SceneBoard(NominalBoard):
             raise ValueError("no table errors with inverted = true: errors are simulated of bright dots only")
         return self
 
+    @model_validator(mode="after")
+    def _mark_of_bright_dots(self) -> SceneBoard:
+        if self.inverted and self.mark:
+            raise ValueError("no mark with inverted = true: a mark is simulated of bright dots only")
+        return self
+
     def dots_mm(self, plane_mm: float) -> np.ndarray:
-        """Return the dot centres (x, y, z) at one depth, x fastest, shape (dot, 3) [mm]."""
+        """Return the dot centres (x, y, z) at one depth, x fastest, without the mark's, shape (dot, 3) [mm]."""
         x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing_mm for n in self.dots)
         y, x = np.meshgrid(y, x, indexing="ij")
-        return np.stack([x.ravel(), y.ravel(), np.full(x.size, float(plane_mm))], axis=1)
+        dot = np.ones((self.dots[1], self.dots[0]), bool)
+        for column, row in self.mark:
+            dot[row, column] = False
+        return np.stack([x[dot], y[dot], np.full(dot.sum(), float(plane_mm))], axis=1)
 
 
 class SceneVolume(Volume):
@@ -72,35 +81,41 @@ class SceneVolume(Volume):
     """Centre (x, y, z) of the volume [mm]."""
 
 
+LARGEST_SEEDING = 1e4
+"""Largest number of particles per microlens."""
+LARGEST_FILL = 1e3
+"""Largest edge of the seeded region relative to the volume's."""
+
+
 class SceneParticles(Table):
     """Table ``[particles]``: number, intensity and size of the particles."""
 
-    per_microlens: Positive | None = None
+    per_microlens: Annotated[float, Field(strict=True, gt=0, le=LARGEST_SEEDING)] | None = None
     """Particles per microlens of the seeded region's x-y face (the paper's ppm). Alternative to `count`."""
-    count: Count | None = None
+    count: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_PARTICLES)] | None = None
     """Particles of each pair or instant, before those in walls are removed."""
-    pairs: Count = 1
+    pairs: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SIMULATED_PAIRS)] = 1
     """Number of image pairs, each with other particles."""
-    instants: Count | None = None
+    instants: Annotated[int, Field(strict=True, ge=2, le=bounds.MOST_SIMULATED_PAIRS)] | None = None
     """Number of instants of a time series, in place of `pairs`: the same particles are carried by the flow, enter and
     leave through the faces of the seeded region, and keep their brightness."""
-    first: Annotated[int, Field(strict=True, ge=0)] = 0
+    first: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] = 0
     """Number of a series' first instant."""
-    step: Count = 1
+    step: bounds.Count = 1
     """Number of instants between the two that are correlated, `dt_s` apart."""
-    images: Annotated[str, Field(min_length=1)] = "particles/{camera}/instant_{instant:06d}.tif"
+    images: bounds.PathText = "particles/{camera}/instant_{instant:06d}.tif"
     """Path of a series' images with ``{camera}`` and ``{instant}``. Behind `#` it names a page of a TIFF file or an
     image of an HDF5 dataset: ``{camera}.tif#{instant}`` or ``{camera}.h5#images[{instant}]``."""
-    fill: Positive = 1.0
+    fill: Annotated[float, Field(strict=True, gt=0, le=LARGEST_FILL)] = 1.0
     """Edges of the seeded region relative to the volume's. Above 1, particles are outside the volume too."""
-    margin_mm: tuple[NonNegative, NonNegative, NonNegative] | None = None
+    margin_mm: tuple[Thickness, Thickness, Thickness] | None = None
     """Distance by which the seeded region reaches beyond `fill` times the volume on each side (x, y, z), for light that
     reaches farther than the volume. `per_microlens` then holds within the volume, `count` in all [mm]."""
     intensity_sd: NonNegative = 0.0
     """Standard deviation of the particles' intensity about 1."""
-    sigma_mm: Positive | None = None
+    sigma_mm: Length | None = None
     """Standard deviation of Gaussian particles [mm]."""
-    radius_mm: Positive | None = None
+    radius_mm: Length | None = None
     """Radius of spheres that emit evenly from their volume [mm]. Without `sigma_mm` and this, particles are points."""
 
     @model_validator(mode="after")
@@ -153,24 +168,24 @@ class Background(Table):
 class Quality(Table):
     """Table ``[quality]``: numbers of rays, rounded up to powers of two."""
 
-    particle_rays: Count = 32_768
+    particle_rays: Rays = 32_768
     """Rays of each particle."""
-    dot_rays: Count = 131_072
+    dot_rays: Rays = 131_072
     """Rays of each board dot."""
-    pixel_rays: Count = 256
+    pixel_rays: Rays = 256
     """Rays of each pixel of white images and of boards with dark dots."""
 
 
 class Scene(Table):
     """Scene file. `smart`, `correlation`, `network` and `compute` are copied into the experiment file."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Name
     """Name of the experiment."""
-    seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    seed: Seed = 0
     """Seed of all random numbers."""
-    dt_s: Positive
+    dt_s: Interval
     """Time between the two frames of a pair, or between instants k and k + step of a series [s]."""
-    camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1)]
+    camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1, max_length=bounds.MOST_CAMERAS)]
     window: Windows = ()
     """Windows of all cameras that state none."""
     aberrations: Aberrations | None = None
@@ -257,7 +272,7 @@ class Scene(Table):
     def _known_flow(cls, table: Any) -> Any:
         if isinstance(table, Mapping):
             kind = table.get("kind")
-            if kind not in KINDS:
+            if not isinstance(kind, str) or kind not in KINDS:
                 raise ValueError(f"a flow with kind = {' or '.join(map(repr, KINDS))}")
             known = KINDS[kind].model_fields
             unknown = [key for key in table if key not in known]

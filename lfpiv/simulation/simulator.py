@@ -278,7 +278,7 @@ def _experiment_text(scene: Scene) -> str:
         *_rows({"name": scene.name, "dt_s": scene.dt_s}),
     ]
     for camera in scene.camera:
-        known = {"name": camera.name, "white_image": f"white/{camera.name}.tif"}
+        known: dict[str, Any] = {"name": camera.name, "white_image": f"white/{camera.name}.tif"}
         if camera.dark_image:
             known["dark_image"] = f"dark/{camera.name}.tif"
         if scene.background is not None:
@@ -287,10 +287,15 @@ def _experiment_text(scene: Scene) -> str:
         if camera.image_flip != "none":
             known["image_flip"] = camera.image_flip
         optics = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")
-        for key in (*optics, "pixel_um", "microlens_layout", "nominal_angle_deg"):
+        for key in (*optics, "pixel_um", "microlens_layout", "nominal_angle_deg", "nominal_direction"):
             known[key] = getattr(camera, key)
+        known = {key: value for key, value in known.items() if value is not None}
+        if camera.nominal_roll_deg:
+            known["nominal_roll_deg"] = camera.nominal_roll_deg
         lines += ["", "[[camera]]", *_rows(known)]
     board = scene.board.model_dump(include={"dots", "spacing_mm", "dot_diameter_mm", "planes_mm"})
+    if scene.board.mark:
+        board["mark"] = scene.board.mark
     board["images"] = "board/{camera}/plane_{plane:02d}.tif"
     volume = {"centre_mm": scene.volume.centre_mm} | scene.volume.model_dump(exclude_unset=True)
     tables = {"board": board, "volume": volume, "particles": _particles_table(scene)}

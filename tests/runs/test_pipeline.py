@@ -253,8 +253,8 @@ def test_a_failure_leaves_no_part_and_no_other_pair_undone(small_run, tmp_path, 
 def numbered(read):
     """Volumes that know their pair."""
 
-    def read_numbered(path):
-        volume = read(path)
+    def read_numbered(path, **options):
+        volume = read(path, **options)
         volume.attrs["pair"] = int(path.stem.split("_")[1])
         return volume
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support import small_run
-from support.series_run import (
+from support.series_forms import (
     CAMERAS,
     FORMS,
     INSTANTS,

@@ -1,132 +1,123 @@
-"""A small time series of the sample data's turbulent flow, in every form of file, and counts of reconstructions."""
+"""A time series made of the images of `small_run`, and the work on it without the steps before."""
 
-import json
-import os
-import sys
-from collections import Counter
-from dataclasses import dataclass
+import dataclasses
+import shutil
 from pathlib import Path
 
 import h5py
-import tifffile
-from support import scenes
-from support.recordings import write_cine
+from distributed import KilledWorker
 
-from lfpiv.simulation.simulator import simulate
+from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.settings import Series
+from lfpiv.results.folder import Folder
+from lfpiv.runs import dispatch, guard
+from lfpiv.runs.pair import PairWork
+from lfpiv.runs.stretches import cut
+from lfpiv.runs.worker import Result
+from lfpiv.weights.operator import build_weights
 
-CAMERAS = ("left", "right")
-INSTANTS, STEP = 7, 3
-PAIRS = range(INSTANTS - STEP)
-"""Numbers of the pairs of a series that starts at 0."""
-
-FORMS = {
-    "single": "particles/{camera}/instant_{instant:06d}.tif",
-    "tiff": "stacks/{camera}.tif#{instant}",
-    "hdf5": "stacks/recording.h5#{camera}/images[{instant}]",
-    "cine": "stacks/{camera}.cine#{instant}",
-}
-"""Path patterns of the same images in files of several forms."""
-
-SITE = '''
-"""Log what every process reconstructs from all cameras together."""
-import hashlib, os
-import lfpiv.report
-from lfpiv.reconstruction.solver import SmartSolver
-
-lfpiv.report.write_report = lambda *arguments: None  # takes as long as the run
-
-original = SmartSolver.solve
-
-def solve(self, images, **options):
-    if len(self.weights.cameras) == {cameras}:
-        digest = hashlib.sha256()
-        for name in sorted(images):
-            digest.update(images[name].tobytes())
-        log = os.open({log!r}, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-        os.write(log, (digest.hexdigest() + chr(10)).encode())
-        os.close(log)
-    return original(self, images, **options)
-
-SmartSolver.solve = solve
-'''
+FIRST = 3
+"""Number of the first instant."""
 
 
-@dataclass(frozen=True)
-class CountedProcesses:
-    """Processes that log what they reconstruct from all cameras together, and write no report."""
+def write_series(small_run, folder: Path) -> Path:
+    """Write the images of the small run's pairs one after the other as instants; return the experiment file.
 
-    folder: Path
+    Instants 3 and 4 are the frames of pair 0, 5 and 6 those of pair 1. Between pairs the particles are others.
+    """
+    file = small_run.images(folder)
+    pairs = read_experiment(file)
+    for pair in pairs.numbers:
+        for number, frame in enumerate(pairs.frames):
+            for camera in pairs.cameras:
+                path = folder / f"run/{camera.name}/{FIRST + 2 * pair + number:05d}.tif"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                pairs.particle_path(camera.name, pair, frame).rename(path)
+    text = file.read_text()
+    head, particles = text.split("[particles]\n")
+    rest = particles.split("\n\n", 1)[1]
+    keys = f'images = "run/{{camera}}/{{instant:05d}}.tif"\ninstants = {2 * pairs.pairs}\nfirst = {FIRST}\n\n'
+    file.write_text(f"{head}[particles]\n{keys}{rest}")
+    return file
 
-    @property
-    def log(self) -> Path:
-        """File with a line for each reconstruction."""
-        return self.folder / "reconstructions.log"
 
-    def environment(self) -> dict[str, str]:
-        """Return the variables of a process whose reconstructions, and those of its workers, are logged."""
-        (self.folder / "sitecustomize.py").write_text(SITE.format(cameras=len(CAMERAS), log=str(self.log)))
-        return os.environ | {"PYTHONPATH": os.pathsep.join([str(self.folder), *filter(None, sys.path)])}
+def make_work(small_run, file: Path, out: Path) -> PairWork:
+    """Return the work on all pairs of a series, with the calibration and the guard layers of the small run."""
+    from lfpiv.calibration.camera import load_calibration
 
-    def counts(self) -> Counter[str]:
-        """Return how often each instant's images were reconstructed."""
-        return Counter(self.log.read_text().split()) if self.log.exists() else Counter()
-
-
-def series_scene(file: Path):
-    """Return a scene of two cameras and tracers that move as given in a file of the sample data."""
-    cameras = [
-        scenes.camera(name, angle, (400, 400), true_yaw_deg=angle - 0.5)
-        for name, angle in zip(CAMERAS, (40.0, -40.0), strict=True)
-    ]
-    return scenes.scene(
-        "series",
-        cameras,
-        planes_mm=(-0.7, 0.0, 0.7),
-        particles={"count": 150, "instants": INSTANTS, "step": STEP, "sigma_mm": 0.05},
-        displacement_mm=(0.0, 0.0, 0.0),
-        flow={
-            "kind": "tracers",
-            "file": str(file),
-            "series": "positions",
-            "size_mm": (5.0, 5.0, 5.0),
-            "box": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
-            "as_given": True,
-        },
-        correlation={"windows": [(12, 16, 16), (12, 12, 12)]},
-        smart={"iterations": 8},
-        network={"hidden": (12,), "epochs": 60},
+    out.mkdir()
+    shutil.copy2(small_run.out / "calibration.h5", out)
+    experiment = read_experiment(file)
+    measured, _ = guard.read(Folder(small_run.out))
+    calibration = load_calibration(out / "calibration.h5")
+    with h5py.File(out / "calibration.h5") as stored:
+        stamp = stored.attrs["settings_hash"]
+    return PairWork(
+        experiment=experiment,
+        folder=Folder(out, experiment.series),
+        calibration_hash=stamp,
+        guard=measured.layers,
+        weights=build_weights(calibration, guard.with_guard(experiment, measured.layers).grid),
+        cameras=calibration.cameras,
+        darks={camera.name: None for camera in experiment.cameras},
+        keep_volumes=False,
     )
 
 
-def make_series(file: Path, folder: Path) -> Path:
-    """Simulate the series, store its images in every form, and return the folder of the experiment files."""
-    path = simulate(series_scene(file), folder / "data")
-    (path.parent / "stacks").mkdir()
-    with h5py.File(path.parent / "stacks" / "recording.h5", "w") as recording:
-        for camera in CAMERAS:
-            names = [FORMS["single"].format(camera=camera, instant=instant) for instant in range(INSTANTS)]
-            frames = tifffile.imread([path.parent / name for name in names])
-            recording[f"{camera}/images"] = frames
-            tifffile.imwrite(path.parent / "stacks" / f"{camera}.tif", frames, photometric="minisblack")
-            write_cine(path.parent / "stacks" / f"{camera}.cine", frames)
-    text = path.read_text("utf-8")
-    for form, pattern in FORMS.items():
-        changed = text.replace(json.dumps(FORMS["single"]), json.dumps(pattern))
-        (path.parent / f"{form}.toml").write_text(changed, "utf-8")
-    return path.parent
+def changed(work: PairWork, out: Path, *, step: int = 1, instants: int | None = None, **settings) -> PairWork:
+    """Return the work with another step, number of instants or output folder."""
+    series = work.experiment.series
+    series = Series(instants=instants or series.instants, first=series.first, step=step)
+    experiment = dataclasses.replace(work.experiment, series=series, pairs=series.instants - step)
+    return dataclasses.replace(work, experiment=experiment, folder=Folder(out, series), **settings)
 
 
-def as_pairs(data: Path) -> Path:
-    """Write an experiment of independent pairs of the same images beside a series; return its file."""
-    text = (data / "single.toml").read_text("utf-8")
-    series = f"images = {json.dumps(FORMS['single'])}\ninstants = {INSTANTS}\nfirst = 0\nstep = {STEP}\n"
-    assert series in text
-    pairs = f'images = "pairs/{{camera}}_{{pair}}_{{frame}}.tif"\npairs = {len(PAIRS)}\n'
-    (data / "pairs.toml").write_text(text.replace(series, pairs), "utf-8")
-    (data / "pairs").mkdir()
-    for camera in CAMERAS:
-        for pair in PAIRS:
-            for frame, instant in (("a", pair), ("b", pair + STEP)):
-                recorded = data / FORMS["single"].format(camera=camera, instant=instant)
-                os.link(recorded, data / "pairs" / f"{camera}_{pair}_{frame}.tif")
-    return data / "pairs.toml"
+class Processes:
+    """A client of Dask whose workers do their stretches at once, in this process; `deaths` tells when one dies.
+
+    `deaths` maps the first pair of a stretch to a list: after how many pairs a worker dies of it, at each trial.
+    """
+
+    def __init__(self, work: PairWork, deaths=None):
+        self.work, self.deaths, self.submitted = work, {key: list(value) for key, value in (deaths or {}).items()}, []
+
+    def submit(self, function, shared, stretch, topic, name, *, key, pure, **options):
+        self.submitted.append(stretch)
+        deaths = self.deaths.get(stretch.pairs[0], [])
+        left, outcomes = deaths.pop(0) if deaths else None, []
+        for outcome in self.work.do(stretch, lambda number, fraction: None):
+            outcomes.append(outcome)
+            if len(outcomes) == left:
+                return Done(key, "error", None)
+        return Done(key, "finished", Result(outcomes=tuple(outcomes)))
+
+    def subscribe_topic(self, topic, handler):
+        pass
+
+    def unsubscribe_topic(self, topic):
+        pass
+
+
+class Done:
+    """A future that is done."""
+
+    def __init__(self, key, status, result):
+        self.key, self.status, self.found = key, status, result
+
+    def result(self, timeout):
+        return self.found
+
+    def exception(self):
+        return KilledWorker(self.key, None, 0)
+
+    def add_done_callback(self, call):
+        call(self)
+
+
+def in_processes(work: PairWork, workers: int, deaths=None):
+    """Do all pairs in stretches for several workers; return their outcomes by pair, and the client."""
+    client = Processes(work, deaths)
+    todo = list(work.experiment.numbers)
+    stretches = cut(todo, work.experiment.series.step, workers)
+    found = dispatch.Dispatch(client, lambda: workers, Path("shared"), stretches, len(todo), "instant")
+    return {outcome.pair: outcome for outcome in found.outcomes(lambda fraction: None)}, client
