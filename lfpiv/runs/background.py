@@ -19,7 +19,7 @@ import numpy as np
 
 from lfpiv import files, hdf5
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
 from lfpiv.lightfield import background, decorrelation, image_checks
 from lfpiv.lightfield.background import Series
@@ -184,24 +184,28 @@ def _independent_after(
     experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, pairs: list[int]
 ) -> int | None:
     """Return the number of instants after which particles are elsewhere; None where the series does not show it."""
-    ends = {pair: _light(experiment, camera, dark, pair) for pair in (pairs[0], pairs[-1])}
+    instants = sorted({frame for pair in pairs for frame in experiment.pair_frames(pair)})
     overlaps: dict[int, list[float]] = {}
-    for pair in pairs:
-        light = _light(experiment, camera, dark, pair)
-        for end, other in ends.items():
-            if pair != end and light is not None and other is not None:
-                overlaps.setdefault(abs(pair - end), []).append(decorrelation.overlap(light, other))
+    for end in (instants[0], instants[-1]):
+        reference = _light(experiment, camera, dark, end)
+        for instant in instants:
+            light = None if instant == end else _light(experiment, camera, dark, instant)
+            if light is not None and reference is not None:
+                overlaps.setdefault(abs(instant.number - end.number), []).append(
+                    decorrelation.overlap(reference, light)
+                )
     lags = sorted(overlaps)
     return decorrelation.independent_after(lags, [float(np.mean(overlaps[lag])) for lag in lags])
 
 
-def _light(experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, pair: int) -> np.ndarray | None:
-    """Return the light of the first image of a pair; None if it cannot be used."""
+def _light(
+    experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, frame: Frame
+) -> np.ndarray | None:
+    """Return the light of an image; None if it cannot be used."""
     try:
-        image = experiment.particle_image(camera.name, pair, experiment.frames[0])
+        return _without_dark(experiment.particle_image(camera.name, *frame), dark, camera)[0]
     except InputError:
         return None
-    return _without_dark(image, dark, camera)[0]
 
 
 def _read_series(

@@ -19,6 +19,9 @@ FIELDS = {"camera", "instant"}
 TIFF, HDF5 = (".tif", ".tiff"), (".h5", ".hdf5")
 """Endings of the files that are written."""
 
+WIDTH = re.compile("(0?([1-9]|1[0-9]|20))?d?")
+"""Format of an instant's number."""
+
 PAGE = re.compile(r"\d+")
 DATASET = re.compile(r"(?P<name>[\w./-]+)\[(?P<index>\d+)\]", re.ASCII)
 
@@ -38,11 +41,13 @@ def check_pattern(pattern: str, instants: Sequence[int]) -> None:
     ValueError
     """
     try:
-        fields = {name for _, name, _, _ in string.Formatter().parse(pattern) if name is not None}
-        if fields != FIELDS:
-            raise ValueError(f"expected exactly the fields {{camera}} and {{instant}}, found {pattern!r}")
+        fields = {name: (width, turn) for _, name, width, turn in string.Formatter().parse(pattern) if name is not None}
+        if set(fields) != FIELDS:
+            raise ValueError("each of them, and no others")
+        if fields["camera"] != ("", None) or fields["instant"][1] or not WIDTH.fullmatch(fields["instant"][0] or ""):
+            raise ValueError("no other format than {instant:06d}")
         paths = [pattern.format(camera="camera", instant=instant) for instant in (instants[0], instants[-1])]
-    except (ValueError, IndexError, KeyError) as error:
+    except ValueError as error:
         raise ValueError(f"images: a path with {{camera}} and {{instant}} ({error})") from None
     path, part = _parts(paths[0])
     if Path(path).is_absolute() or ".." in Path(path).parts:
