@@ -192,7 +192,8 @@ def print_vectors(summary: dict[str, Any], out: Path) -> None:
     for pair in pairs[:LISTED_PAIRS]:
         print(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.0f} % valid vectors")
     if len(pairs) > LISTED_PAIRS:
-        print(f"{len(pairs)} pairs in all, {100 * summary['valid_fraction']:.0f} % valid vectors on average")
+        count = summary.get("pairs_finished", len(pairs))
+        print(f"{count} pairs in all, {100 * summary['valid_fraction']:.0f} % valid vectors on average")
 
 
 def print_failed(summary: dict[str, Any], where: TextIO) -> None:
@@ -201,8 +202,9 @@ def print_failed(summary: dict[str, Any], where: TextIO) -> None:
     for item in failed[:LISTED_PAIRS]:
         print(f"failed: pair {item['pair']}: {item['reason']}", file=where)
     total, earlier = summary["experiment"]["pairs"], len(summary["failed"]) - len(failed)
+    unnamed = summary.get("pairs_failed", len(summary["failed"])) - len(summary["failed"])
     if failed:
-        print(f"{len(failed)} of {total} pairs failed; the same command tries them again", file=where)
+        print(f"{len(failed) + unnamed} of {total} pairs failed; the same command tries them again", file=where)
     if earlier:
         print(f"{earlier} of {total} pairs failed in earlier runs and were not tried in this one", file=where)
 

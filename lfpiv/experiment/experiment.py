@@ -35,6 +35,9 @@ from lfpiv.geometry.optics import Optics
 DECODED_PIXELS = 100_000_000
 """Largest number of pixels of particle images that are decoded before the work starts [pixel]."""
 
+CHECKED_PAIRS = 100
+"""Largest number of pairs whose images are checked before the work starts; it takes about a second."""
+
 MICROLENS_SHARE = 0.2
 """Largest focal length of the microlenses over the main lens's image distance; more is a wrong unit."""
 
@@ -182,8 +185,8 @@ def open_experiment(path: str | Path) -> Experiment:
     """Read an experiment file and check all its keys and images.
 
     White, dark and board images are decoded, and particle images up to `DECODED_PIXELS`. Of the other particle images
-    the header and the length are checked; DaVis images must exist. `lfpiv.run` checks the particle images by
-    `check_pairs` instead and continues without damaged pairs.
+    the header and the length are checked; DaVis images must exist. Of more than `CHECKED_PAIRS` pairs, that many are
+    checked, evenly spread from the first to the last. `lfpiv.run` continues without damaged pairs.
 
     Parameters
     ----------
@@ -201,7 +204,11 @@ def open_experiment(path: str | Path) -> Experiment:
         if a nominal camera certainly sees nothing of the volume.
     """
     experiment = read_experiment(path)
-    for _, reason in check_pairs(experiment, experiment.numbers):
+    numbers: Sequence[int] = experiment.numbers
+    most = CHECKED_PAIRS
+    if len(numbers) > most:
+        numbers = [numbers[place * (len(numbers) - 1) // (most - 1)] for place in range(most)]
+    for _, reason in check_pairs(experiment, numbers):
         raise InputError(reason)
     return experiment
 

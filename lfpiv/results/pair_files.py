@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,11 @@ class PairFiles:
         volumes = (folder.volume(pair, 0), folder.volume(pair, 1))
         return cls(pair=pair, vectors=folder.vectors(pair), volumes=volumes, stamps=stamps)
 
+    @cached_property
+    def vector_marks(self) -> Marks | None:
+        """Marks of the vectors, read once; None if they are missing."""
+        return provenance.read_marks(self.vectors)
+
     def _wanted(self, vectors: bool, volumes: bool) -> Iterator[tuple[Path, Stamp]]:
         if vectors:
             yield self.vectors, self.stamps.vectors
@@ -97,7 +103,7 @@ class PairFiles:
     def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:
         """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""
         for path, stamp in self._wanted(vectors, volumes):
-            marks = provenance.read_marks(path)
+            marks = self.vector_marks if path == self.vectors else provenance.read_marks(path)
             changes = [] if marks is None else stamp.changes(marks)
             if changes or marks is None:
                 return changes
@@ -105,8 +111,7 @@ class PairFiles:
 
     def fitting_vectors(self) -> Marks | None:
         """Return the marks of the vectors; None if they are missing or do not fit."""
-        marks = provenance.read_marks(self.vectors)
-        return marks if self.stamps.vectors.fits(marks) else None
+        return self.vector_marks if self.stamps.vectors.fits(self.vector_marks) else None
 
     def fitting_volumes(self) -> tuple[Marks, ...] | None:
         """Return the marks of both volumes; None if one is missing or does not fit."""

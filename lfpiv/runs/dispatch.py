@@ -12,7 +12,8 @@ import logging
 import os
 import queue
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable
+from operator import length_hint
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +33,22 @@ TICK_S = 0.5
 """Interval at which the state of the cluster is checked and progress is reported [s]."""
 
 
-def sequential(work: PairWork, todo: Sequence[int], progress: StepProgress) -> Generator[Outcome, None, None]:
-    """Do pairs one after the other in this process; yield the outcome of each."""
-    for number, pair in enumerate(todo):
-        step = part_of(progress, number / len(todo), (number + 1) / len(todo))
+def sequential(work: PairWork, todo: Iterable[int], progress: StepProgress) -> Generator[Outcome, None, None]:
+    """Do pairs one after the other in this process; yield the outcome of each.
+
+    Pairs are taken from `todo` when their turn comes. `operator.length_hint` says how many may come.
+    """
+    source = iter(todo)
+    total = length_hint(source)
+    for pair in source:
+        left = length_hint(source)
+        step = part_of(progress, 1 - (left + 1) / total, 1 - left / total)
         step(0.0)
         yield work.do(pair, step)
 
 
 def parallel(
-    shared: Path, todo: Sequence[int], workers: Plan | str, progress: StepProgress
+    shared: Path, todo: Iterable[int], workers: Plan | str, progress: StepProgress
 ) -> Generator[Outcome, None, None]:
     """Do pairs in parallel, in any order; yield the outcome of each.
 
@@ -49,8 +56,8 @@ def parallel(
     ----------
     shared : Path
         Folder with everything that the workers need, from `worker.share`.
-    todo : sequence of int
-        Pairs to do.
+    todo : iterable of int
+        Pairs to do; each is taken when a worker is free.
     workers : Plan or str
         Processes to start on this machine, or the address of a Dask scheduler whose workers see `shared`.
     progress : callable
@@ -77,11 +84,13 @@ def parallel(
 class Dispatch:
     """Pairs of a run on their way to and from the workers of a Dask client."""
 
-    def __init__(self, client: Any, capacity: Capacity, shared: Path, todo: Sequence[int]):
+    def __init__(self, client: Any, capacity: Capacity, shared: Path, todo: Iterable[int]):
         self.client, self.capacity, self.shared = client, capacity, shared
-        self.total, self.done = len(todo), 0
-        self.waiting, self.again = deque(todo), deque[int]()
-        """Pairs to submit now, and after all others."""
+        self.source = iter(todo)
+        """Pairs that were not submitted yet."""
+        self.total = max(length_hint(self.source), 1)
+        self.waiting, self.again = deque[int](), deque[int]()
+        """Pairs to submit once more: before those of `source`, and after all others."""
         self.running: dict[str, tuple[Any, int]] = {}
         """Key of Dask -> future and pair; futures that are not referenced are cancelled."""
         self.fractions: dict[int, float] = {}
@@ -96,8 +105,10 @@ class Dispatch:
         """Submit all pairs and yield their outcomes."""
         self.client.subscribe_topic(self.topic, lambda event: self.fractions.update([event[1]]))
         try:
-            while self.done < self.total:
+            while True:
                 self._submit()
+                if not self.running and not self.waiting and not self.again and not length_hint(self.source):
+                    return
                 progress(self._fraction())
                 try:
                     future = self.arrived.get(timeout=TICK_S)
@@ -105,7 +116,6 @@ class Dispatch:
                     continue
                 outcome = self._outcome(future)
                 if outcome is not None:
-                    self.done += 1
                     yield outcome
         finally:
             with contextlib.suppress(Exception):  # the cluster may be lost
@@ -113,19 +123,27 @@ class Dispatch:
 
     def _submit(self) -> None:
         """Submit as many waiting pairs as the workers take."""
-        if not self.waiting and not self.running:
-            self.waiting, self.again = self.again, self.waiting
         room = self.capacity() - len(self.running)
-        while self.waiting and room > 0:
-            pair, room = self.waiting.popleft(), room - 1
+        while room > 0 and (pair := self._next()) is not None:
+            room -= 1
             name = f"{self.topic}-{pair}-{next(self.numbers)}"
             future = self.client.submit(_in_worker, str(self.shared), pair, self.topic, key=name, pure=False)
             self.running[name] = future, pair
             future.add_done_callback(self.arrived.put)
 
+    def _next(self) -> int | None:
+        """Return the next pair to submit; None if there is none at present."""
+        if self.waiting:
+            return self.waiting.popleft()
+        if (pair := next(self.source, None)) is None and self.again and not self.running:
+            self.waiting, self.again = self.again, self.waiting
+            pair = self.waiting.popleft()
+        return pair
+
     def _fraction(self) -> float:
         running = sum(self.fractions.get(pair, 0.0) for _, pair in list(self.running.values()))
-        return (self.done + min(running, len(self.running))) / self.total
+        left = length_hint(self.source) + len(self.waiting) + len(self.again) + len(self.running)
+        return 1 - (left - min(running, len(self.running))) / self.total
 
     def _outcome(self, future: Any) -> Outcome | None:
         """Return the outcome of a pair that came back; None if the pair is submitted once more."""

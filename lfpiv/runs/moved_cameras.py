@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -151,7 +151,9 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
         return None
     darks, volumes, used = read_darks(experiment), CameraVolumes(weights), list[int]()
     separation, lost, clear = None, list[str](), True
-    for pair in islice(dict.fromkeys([*pairs, *experiment.numbers]), TRIED):
+    first = list(islice(pairs, TRIED))
+    others = (pair for pair in experiment.numbers if pair not in first)
+    for pair in islice(chain(first, others), TRIED):
         try:
             light = _moving_light(experiment, weights.cameras, darks, pair)
             for images in light:
