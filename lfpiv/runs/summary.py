@@ -102,7 +102,7 @@ def build(
 
     ``timings_s`` is the time that the results took, also those of earlier invocations. ``warnings`` are
     sentences for people. ``warning_records`` are the same warnings, in the same order, with code and figures. Of more
-    than `MOST_LISTED` finished pairs that many are in ``pairs``, evenly chosen, and this writes the file ``pairs.jsonl``
+    than `MOST_LISTED` finished pairs that many are in ``pairs``, evenly chosen. This writes the file ``pairs.jsonl``
     with all of them.
     """
     reports = {name: _report(camera, experiment.grid) for name, camera in calibrated.calibration.cameras.items()}
