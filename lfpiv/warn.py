@@ -17,6 +17,9 @@ from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from lfpiv import records
+from lfpiv.records import RecordError
+
 NAMED_PAIRS = 5
 """Largest number of pairs that a sentence names one by one."""
 
@@ -148,8 +151,8 @@ SENTENCES: Mapping[Code, str] = {
         "it. Check that place in board.planes_mm, and the stage."
     ),
     Code.TURNED: (
-        "the board's dots show the camera {turn_deg:.0f} degrees away from nominal_angle_deg = {nominal_deg:g}. Are "
-        "its pictures turned by 90 degrees? Then x and y are exchanged."
+        "the board's dots show the camera turned by {turn_deg:.0f} degrees from where it is stated to be, {nominal}. "
+        "Are its pictures turned by 90 degrees? Then x and y are exchanged; otherwise check its nominal orientation."
     ),
     Code.MAGNIFIED: (
         "the board's dots are magnified {magnification:.3f} times, not {stated:g} times as stated. Check "
@@ -248,44 +251,56 @@ class Warning:
     """Numbers and names that the sentence shows."""
     pairs: tuple[int, ...] = ()
     """Numbers of the pairs it concerns; empty where it concerns no pair in particular."""
+    instants: tuple[int, ...] = ()
+    """Numbers of the instants of a series that it concerns, in place of pairs."""
 
     @property
     def sentence(self) -> str:
         """Sentence for people: subject, pairs and text."""
-        heads = [part for part in (self.subject, name_pairs(self.pairs)) if part]
+        heads = [part for part in (self.subject, name_pairs(self.pairs), name_pairs(self.instants, "instant")) if part]
         text = _Words().vformat(SENTENCES[self.code], (), self.figures)
         return f"{', '.join(heads)}: {text}" if heads else text
 
     def of_pair(self, pair: int) -> Warning:
-        """Return the same warning about one pair."""
-        return replace(self, pairs=(pair,))
+        """Return the same warning about one pair; one about instants stays as it is."""
+        return self if self.instants else replace(self, pairs=(pair,))
+
+    def by_instant(self) -> Warning:
+        """Return the same warning with its pairs named by their first instants, for a series."""
+        return replace(self, pairs=(), instants=self.pairs) if self.pairs else self
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that a file stores."""
         figures = {name: asdict(value) if isinstance(value, Span) else value for name, value in self.figures.items()}
         stored = {"code": self.code.value, "subject": self.subject, "figures": figures}
-        return stored | {"pairs": list(self.pairs)} if self.pairs else stored
+        numbers = {"pairs": list(self.pairs), "instants": list(self.instants)}
+        return stored | {name: found for name, found in numbers.items() if found}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
-        """Read the form that a file stores; sentences and findings of version 0.1.0 too."""
+        """Read the form that a file stores; sentences and findings of version 0.1.0 too.
+
+        Raises
+        ------
+        RecordError
+            If it has none of these forms, or its figures do not fit its sentence.
+        """
         if isinstance(stored, str):
             return cls(code=Code.OTHER, figures={"text": stored})
-        if "what" in stored:
-            subject = stored["camera"] + (f", frame {stored['frame']}" if stored["frame"] else "")
-            figures = {_FINDING_FIGURES[stored["what"]]: stored["value"]}
-            if stored["what"] == Code.UNEVEN.value:
-                figures["ratio"] = 4.0  # the limit of version 0.1.0
-            return cls(code=Code(stored["what"]), subject=subject, figures=figures)
-        code, pairs = stored["code"], tuple(stored.get("pairs", ()))
-        if code not in {known.value for known in Code}:
-            values = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
-            text = f"{code} ({values})" if values else str(code)
-            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text}, pairs=pairs)
-        figures = {
-            name: Span(**value) if isinstance(value, dict) else value for name, value in stored["figures"].items()
-        }
-        return cls(code=Code(code), subject=stored["subject"], figures=figures, pairs=pairs)
+        if isinstance(stored, Mapping) and "what" in stored:
+            return _of_finding(records.validate(_Finding, stored))
+        found = records.validate(_Stored, stored)
+        numbers = {"pairs": found.pairs, "instants": found.instants}
+        if found.code not in {known.value for known in Code}:
+            values = ", ".join(f"{name} = {value}" for name, value in found.figures.items())
+            text = f"{found.code} ({values})" if values else found.code
+            return cls(code=Code.OTHER, subject=found.subject, figures={"text": text}, **numbers)
+        warning = cls(code=Code(found.code), subject=found.subject, figures=found.figures, **numbers)
+        try:
+            _ = warning.sentence
+        except (KeyError, ValueError, TypeError, IndexError, AttributeError) as error:
+            raise RecordError(f"figures of the warning {found.code!r} do not fit it ({error})") from None
+        return warning
 
 
 @dataclass(frozen=True)
@@ -294,6 +309,37 @@ class Span:
 
     low: float
     high: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """A warning as files store it."""
+
+    code: str
+    subject: str
+    figures: Mapping[str, Span | int | float | str | bool | Sequence[int | float | str] | None]
+    pairs: tuple[int, ...] = ()
+    instants: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Finding:
+    """A warning as files of version 0.1.0 store it."""
+
+    what: str
+    camera: str
+    frame: str
+    value: float
+
+
+def _of_finding(found: _Finding) -> Warning:
+    if found.what not in _FINDING_FIGURES:
+        raise RecordError(f"unknown finding {found.what!r}")
+    figures = {_FINDING_FIGURES[found.what]: found.value}
+    if found.what == Code.UNEVEN.value:
+        figures["ratio"] = 4.0  # the limit of version 0.1.0
+    subject = found.camera + (f", frame {found.frame}" if found.frame else "")
+    return Warning(code=Code(found.what), subject=subject, figures=figures)
 
 
 class _Words(string.Formatter):
@@ -314,8 +360,27 @@ def to_text(warnings: Iterable[Warning]) -> str:
 
 
 def from_text(text: str) -> tuple[Warning, ...]:
-    """Read the JSON text that an attribute of a file stores."""
-    return tuple(Warning.from_json(stored) for stored in json.loads(text))
+    """Read the JSON text that an attribute of a file stores.
+
+    Raises
+    ------
+    RecordError
+        If it is no list of warnings.
+    """
+    return from_list(records.read_json(text))
+
+
+def from_list(stored: Any) -> tuple[Warning, ...]:
+    """Read the list of warnings that a record holds.
+
+    Raises
+    ------
+    RecordError
+        If it is no list of warnings.
+    """
+    if not isinstance(stored, list):
+        raise RecordError("expected a list of warnings")
+    return tuple(map(Warning.from_json, stored))
 
 
 class Gathering:
@@ -351,7 +416,8 @@ class _Group:
     """Warnings of equal code, subject and texts."""
 
     def __init__(self, first: Warning):
-        self.first, self.count, self.pairs = first, 0, array("q")
+        self.first, self.count = first, 0
+        self.pairs, self.instants = array("q"), array("q")
         self.spans: dict[str, tuple[Any, Any]] = {}
         """Figure -> lowest and highest number."""
         self.unlike = set[str]()
@@ -359,7 +425,8 @@ class _Group:
 
     def add(self, warning: Warning) -> None:
         self.count += 1
-        self.pairs.extend(pair for pair in warning.pairs if not self.pairs or pair != self.pairs[-1])
+        _extend(self.pairs, warning.pairs)
+        _extend(self.instants, warning.instants)
         for name in self.first.figures:
             value = warning.figures[name]
             if isinstance(value, (int, float)):
@@ -370,7 +437,8 @@ class _Group:
 
     def join(self, other: _Group) -> None:
         self.count += other.count
-        self.pairs.extend(other.pairs)
+        _extend(self.pairs, other.pairs)
+        _extend(self.instants, other.instants)
         self.unlike |= other.unlike
         for name, (low, high) in other.spans.items():
             own = self.spans.get(name, (low, high))
@@ -380,7 +448,15 @@ class _Group:
         figures: dict[str, object] = dict(self.first.figures)
         if self.count > 1:
             figures |= {name: Span(*span) for name, span in self.spans.items() if name not in self.unlike}
-        return replace(self.first, figures=figures, pairs=tuple(dict.fromkeys(self.pairs)))
+        pairs, instants = tuple(dict.fromkeys(self.pairs)), tuple(sorted({*self.instants}))
+        return replace(self.first, figures=figures, pairs=pairs, instants=instants)
+
+
+def _extend(known: array[int], numbers: Iterable[int]) -> None:
+    """Add numbers, but not one that equals the last one."""
+    for number in numbers:
+        if not known or number != known[-1]:
+            known.append(number)
 
 
 def gather(warnings: Iterable[Warning]) -> list[Warning]:
@@ -390,14 +466,17 @@ def gather(warnings: Iterable[Warning]) -> list[Warning]:
     return found.merged()
 
 
-def name_pairs(pairs: Sequence[int], count: int | None = None) -> str:
-    """Name the first pairs and count the others; empty for none. `count` is that of all pairs; default: those given."""
+def name_pairs(pairs: Sequence[int], noun: str = "pair", count: int | None = None) -> str:
+    """Name the first pairs, or what else the noun says, and count the others; empty for none.
+
+    `count` is the number of all, where `pairs` are the first ones. Default: all are given.
+    """
     count = len(pairs) if count is None else count
     if not count:
         return ""
     names = ", ".join(map(str, pairs[:NAMED_PAIRS]))
     more = f" and {count - NAMED_PAIRS} more" if count > NAMED_PAIRS else ""
-    return f"pair{'s' if count > 1 else ''} {names}{more}"
+    return f"{noun}{'s' if count > 1 else ''} {names}{more}"
 
 
 _collected: ContextVar[list[Warning] | None] = ContextVar("collected", default=None)

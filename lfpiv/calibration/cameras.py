@@ -32,6 +32,7 @@ from lfpiv.calibration.virtual_samples import sampler_between_dots
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.geometry.optics import LensLattice
+from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.lens_array import find_lens_array
 from lfpiv.progress import StepProgress, part_of
@@ -46,7 +47,7 @@ MODEL_ERROR_PITCH = 0.002
 def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> Calibration:
     """Calibrate every camera of an experiment from its white and board images (section 3.1 of the paper).
 
-    The mapping does not depend on the nominal camera angles. They only help to number the board's dots.
+    The mapping does not depend on the nominal orientations. They only help to number the board's dots.
 
     Parameters
     ----------
@@ -84,14 +85,14 @@ def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> C
 
 
 def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibration:
-    """Calibrate by direct ray tracing (DRT): the ideal thin lens of section 2.1 at the nominal camera angles.
+    """Calibrate by direct ray tracing (DRT): the ideal thin lens of section 2.1 in the nominal orientations.
 
     Parameters
     ----------
     experiment : Experiment
         From `open_experiment`. Its white images give the microlens arrays.
     angle_error_deg : float
-        Error added to the magnitude of every camera's angle [degree], Eqs. 11-12.
+        Error added to the angle of every camera's axis to z [degree], Eqs. 11-12.
 
     Returns
     -------
@@ -100,7 +101,7 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
     Raises
     ------
     InputError
-        If a white image shows no microlens array.
+        If a white image shows no microlens array, or a camera has no nominal orientation.
     ValueError
         If `angle_error_deg` is not finite.
     """
@@ -110,19 +111,25 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
     for setup in experiment.cameras:
         with collected() as warnings:
             sensor = _decode(experiment, setup)
-        nominal = setup.nominal_angle_deg
         cameras[setup.name] = CalibratedCamera(
             name=setup.name,
             optics=setup.optics,
             lattice=sensor.lattice,
             decoder=sensor.decoder,
-            baseline=thin_lens_model(
-                setup.optics, nominal + np.copysign(angle_error_deg, nominal) if nominal else angle_error_deg
-            ),
+            baseline=thin_lens_model(setup.optics, _stated(experiment, setup).away_from_z(angle_error_deg)),
             report=sensor.quality,
             warnings=tuple(replace(warning, subject=setup.name) for warning in warnings),
         )
     return Calibration(cameras)
+
+
+def _stated(experiment: Experiment, setup: CameraSetup) -> Orientation:
+    if setup.orientation is None:
+        raise InputError(
+            f"{experiment.path}: camera {setup.name!r}: expected nominal_direction or nominal_angle_deg, which direct ray "
+            "tracing takes in place of a calibration, found neither. Add one."
+        )
+    return setup.orientation
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -281,7 +288,7 @@ def _measure_dots(
                 images,
                 decoder,
                 DotBoard.from_settings(board),
-                nominal_angle_deg=setup.nominal_angle_deg,
+                orientation=setup.orientation,
                 estimator=experiment.network.estimator,
                 dark=dark,
             )

@@ -18,7 +18,7 @@ from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import CalibrationQuality
-from lfpiv.calibration.thin_lens_model import ThinLensModel, thin_lens_model
+from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.lightfield.decoder import LightFieldDecoder
@@ -110,7 +110,7 @@ def check_pupil(experiment: Experiment, setup: CameraSetup, dots: BoardDots, fit
         raise InputError(
             f"{experiment.path}: camera {setup.name!r}: expected dots that a camera of the stated optics can see, "
             f"found {found} of {expected} dots that would need its pupil scaled by {fitted.pupil_scale:.2f}. Check the "
-            "sign of nominal_angle_deg, image_flip, and the order and sign of board.planes_mm."
+            "sign of nominal_angle_deg or nominal_direction, image_flip, and the order and sign of board.planes_mm."
         )
 
 
@@ -121,13 +121,15 @@ def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, residual_pit
     no other check finds them. The magnification is compared only where the thin lens fits the labels, so not behind a
     tilted window. `residual_pitch` is the labels' median distance from the fitted thin lens [microlens pitch].
     """
-    nominal = thin_lens_model(setup.optics, setup.nominal_angle_deg)
-    turn = Rotation.from_matrix(fitted.rotation @ nominal.rotation.T).magnitude() * 180 / math.pi
+    stated = setup.orientation
+    turn = 0.0
+    if stated is not None:
+        turn = Rotation.from_matrix(fitted.rotation @ stated.rotation.T).magnitude() * 180 / math.pi
     depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the middle of the board
     magnification = fitted.image_distance_mm / (fitted.object_distance_mm - depth)
-    ratio = magnification * nominal.object_distance_mm / nominal.image_distance_mm
+    ratio = magnification * setup.optics.object_distance_mm / setup.optics.image_distance_mm
     if turn > TURN_DEG:
-        figures = {"turn_deg": float(turn), "nominal_deg": setup.nominal_angle_deg}
+        figures = {"turn_deg": float(turn), "nominal": str(stated)}
         warn(log, Warning(code=Code.TURNED, subject=setup.name, figures=figures))
     if residual_pitch < EXPLAINED_PITCH and not 1 / (1 + MAGNIFICATION) < ratio < 1 + MAGNIFICATION:
         figures = {"magnification": float(magnification), "stated": abs(setup.optics.magnification)}

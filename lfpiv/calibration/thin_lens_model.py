@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import NORMAL_MAD
 
 FIT_SAMPLES = 20_000
@@ -116,25 +117,27 @@ class ThinLensModel:
         return cls(**fields)
 
 
-def thin_lens_model(optics: Optics, angle_deg: float) -> ThinLensModel:
-    """Return the DRT mapping: an ideal camera rotated about y by its angle, Eqs. 1-3.
+def thin_lens_model(optics: Optics, orientation: Orientation | float) -> ThinLensModel:
+    """Return the DRT mapping: an ideal camera whose axis meets the origin, Eqs. 1-3.
 
     Parameters
     ----------
     optics : Optics
         Nominal optics.
-    angle_deg : float
-        Angle of the camera to the z axis [degree]. It includes the angle error of Eqs. 11-12.
+    orientation : Orientation or float
+        Orientation of the camera, or its angle about y [degree]. It includes the angle error of Eqs. 11-12.
 
     Raises
     ------
     ValueError
         If the angle is not finite.
     """
-    if not np.isfinite(angle_deg):
-        raise ValueError(f"angle_deg: expected a finite angle [degree], got {angle_deg}.")
+    if not isinstance(orientation, Orientation):
+        if not np.isfinite(orientation):
+            raise ValueError(f"angle_deg: expected a finite angle [degree], got {orientation}.")
+        orientation = Orientation(float(orientation))
     return ThinLensModel(
-        rotation=_rotation_y(np.deg2rad(angle_deg)),
+        rotation=orientation.rotation,
         offset_mm=np.zeros(3),
         object_distance_mm=optics.object_distance_mm,
         image_distance_mm=optics.image_distance_mm,
@@ -291,12 +294,6 @@ def _linear_start(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, opti
     depth = optics.object_distance_mm - optics.image_distance_mm / magnification
     camera_middle = np.array([-solution[0] / magnification, -solution[4] / magnification, depth])
     return replace(thin_lens_model(optics, 0.0), rotation=rotation, offset_mm=middle - rotation.T @ camera_middle)
-
-
-def _rotation_y(angle: float) -> np.ndarray:
-    """Return the rotation of Eqs. 1-3."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.report import markup
 from lfpiv.report.markup import number, percent
 from lfpiv.report.summary import Summary, WeightFigures
@@ -97,7 +97,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         ("Time between frames", f"{experiment.dt_s:g} s: 1 voxel is {voxel / 1000 / experiment.dt_s:g} m/s"),
         (
             "Cameras",
-            ", ".join(f"{camera.name} at {markup.general(camera.nominal_angle_deg)}°" for camera in experiment.cameras)
+            ", ".join(f"{camera.name}{_orientation(camera)}" for camera in experiment.cameras)
             + f" (nominal); {'each' if same else 'the first'} f = {optics.focal_length_mm:g} mm, "
             f"f/{optics.f_number:g}, magnification {abs(optics.magnification):g}, "
             f"{optics.sensor_shape[1]} × {optics.sensor_shape[0]} pixels of {1000 * optics.pixel_mm:g} µm, "
@@ -116,6 +116,10 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         ("Computed on", f"{summary.device.kind}, {summary.device.threads} threads"),
     ]
     return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
+
+
+def _orientation(camera: CameraSetup) -> str:
+    return "" if camera.orientation is None else f" {camera.orientation}".replace("-", "−")
 
 
 def _axes(experiment: Experiment) -> str:

@@ -193,7 +193,7 @@ def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
         [experiment.board_image(name, plane) for plane in range(len(experiment.board.planes_mm))],
         camera.decoder,
         DotBoard.from_settings(experiment.board),
-        nominal_angle_deg=experiment.camera(name).nominal_angle_deg,
+        orientation=experiment.camera(name).orientation,
         estimator="gaussian",
         dark=experiment.dark(name),
     )

@@ -10,15 +10,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 import xarray as xr
 
+from lfpiv import hdf5
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import AXES
-from lfpiv.results import netcdf
+from lfpiv.records import read_object
+from lfpiv.results import finished, netcdf, provenance
+
+if TYPE_CHECKING:
+    import h5py
 
 COMMON = ("dt_s", "voxel_mm", "smart", "correlation", "settings")
 """Attributes that must be equal in all files."""
@@ -113,12 +117,10 @@ class StackedFiles:
             If the file is damaged, or differs from the first one in settings, axes or variables.
         """
         path = self.path(place)
-        try:
-            with h5py.File(path, "r") as file:
-                signature = None if self._compared[place] else _signature(file, path)
-                found = [np.asarray(file[name][...], self.first[name].dtype) for name in names]
-        except (OSError, KeyError, ValueError) as error:
-            raise InputError(_unreadable(path, error)) from None
+        finished.require_vectors(path)
+        with hdf5.opened(path) as file:
+            signature = None if self._compared[place] else _signature(file, path)
+            found = [np.asarray(file[name][...], self.first[name].dtype) for name in names]
         if signature is not None:
             self._compare(place, signature)
         for name, values in zip(names, found, strict=True):
@@ -208,21 +210,18 @@ class Signature:
 
 def _read_signature(path: Path) -> Signature:
     """Read the signature of a file without its values."""
-    try:
-        with h5py.File(path, "r") as file:
-            return _signature(file, path)
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(_unreadable(path, error)) from None
+    with hdf5.glanced(path) as file:
+        return _signature(file, path)
 
 
 def _signature(file: h5py.File, path: Path) -> Signature:
-    version = int(np.ravel(file.attrs.get("schema_version", 0))[0])
+    netcdf.require_schema(file.attrs.get("schema_version", 0), path)
+    provenance.require_name(path, file.attrs)
     attributes = {key: file.attrs[key] for key in COMMON if key in file.attrs}
-    depends_on = json.loads(file.attrs.get("depends_on", "{}"))
+    depends_on = read_object(file.attrs.get("depends_on", "{}"))
     axes = {axis: file[axis][...] for axis in AXES}
     names = set(file) - {*AXES, netcdf.RECONSTRUCTION}
     attributes |= {key: json.dumps(value, sort_keys=True) for key, value in depends_on.items() if key != "images"}
-    netcdf.require_schema(version, path)
     return Signature(path=path, attributes=attributes, axes=axes, names=names)
 
 
@@ -245,11 +244,6 @@ def _unequal(signature: Signature, reference: Signature, found: str) -> InputErr
         f"{signature.path}: expected vectors made as those of {reference.path}, found {found}. "
         "Run `lfpiv run` on all pairs again, or choose pairs that belong together."
     )
-
-
-def _unreadable(path: Path, error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return f"{path}: expected the vectors of a pair, found a damaged file ({text}). Remove it and run again."
 
 
 def _difference(key: str, expected: Any, found: Any) -> str:

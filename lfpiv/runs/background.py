@@ -11,25 +11,28 @@ import io
 import json
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lfpiv import files
-from lfpiv.errors import InputError
+from lfpiv import files, hdf5
+from lfpiv.errors import DamagedFile, InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import writing
 from lfpiv.lightfield import background, image_checks
 from lfpiv.lightfield.background import Series
 from lfpiv.lightfield.standing_light import StandingLight, nothing
 from lfpiv.progress import StepProgress
-from lfpiv.results import provenance
+from lfpiv.records import RecordError, read_object, validate
+from lfpiv.results import netcdf, provenance
 from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.warn import Code, Warning, to_text, warn
 
 if TYPE_CHECKING:
+    import h5py
+
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.runs.run import Run
 
@@ -72,11 +75,15 @@ def prepare(run: Run, calibration: Calibration) -> Background:
     experiment, path = run.experiment, run.folder.background
     pairs = series(experiment)
     stamp = provenance.of_background(experiment, run.calibration_stamp.hash, pairs)
-    marks = provenance.read_marks(path)
+    marks, found = provenance.read_marks(path), None
     if marks is not None and marks.figures is not None and (stamp.fits(marks) or _images_lost(stamp, marks)):
-        log.info("background: estimated before from the same images, kept")
-        found = load(path)
-    else:
+        try:
+            found = load(path, calibration)
+            log.info("background: estimated before from the same images, kept")
+        except DamagedFile as error:
+            provenance.reject(path, error.reason)
+            found = None
+    if found is None:
         found = estimate(experiment, calibration.cameras, pairs, run.step("background"))
         _write(found, path, stamp.attributes)
     for warning in found.warnings:
@@ -88,7 +95,7 @@ def _images_lost(stamp: Stamp, marks: Marks) -> bool:
     """Return whether all that changed is that some images are missing, because raw data may be deleted."""
     if stamp.changes(marks) != ["images"]:
         return False
-    before = json.loads(marks.depends_on)["images"] or []
+    before = read_object(marks.depends_on).get("images") or []
     return all(image in before for image in files.plain(stamp.parts)["images"] or [])
 
 
@@ -237,31 +244,63 @@ def _digest(standing: Mapping[str, StandingLight]) -> str | None:
     return digest.hexdigest()
 
 
-def load(path: Path) -> Background:
-    """Read a background that `prepare` stored.
+@dataclass(frozen=True, kw_only=True)
+class _Light:
+    """Numbers of one camera's standing light, as its file stores them."""
+
+    found: bool
+    stray: float
+    ratio: float | None
+    share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Figures:
+    """Figures of a background, as its file stores them."""
+
+    content: str | None
+    cameras: dict[str, dict[str, float | None]]
+
+
+def load(path: Path, calibration: Calibration) -> Background:
+    """Read a background that `prepare` stored for the cameras of a calibration.
 
     Raises
     ------
     InputError
-        If the file cannot be read.
+        If the file is missing, damaged, or of other cameras.
     """
-    import h5py
-
     try:
-        with h5py.File(path, "r") as file:
-            figures, stored = json.loads(file.attrs["figures"]), provenance.stored_warnings(file.attrs)
-            found = {}
-            for name, group in file.items():
-                first, second = group["light"][()]
-                found[name] = StandingLight(
-                    light=(first, second),
-                    unusable=group["unusable"][()],
-                    region=group["region"][()],
-                    **json.loads(group.attrs["figures"]),
-                )
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: expected a stored background, could not read it ({error}). Remove it.") from None
-    return Background(found, figures["content"], figures["cameras"], stored)
+        with hdf5.opened(path) as file:
+            figures = validate(_Figures, read_object(file.attrs["figures"]))
+            warnings = provenance.stored_warnings(file.attrs)
+            strange = set(file) - set(calibration.cameras)
+            if strange:
+                raise DamagedFile(path, f"it is of other cameras: {', '.join(sorted(strange))}")
+            found = {
+                name: _read_light(file[name], camera.optics.sensor_shape)
+                for name, camera in calibration.cameras.items()
+                if name in file
+            }
+            if _digest(found) != figures.content:
+                raise DamagedFile(path, "its light is not that of its figures")
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a stored background, found no such file. Run `lfpiv run`.") from None
+    return Background(found, figures.content, figures.cameras, warnings)
+
+
+def _read_light(group: h5py.Group, shape: tuple[int, int]) -> StandingLight:
+    """Read one camera's light; its arrays must have the shape of the sensor."""
+    expected = {"light": ((2, *shape), "f"), "unusable": (shape, "b"), "region": (shape, "b")}
+    for name, (size, kind) in expected.items():
+        if group[name].shape != size or group[name].dtype.kind != kind:
+            raise RecordError(f"{group.name}/{name}: expected {size}, found {group[name].shape} {group[name].dtype}")
+    (first, second), numbers = group["light"][()], validate(_Light, read_object(group.attrs["figures"]))
+    if not (np.isfinite(first).all() and np.isfinite(second).all()):
+        raise RecordError(f"{group.name}/light: expected finite numbers")
+    return StandingLight(
+        light=(first, second), unusable=group["unusable"][()], region=group["region"][()], **asdict(numbers)
+    )
 
 
 def _write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
@@ -269,14 +308,15 @@ def _write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
     with h5py.File(content, "w") as file:
-        file.attrs.update(attributes)
+        file.attrs.update({**attributes, netcdf.FILE: path.name})
         file.attrs["figures"] = json.dumps({"content": found.content, "cameras": found.figures})
         file.attrs["warnings"] = to_text(found.warnings)
         for name, light in found.cameras.items():
             group = file.create_group(name)
             arrays = {"light": np.stack(light.light), "unusable": light.unusable, "region": light.region}
             for key, value in arrays.items():
-                group.create_dataset(key, data=value, compression="gzip", compression_opts=1)
+                group.create_dataset(key, data=value, **hdf5.options(value.shape))
             group.attrs["figures"] = json.dumps(light.figures)
+    hdf5.seal(content)
     with writing(path):
         files.write_bytes(content.getbuffer(), path)

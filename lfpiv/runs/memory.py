@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import LEAST_BYTES_PER_VOXEL, Experiment
 from lfpiv.files import MIB
 
 if TYPE_CHECKING:
@@ -22,10 +22,10 @@ log = logging.getLogger(__name__)
 
 GIB = 1 << 30
 
-BYTES_PER_VOXEL = 64
+BYTES_PER_VOXEL = LEAST_BYTES_PER_VOXEL
 """Least memory per voxel [byte]: two volumes, and the float32 arrays that SMART or the correlation works on."""
 
-BYTES_PER_VOXEL_AND_CAMERA = 64
+BYTES_PER_VOXEL_AND_CAMERA = LEAST_BYTES_PER_VOXEL
 """Ray model of a voxel in one camera [byte]: chief ray, slopes, second-order terms, widths."""
 
 BYTES_PER_PIXEL = 64
@@ -188,6 +188,7 @@ def _nominal_cameras(experiment: Experiment) -> Calibration:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.calibration.thin_lens_model import thin_lens_model
     from lfpiv.geometry.optics import LensLattice
+    from lfpiv.geometry.orientation import Orientation
 
     cameras = {}
     for setup in experiment.cameras:
@@ -198,6 +199,6 @@ def _nominal_cameras(experiment: Experiment) -> Calibration:
             optics=setup.optics,
             lattice=LensLattice(origin_mm=(0.0, 0.0), basis_mm=((pitch, 0.0), second), layout=setup.optics.layout),
             decoder=None,  # type: ignore[arg-type]  # made from images
-            baseline=thin_lens_model(setup.optics, setup.nominal_angle_deg),
+            baseline=thin_lens_model(setup.optics, setup.orientation or Orientation(0.0)),
         )
     return Calibration(cameras)

@@ -1,17 +1,18 @@
-"""The work on one image pair: images to volumes to vectors, and files of both.
+"""The work on pairs: images to volumes to vectors, and files of both.
 
-`PairWork.do` takes the number of a pair and returns its `Outcome`. Volumes that are in the output folder and still fit
-are read instead of reconstructed.
+`PairWork.do` takes a stretch of pairs and yields the `Outcome` of each. Volumes that are in the output folder and still
+fit are read instead of reconstructed. The two frames of an image pair are reconstructed together; the instants of a
+series are each reconstructed once, for both their pairs (`lfpiv.runs.instants`).
 """
 
 from __future__ import annotations
 
 import logging
 import time
-import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv import warn
 from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.experiment.settings import Correlation
 from lfpiv.geometry.grid import Grid, Layers
 from lfpiv.geometry.volume import VIEWS
@@ -29,14 +30,16 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.motion import Motion, PairSolver, unshared_quality
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.folder import Folder
-from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
+from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairFiles, PairVolumes, VolumeFile
 from lfpiv.runs import pair_figures
-from lfpiv.runs.frame_light import FrameLight, pair_light
+from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.guard import with_guard
+from lfpiv.runs.instants import Instants, failure
 from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.warn import FirstOfEachCode
+from lfpiv.warn import FirstOfEachCode, Warning
 
 if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
@@ -46,6 +49,9 @@ RECONSTRUCTED = 0.9
 
 CORRELATED = 0.99
 """Finished fraction of a pair when only its vectors remain to be written."""
+
+PairProgress = Callable[[int, float], None]
+"""Called as ``progress(number, fraction)``: the place of a pair in its stretch, from 0, and its finished fraction."""
 
 NO_PARTICLES = "no particles in the images: none of the vectors counts"
 """Verdict on the vectors of a pair if the images of one frame show only noise."""
@@ -58,6 +64,8 @@ class Outcome:
     pair: int
     reason: str = ""
     """Why the pair failed; empty if it is finished."""
+    died: bool = False
+    """Whether the worker process died, perhaps after it finished the pair."""
     peak_memory_mib: float = 0.0
     """Largest memory that the worker process held so far; 0 for pairs done in the process of the run."""
 
@@ -73,37 +81,46 @@ class PairWork:
     """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
     weights: Weights | None
     """None if all volumes are in the folder."""
+    cameras: Mapping[str, CalibratedCamera]
+    """Cameras that know what stands still in their images; empty if no image is read."""
     darks: Mapping[str, np.ndarray | None]
-    """Dark image of every camera [counts]; empty if all volumes are in the folder."""
+    """Dark image of every camera [counts]; empty if no image is read."""
     keep_volumes: bool
     """Write the volumes."""
     background: str | None = None
     """Hash of the light that is subtracted from the images; None if there is none."""
     vectors: bool = True
     """Correlate the volumes and write the vectors."""
+    scratch: Path | None = None
+    """Folder in which processes store volumes for each other; None for a process by itself."""
     log_first: FirstOfEachCode = field(default_factory=lambda: FirstOfEachCode(log))
 
-    def do(self, pair: int, progress: StepProgress) -> Outcome:
-        """Work on one pair. An error ends this pair only and is returned as its outcome.
+    def do(self, pairs: Iterable[int], progress: PairProgress, *, stored: Collection[int] = ()) -> Iterator[Outcome]:
+        """Work on pairs, one after the other; yield the outcome of each.
+
+        An error ends one pair only and is returned as its outcome. `stored` are the instants of a series whose volumes
+        other processes need.
 
         Raises
         ------
         StorageError
             If a result cannot be written; then no other pair could be written either.
         """
+        instants = None if self.experiment.series is None else Instants(self, stored)
+        for number, pair in enumerate(pairs):
+            yield self._outcome(pair, instants, partial(progress, number))
+        if instants is not None:
+            instants.clear()
+
+    def _outcome(self, pair: int, instants: Instants | None, progress: StepProgress) -> Outcome:
         try:
             # sums of BLAS depend on its number of threads; the numbers must not depend on the number of workers
             with threadpool_limits(1):
-                self._do(pair, progress)
+                self._do(pair, instants, progress)
         except StorageError:
             raise
-        except MemoryError:
-            return Outcome(pair=pair, reason="out of memory: use fewer workers, larger voxels or a smaller volume")
-        except ValueError as error:
-            return Outcome(pair=pair, reason=" ".join(str(error).split()))
         except Exception as error:  # an error in one pair must not end the others
-            log.debug("pair %d: %s", pair, traceback.format_exc())
-            return Outcome(pair=pair, reason=f"unexpected {type(error).__name__}: {' '.join(str(error).split())}")
+            return Outcome(pair=pair, reason=str(failure(error)))
         progress(1.0)
         return Outcome(pair=pair)
 
@@ -123,8 +140,9 @@ class PairWork:
             mask=with_guard(self.experiment, self.guard).solid,
         )
 
-    def _do(self, pair: int, progress: StepProgress) -> None:
-        files = PairFiles.of(
+    def files(self, pair: int) -> PairFiles:
+        """Return the files of a pair with the stamps that they must have."""
+        return PairFiles.of(
             self.experiment,
             self.calibration_hash,
             self.folder,
@@ -132,50 +150,112 @@ class PairWork:
             background=self.background,
             guard=self.guard,
         )
-        volumes = files.read_volumes()
-        if volumes is None:
-            volumes = self._reconstruct(files, part_of(progress, 0.0, RECONSTRUCTED))
-            if self.keep_volumes:
-                files.write_volumes(volumes)
+
+    def _do(self, pair: int, instants: Instants | None, progress: StepProgress) -> None:
+        files = self.files(pair)
+        if files.outdated(vectors=self.vectors, volumes=self.keep_volumes) is None:
+            return  # by a worker that died afterwards
+        if instants is None:
+            volumes = self._pair_volumes(files, part_of(progress, 0.0, RECONSTRUCTED))
+        elif self.vectors:
+            volumes = instants.volumes(files, part_of(progress, 0.0, RECONSTRUCTED))
+        else:
+            instants.keep(files, progress)
+            return
         if self.vectors:
             progress(RECONSTRUCTED)
             self._correlate(files, volumes, progress)
 
-    def _reconstruct(self, files: PairFiles, progress: StepProgress) -> PairVolumes:
+    def _pair_volumes(self, files: PairFiles, progress: StepProgress) -> PairVolumes:
+        """Read the volumes of an image pair, or reconstruct both together."""
+        frames = files.read_volumes()
+        if frames is None:
+            frames = self._reconstruct_pair(files, progress)
+            if self.keep_volumes:
+                for file, found in zip(files.frames, frames, strict=True):
+                    file.write(found)
+        return PairVolumes(frames=frames, names=self.experiment.frames)
+
+    def _reconstruct_pair(self, files: PairFiles, progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
         if self.weights is None:
             raise InputError(
-                f"{files.volumes[0]}: expected the two volumes of pair {files.pair} made with the present "
+                f"{files.frames[0].path}: expected the two volumes of pair {files.pair} made with the present "
                 "settings, found none. Run `lfpiv reconstruct` first."
             )
-        light = pair_light(self.experiment, self.weights.cameras, self.darks, files.pair)
-        self.log_first(warning.of_pair(files.pair) for frame in light for warning in frame.warnings)
+        light = pair_light(self.experiment, self.cameras, self.darks, files.pair)
+        self._log(files.pair, [warning for frame in light for warning in frame.warnings])
         start = time.perf_counter()
         guarded = _reconstruct_frames(self.solver, light, files.pair, progress)
-        grid, padded = self.experiment.grid, self.weights.grid
-        volumes = _without_guard(guarded[0], grid, padded), _without_guard(guarded[1], grid, padded)
         seconds = (time.perf_counter() - start) / 2
         first, second = (
-            FrameRecord(
-                frame=frame.frame,
-                structure=frame.structure,
-                warnings=frame.warnings,
-                seconds=seconds + frame.seconds,
-            )
-            for frame in light
+            self._frame_volume(volume, frame, seconds) for volume, frame in zip(guarded, light, strict=True)
         )
-        return PairVolumes(volumes=volumes, records=(first, second))
+        return first, second
+
+    def read_light(self, file: VolumeFile) -> FrameLight:
+        """Read and check the images of an instant whose volume is to be reconstructed.
+
+        Raises
+        ------
+        InputError
+            If an image cannot be used, or there are no weights because all volumes should be in the folder.
+        """
+        if self.weights is None:
+            raise InputError(
+                f"{file.path}: expected the volume of instant {file.frame.number} made with the present settings, "
+                "found none. Run `lfpiv reconstruct` first."
+            )
+        return self.light_again(file.frame)
+
+    def light_again(self, instant: Frame) -> FrameLight:
+        """Read the images of an instant, also if its volume is known; raise InputError if that is not possible."""
+        if not self.cameras:
+            raise InputError(f"instant {instant.number}: no image is read in this step.")
+        return frame_light(self.experiment, self.cameras, self.darks, instant)
+
+    def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one instant of a series.
+
+        Raises
+        ------
+        InputError
+            If its images cannot be reconstructed.
+        """
+        instant = light.frame.number
+        self._log(instant, light.warnings)
+        start = time.perf_counter()
+        try:
+            found = self.solver.smart.solve(light.images, floor=light.noise, progress=progress)
+        except ValueError as error:
+            raise InputError(f"instant {instant}: {error}") from error
+        seconds = time.perf_counter() - start
+        log.info("instant %d: reconstructed in %.1f s", instant, seconds)
+        return self._frame_volume(found.to_dataarray(), light, seconds)
+
+    def _frame_volume(self, guarded: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
+        """Return a volume without its guard layers, with its record."""
+        assert self.weights is not None
+        volume = _without_guard(guarded, self.experiment.grid, self.weights.grid)
+        record = FrameRecord(structure=light.structure, warnings=light.warnings, seconds=seconds + light.seconds)
+        return FrameVolume(volume=volume, record=record)
+
+    def _log(self, pair: int, warnings: Iterable[Warning]) -> None:
+        """Log the first warning of each code about a pair or an instant."""
+        found = [warning.of_pair(pair) for warning in warnings]
+        self.log_first(found if self.experiment.series is None else [warning.by_instant() for warning in found])
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment, start = self.experiment, time.perf_counter()
         vectors = correlate(*volumes.volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
         vectors = _without_unmeasured(_with_motion(vectors, volumes), volumes)
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
-        vectors.attrs["reconstruction_s"] = sum(record.seconds for record in volumes.records)
+        vectors.attrs["reconstruction_s"] = self._reconstruction_s(files.pair, volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         condensed = volumes.condensed()
         figures = pair_figures.measure(vectors, condensed, volumes.warnings)
+        self._log(files.pair, volumes.between)
         if figures.lost_unseeded > 0:
-            self.log_first([figures.unseeded_warning(files.pair)])
+            self._log(files.pair, [figures.unseeded_warning(files.pair)])
         progress(CORRELATED)
         attributes = {
             "experiment": experiment.name,
@@ -184,7 +264,18 @@ class PairWork:
             "figures": figures.to_json(),
         }
         files.write_vectors(vectors, condensed, attributes)
-        log.info("pair %d: %.0f %% of the vectors valid", files.pair, 100 * figures.valid_fraction)
+        name = experiment.name_of(files.pair)
+        log.info("%s: %.0f %% of the vectors valid", name, 100 * figures.valid_fraction)
+
+    def _reconstruction_s(self, pair: int, volumes: PairVolumes) -> float:
+        """Return the time that the volumes of a pair took [s].
+
+        In a series the second instant counts, and the first one only if it is the second of no other pair: the sum over
+        all pairs then counts each instant once.
+        """
+        first, second = (record.seconds for record in volumes.records)
+        series = self.experiment.series
+        return second if series is not None and pair - series.step in self.experiment.numbers else first + second
 
 
 def _reconstruct_frames(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import background, dispatch, local_workers, memory, rig, worker, worker_plan
+from lfpiv.runs import dispatch, local_workers, memory, rig, worker, worker_plan
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import Outcome, PairWork
@@ -25,10 +25,13 @@ from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
+    from lfpiv.calibration.camera import Calibration
     from lfpiv.weights.operator import Weights
 
 PAIRS = "image pairs"
 """Name of the step that works on pairs, for progress."""
+INSTANTS = "instants"
+"""The same for a time series."""
 
 
 def run(
@@ -91,7 +94,7 @@ def run(
             checked = _check(current, todo, workers, scheduler)
         calibrated = replace(calibrated, calibration=prepared.board)
         done = _process(current, prepared, checked, keep_volumes)
-        return current.finish(calibrated, _with_reused(done, checked.todo, "vectors"), report=True)
+        return current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
 
 
 def calibrate(
@@ -126,7 +129,7 @@ def reconstruct(
             weights, figures = rig.build_weights(current, prepared, first)
             work = _work(current, weights, keep_volumes=True, vectors=False)
             done = Invocation(tried=_sequential(current, work, checked.todo), weights=figures)
-        return current.finish(calibrated, _with_reused(done, checked.todo, "volumes"), report=False)
+        return current.finish(calibrated, _with_reused(current, done, checked.todo, "volumes"), report=False)
 
 
 def correlate(
@@ -147,13 +150,16 @@ def correlate(
     with open_run(experiment, out, device, progress, pairs) as current:
         calibrated = rig.load_calibration(current)
         todo = current.unfinished()
-        if (first := todo.ahead()) and not current.has_some_volumes():
+        if (known := todo.ahead()) and not current.has_some_volumes():
+            first = known[0]
             raise InputError(
-                f"{current.folder.volume(first[0], 0)}: expected the two volumes of pair {first[0]} made "
-                "with the present settings, found none. Run `lfpiv reconstruct` first."
+                f"{current.folder.volume(first, 0)}: expected the two volumes of {current.experiment.name_of(first)} "
+                "made with the present settings, found none. Run `lfpiv reconstruct` first."
             )
-        tried = _sequential(current, _work(current, None, keep_volumes=False), todo)
-        return current.finish(calibrated, _with_reused(Invocation(tried=tried), todo, "vectors"), report=False)
+        calibration = rig.with_standing_light(current, calibrated.calibration)
+        work = _work(current, None, keep_volumes=False, calibration=calibration)
+        done = Invocation(tried=_sequential(current, work, todo))
+        return current.finish(calibrated, _with_reused(current, done, todo, "vectors"), report=False)
 
 
 def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, Any]:
@@ -162,13 +168,12 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
     Raises
     ------
     InputError
-        If the folder holds no calibration that fits the experiment.
+        If the folder holds no calibration that fits the experiment, or a file in it is damaged.
     """
     with open_run(experiment, out, None, None, writes_results=False) as current:
         calibrated = rig.load_calibration(current)
-        if current.background is not None:
-            standing = background.load(current.folder.background)
-            calibrated = replace(calibrated, calibration=standing.seen_by(calibrated.calibration))
+        current.require_whole()
+        calibrated = replace(calibrated, calibration=rig.with_standing_light(current, calibrated.calibration))
         return current.finish(calibrated, Invocation(), report=True)
 
 
@@ -215,7 +220,7 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
         if isinstance(workers, Plan):
             guarded = current.guarded_experiment
             workers = worker_plan.fit_memory(workers, guarded, weights.memory_bytes, current.device)
-    work = _work(current, weights, keep_volumes=keep_volumes)
+    work = _work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration)
     if isinstance(workers, Plan) and workers.workers == 1:
         return Invocation(tried=_sequential(current, work, todo), weights=figures)
     if isinstance(workers, Plan):
@@ -225,27 +230,46 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     device = current.device.kind if isinstance(workers, Plan) else current.device_request
     shared = worker.share(work, device, used.threads)
     del work, weights  # the workers map them from files; the memory may not have room for both
-    tried = _collect(current, dispatch.parallel(shared, todo, workers, current.step(PAIRS)))
+    tried = _collect(
+        current, dispatch.parallel(shared, current.experiment, todo, workers, current.step(_step_name(current)))
+    )
     return Invocation(
         tried=tried, weights=figures, workers=replace(used, peak_memory_mib=tried.peak_memory_mib or None)
     )
 
 
-def _with_reused(done: Invocation, todo: Todo, kind: str) -> Invocation:
+def _with_reused(current: Run, done: Invocation, todo: Todo, kind: str) -> Invocation:
     """Return the results of an invocation with the names of the pairs that were finished before."""
     first, count = todo.finished
-    more = (f"{kind} of {count - len(first)} more pairs",) if count > len(first) else ()
-    return replace(done, reused=(*(f"{kind} of pair {pair}" for pair in first), *more))
+    names = tuple(f"{kind} of {current.experiment.name_of(pair)}" for pair in sorted(first))
+    more = (f"{kind} of {count - len(first)} more {current.experiment.noun}s",) if count > len(first) else ()
+    return replace(done, reused=names + more)
 
 
-def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors: bool = True) -> PairWork:
+def _step_name(current: Run) -> str:
+    return PAIRS if current.experiment.series is None else INSTANTS
+
+
+def _work(
+    current: Run,
+    weights: Weights | None,
+    *,
+    keep_volumes: bool,
+    vectors: bool = True,
+    calibration: Calibration | None = None,
+) -> PairWork:
+    """Return the work on pairs. A series takes its cameras from `calibration` if there are no weights."""
+    cameras = {} if calibration is None or current.experiment.series is None else calibration.cameras
+    if weights is not None:
+        cameras = weights.cameras
     return PairWork(
         experiment=current.experiment,
         folder=current.folder,
         calibration_hash=current.calibration_stamp.hash,
         guard=current.guard_layers,
         weights=weights,
-        darks={} if weights is None else read_darks(current.experiment),
+        cameras=cameras,
+        darks=read_darks(current.experiment) if cameras else {},
         keep_volumes=keep_volumes,
         background=current.background,
         vectors=vectors,
@@ -255,7 +279,7 @@ def _work(current: Run, weights: Weights | None, *, keep_volumes: bool, vectors:
 def _sequential(current: Run, work: PairWork, todo: Todo) -> Tried:
     if not todo.ahead():
         return Tried(current.numbers)
-    return _collect(current, dispatch.sequential(work, todo, current.step(PAIRS)))
+    return _collect(current, dispatch.sequential(work, todo, current.step(_step_name(current))))
 
 
 def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> Tried:
@@ -264,5 +288,5 @@ def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> Tried:
     with contextlib.closing(outcomes):  # ends the workers if the run is interrupted
         for outcome in outcomes:
             current.record(outcome, tried)
-    current.progress(PAIRS, 1.0)
+    current.progress(_step_name(current), 1.0)
     return tried

@@ -7,11 +7,11 @@ the results of all steps.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from lfpiv.experiment.experiment import CHECKED_PAIRS, Experiment, check_pairs, 
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import provenance
+from lfpiv.results import finished, provenance
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
@@ -176,7 +176,10 @@ class Run:
             return changed
 
         stored = self.folder.stored(self.numbers, vectors=vectors, volumes=volumes)
-        return Todo(self.numbers, stored, changes, self.step("stored results"), quiet=quiet)
+        step = 1 if self.experiment.series is None else self.experiment.series.step
+        todo = Todo(self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun)
+        todo.quiet = quiet
+        return todo
 
     def _keep(self, found: PairFiles) -> None:
         """Keep the figures of a pair's vectors for the summary, if they fit."""
@@ -212,7 +215,8 @@ class Run:
         bad = dict(check_pairs(self.experiment, [pair for pair in known if not self.has_volumes(pair)]))
         whole = todo.whole and len(bad) == len(known)
         if bad and known[0] in bad and not self._has_results():
-            others = "" if whole else f" To do the pairs after it, use --pairs {known[0] + 1}:."
+            noun = self.experiment.noun
+            others = "" if whole else f" To do the {noun}s after it, use --pairs {known[0] + 1}:."
             raise InputError(bad[known[0]] + others)
         if whole:
             tried = Tried(self.numbers)
@@ -220,9 +224,10 @@ class Run:
                 self.record(Outcome(pair=pair, reason=reason), tried)
             return tried
         for reason in list(bad.values())[:NAMED_PAIRS]:
-            log.error("%s The other pairs will be done.", reason)
+            log.error("%s The other %ss will be done.", reason, self.experiment.noun)
         if len(bad) > NAMED_PAIRS:
-            log.error("%d pairs have images that cannot be used: %s", len(bad), name_pairs(list(bad)))
+            names = name_pairs(list(bad), self.experiment.noun)
+            log.error("%d %ss have images that cannot be used: %s", len(bad), self.experiment.noun, names)
         return None
 
     def _has_results(self) -> bool:
@@ -231,20 +236,36 @@ class Run:
         vectors = self.folder.stored(numbers, vectors=True, volumes=False)
         volumes = self.folder.stored(numbers, vectors=False, volumes=True)
         stored = (pair for pair, one, other in zip(numbers, vectors, volumes, strict=True) if one or other)
-        return any(map(self._is_finished, islice(stored, CHECKED_PAIRS)))
+        return any(map(self._is_finished, itertools.islice(stored, CHECKED_PAIRS)))
 
     def _is_finished(self, pair: int) -> bool:
         found = self.files(pair)
         return found.fitting_vectors() is not None or found.fitting_volumes() is not None
 
+    def require_whole(self) -> None:
+        """Verify the results that a report shows, where they cannot be made again.
+
+        Raises
+        ------
+        InputError
+            If a file is damaged, or is another one's copy.
+        """
+        numbers = self.experiment.numbers
+        stored = self.folder.stored(numbers, vectors=True, volumes=False)
+        vectors = (self.folder.vectors(pair) for pair, there in zip(numbers, stored, strict=True) if there)
+        finished.require(itertools.chain([self.folder.background], vectors))
+
     def record(self, outcome: Outcome, tried: Tried) -> None:
         """Keep the outcome of a pair and its figures. Log a failure, and rename the results from earlier images."""
+        files = self.files(outcome.pair)
+        if not outcome.reason or outcome.died:
+            self._keep(files)
+        if outcome.died and outcome.pair in self.finished:
+            outcome = replace(outcome, reason="")  # its worker died after it
         tried.add(outcome)
-        if not outcome.reason:
-            self._keep(self.files(outcome.pair))
-        else:
-            log.error("pair %d failed and is left out: %s", outcome.pair, outcome.reason)
-            for path, aside in self.files(outcome.pair).retire_outdated():
+        if outcome.reason:
+            log.error("%s failed and is left out: %s", self.experiment.name_of(outcome.pair), outcome.reason)
+            for path, aside in files.retire_outdated():
                 log.warning("%s: made of other images than there are now; renamed %s", path, aside.name)
 
     def finish(self, calibrated: Calibrated, done: Invocation, *, report: bool) -> dict[str, Any]:
@@ -284,13 +305,11 @@ class Run:
             self._keep(found)
             if pair not in self.finished and (frames := found.fitting_volumes()) is not None:
                 volumes.add(warning.of_pair(pair) for frame in frames for warning in frame.warnings)
-        marks = provenance.read_marks(self.folder.background)
-        found_light = {} if marks is None or marks.figures is None else marks.figures["cameras"]
-        warnings = () if marks is None else marks.warnings
+        light, warnings = provenance.background_figures(self.folder.background)
         return Contents(
             vectors=self.finished,
             volumes=volumes,
-            background=found_light,
+            background=light,
             background_warnings=warnings,
             guard=self.guard,
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,18 +21,21 @@ from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
+from lfpiv.records import RecordError, read_object, read_text, validate
 from lfpiv.results.folder import Folder
 from lfpiv.runs import guard
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.velocity.cross_correlation import Verdict
-from lfpiv.warn import Code, Gathering, Warning, gather
+from lfpiv.warn import Code, Gathering, Warning, from_list, gather
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.geometry.grid import Grid
     from lfpiv_kernels.runtime import Device
+
+log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
 
@@ -73,19 +77,44 @@ class EarlierSummary:
     peak_memory_mib: float | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Failure:
+    """A pair that failed, as the summary stores it."""
+
+    pair: int
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """Entries of the summary that a later invocation reads."""
+
+    weights: dict[str, Any] = field(default_factory=dict)
+    timings_s: dict[str, float | None] = field(default_factory=dict)
+    failed: list[_Failure] = field(default_factory=list)
+    peak_memory_mib: float | None = None
+
+
 def read(path: Path) -> EarlierSummary:
     """Read an earlier summary; an empty one if the file is missing, damaged or of another schema."""
     try:
-        found = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError):
+        found = read_object(read_text(path))
+        if found.get("schema_version") != SCHEMA_VERSION:
+            raise RecordError(
+                f"expected schema version {SCHEMA_VERSION}, found {str(found.get('schema_version'))[:40]}"
+            )
+        known = validate(_Stored, found)
+        from_list(known.weights.get("warnings", []))
+    except FileNotFoundError:
         return EarlierSummary()
-    if not isinstance(found, dict) or found.get("schema_version") != SCHEMA_VERSION:
+    except RecordError as error:
+        log.warning("%s: damaged or of another version, written anew: %s", path, error)
         return EarlierSummary()
     return EarlierSummary(
-        weights=found.get("weights", {}),
-        weights_s=float(found.get("timings_s", {}).get("weights") or 0.0),
-        failed={entry["pair"]: entry["reason"] for entry in found.get("failed", ())},
-        peak_memory_mib=found.get("peak_memory_mib"),
+        weights=known.weights,
+        weights_s=known.timings_s.get("weights") or 0.0,
+        failed={failure.pair: failure.reason for failure in known.failed},
+        peak_memory_mib=known.peak_memory_mib,
     )
 
 
@@ -199,8 +228,9 @@ def _lines(path: Path | None) -> Iterator[Callable[[Any], object]]:
 def _record(warning: Warning) -> dict[str, Any]:
     """Return the form of a warning in the summary; it names the first `MOST_LISTED` pairs and counts all."""
     stored = warning.to_json()
-    if len(warning.pairs) > MOST_LISTED:
-        stored |= {"pairs": stored["pairs"][:MOST_LISTED], "pairs_count": len(warning.pairs)}
+    for name in ("pairs", "instants"):
+        if (count := len(stored.get(name, ()))) > MOST_LISTED:
+            stored |= {name: stored[name][:MOST_LISTED], f"{name}_count": count}
     return stored
 
 
@@ -238,7 +268,7 @@ def _warnings(
         *done.warnings,
     ]
     by_sentence: dict[str, Warning] = {}
-    for warning in found:
+    for warning in found if experiment.series is None else (warning.by_instant() for warning in found):
         by_sentence.setdefault(warning.sentence, warning)
     return by_sentence
 

@@ -34,8 +34,10 @@ class Todo:
         Takes a pair; returns the names of the settings that its results do not fit, None if they fit.
     progress : callable
         Called with the fraction of the files that are verified.
-    quiet : bool
-        Log nothing.
+    step : int
+        Step of a time series. Pairs k, k + step, k + 2 step, ... come one after the other, because they share instants.
+    noun : str
+        Name of what has a number, for messages.
     """
 
     def __init__(
@@ -45,10 +47,11 @@ class Todo:
         changes: Callable[[int], list[str] | None],
         progress: StepProgress,
         *,
-        quiet: bool = False,
+        step: int = 1,
+        noun: str = "pair",
     ):
-        self._numbers, self._stored, self._changes, self._quiet = numbers, stored, changes, quiet
-        self._progress = progress
+        self._numbers, self._stored, self._changes, self._progress = numbers, stored, changes, progress
+        self._step, self._noun = step, noun
         self._missing, self._examined, self._total = stored.count(0), 0, stored.count(1)
         self._finished: tuple[list[int], int] = [], 0
         self._changed: dict[str, tuple[list[int], int]] = {}
@@ -57,6 +60,8 @@ class Todo:
         self._source = self._search()
         self.whole = False
         """Whether all pairs to do are known."""
+        self.quiet = False
+        """Log nothing."""
 
     def __iter__(self) -> Iterator[int]:
         return self
@@ -86,18 +91,25 @@ class Todo:
                 break
             self._ahead.append(pair)
         if self.whole:
-            self._ahead = deque(sorted(self._ahead))
+            self._ahead = deque(sorted(self._ahead, key=lambda pair: (self._numbers.index(pair) % self._step, pair)))
         self._tell_changes()
         return list(self._ahead)
 
+    def _places(self) -> Iterator[tuple[int, int]]:
+        """Yield place and number of the pairs, in the order in which they are done."""
+        for rest in range(self._step):
+            for place in range(rest, len(self._numbers), self._step):
+                yield place, self._numbers[place]
+
     def _search(self) -> Iterator[int]:
-        for place, pair in enumerate(self._numbers):
+        for place, pair in self._places():
             if not self._stored[place]:
                 self._missing, self._left = self._missing - 1, self._left - 1
                 yield pair
-        if self._total > CHECKED_PAIRS and not self._quiet:
-            log.info("%d of %d pairs have results, which are verified now", self._total, len(self._numbers))
-        for place, pair in enumerate(self._numbers):
+        if self._total > CHECKED_PAIRS and not self.quiet:
+            text = "%d of %d %ss have results, which are verified now"
+            log.info(text, self._total, len(self._numbers), self._noun)
+        for place, pair in self._places():
             if not self._stored[place]:
                 continue
             changes = self._changes(pair)
@@ -113,14 +125,15 @@ class Todo:
                 yield pair
         self.whole = True
         kept = self._finished[1]
-        if kept and not self._quiet:
-            log.info("%d of %d pairs: finished before with the same settings, kept", kept, len(self._numbers))
+        if kept and not self.quiet:
+            text = "%d of %d %ss: finished before with the same settings, kept"
+            log.info(text, kept, len(self._numbers), self._noun)
         self._tell_changes()
 
     def _tell_changes(self) -> None:
-        if not self._quiet:
+        if not self.quiet:
             for reason, (first, count) in self._changed.items():
-                log.info("%s changed: %s made again", reason, name_pairs(first, count))
+                log.info("%s changed: %s made again", reason, name_pairs(first, self._noun, count))
         self._changed.clear()
 
 

@@ -235,8 +235,10 @@ def _disparity(
     if near_mm is not None:
         centre, reach = np.rint(near_mm[::-1] / grid.voxel_mm).astype(int), NEAR_VOXEL + FIT_REACH
     coefficient = masked_correlation(first, second, window, centre=centre, reach=reach)
-    mirrored_window = _mirror(window, grid.shape[1])
-    mirrored = masked_correlation(first, [volume[:, ::-1] for volume in second], mirrored_window, centre, reach)
+    mirrored_window = _mirror(window, grid.shape)
+    mirrored = masked_correlation(
+        first, [volume[::-1, ::-1, ::-1] for volume in second], mirrored_window, centre, reach
+    )
     coefficient, mirrored = (_along(values, slanted) for values in (coefficient, mirrored))
     lags = np.indices(coefficient.shape).reshape(3, -1) - reach + centre[:, None]
     searched = np.linalg.norm(slanted @ lags[::-1], axis=0) <= SLANT_VOXEL
@@ -292,10 +294,9 @@ def _peak(around: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     return axes @ np.clip(along, -FIT_REACH, FIT_REACH), axes * sizes @ axes.T
 
 
-def _mirror(window: tuple[slice, ...], edge: int) -> tuple[slice, ...]:
-    """Return the window of the same voxels in a volume that is mirrored along y."""
-    z, y, x = window
-    return z, slice(edge - y.stop, edge - y.start), x
+def _mirror(window: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return the window of the same voxels in a volume mirrored in its middle, which keeps all lines of sight."""
+    return tuple(slice(n - part.stop, n - part.start) for part, n in zip(window, shape, strict=True))
 
 
 def masked_correlation(

@@ -14,11 +14,13 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial import cKDTree
 
-from lfpiv.experiment.settings import Flag, Number, Point, Positive, Table
+from lfpiv.experiment.bounds import Coordinate, Flag, Length, Name, Number, PathText, Point
+from lfpiv.experiment.settings import Table
 from lfpiv.simulation.swirl import injector_profiles
 from lfpiv.simulation.tracers import TracerScaling, TracerSet, load_tracers
 from lfpiv.simulation.turbulence import CHUNK, TurbulentFlow, checked_points
 
+Corner = tuple[Number, Number, Number]
 Axis = Literal["x", "y", "z"]
 
 LAMB_OSEEN = 1.2564312086261697
@@ -72,11 +74,11 @@ class Ring(Table):
     """
 
     kind: Literal["ring"] = "ring"
-    radius_mm: Positive
+    radius_mm: Length
     """Radius of the core line [mm]."""
-    core_mm: Positive
+    core_mm: Length
     """Distance from the core line where the displacement is largest [mm]."""
-    peak_mm: Number
+    peak_mm: Coordinate
     """Largest displacement [mm]."""
     centre_mm: Point = (0.0, 0.0, 0.0)
     """Centre of the ring (x, y, z) [mm]."""
@@ -96,9 +98,9 @@ class Swirl(Table):
     """Rotation about an axis, right-handed for a positive peak, with a Gaussian jet along it."""
 
     kind: Literal["swirl"] = "swirl"
-    peak_mm: Number
+    peak_mm: Coordinate
     """Tangential displacement at the core radius [mm]."""
-    core_mm: Positive
+    core_mm: Length
     """Core radius [mm]."""
     profile: Literal["lamb_oseen", "solid"] = "lamb_oseen"
     """Lamb-Oseen vortex, which peaks at the core radius and decays, or solid-body rotation."""
@@ -106,9 +108,9 @@ class Swirl(Table):
     """Direction of the axis of rotation."""
     centre_mm: Point = (0.0, 0.0, 0.0)
     """A point on the axis (x, y, z) [mm]."""
-    axial_mm: Number = 0.0
+    axial_mm: Coordinate = 0.0
     """Displacement along the axis, on the axis [mm]."""
-    axial_core_mm: Positive | None = None
+    axial_core_mm: Length | None = None
     """Distance from the axis at which the jet falls to 1/e [mm]; absent: the core radius."""
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
@@ -139,17 +141,17 @@ class SwirlingJet(Table):
     """
 
     kind: Literal["swirling_jet"] = "swirling_jet"
-    bulk_mm: Number
+    bulk_mm: Coordinate
     """Displacement at the bulk velocity (volume flow over nozzle area) [mm]; negative: against the axis."""
     swirl_number: Number = 0.55
     """Swirl number S at the outlet; positive: right-handed about the axis."""
-    nozzle_radius_mm: Positive = 17.0
+    nozzle_radius_mm: Length = 17.0
     """Radius R of the nozzle [mm]."""
     radius_ratio: Annotated[float, Field(strict=True, gt=0.05, lt=0.95)] = 12 / 17
     """Radius of the central channel over the nozzle's."""
     mass_ratio: Annotated[float, Field(strict=True, ge=0, le=20)] = 0.42
     """Mass flow of the central channel over that of the swirled annulus."""
-    shear_layer_mm: Positive = 1.7
+    shear_layer_mm: Length = 1.7
     """Half thickness of the shear layers, which are tanh profiles [mm]."""
     spreading: Annotated[float, Field(strict=True, ge=0, le=2)] = 0.5
     """Tangent of the half angle of spreading far from the outlet."""
@@ -194,19 +196,19 @@ class Tracers(Table):
     """
 
     kind: Literal["tracers"] = "tracers"
-    file: Annotated[str, Field(min_length=1)]
+    file: PathText
     """A .npz file, relative to the scene file."""
-    first: str = "t0"
+    first: Name = "t0"
     """Array (tracer, >= 3) in the file whose first columns are x, y, z at the first instant, in any unit."""
-    second: str = "t1"
+    second: Name = "t1"
     """Array of the same tracers, in the same order, at the second instant."""
-    size_mm: tuple[Positive, Positive, Positive]
+    size_mm: tuple[Length, Length, Length]
     """Size (x, y, z) of the box of tracers [mm]."""
     centre_mm: Point = (0.0, 0.0, 0.0)
     """Centre (x, y, z) of the box [mm]."""
-    box: tuple[Point, Point] | None = None
+    box: tuple[Corner, Corner] | None = None
     """Two opposite corners of the box in the unit of the file; absent: the extent of the tracers."""
-    peak_mm: Positive | None = None
+    peak_mm: Length | None = None
     """Largest magnitude of the scaled displacement [mm]; absent: as in the file."""
     as_given: Flag = False
     """Render the tracers as particles. False places particles at random and interpolates."""

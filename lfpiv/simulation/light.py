@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from lfpiv.experiment.settings import NonNegative, Number, Point, Positive, Table
+from lfpiv.experiment.bounds import Coordinate, Direction, Length, NonNegative
+from lfpiv.experiment.settings import Table
 
 Pulses = tuple[NonNegative, NonNegative]
 LogSd = Annotated[float, Field(strict=True, ge=0, le=2)]
@@ -61,23 +62,16 @@ class Sheet(Table):
 
     profile: Literal["even", "top_hat", "gaussian"] = "even"
     """Profile across the sheet: even everywhere, even inside the thickness, or Gaussian."""
-    thickness_mm: Positive | tuple[Positive, Positive] | None = None
+    thickness_mm: Length | tuple[Length, Length] | None = None
     """Thickness: the width of a top hat, the width between 1/e^2 of the middle of a Gaussian [mm]."""
-    position_mm: Number | tuple[Number, Number] = 0.0
+    position_mm: Coordinate | tuple[Coordinate, Coordinate] = 0.0
     """Position of the sheet's middle along `direction`, from the world's origin [mm]."""
-    direction: Point = (0.0, 0.0, 1.0)
+    direction: Direction = (0.0, 0.0, 1.0)
     """Direction across the sheet (x, y, z), of any length."""
     power: Pulses = (1.0, 1.0)
     """Power of the first and the second pulse."""
     power_sd: Annotated[float, Field(strict=True, ge=0, le=0.3)] = 0.0
     """Standard deviation of each pulse's power from pair to pair, relative to its mean."""
-
-    @field_validator("direction")
-    @classmethod
-    def _has_length(cls, value: Point) -> Point:
-        if not any(value):
-            raise ValueError("a direction other than (0, 0, 0)")
-        return value
 
     @model_validator(mode="after")
     def _thickness_fits_profile(self) -> Sheet:
@@ -143,7 +137,7 @@ class StrayLight(Table):
     in both frames."""
     variation: Annotated[float, Field(strict=True, ge=0, le=0.5)] = 0.0
     """Standard deviation of the slow variation over the sensor, relative to the mean."""
-    length_mm: Positive = 2.0
+    length_mm: Length = 2.0
     """Length of the variation on the sensor: the inverse of its standard wave number [mm/rad]."""
 
     def fields(

@@ -9,20 +9,20 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from lfpiv.experiment.settings import (
-    Compute,
-    Correlation,
-    Count,
+from lfpiv.experiment import bounds
+from lfpiv.experiment.bounds import (
     Flag,
-    Network,
-    NominalBoard,
+    Interval,
+    Length,
+    Name,
     NonNegative,
     Point,
     Positive,
-    Smart,
-    Table,
-    Volume,
+    Rays,
+    Seed,
+    Thickness,
 )
+from lfpiv.experiment.settings import Compute, Correlation, Network, NominalBoard, Smart, Table, Volume
 from lfpiv.experiment.toml import read_toml
 from lfpiv.simulation.board_errors import BoardErrors
 from lfpiv.simulation.flows import KINDS, Flow, Tracers
@@ -70,25 +70,31 @@ class SceneVolume(Volume):
     """Centre (x, y, z) of the volume [mm]."""
 
 
+LARGEST_SEEDING = 1e4
+"""Largest number of particles per microlens."""
+LARGEST_FILL = 1e3
+"""Largest edge of the seeded region relative to the volume's."""
+
+
 class SceneParticles(Table):
     """Table ``[particles]``: number, intensity and size of the particles."""
 
-    per_microlens: Positive | None = None
+    per_microlens: Annotated[float, Field(strict=True, gt=0, le=LARGEST_SEEDING)] | None = None
     """Particles per microlens of the seeded region's x-y face (the paper's ppm). Alternative to `count`."""
-    count: Count | None = None
+    count: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_PARTICLES)] | None = None
     """Particles of each pair, before those in walls are removed."""
-    pairs: Count = 1
+    pairs: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SIMULATED_PAIRS)] = 1
     """Number of image pairs, each with other particles."""
-    fill: Positive = 1.0
+    fill: Annotated[float, Field(strict=True, gt=0, le=LARGEST_FILL)] = 1.0
     """Edges of the seeded region relative to the volume's. Above 1, particles are outside the volume too."""
-    margin_mm: tuple[NonNegative, NonNegative, NonNegative] | None = None
+    margin_mm: tuple[Thickness, Thickness, Thickness] | None = None
     """Distance by which the seeded region reaches beyond `fill` times the volume on each side (x, y, z), for light that
     reaches farther than the volume. `per_microlens` then holds within the volume, `count` in all [mm]."""
     intensity_sd: NonNegative = 0.0
     """Standard deviation of the particles' intensity about 1."""
-    sigma_mm: Positive | None = None
+    sigma_mm: Length | None = None
     """Standard deviation of Gaussian particles [mm]."""
-    radius_mm: Positive | None = None
+    radius_mm: Length | None = None
     """Radius of spheres that emit evenly from their volume [mm]. Without `sigma_mm` and this, particles are points."""
 
     @model_validator(mode="after")
@@ -121,24 +127,24 @@ class Background(Table):
 class Quality(Table):
     """Table ``[quality]``: numbers of rays, rounded up to powers of two."""
 
-    particle_rays: Count = 32_768
+    particle_rays: Rays = 32_768
     """Rays of each particle."""
-    dot_rays: Count = 131_072
+    dot_rays: Rays = 131_072
     """Rays of each board dot."""
-    pixel_rays: Count = 256
+    pixel_rays: Rays = 256
     """Rays of each pixel of white images and of boards with dark dots."""
 
 
 class Scene(Table):
     """Scene file. `smart`, `correlation`, `network` and `compute` are copied into the experiment file."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Name
     """Name of the experiment."""
-    seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    seed: Seed = 0
     """Seed of all random numbers."""
-    dt_s: Positive
+    dt_s: Interval
     """Time between the two frames of a pair [s]."""
-    camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1)]
+    camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1, max_length=bounds.MOST_CAMERAS)]
     window: Windows = ()
     """Windows of all cameras that state none."""
     aberrations: Aberrations | None = None
@@ -210,7 +216,7 @@ class Scene(Table):
     def _known_flow(cls, table: Any) -> Any:
         if isinstance(table, Mapping):
             kind = table.get("kind")
-            if kind not in KINDS:
+            if not isinstance(kind, str) or kind not in KINDS:
                 raise ValueError(f"a flow with kind = {' or '.join(map(repr, KINDS))}")
             known = KINDS[kind].model_fields
             unknown = [key for key in table if key not in known]

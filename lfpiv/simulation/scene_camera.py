@@ -6,14 +6,22 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from lfpiv.experiment.settings import Count, Flag, NominalCamera, NonNegative, Number, Point, Positive, Table
+from lfpiv.experiment import bounds
+from lfpiv.experiment.bounds import Angle, Coordinate, Direction, Flag, Length, Point, Thickness
+from lfpiv.experiment.settings import NominalCamera, Table
 from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.geometry.orientation import Orientation, camera_rotation
 from lfpiv.simulation.sensor import Sensor
 from lfpiv_kernels.rendering import real_optics
 
-Pair = tuple[Number, Number]
+LARGEST_BLUR_PX = 100.0
+"""Largest standard deviation of a sensor's point spread function [pixel]."""
+
+Pair = tuple[Coordinate, Coordinate]
+Side = Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SIDE_PX)]
+Blur = Annotated[float, Field(strict=True, ge=0, le=LARGEST_BLUR_PX)]
 Pitches = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Index = Annotated[float, Field(strict=True, ge=1, le=4)]
 Drift = Annotated[float, Field(strict=True, ge=-0.05, le=0.05)]
@@ -35,21 +43,14 @@ class Window(Table):
 
     point_mm: Point
     """A point of the surface on the particles' side (x, y, z) [mm]."""
-    normal: Point
+    normal: Direction
     """Normal of the surfaces (x, y, z), of any length and sign."""
-    thickness_mm: NonNegative
+    thickness_mm: Thickness
     """Thickness [mm]; 0 for an interface, such as the free surface of a liquid."""
     index: Index
     """Refractive index of the plate (about 1.46 fused silica, 1.52 crown glass, 1.49 acrylic)."""
     medium_index: Index = 1.0
     """Refractive index of the medium around the particles (1.333 water); only in the window next to them."""
-
-    @field_validator("normal")
-    @classmethod
-    def _has_length(cls, value: Point) -> Point:
-        if not any(value):
-            raise ValueError("a direction other than (0, 0, 0)")
-        return value
 
 
 def _as_list(value: Any) -> Any:
@@ -62,7 +63,12 @@ def _next_to_particles_first(windows: tuple[Window, ...]) -> tuple[Window, ...]:
     return windows
 
 
-Windows = Annotated[tuple[Window, ...], BeforeValidator(_as_list), AfterValidator(_next_to_particles_first)]
+Windows = Annotated[
+    tuple[Window, ...],
+    Field(max_length=bounds.MOST_SOLIDS),
+    BeforeValidator(_as_list),
+    AfterValidator(_next_to_particles_first),
+]
 
 
 class Aberrations(Table):
@@ -106,36 +112,37 @@ class Moved(Table):
 
     shift_mm: Point = (0.0, 0.0, 0.0)
     """Shift of the point in focus at the sensor's centre (x, y, z) [mm]."""
-    yaw_deg: Number = 0.0
-    """Increase of the camera's angle about y [degree]."""
-    pitch_deg: Number = 0.0
+    yaw_deg: Angle = 0.0
+    """Increase of the camera's angle about y, or with `nominal_direction` about its own y axis [degree]."""
+    pitch_deg: Angle = 0.0
     """Increase of the rotation about the camera's x axis [degree]."""
-    roll_deg: Number = 0.0
+    roll_deg: Angle = 0.0
     """Increase of the rotation about the camera's z axis [degree]."""
 
 
 class SceneCamera(NominalCamera):
     """Table ``[[camera]]``: nominal optics for the experiment file, and the truth, which is not in that file."""
 
-    sensor_width_px: Count
+    sensor_width_px: Side
     """Columns of the sensor."""
-    sensor_height_px: Count
+    sensor_height_px: Side
     """Rows of the sensor."""
-    true_yaw_deg: Number | None = None
-    """True camera angle about y [degree]; absent: the nominal one."""
-    true_pitch_deg: Number = 0.0
+    true_yaw_deg: Angle | None = None
+    """True camera angle about y, or with `nominal_direction` the departure from it, about the camera's y axis [degree];
+    absent: as stated."""
+    true_pitch_deg: Angle = 0.0
     """Right-handed rotation about the camera's x axis, after the yaw [degree]."""
-    true_roll_deg: Number = 0.0
-    """Right-handed rotation about the camera's z axis, after the pitch [degree]."""
+    true_roll_deg: Angle = 0.0
+    """Right-handed rotation about the camera's z axis, after the pitch, beside `nominal_roll_deg` [degree]."""
     true_offset_mm: Point = (0.0, 0.0, 0.0)
     """World point in focus at the sensor's centre (x, y, z) [mm], through the windows if there are any."""
-    true_array_roll_deg: Number = 0.0
+    true_array_roll_deg: Angle = 0.0
     """Rotation of the microlens array on the sensor [degree]."""
     true_array_offset_mm: Pair = (0.0, 0.0)
     """Centre (s, t) of a lens, relative to the sensor's centre [mm]."""
-    true_microlens_pitch_mm: Positive | None = None
+    true_microlens_pitch_mm: Length | None = None
     """True pitch of the array [mm]; absent: the nominal one."""
-    blur_px: NonNegative = 0.4
+    blur_px: Blur = 0.4
     """Standard deviation of the sensor's Gaussian point spread function [pixel]."""
     vignetting: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
     """Fraction of the light lost in the sensor's corners. The loss grows with the square of the distance."""
@@ -153,6 +160,12 @@ class SceneCamera(NominalCamera):
     """Sensor of this camera; absent: the scene's."""
     moved: Moved | None = None
     """Movement of this camera between board and particles."""
+
+    @model_validator(mode="after")
+    def _is_placed(self) -> SceneCamera:
+        if self.nominal_angle_deg is None and self.nominal_direction is None:
+            raise ValueError("nominal_angle_deg or nominal_direction")
+        return self
 
     @model_validator(mode="after")
     def _windows_face_the_camera(self) -> SceneCamera:
@@ -187,12 +200,11 @@ class SceneCamera(NominalCamera):
         """The camera where it stood when the particles were recorded."""
         if self.moved is None:
             return self
-        yaw = self.nominal_angle_deg if self.true_yaw_deg is None else self.true_yaw_deg
         offset = tuple(a + b for a, b in zip(self.true_offset_mm, self.moved.shift_mm, strict=True))
         return self.model_copy(
             update={
                 "true_offset_mm": offset,
-                "true_yaw_deg": yaw + self.moved.yaw_deg,
+                "true_yaw_deg": self._yaw_deg + self.moved.yaw_deg,
                 "true_pitch_deg": self.true_pitch_deg + self.moved.pitch_deg,
                 "true_roll_deg": self.true_roll_deg + self.moved.roll_deg,
                 "moved": None,
@@ -205,16 +217,19 @@ class SceneCamera(NominalCamera):
         return self.optics_of((self.sensor_height_px, self.sensor_width_px))
 
     @property
+    def _yaw_deg(self) -> float:
+        """True angle about y, or the departure from a nominal direction [degree]."""
+        return (self.nominal_angle_deg or 0.0) if self.true_yaw_deg is None else self.true_yaw_deg
+
+    @property
     def rotation(self) -> np.ndarray:
-        """Rotation from world to camera, Rz Rx Ry with Ry the rotation of Eqs. 1-3, shape (3, 3)."""
-        yaw = self.nominal_angle_deg if self.true_yaw_deg is None else self.true_yaw_deg
-        (cy, sy), (cx, sx), (cz, sz) = (
-            (np.cos(angle), np.sin(angle)) for angle in np.radians([yaw, self.true_pitch_deg, self.true_roll_deg])
-        )
-        about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
-        about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-        about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        rotation: np.ndarray = about_z @ about_x @ about_y
+        """Rotation from world to camera, shape (3, 3): Rz Rx Ry with Ry the rotation of Eqs. 1-3, after the rotation
+        to the nominal direction if one is stated.
+        """
+        roll = self.nominal_roll_deg + self.true_roll_deg
+        rotation = camera_rotation(*np.radians([self._yaw_deg, self.true_pitch_deg, roll]))
+        if self.nominal_direction is not None:
+            rotation = rotation @ Orientation.from_direction(self.nominal_direction).rotation
         return rotation
 
     @property

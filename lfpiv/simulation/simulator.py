@@ -249,8 +249,11 @@ def _experiment_text(scene: Scene) -> str:
         if camera.image_flip != "none":
             known["image_flip"] = camera.image_flip
         optics = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")
-        for key in (*optics, "pixel_um", "microlens_layout", "nominal_angle_deg"):
+        for key in (*optics, "pixel_um", "microlens_layout", "nominal_angle_deg", "nominal_direction"):
             known[key] = getattr(camera, key)
+        known = {key: value for key, value in known.items() if value is not None}
+        if camera.nominal_roll_deg:
+            known["nominal_roll_deg"] = camera.nominal_roll_deg
         lines += ["", "[[camera]]", *_rows(known)]
     board = scene.board.model_dump(include={"dots", "spacing_mm", "dot_diameter_mm", "planes_mm"})
     board["images"] = "board/{camera}/plane_{plane:02d}.tif"

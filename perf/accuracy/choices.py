@@ -249,7 +249,7 @@ def _traced(own: Bench, choice: Choice) -> Calibration:
     nominal = thin_lens(experiment).cameras
     for sign, name in zip((0.5, -0.5), bench.TWO, strict=True):
         camera = nominal[name]
-        lens = thin_lens_model(camera.optics, experiment.camera(name).nominal_angle_deg)
+        lens = thin_lens_model(camera.optics, experiment.camera(name).orientation)
         offset = lens.offset_mm + [0.0, sign * choice.apart_mm, 0.0]
         cameras[name] = replace(camera, baseline=replace(lens, offset_mm=offset))
     return Calibration(cameras)

@@ -22,6 +22,7 @@ from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.coverage import warn_outside
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.image_checks import APERTURE, microimage_px, stated_px
 from lfpiv.runs import summary
@@ -143,7 +144,7 @@ def test_a_board_that_no_such_camera_can_see_is_refused(rig, mistake):
         board = experiment.board.model_copy(update={"planes_mm": tuple(-z for z in experiment.board.planes_mm)})
         wrong = dataclasses.replace(experiment, board=board)
     else:
-        camera = dataclasses.replace(experiment.cameras[0], nominal_angle_deg=-experiment.cameras[0].nominal_angle_deg)
+        camera = dataclasses.replace(experiment.cameras[0], orientation=Orientation(30.0))
         wrong = dataclasses.replace(experiment, cameras=(camera,))
     with pytest.raises(lfpiv.InputError, match="image_flip"):
         lfpiv.calibrate(wrong)

@@ -12,6 +12,7 @@ import pytest
 from distributed import KilledWorker
 from support.ideal_rig import two_cameras
 from support.small_run import PAIRS
+from support.stored import rewrite
 
 import lfpiv
 from lfpiv.cli import commands
@@ -21,6 +22,7 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import cluster_workers, dispatch, memory, pipeline, worker_plan
 from lfpiv.runs.pair import Outcome
+from lfpiv.runs.stretches import cut
 from lfpiv.runs.worker import Result
 from lfpiv.weights import storage
 from lfpiv_kernels.runtime import Device
@@ -166,16 +168,17 @@ class DeadlyClient:
     def __init__(self, deaths, result=None, how="error"):
         self.deaths, self.result, self.how, self.submitted, self.keys = dict(deaths), result, how, [], set()
 
-    def submit(self, function, shared, pair, topic, *, key, pure):
+    def submit(self, function, shared, stretch, topic, name, *, key, pure, **options):
+        (pair,) = stretch.pairs
         assert key not in self.keys, "the cluster would hand out what it knows under this key"
         self.keys.add(key)
         self.submitted.append(pair)
         self.deaths[pair] = self.deaths.get(pair, 0) - 1
         status = self.how if self.deaths[pair] >= 0 else "finished"
-        return DeadlyFuture(key, status, self.result or Result(outcome=Outcome(pair=pair)))
+        return DeadlyFuture(key, status, self.result or Result(outcomes=(Outcome(pair=pair),)))
 
     def subscribe_topic(self, topic, handler):
-        handler((0.0, (0, 0.5)))
+        handler((0.0, ("", 0.5)))
 
     def unsubscribe_topic(self, topic):
         pass
@@ -197,7 +200,9 @@ class DeadlyFuture:
 
 def outcomes(client, todo, width=2):
     fractions = []
-    found = list(dispatch.Dispatch(client, lambda: width, Path("shared"), todo).outcomes(fractions.append))
+    stretches = cut(todo, None, width)
+    work = dispatch.Dispatch(client, lambda: width, Path("shared"), stretches, len(todo))
+    found = list(work.outcomes(fractions.append))
     assert fractions == sorted(fractions) and fractions[-1] <= 1
     return {outcome.pair: outcome.reason for outcome in found}
 
@@ -221,7 +226,7 @@ def test_a_broken_connection_is_no_trial_of_a_pair():
 def test_what_stops_all_pairs_ends_the_run():
     for full, kind in ((True, StorageError), (False, InputError)):
         with pytest.raises(kind, match="no room"):
-            outcomes(DeadlyClient({}, Result(outcome=None, fatal="no room", storage=full)), range(3))
+            outcomes(DeadlyClient({}, Result(outcomes=None, fatal="no room", storage=full)), range(3))
 
 
 def test_a_scheduler_that_hangs_is_told_and_given_up(monkeypatch, caplog):
@@ -295,13 +300,11 @@ def test_finishing_thousands_of_pairs_opens_each_file_at_most_twice(small_run, t
     (out / "vectors").mkdir()
     calibration = provenance.of_calibration(experiment).hash
     content = (small_run.out / "vectors" / "pair_0000.nc").read_bytes()
-    import h5py
-
     for pair in range(pairs):
         path = out / "vectors" / f"pair_{pair:04d}.nc"
         path.write_bytes(content)
-        with h5py.File(path, "a") as vectors:
-            vectors.attrs.update(provenance.of_pair(experiment, calibration, pair).vectors.attributes)
+        stamp = provenance.of_pair(experiment, calibration, pair).vectors.attributes | {netcdf.FILE: path.name}
+        rewrite(path, lambda file, stamp=stamp: file.attrs.update(stamp), sealed=True)
     opened, read_marks = [], provenance.read_marks
     monkeypatch.setattr(provenance, "read_marks", lambda path: opened.append(path) or read_marks(path))
     monkeypatch.setattr(netcdf, "read_vectors", lambda path: pytest.fail(f"{path} is read as a whole"))

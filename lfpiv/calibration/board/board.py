@@ -20,6 +20,7 @@ from lfpiv.calibration.board.label_gaussian import label_by_gaussian
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import NORMAL_MAD, LightFieldDecoder
 
 log = logging.getLogger(__name__)
@@ -40,7 +41,8 @@ def measure_board(
     decoder: LightFieldDecoder,
     board: DotBoard,
     *,
-    nominal_angle_deg: float,
+    nominal_angle_deg: float | None = None,
+    orientation: Orientation | None = None,
     estimator: str = "lens_integral",
     dark: np.ndarray | None = None,
 ) -> BoardDots:
@@ -54,8 +56,10 @@ def measure_board(
         The camera's decoder.
     board : DotBoard
         The board and the depths of its planes.
-    nominal_angle_deg : float
-        Planned camera angle alpha (Eqs. 1-3), correct to about 10 degrees [degree].
+    nominal_angle_deg : float, optional
+        Planned camera angle alpha (Eqs. 1-3), correct to about 10 degrees [degree]. Alternative to `orientation`.
+    orientation : Orientation, optional
+        Planned orientation of the camera, correct to about 10 degrees.
     estimator : {"lens_integral", "gaussian"}
         "lens_integral" fits each dot to all its raw pixels, integrated over the microlenses. "gaussian" fits a Gaussian
         to the lenses around the dot in each sub-aperture view (section 3.1 (2) of the paper).
@@ -71,17 +75,22 @@ def measure_board(
     InputError
         If the images do not match the board or the camera, or no plane shows the board's dots.
     ValueError
-        If `estimator` is unknown, or the angle is not finite.
+        If `estimator` is unknown, the angle is not finite, or not exactly one of angle and orientation is given.
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator: expected one of {', '.join(map(repr, ESTIMATORS))}, got {estimator!r}.")
-    if not math.isfinite(nominal_angle_deg):
-        raise ValueError(f"nominal_angle_deg: expected a finite angle [degree], got {nominal_angle_deg}.")
+    if (nominal_angle_deg is None) == (orientation is None):
+        raise ValueError("nominal_angle_deg, orientation: expected one of the two.")
+    if nominal_angle_deg is not None:
+        if not math.isfinite(nominal_angle_deg):
+            raise ValueError(f"nominal_angle_deg: expected a finite angle [degree], got {nominal_angle_deg}.")
+        orientation = Orientation(nominal_angle_deg)
+    assert orientation is not None
     if len(images) != len(board.planes_mm):
         raise InputError(f"images: expected one per plane, {len(board.planes_mm)}, got {len(images)}.")
     signals = Signals.from_images(images, decoder, dark)
     with threadpool_limits(1, user_api="blas"):  # threads slow down operations on small matrices
-        detection = find_dots(signals, decoder, board, nominal_angle_deg)
+        detection = find_dots(signals, decoder, board, orientation)
         if estimator == "gaussian":
             labels = label_by_gaussian(signals, decoder, board, detection)
         else:

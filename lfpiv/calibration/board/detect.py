@@ -1,6 +1,6 @@
 """Find and name the dots of a calibration board in all planes of one camera.
 
-A board has no mark, so the nominal rig names its dots: the camera's angle is known to about 10 degrees, and the board's
+A board has no mark, so the nominal rig names its dots: the orientation is known to about 10 degrees, and the board's
 middle is the lattice site nearest to its planned position. All planes of a camera share one pose, which is fitted from
 the plane nearest to z = 0 outwards. The edges of the board that are in view then correct the names.
 """
@@ -19,6 +19,7 @@ from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import BIN_PITCHES, Blobs, CameraPose, Rectified, Rectifier
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics, spread_over_pupil
+from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.warn import Code, Warning, warn
 
@@ -38,10 +39,10 @@ _FULLY_SEEN = 0.9  # least share of a site's light on lit pixels for an empty si
 _LIT_GAIN = 0.3  # least gain of a lit pixel; less is a vignetted corner or a dead lens
 
 
-def find_dots(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, nominal_angle_deg: float) -> Detection:
+def find_dots(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation) -> Detection:
     """Find and name the dots: the lattice in the first plane that shows one, then each plane with the fitted pose.
 
-    The nominal camera angle must be correct to about 10 degrees.
+    The nominal orientation must be correct to about 10 degrees.
 
     Raises
     ------
@@ -51,8 +52,8 @@ def find_dots(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, nom
     optics = decoder.optics
     half_x, half_y = ((n / 2 + MARGIN + 0.5) * board.spacing_mm for n in board.dots)
     rectify = Rectifier(decoder, (half_x, half_y), board.diameter_mm)
-    plan = CameraPose.from_plan(optics, nominal_angle_deg)
-    start = _find_first_lattice(signals, rectify, board, plan, optics)
+    plan = CameraPose.from_plan(optics, orientation)
+    start = _find_first_lattice(signals, rectify, board, orientation, optics)
     pose = plan.fitted(start.points_mm, start.chief_mm, optics)
     planes, pose = _find_in_planes(signals, rectify, board, pose, start.sign, optics)
     shift = _shift_to_edges([plane.site for plane in planes], pose, decoder, board)
@@ -87,10 +88,10 @@ class _FirstLattice:
 
 
 def _find_first_lattice(
-    signals: Signals, rectify: Rectifier, board: DotBoard, plan: CameraPose, optics: Optics
+    signals: Signals, rectify: Rectifier, board: DotBoard, orientation: Orientation, optics: Optics
 ) -> _FirstLattice:
     """Find the lattice with the nominal pose in one of the planes nearest to z = 0."""
-    order = _planes_from_middle(board)
+    order, plan = _planes_from_middle(board), CameraPose.from_plan(optics, orientation)
     found: list[_FirstLattice] = []
     for plane in order:
         if len(found) >= _FIRST_PLANES and any(lattice.regular for lattice in found):
@@ -108,7 +109,7 @@ def _find_first_lattice(
         raise InputError(
             f"board: expected a lattice of {board.dots[0]} x {board.dots[1]} dots, {board.spacing_mm:g} mm apart, near "
             f"z = {board.planes_mm[order[0]]:g} mm; found {len(start.points_mm)} dots of it{blobs}. Check that these "
-            f"are board images, the board's numbers and the nominal angle ({np.degrees(plan.nominal[0]):g} degrees)."
+            f"are board images, the board's numbers and the nominal orientation ({orientation})."
         )
     return start
 

@@ -1,18 +1,20 @@
 """Thin-lens pose of a camera before its calibration, and raw images carried to a board plane along their rays.
 
 The pose is Eqs. 1-3 with free angles, offset, magnification, object distance and slope: s = k u - m x_c with
-x_c = Rz(roll) Rx(pitch) Ry(yaw) (x - offset). It is exact enough to find and name the dots of a board.
+x_c = Rz(roll) Rx(pitch) Ry(yaw) R (x - offset), R the nominal rotation. The angles are small, so a camera that looks
+down from above has the same parameters as any other. The pose is exact enough to find and name the dots of a board.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 from scipy.optimize import least_squares
 
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation, camera_rotation
 from lfpiv.lightfield.decoder import NORMAL_MAD, LightFieldDecoder
 
 BIN_PITCHES = 0.35
@@ -27,36 +29,35 @@ _FAINTEST = 0.2  # least contrast of a dot relative to the typical dot of its pl
 _STEP_MM = 1e-3  # of a difference quotient on the board
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CameraPose:
     """Thin-lens camera in the world."""
 
     parameters: tuple[float, ...]
-    """Yaw, pitch, roll [rad]; offset (x, y, z) [mm]; log ratios to nominal of magnification, object distance, slope."""
-    nominal: tuple[float, float, float]
-    """Nominal yaw [rad], magnification (positive) and object distance [mm]."""
+    """Yaw, pitch, roll about the nominal pose [rad]; offset (x, y, z) [mm]; log ratios to nominal of magnification,
+    object distance, slope."""
+    nominal_rotation: np.ndarray
+    """Nominal rotation from world to camera axes, shape (3, 3)."""
+    nominal: tuple[float, float]
+    """Nominal magnification (positive) and object distance [mm]."""
 
     @classmethod
-    def from_plan(cls, optics: Optics, nominal_angle_deg: float) -> CameraPose:
+    def from_plan(cls, optics: Optics, orientation: Orientation) -> CameraPose:
         """Return the pose of a perfectly aligned camera."""
-        yaw = np.radians(nominal_angle_deg)
-        nominal = (yaw, abs(optics.magnification), optics.object_distance_mm)
-        return cls(parameters=(yaw,) + 8 * (0.0,), nominal=nominal)
+        nominal = (abs(optics.magnification), optics.object_distance_mm)
+        return cls(parameters=9 * (0.0,), nominal_rotation=orientation.rotation, nominal=nominal)
 
     @property
     def _lens(self) -> tuple[float, float, float]:
         """Return the magnification, the object distance [mm] and the factor of the slope k."""
         ratio = np.exp(self.parameters[6:])
-        return self.nominal[1] * ratio[0], self.nominal[2] * ratio[1], ratio[2]
+        return self.nominal[0] * ratio[0], self.nominal[1] * ratio[1], ratio[2]
 
     @property
     def rotation(self) -> np.ndarray:
         """Rotation from world to camera axes, shape (3, 3)."""
-        (cy, cp, cr), (sy, sp, sr) = np.cos(self.parameters[:3]), np.sin(self.parameters[:3])
-        yaw = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
-        pitch = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
-        roll = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
-        rotation: np.ndarray = roll @ pitch @ yaw
+        yaw, pitch, roll = self.parameters[:3]
+        rotation: np.ndarray = camera_rotation(yaw, pitch, roll) @ self.nominal_rotation
         return rotation
 
     def rays(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,18 +113,17 @@ class CameraPose:
         """
         angle, tilt = np.radians(_PRIOR["angle_deg"]), np.radians(_PRIOR["tilt_deg"])
         sigma = np.array([angle, tilt, tilt] + 3 * [_PRIOR["offset_mm"]] + 3 * [_PRIOR["relative"]])
-        mean = np.array((self.nominal[0],) + 8 * (0.0,))
         accuracy = _ROBUST_PITCHES * optics.microlens_pitch_mm
 
         def residuals(parameters: np.ndarray) -> np.ndarray:
-            chief, k = CameraPose(parameters=tuple(parameters), nominal=self.nominal).rays(points_mm)
-            misses = [((chief - array_mm) / accuracy).ravel(), 0.1 * (parameters - mean) / sigma]
+            chief, k = replace(self, parameters=tuple(parameters)).rays(points_mm)
+            misses = [((chief - array_mm) / accuracy).ravel(), 0.1 * parameters / sigma]
             if slope is not None:
                 misses.append((k - slope) * optics.pupil_radius_mm / accuracy)
             return np.concatenate(misses)
 
         fit = least_squares(residuals, self.parameters, x_scale=sigma, loss="soft_l1")
-        return CameraPose(parameters=tuple(float(p) for p in fit.x), nominal=self.nominal)
+        return replace(self, parameters=tuple(float(p) for p in fit.x))
 
 
 @dataclass(frozen=True, eq=False)
