@@ -25,6 +25,7 @@ from lfpiv.runs import cluster_workers, local_workers, worker
 from lfpiv.runs.local_workers import Capacity
 from lfpiv.runs.pair import Outcome, PairWork
 from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut
+from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan
 from lfpiv.warn import name_pairs
 from lfpiv_kernels.runtime import cores
@@ -45,8 +46,14 @@ def sequential(work: PairWork, todo: Iterable[int], progress: StepProgress) -> G
     """
     source = iter(todo)
     total = max(length_hint(source), 1)
+    before = _kept(todo)
     progress(0.0)
-    yield from work.do(source, lambda number, fraction: progress(1 - (length_hint(source) + 1 - fraction) / total))
+    yield from work.do(source, lambda number, fraction: progress((_kept(todo) - before + number + fraction) / total))
+
+
+def _kept(todo: Iterable[int]) -> int:
+    """Return the number of pairs that were passed over because they are finished."""
+    return todo.finished[1] if isinstance(todo, Todo) else 0
 
 
 def _step(experiment: Experiment) -> int | None:
