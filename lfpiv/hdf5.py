@@ -15,13 +15,14 @@ import hashlib
 import io
 import math
 import os
-import stat
 import time
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 from lfpiv.errors import DamagedFile, InputError
+from lfpiv.records import RecordError, open_regular
 
 if TYPE_CHECKING:
     import h5py
@@ -68,8 +69,10 @@ def seal(target: Path | io.BytesIO) -> None:
     """
     import h5py
 
+    text = f"{ALGORITHM} of all bytes before the last {_SEAL_BYTES}, which state it"
     with h5py.File(target, "r+") as file:
-        file.attrs[SEALED] = f"{ALGORITHM} of all bytes before the last {_SEAL_BYTES}, which state it"
+        if file.attrs.get(SEALED) != text:
+            file.attrs[SEALED] = text
     with contextlib.ExitStack() as stack:
         content: Any = target if isinstance(target, io.BytesIO) else stack.enter_context(target.open("r+b"))
         end = _end(content)
@@ -87,7 +90,7 @@ def is_sealed(path: str | Path) -> bool:
     DamagedFile
         If it is no regular file.
     """
-    with _regular(path) as (file, _):
+    with _regular(path) as file:
         return _stated(file) is not None
 
 
@@ -165,25 +168,17 @@ def verify(path: str | Path) -> None:
 # -- the seal ----------------------------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def _regular(path: str | Path) -> Iterator[tuple[BinaryIO, os.stat_result]]:
-    """Open a regular file to read bytes; a pipe, a device or a folder is refused without waiting for it."""
+def _regular(path: str | Path) -> FileIO:
     try:
-        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise DamagedFile(path, (error.strerror or str(error)).lower()) from None
-    with open(number, "rb", buffering=0) as file:
-        status = os.fstat(number)
-        if not stat.S_ISREG(status.st_mode):
-            raise DamagedFile(path, "it is no regular file")
-        yield file, status
+        return open_regular(path)
+    except RecordError as error:
+        raise DamagedFile(path, str(error)) from None
 
 
 def _check_seal(path: str | Path) -> tuple[int, bool]:
     """Check that the bytes of a file are those of its seal; return the key to remember it, and whether it is sealed."""
-    with _regular(path) as (file, status):
+    with _regular(path) as file:
+        status = os.fstat(file.fileno())
         key = _key(path, status)
         try:
             stated = _stated(file)

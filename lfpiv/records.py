@@ -13,6 +13,7 @@ import os
 import stat
 from collections.abc import Mapping
 from functools import lru_cache
+from io import FileIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,18 +34,35 @@ def read_text(path: Path) -> str:
     RecordError
         If it is no regular file, cannot be read, or is not UTF-8.
     """
+    with open_regular(path) as file:
+        try:
+            return file.read().decode("utf-8")
+        except OSError as error:
+            raise RecordError((error.strerror or str(error)).lower()) from None
+        except UnicodeDecodeError:
+            raise RecordError("it is no text") from None
+
+
+def open_regular(path: str | Path) -> FileIO:
+    """Open a regular file to read bytes, unbuffered; a pipe, a device or a folder is refused without waiting for it.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    RecordError
+        If it is no regular file, or cannot be opened.
+    """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        with open(number, "rb") as file:
-            if not stat.S_ISREG(os.fstat(number).st_mode):
-                raise RecordError("it is no regular file")
-            return file.read().decode("utf-8")
     except FileNotFoundError:
         raise
     except OSError as error:
         raise RecordError((error.strerror or str(error)).lower()) from None
-    except UnicodeDecodeError:
-        raise RecordError("it is no text") from None
+    if stat.S_ISREG(os.fstat(number).st_mode):
+        return FileIO(number)
+    os.close(number)
+    raise RecordError("it is no regular file")
 
 
 def read_json(text: str | bytes) -> Any:

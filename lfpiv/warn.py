@@ -10,6 +10,7 @@ import contextlib
 import enum
 import json
 import logging
+import math
 import string
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -295,7 +296,8 @@ class Warning:
             values = ", ".join(f"{name} = {value}" for name, value in found.figures.items())
             text = f"{found.code} ({values})" if values else found.code
             return cls(code=Code.OTHER, subject=found.subject, figures={"text": text}, **numbers)
-        warning = cls(code=Code(found.code), subject=found.subject, figures=found.figures, **numbers)
+        figures = {name: math.nan if value is None else value for name, value in found.figures.items()}
+        warning = cls(code=Code(found.code), subject=found.subject, figures=figures, **numbers)
         try:
             _ = warning.sentence
         except (KeyError, ValueError, TypeError, IndexError, AttributeError) as error:

@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "errors": set(),
     "version": set(),
     "progress": set(),
-    "hdf5": {"errors"},
+    "hdf5": {"errors", "records"},
     "records": set(),
     "warn": {"errors", "records"},
     "files": {"errors", "version"},

@@ -126,8 +126,8 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
 def _stated(experiment: Experiment, setup: CameraSetup) -> Orientation:
     if setup.orientation is None:
         raise InputError(
-            f"{experiment.path}: camera {setup.name!r}: expected nominal_direction or nominal_angle_deg, which direct ray "
-            "tracing takes in place of a calibration, found neither. Add one."
+            f"{experiment.path}: camera {setup.name!r}: expected nominal_direction or nominal_angle_deg, which direct "
+            "ray tracing takes in place of a calibration, found neither. Add one."
         )
     return setup.orientation
 

@@ -192,21 +192,29 @@ def print_vectors(summary: dict[str, Any], out: Path) -> None:
     for pair in pairs[:LISTED_PAIRS]:
         print(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.0f} % valid vectors")
     if len(pairs) > LISTED_PAIRS:
-        count = summary.get("pairs_finished", len(pairs))
-        print(f"{count} pairs in all, {100 * summary['valid_fraction']:.0f} % valid vectors on average")
+        count, share = summary.get("pairs_finished", len(pairs)), 100 * summary["valid_fraction"]
+        print(f"{count} {_noun(summary)}s in all, {share:.0f} % valid vectors on average")
 
 
 def print_failed(summary: dict[str, Any], where: TextIO) -> None:
     """List the pairs that failed, and print the number of pairs that failed in earlier runs and were not repeated."""
     failed = failed_now(summary)
     for item in failed[:LISTED_PAIRS]:
-        print(f"failed: pair {item['pair']}: {item['reason']}", file=where)
+        print(f"failed: {_noun(summary)} {item['pair']}: {item['reason']}", file=where)
     total, earlier = summary["experiment"]["pairs"], len(summary["failed"]) - len(failed)
     unnamed = summary.get("pairs_failed", len(summary["failed"])) - len(summary["failed"])
     if failed:
-        print(f"{len(failed) + unnamed} of {total} pairs failed; the same command tries them again", file=where)
+        count = len(failed) + unnamed
+        print(f"{count} of {total} {_noun(summary)}s failed; the same command tries them again", file=where)
     if earlier:
-        print(f"{earlier} of {total} pairs failed in earlier runs and were not tried in this one", file=where)
+        print(
+            f"{earlier} of {total} {_noun(summary)}s failed in earlier runs and were not tried in this one", file=where
+        )
+
+
+def _noun(summary: dict[str, Any]) -> str:
+    """Return what the results are numbered by."""
+    return "instant" if "series" in summary["experiment"] else "pair"
 
 
 def failed_now(summary: dict[str, Any]) -> list[dict[str, Any]]:

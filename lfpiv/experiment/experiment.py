@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import bounds, images, nominal_checks
@@ -84,6 +85,8 @@ class Frame(NamedTuple):
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """An experiment with checked settings and images. Made by `open_experiment`."""
+
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True, extra="forbid")  # workers get it as JSON
 
     path: Path
     name: str
@@ -280,7 +283,8 @@ def read_experiment(path: str | Path) -> Experiment:
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
     for one in table.camera:
-        _require_orientation(path, one)
+        if not table.board.mark:
+            _require_orientation(path, one)
     board, particles = table.board, table.particles
     check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
     _check_particle_pattern(path, particles, names)
@@ -370,7 +374,7 @@ def _require_orientation(path: Path, camera: CameraTable) -> None:
     if camera.orientation is None:
         raise InputError(
             f"{path}: camera {camera.name!r}: expected nominal_angle_deg, its angle about y, or nominal_direction, a "
-            "vector from the origin towards it, found neither. Add one."
+            "vector from the origin towards it, found neither. Add one, or use a board with a mark (board.mark)."
         )
 
 
@@ -378,6 +382,11 @@ def _check_background(path: Path, camera: CameraTable, particles: Particles) -> 
     """Refuse a pattern with unknown fields, and an image that `particles.background` would not use."""
     key = f"camera {camera.name!r}, background_image"
     assert camera.background_image is not None
+    if particles.series is not None and "{frame" in camera.background_image:
+        raise InputError(
+            f"{path}: {key}: expected no {{frame}}, because one laser lights all instants of a time series, found "
+            f"{camera.background_image!r}."
+        )
     check_pattern(path, key, camera.background_image, {"frame": particles.frames[:1]})
     if particles.background in ("minimum", "median"):
         raise InputError(

@@ -29,8 +29,13 @@ FEWEST_LENSES = 3
 """Least number of microlenses along each axis of a sensor; fewer are a wrong pitch or pixel size."""
 LARGEST_BOARD = 4.0
 """Largest size of a board, along x or y, relative to the part that a camera may see."""
+FEWEST_LENSES_APART = 0.5
+"""Least distance of dots as an oblique camera sees them [microlens]. Two are needed; this little is never enough."""
+
 STEEPEST_COSINE = 0.17
-"""Cosine of the steepest angle at which a camera may see a board, 80 degrees."""
+"""Cosine of the steepest angle at which a camera sees a board well, 80 degrees."""
+ALONG_COSINE = 0.087
+"""Cosine of the angle above which a camera looks along a board, 85 degrees."""
 
 
 def field_mm(optics: Optics) -> np.ndarray:
@@ -75,8 +80,9 @@ def require_board(path: Path, board: Board, name: str, optics: Optics, orientati
     Raises
     ------
     InputError
-        If the dots are less than a microlens apart, the board is more than `LARGEST_BOARD` times as large as the part
-        of it that the camera may see, a plane is behind the lens, or there are more than `bounds.MOST_DOTS` dots.
+        If the camera looks along the board's planes, the dots cannot be told apart as it sees them, the board is more
+        than `LARGEST_BOARD` times as large as the part of it that the camera may see, a plane is behind the lens, or
+        there are more than `bounds.MOST_DOTS` dots.
     """
     lens_mm = optics.microlens_pitch_mm / abs(optics.magnification)
     if board.spacing_mm < lens_mm * (1 - 1e-9):
@@ -91,6 +97,20 @@ def require_board(path: Path, board: Board, name: str, optics: Optics, orientati
             f"{path}: board.planes_mm: expected planes in front of camera {name!r}, whose main lens is "
             f"{optics.object_distance_mm:g} mm from the origin, found one at z = {depth:g} mm, behind the lens. Depths "
             "are millimetres from where the cameras' axes meet."
+        )
+    oblique = abs(float(orientation.rotation[2, 2]))
+    if oblique < ALONG_COSINE:
+        raise InputError(
+            f"{path}: camera {name!r}: expected a camera that sees the board's planes at no more than "
+            f"{np.degrees(np.arccos(STEEPEST_COSINE)):.0f} degrees from their normal, the z axis, found one "
+            f"{orientation}, at {np.degrees(np.arccos(oblique)):.0f} degrees. Turn the board towards all cameras: z is "
+            "its normal."
+        )
+    if board.spacing_mm * oblique < FEWEST_LENSES_APART * lens_mm:
+        raise InputError(
+            f"{path}: board.spacing_mm: expected dots about two microlenses apart as camera {name!r} sees them, found "
+            f"{board.spacing_mm * oblique:.3g} mm where a microlens covers {lens_mm:g} mm: it sees the board at "
+            f"{np.degrees(np.arccos(oblique)):.0f} degrees from its normal. Use a coarser board."
         )
     across, cosines, along = np.linalg.svd(orientation.rotation[:2, :2])  # of the board's axes to the picture's
     widened = np.abs(along.T @ np.diag(1 / np.maximum(cosines, STEEPEST_COSINE)) @ across.T)

@@ -34,6 +34,9 @@ from lfpiv.experiment.bounds import (
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
 
+TURNS = 8
+"""Turns and mirrors of a square grid."""
+
 SMALLEST_WINDOW = 4
 """Smallest edge of an interrogation window that holds a correlation peak [voxel]."""
 
@@ -245,6 +248,22 @@ class CameraTable(NominalCamera):
 Dots = Annotated[int, Field(strict=True, ge=2, le=bounds.MOST_DOTS_ACROSS)]
 
 
+Place = Annotated[int, Field(strict=True, ge=0, lt=bounds.MOST_DOTS_ACROSS)]
+
+
+def _turned(places: tuple[tuple[int, int], ...]) -> list[list[tuple[int, int]]]:
+    """Return places on a square grid in its eight turns and mirrors."""
+    signs = [(a, b) for a in (1, -1) for b in (1, -1)]
+    both = (places, [(row, column) for column, row in places])
+    return [[(a * column, b * row) for column, row in some] for some in both for a, b in signs]
+
+
+def _from_corner(places: list[tuple[int, int]]) -> frozenset[tuple[int, int]]:
+    """Return places counted from the corner of the rectangle around them."""
+    left, low = (min(place[axis] for place in places) for axis in (0, 1))
+    return frozenset((column - left, row - low) for column, row in places)
+
+
 class NominalBoard(Table):
     """Keys of ``[board]``, in experiments and in scenes of the simulator."""
 
@@ -256,6 +275,22 @@ class NominalBoard(Table):
     """Diameter of a dot, less than their distance [mm]."""
     planes_mm: Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=bounds.MOST_PLANES)]
     """Depth z of each plane, all different [mm]."""
+    mark: Annotated[tuple[tuple[Place, Place], ...], Field(max_length=bounds.MOST_DOTS_ACROSS)] = ()
+    """Places (column, row) without a dot, counted from 0 along x and y: a mark that names the dots, so that cameras
+    need no nominal orientation. No turn or mirror of the grid may carry it over into itself; three places suffice."""
+
+    @field_validator("mark")
+    @classmethod
+    def _tells_turns(cls, mark: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+        if mark and len(set(map(_from_corner, _turned(mark)))) < TURNS:
+            raise ValueError("places that no turn or mirror of the grid carries over into themselves")
+        return mark
+
+    @model_validator(mode="after")
+    def _mark_on_board(self) -> NominalBoard:
+        if any(column >= self.dots[0] or row >= self.dots[1] for column, row in self.mark):
+            raise ValueError("a mark of places on the board: column below dots[0], row below dots[1]")
+        return self
 
     @model_validator(mode="after")
     def _dots_apart(self) -> NominalBoard:

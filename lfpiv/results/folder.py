@@ -10,8 +10,10 @@ import logging
 import operator
 import os
 import re
+import secrets
 import shutil
 import socket
+import stat
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,6 +21,7 @@ from pathlib import Path
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.settings import Series
+from lfpiv.records import RecordError, read_object, validate
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
@@ -126,8 +129,11 @@ class Folder:
         """Remove half-written and shared files of a run that was killed. The caller must hold the lock."""
         for place in (self.path, self.vectors(0).parent, self.volume(0, 0).parent):
             for path in place.glob(".*.tmp"):
-                path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # a folder is nobody's half-written file
+                    path.unlink(missing_ok=True)
         shutil.rmtree(self.shared, ignore_errors=True)
+        with contextlib.suppress(OSError):  # a file or a link in its place
+            self.shared.unlink()
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
@@ -171,7 +177,7 @@ def _lock(path: Path) -> int | None:
     import fcntl
 
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        file = _open_lock(path)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -198,13 +204,37 @@ def _lock(path: Path) -> int | None:
     return file
 
 
+def _open_lock(path: Path) -> int:
+    """Open a lock file and return its descriptor; refuse at once a folder, a link or a pipe of that name."""
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        if error.errno not in (errno.EISDIR, errno.ELOOP, errno.ENXIO):
+            raise
+        file = None
+    if file is not None and stat.S_ISREG(os.fstat(file).st_mode):
+        return file
+    if file is not None:
+        os.close(file)
+    raise InputError(f"{path}: expected the lock file of a run, found a folder, a link or a pipe. Remove it.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Holder:
+    """Content of a lock file."""
+
+    process: int
+    host: str
+    since: str
+
+
 def _process_name(holder: bytes) -> str:
     """Return the process that holds a lock, from the content of the lock file."""
     try:
-        found = json.loads(holder)
-        return f"process {found['process']} on {found['host']} since {found['since']}"
-    except (ValueError, KeyError, TypeError):  # the holder has not written its name yet
+        found = validate(_Holder, read_object(holder))
+    except RecordError:  # the holder has not written its name yet
         return "another process"
+    return f"process {found.process} on {found.host[:80]} since {found.since[:40]}"
 
 
 def retire(path: Path) -> Path:
@@ -221,7 +251,7 @@ def make_writable(path: Path) -> list[Path]:
                 break
             made.append(parent)
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".write-test-{os.getpid()}"
+        probe = path / f".write-test-{os.getpid()}-{secrets.token_hex(4)}"
         probe.touch()
         probe.unlink()
     except OSError as error:
@@ -238,7 +268,8 @@ def make_writable(path: Path) -> list[Path]:
             raise InputError(
                 f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
             )
-    for place in (folder.calibration, folder.background, folder.summary, folder.report):
+    results = (folder.calibration, folder.self_calibration, folder.background, folder.guard)
+    for place in (*results, folder.summary, folder.report):
         if place.is_dir():
             raise InputError(
                 f"{place}: expected a place for a file, found a folder. Remove it or choose another --out."

@@ -248,7 +248,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
         {
             "version": __version__,
             "camera": cameras,
-            "board": experiment.board.model_dump(),
+            "board": experiment.board.model_dump(exclude=None if experiment.board.mark else {"mark"}),
             "network": experiment.network.model_dump(),
             "images": content_hash(experiment.calibration_images()),
         }
@@ -268,9 +268,11 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
     """
     recorded = {camera.name: camera.background for camera in experiment.cameras}
     paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
-    frames = experiment.frames if experiment.series is None else experiment.frames[:1]
     images = [
-        path for name in recorded for frame in frames if (path := experiment.background_path(name, frame)) is not None
+        path
+        for name in recorded
+        for frame in lit_frames(experiment)
+        if (path := experiment.background_path(name, frame)) is not None
     ]
     return Stamp(
         {
@@ -281,6 +283,11 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
             "images": _identity(_existing(paths), experiment.path.parent) if None in recorded.values() else None,
         }
     )
+
+
+def lit_frames(experiment: Experiment) -> tuple[str, ...]:
+    """Return the names of the frames that lasers of their own light; one laser lights all instants of a series."""
+    return experiment.frames if experiment.series is None else experiment.frames[:1]
 
 
 def _existing(paths: Iterable[Path]) -> list[Path]:

@@ -85,7 +85,7 @@ def prepare(run: Run, calibration: Calibration) -> Background:
             found = None
     if found is None:
         found = estimate(experiment, calibration.cameras, pairs, run.step("background"))
-        _write(found, path, stamp.attributes)
+        write(found, path, stamp.attributes)
     for warning in found.warnings:
         warn(log, warning)
     return found
@@ -113,7 +113,7 @@ def estimate(
     for number, (name, camera) in enumerate(cameras.items()):
         dark = experiment.dark(name)
         if experiment.camera(name).background is not None:
-            images = [experiment.background_image(name, frame) for frame in experiment.frames]
+            images = [experiment.background_image(name, frame) for frame in provenance.lit_frames(experiment)]
             found[name] = background.recorded_light(
                 [_without_dark(image, dark, camera) for image in images if image is not None], camera.decoder
             )
@@ -126,7 +126,7 @@ def estimate(
     warnings = tuple(_warnings(experiment, standing, len(pairs)))
     if experiment.background == "none":
         return Background(figures=figures, warnings=warnings)
-    return Background(standing, _digest(standing), figures, warnings)
+    return Background(standing, content_hash(standing), figures, warnings)
 
 
 def _figures(light: StandingLight) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def _of_series(
         if found.region.any():  # again, with the images at equal power of the laser
             first, second, _ = _read_series(experiment, camera, dark, pairs, estimate=found)
             found = background.standing_light(first, second, everywhere=everywhere)
-    _log_series(camera.name, found, first.count)
+    _log_series(experiment, camera.name, found, first.count)
     return found
 
 
@@ -182,43 +182,48 @@ def _read_series(
     *,
     keep: bool = False,
     estimate: StandingLight | None = None,
-) -> tuple[Series, Series, tuple[list[np.ndarray], list[np.ndarray]]]:
+) -> tuple[Series, Series | None, tuple[list[np.ndarray], list[np.ndarray]]]:
     """Read the images of one camera; return the series of both frames, and with `keep` all light.
 
-    An `estimate` gives the power of the laser in each image, by which it is divided.
+    All images of a time series are of one frame: one laser lights them. An `estimate` gives the power of the laser in
+    each image, by which it is divided.
     """
     series = Series(camera.decoder, 0), Series(camera.decoder, 1)
     kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for pair in pairs:
+        frames = experiment.pair_frames(pair)
         try:
-            images = [experiment.particle_image(camera.name, pair, frame) for frame in experiment.frames]
+            images = [experiment.particle_image(camera.name, *frame) for frame in frames]
         except InputError as error:  # the pair fails when it is reconstructed
-            log.debug("background of %s: pair %d is left out: %s", camera.name, pair, error)
+            log.debug("background of %s: %s is left out: %s", camera.name, experiment.name_of(pair), error)
             continue
-        for number, image in enumerate(images):
+        for frame, image in zip(frames, images, strict=True):
+            number = experiment.frames.index(frame.name)
             light, noise, saturated = _without_dark(image, dark, camera)
             power = 1.0 if estimate is None else estimate.power(light, number)
             series[number].add(light / np.float32(power), noise / power, saturated)
             if keep:
                 kept[number].append(light)
-    return *series, kept
+    return series[0], series[1] if experiment.series is None else None, kept
 
 
-def _log_series(name: str, light: StandingLight, pairs: int) -> None:
+def _log_series(experiment: Experiment, name: str, light: StandingLight, count: int) -> None:
+    images = f"{count} {experiment.noun}s"
     if light.at_rest:
         text = "light stands nearly everywhere, as that of particles at rest: nothing is subtracted"
         log.info('background of %s: %s. particles.background = "minimum" subtracts it', name, text)
         return
     if not light.found:
-        log.info("background of %s: nothing stands out in %d pairs, nothing is subtracted", name, pairs)
+        log.info("background of %s: nothing stands out in %s, nothing is subtracted", name, images)
         return
     frames = "both frames" if light.ratio is not None else "each frame"
+    if experiment.series is None:
+        images = f"{frames} of {images}"
     log.info(
-        "background of %s: estimated from %s of %d pairs; light stands in %.1f %% of the sensor, %d pixels are "
+        "background of %s: estimated from %s; light stands in %.1f %% of the sensor, %d pixels are "
         "unusable, stray light of %.1f counts",
         name,
-        frames,
-        pairs,
+        images,
         100 * light.region.mean(),
         np.count_nonzero(light.unusable),
         light.stray,
@@ -234,7 +239,8 @@ def _without_dark(
     return image - np.float32(level), noise, image_checks.saturated_pixels(raw)
 
 
-def _digest(standing: Mapping[str, StandingLight]) -> str | None:
+def content_hash(standing: Mapping[str, StandingLight]) -> str | None:
+    """Return the hash of the light of all cameras; None where nothing is subtracted."""
     if not standing:
         return None
     digest = hashlib.blake2b(digest_size=8)
@@ -282,7 +288,7 @@ def load(path: Path, calibration: Calibration) -> Background:
                 for name, camera in calibration.cameras.items()
                 if name in file
             }
-            if _digest(found) != figures.content:
+            if content_hash(found) != figures.content:
                 raise DamagedFile(path, "its light is not that of its figures")
     except FileNotFoundError:
         raise InputError(f"{path}: expected a stored background, found no such file. Run `lfpiv run`.") from None
@@ -303,7 +309,8 @@ def _read_light(group: h5py.Group, shape: tuple[int, int]) -> StandingLight:
     )
 
 
-def _write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
+def write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
+    """Write a background with the attributes of its stamp, atomically."""
     import h5py
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk

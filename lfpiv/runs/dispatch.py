@@ -68,7 +68,7 @@ def parallel(
     Parameters
     ----------
     shared : Path
-        Folder with everything that the workers need, from `worker.share`.
+        Folder with everything that the workers need, from `task.write_task`.
     experiment : Experiment
     todo : iterable of int
         Pairs to do; each is taken when a worker is free.

@@ -115,7 +115,11 @@ class PairFigures:
             If it has another form.
         """
         warnings = warn.from_list(stored.get("warnings", stored.get("findings", [])))
-        return replace(validate(cls, {**stored, "warnings": []}), warnings=warnings)
+        found = replace(validate(cls, {**stored, "warnings": []}), warnings=warnings)
+        shares = (found.valid_fraction, found.finite_fraction, found.seen_fraction, found.masked_fraction)
+        if not all(0 <= share <= 1 for share in shares):
+            raise RecordError(f"expected shares from 0 to 1, found {shares}")
+        return found
 
 
 _OPTIONAL = ("motion", "residual", *netcdf.OF_IMAGES, "stop")

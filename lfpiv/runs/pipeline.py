@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import dispatch, local_workers, memory, rig, worker, worker_plan
+from lfpiv.runs import dispatch, local_workers, memory, rig, task, worker_plan
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import Outcome, PairWork
@@ -228,7 +228,7 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     else:
         used = Workers(count=None, threads=current.experiment.compute.threads)
     device = current.device.kind if isinstance(workers, Plan) else current.device_request
-    shared = worker.share(work, device, used.threads)
+    shared = task.write_task(work, device, used.threads)
     del work, weights  # the workers map them from files; the memory may not have room for both
     tried = _collect(
         current, dispatch.parallel(shared, current.experiment, todo, workers, current.step(_step_name(current)))

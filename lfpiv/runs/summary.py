@@ -26,6 +26,7 @@ from lfpiv.results.folder import Folder
 from lfpiv.runs import guard
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation
+from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import Code, Gathering, Warning, from_list, gather
@@ -86,6 +87,21 @@ class _Failure:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Weights:
+    """Figures of the weights, as the summary stores them."""
+
+    method: str = ""
+    memory_mib: float = 0.0
+    form: dict[str, str] = field(default_factory=dict)
+    cuts: dict[str, list[int]] = field(default_factory=dict)
+    profiles_check_l2: dict[str, list[float | None]] = field(default_factory=dict)
+    count_check_l2: list[float] = field(default_factory=list)
+    disparity_pair: int | None = None
+    disparity_voxel: float | None = None
+    self_calibration: SelfCalibrationFigures | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Stored:
     """Entries of the summary that a later invocation reads."""
 
@@ -104,6 +120,7 @@ def read(path: Path) -> EarlierSummary:
                 f"expected schema version {SCHEMA_VERSION}, found {str(found.get('schema_version'))[:40]}"
             )
         known = validate(_Stored, found)
+        validate(_Weights, known.weights)
         from_list(known.weights.get("warnings", []))
     except FileNotFoundError:
         return EarlierSummary()
@@ -243,6 +260,7 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
             "pairs": experiment.pairs,
             "volume_shape": list(experiment.grid.shape),
             "voxel_mm": experiment.grid.voxel_mm,
+            **({} if experiment.series is None else {"series": experiment.series.model_dump()}),
         },
         "settings": {
             name: getattr(experiment, name).model_dump() for name in ("smart", "correlation", "network", "compute")

@@ -236,9 +236,7 @@ def _disparity(
         centre, reach = np.rint(near_mm[::-1] / grid.voxel_mm).astype(int), NEAR_VOXEL + FIT_REACH
     coefficient = masked_correlation(first, second, window, centre=centre, reach=reach)
     mirrored_window = _mirror(window, grid.shape)
-    mirrored = masked_correlation(
-        first, [volume[::-1, ::-1, ::-1] for volume in second], mirrored_window, centre, reach
-    )
+    mirrored = masked_correlation(first, [np.flip(volume) for volume in second], mirrored_window, centre, reach)
     coefficient, mirrored = (_along(values, slanted) for values in (coefficient, mirrored))
     lags = np.indices(coefficient.shape).reshape(3, -1) - reach + centre[:, None]
     searched = np.linalg.norm(slanted @ lags[::-1], axis=0) <= SLANT_VOXEL

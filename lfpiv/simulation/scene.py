@@ -56,11 +56,20 @@ class SceneBoard(NominalBoard):
             raise ValueError("no table errors with inverted = true: errors are simulated of bright dots only")
         return self
 
+    @model_validator(mode="after")
+    def _mark_of_bright_dots(self) -> SceneBoard:
+        if self.inverted and self.mark:
+            raise ValueError("no mark with inverted = true: a mark is simulated of bright dots only")
+        return self
+
     def dots_mm(self, plane_mm: float) -> np.ndarray:
-        """Return the dot centres (x, y, z) at one depth, x fastest, shape (dot, 3) [mm]."""
+        """Return the dot centres (x, y, z) at one depth, x fastest, without the mark's, shape (dot, 3) [mm]."""
         x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing_mm for n in self.dots)
         y, x = np.meshgrid(y, x, indexing="ij")
-        return np.stack([x.ravel(), y.ravel(), np.full(x.size, float(plane_mm))], axis=1)
+        dot = np.ones((self.dots[1], self.dots[0]), bool)
+        for column, row in self.mark:
+            dot[row, column] = False
+        return np.stack([x[dot], y[dot], np.full(dot.sum(), float(plane_mm))], axis=1)
 
 
 class SceneVolume(Volume):

@@ -223,8 +223,9 @@ class SceneCamera(NominalCamera):
 
     @property
     def rotation(self) -> np.ndarray:
-        """Rotation from world to camera, shape (3, 3): Rz Rx Ry with Ry the rotation of Eqs. 1-3, after the rotation
-        to the nominal direction if one is stated.
+        """Rotation from world to camera, shape (3, 3).
+
+        It is Rz Rx Ry with Ry the rotation of Eqs. 1-3, after the rotation to the nominal direction if one is stated.
         """
         roll = self.nominal_roll_deg + self.true_roll_deg
         rotation = camera_rotation(*np.radians([self._yaw_deg, self.true_pitch_deg, roll]))

@@ -241,7 +241,7 @@ def _experiment_text(scene: Scene) -> str:
         *_rows({"name": scene.name, "dt_s": scene.dt_s}),
     ]
     for camera in scene.camera:
-        known = {"name": camera.name, "white_image": f"white/{camera.name}.tif"}
+        known: dict[str, Any] = {"name": camera.name, "white_image": f"white/{camera.name}.tif"}
         if camera.dark_image:
             known["dark_image"] = f"dark/{camera.name}.tif"
         if scene.background is not None:
@@ -256,6 +256,8 @@ def _experiment_text(scene: Scene) -> str:
             known["nominal_roll_deg"] = camera.nominal_roll_deg
         lines += ["", "[[camera]]", *_rows(known)]
     board = scene.board.model_dump(include={"dots", "spacing_mm", "dot_diameter_mm", "planes_mm"})
+    if scene.board.mark:
+        board["mark"] = scene.board.mark
     board["images"] = "board/{camera}/plane_{plane:02d}.tif"
     particles = {
         "images": "particles/{camera}/pair_{pair:04d}_{frame}.tif",

@@ -32,7 +32,7 @@ EVERY_TABLE = re.sub(r"(?m)^# (?=\[|\w+ = )", "", DEMO_SCENE.read_text("utf-8"))
 
 
 def outcome(read, path):
-    """Return the message of a refused file, None for an accepted one. Fail for any other exception, and for a slow one."""
+    """Return the message of a refused file, None for an accepted one. Fail for another exception or a slow one."""
     before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     try:
         read(path)

@@ -44,7 +44,8 @@ LINES = (
     "point_mm = [0, 0, 0]\nnormal = [1e-300, 0, 0]", "[[volume.solid]]\nkind = 'box'\ncentre_mm = [0, 0, 0]\n"
     "size_mm = [0.1, 0.1, 0.1]", "\n".join(f"unknown_{number} = {number}" for number in range(5000)),
     "[particles.deeper]\nx = 1", "guard_mm = 1e6", "guard_mm = [0, 0, 1e300]", "pairs = 100000000",
-    "instants = 2000000", "first = 999999999", "seed = 170141183460469231731687303715884105727", "frames = ['\\u0000', 'b']", "\ufeff",
+    "instants = 2000000", "first = 999999999", "seed = 170141183460469231731687303715884105727",
+    "frames = ['\\u0000', 'b']", "\ufeff",
 )  # fmt: skip
 """Lines that a file may gain."""
 

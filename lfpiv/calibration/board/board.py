@@ -17,6 +17,7 @@ from lfpiv.calibration.board.detect import find_dots
 from lfpiv.calibration.board.dots import BoardDots, Detection, DotBoard, Labels
 from lfpiv.calibration.board.label import label_by_integral
 from lfpiv.calibration.board.label_gaussian import label_by_gaussian
+from lfpiv.calibration.board.marked import find_marked_dots
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
@@ -59,7 +60,7 @@ def measure_board(
     nominal_angle_deg : float, optional
         Planned camera angle alpha (Eqs. 1-3), correct to about 10 degrees [degree]. Alternative to `orientation`.
     orientation : Orientation, optional
-        Planned orientation of the camera, correct to about 10 degrees.
+        Planned orientation of the camera, correct to about 10 degrees. A board with a mark needs none.
     estimator : {"lens_integral", "gaussian"}
         "lens_integral" fits each dot to all its raw pixels, integrated over the microlenses. "gaussian" fits a Gaussian
         to the lenses around the dot in each sub-aperture view (section 3.1 (2) of the paper).
@@ -79,18 +80,18 @@ def measure_board(
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator: expected one of {', '.join(map(repr, ESTIMATORS))}, got {estimator!r}.")
-    if (nominal_angle_deg is None) == (orientation is None):
-        raise ValueError("nominal_angle_deg, orientation: expected one of the two.")
+    stated = (nominal_angle_deg is not None) + (orientation is not None)
+    if stated > 1 or not (stated or board.mark):
+        raise ValueError("nominal_angle_deg, orientation: expected one of the two, or a board with a mark.")
     if nominal_angle_deg is not None:
         if not math.isfinite(nominal_angle_deg):
             raise ValueError(f"nominal_angle_deg: expected a finite angle [degree], got {nominal_angle_deg}.")
         orientation = Orientation(nominal_angle_deg)
-    assert orientation is not None
     if len(images) != len(board.planes_mm):
         raise InputError(f"images: expected one per plane, {len(board.planes_mm)}, got {len(images)}.")
     signals = Signals.from_images(images, decoder, dark)
     with threadpool_limits(1, user_api="blas"):  # threads slow down operations on small matrices
-        detection = find_dots(signals, decoder, board, orientation)
+        detection = _find(signals, decoder, board, orientation)
         if estimator == "gaussian":
             labels = label_by_gaussian(signals, decoder, board, detection)
         else:
@@ -99,6 +100,13 @@ def measure_board(
             except InputError as error:
                 raise InputError(f"{error}{few_pixels(decoder.optics)}") from None
     return _count(labels, board, detection)
+
+
+def _find(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation | None) -> Detection:
+    if board.mark:
+        return find_marked_dots(signals, decoder, board, orientation)
+    assert orientation is not None
+    return find_dots(signals, decoder, board, orientation)
 
 
 def few_pixels(optics: Optics) -> str:

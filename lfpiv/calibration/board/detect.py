@@ -25,6 +25,9 @@ from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
+FULLY_SEEN = 0.9
+"""Least share of a site's light on lit pixels for an empty site to mean something."""
+
 _FIRST_PLANES = 3  # planes that are searched for the lattice with the nominal pose
 _FEWEST_SHARE = 0.25  # least share of the dots in the field on the first lattice
 _REGULAR = 0.5  # least share of the strongest blobs on one lattice
@@ -35,7 +38,6 @@ _JUDGED_DOTS = 6  # least number of blobs of a plane that distinguish a board fr
 _JUDGED_BINS = 3  # least search radius that distinguishes them [elements]
 _CHANCE = 0.2  # largest scatter of a board's dots about their sites [search radius],
 _CHANCE_PITCHES = 0.5  # or [microlens pitch], because a focused dot is located to a lens only
-_FULLY_SEEN = 0.9  # least share of a site's light on lit pixels for an empty site to mean something
 _LIT_GAIN = 0.3  # least gain of a lit pixel; less is a vignetted corner or a dead lens
 
 
@@ -50,24 +52,30 @@ def find_dots(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, ori
         If no plane shows the board's lattice, or the board certainly has another number of dots than stated.
     """
     optics = decoder.optics
-    half_x, half_y = ((n / 2 + MARGIN + 0.5) * board.spacing_mm for n in board.dots)
-    rectify = Rectifier(decoder, (half_x, half_y), board.diameter_mm)
+    rectify = rectifier(decoder, board)
     plan = CameraPose.from_plan(optics, orientation)
-    start = _find_first_lattice(signals, rectify, board, orientation, optics)
+    start = first_lattice(signals, rectify, board, plan)
+    _require_lattice(start, board, plan, f"the nominal orientation ({orientation})", optics)
     pose = plan.fitted(start.points_mm, start.chief_mm, optics)
-    planes, pose = _find_in_planes(signals, rectify, board, pose, start.sign, optics)
+    planes, pose = find_in_planes(signals, rectify, board, pose, start.sign, optics)
     shift = _shift_to_edges([plane.site for plane in planes], pose, decoder, board)
     named = [_name(planes[number], number, shift, board) for number in range(len(planes))]
     dot, chief = (np.concatenate(part) for part in zip(*named, strict=True))
     if any(shift):
         warn(log, Warning(code=Code.BOARD_RENAMED, figures={"columns": int(shift[0]), "rows": int(shift[1])}))
         pose = plan.fitted(board.of_dots_mm(dot), chief, optics)
-    in_field = np.stack([_in_field(pose, board.points_mm(plane), optics) for plane in range(len(planes))])
-    return Detection(pose=pose, sign=start.sign, dot=dot, chief_mm=chief, in_field=in_field)
+    visible = np.stack([in_field(pose, board.points_mm(plane), optics) for plane in range(len(planes))])
+    return Detection(pose=pose, sign=start.sign, dot=dot, chief_mm=chief, in_field=visible)
+
+
+def rectifier(decoder: LightFieldDecoder, board: DotBoard) -> Rectifier:
+    """Return the rectifier of a camera to the board with its margin."""
+    half_x, half_y = ((n / 2 + MARGIN + 0.5) * board.spacing_mm for n in board.dots)
+    return Rectifier(decoder, (half_x, half_y), board.diameter_mm)
 
 
 @dataclass(frozen=True, eq=False)
-class _FirstLattice:
+class FirstLattice:
     """The lattice that one plane shows with the nominal pose."""
 
     points_mm: np.ndarray
@@ -87,12 +95,10 @@ class _FirstLattice:
         return self.share >= _REGULAR
 
 
-def _find_first_lattice(
-    signals: Signals, rectify: Rectifier, board: DotBoard, orientation: Orientation, optics: Optics
-) -> _FirstLattice:
+def first_lattice(signals: Signals, rectify: Rectifier, board: DotBoard, plan: CameraPose) -> FirstLattice:
     """Find the lattice with the nominal pose in one of the planes nearest to z = 0."""
-    order, plan = _planes_from_middle(board), CameraPose.from_plan(optics, orientation)
-    found: list[_FirstLattice] = []
+    order = planes_from_middle(board)
+    found: list[FirstLattice] = []
     for plane in order:
         if len(found) >= _FIRST_PLANES and any(lattice.regular for lattice in found):
             break
@@ -100,8 +106,13 @@ def _find_first_lattice(
         found.append(_lattice_of_plane(rectified, board, plan, plane))
     candidates = [lattice for lattice in found if lattice.regular] or found
     best = max(lattice.score for lattice in candidates)
-    start = next(lattice for lattice in candidates if lattice.score >= best / 2)  # planes near z = 0 are more certain
-    visible = max(_in_field(plan, board.points_mm(plane), optics).sum() for plane in order[: len(found)])
+    return next(lattice for lattice in candidates if lattice.score >= best / 2)  # planes near z = 0 are more certain
+
+
+def _require_lattice(start: FirstLattice, board: DotBoard, plan: CameraPose, stated: str, optics: Optics) -> None:
+    """Refuse a lattice of too few dots, and blobs that are no lattice. `stated` is what the message asks to check."""
+    order = planes_from_middle(board)
+    visible = max(in_field(plan, board.points_mm(plane), optics).sum() for plane in order[:_FIRST_PLANES])
     fewest = min(max(FEWEST_DOTS, _FEWEST_SHARE * visible), board.size)
     if len(start.points_mm) < fewest or not start.regular:
         chance = len(start.points_mm) > 0 and not start.regular
@@ -109,18 +120,18 @@ def _find_first_lattice(
         raise InputError(
             f"board: expected a lattice of {board.dots[0]} x {board.dots[1]} dots, {board.spacing_mm:g} mm apart, near "
             f"z = {board.planes_mm[order[0]]:g} mm; found {len(start.points_mm)} dots of it{blobs}. Check that these "
-            f"are board images, the board's numbers and the nominal orientation ({orientation})."
+            f"are board images, the board's numbers and {stated}."
         )
-    return start
 
 
-def _planes_from_middle(board: DotBoard) -> np.ndarray:
+def planes_from_middle(board: DotBoard) -> np.ndarray:
+    """Return the numbers of the planes, the nearest to z = 0 first."""
     return np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
 
 
-def _lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> _FirstLattice:
+def _lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> FirstLattice:
     """Match the lattice to the blobs of a plane, bright or dark ones."""
-    best = _FirstLattice(np.empty((0, 3)), np.empty((0, 2)), 1, 0.0, 0.0)
+    best = FirstLattice(np.empty((0, 3)), np.empty((0, 2)), 1, 0.0, 0.0)
     for sign in (1, -1):
         blobs = rectified.peaks(_PEAK_SPACINGS * board.spacing_mm, sign)
         match = _match_lattice(blobs, board)
@@ -129,7 +140,7 @@ def _lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, p
             points = board.points_mm(plane)[match.index[:, 1] * board.dots[0] + match.index[:, 0]]
             at = np.column_stack([blobs.position_mm[match.member], np.full(len(points), board.planes_mm[plane])])
             strongest = np.argsort(-blobs.contrast, kind="stable")[: board.size]
-            best = _FirstLattice(points, pose.rays(at)[0], sign, score, float(match.regular[strongest].mean()))
+            best = FirstLattice(points, pose.rays(at)[0], sign, score, float(match.regular[strongest].mean()))
     return best
 
 
@@ -195,21 +206,23 @@ def _lattice_waves(blobs: Blobs, board: DotBoard) -> tuple[np.ndarray, np.ndarra
 
 
 @dataclass(frozen=True, eq=False)
-class _PlaneDots:
+class PlaneDots:
     """Dots of one plane, on the stated lattice with its margin."""
 
     site: np.ndarray
     """Numbers of their lattice sites, row by row, shape (d,)."""
     chief_mm: np.ndarray
     """Their chief rays on the array [mm], shape (d, 2)."""
+    contrast: float
+    """Sum of their contrasts."""
 
 
-def _find_in_planes(
+def find_in_planes(
     signals: Signals, rectify: Rectifier, board: DotBoard, pose: CameraPose, sign: int, optics: Optics
-) -> tuple[list[_PlaneDots], CameraPose]:
+) -> tuple[list[PlaneDots], CameraPose]:
     """Find the dots of every plane near where the pose expects them; fit the pose again after each plane."""
-    seen: dict[int, _PlaneDots] = {}
-    for plane in _planes_from_middle(board):
+    seen: dict[int, PlaneDots] = {}
+    for plane in planes_from_middle(board):
         z_mm, sites = board.planes_mm[plane], board.points_mm(plane, MARGIN)
         rectified = rectify(signals.of_plane(plane), pose, z_mm)
         blobs = _near_sites(rectified, sites[:, :2], board, sign)
@@ -218,7 +231,7 @@ def _find_in_planes(
         if not on_lattice(found - sites[site, :2], sites[site, :2], board, rectified.bin_mm):
             site, found = site[:0], found[:0]
         at = np.column_stack([found, np.full(len(site), z_mm)])
-        seen[plane] = _PlaneDots(site, pose.rays(at)[0])
+        seen[plane] = PlaneDots(site, pose.rays(at)[0], float(blobs.contrast[site].sum()))
         points = np.concatenate([board.points_mm(p, MARGIN)[dots.site] for p, dots in seen.items()])
         pose = pose.fitted(points, np.concatenate([dots.chief_mm for dots in seen.values()]), optics)
     return [seen[plane] for plane in range(len(seen))], pose
@@ -264,7 +277,7 @@ def _shift_to_edges(
     """Return the columns and rows by which the names must move to match the board's edges in view."""
     found = sites_found(sites, board.dots)
     points = [board.points_mm(plane, MARGIN) for plane in range(len(sites))]
-    in_view = np.stack([_lit_share(pose, at, decoder) >= _FULLY_SEEN for at in points]).reshape(found.shape)
+    in_view = np.stack([lit_share(pose, at, decoder) >= FULLY_SEEN for at in points]).reshape(found.shape)
     extents = find_extents(found, in_view, board.dots)
     if extents is None:
         return 0, 0
@@ -277,7 +290,7 @@ def _shift_to_edges(
     return extents[0].shift, extents[1].shift
 
 
-def _name(dots: _PlaneDots, plane: int, shift: tuple[int, int], board: DotBoard) -> tuple[np.ndarray, np.ndarray]:
+def _name(dots: PlaneDots, plane: int, shift: tuple[int, int], board: DotBoard) -> tuple[np.ndarray, np.ndarray]:
     """Return the numbers and chief rays of the dots of a plane that are on the board."""
     row, column = np.divmod(dots.site, board.dots[0] + 2 * MARGIN)
     column, row = column - MARGIN - shift[0], row - MARGIN - shift[1]
@@ -285,7 +298,7 @@ def _name(dots: _PlaneDots, plane: int, shift: tuple[int, int], board: DotBoard)
     return plane * board.size + (row * board.dots[0] + column)[on_board], dots.chief_mm[on_board]
 
 
-def _lit_share(pose: CameraPose, points: np.ndarray, decoder: LightFieldDecoder) -> np.ndarray:
+def lit_share(pose: CameraPose, points: np.ndarray, decoder: LightFieldDecoder) -> np.ndarray:
     """Return the share of each dot's light on pixels that respond to light, shape (n,)."""
     column, row = np.moveaxis(np.rint(_light_px(pose, points, decoder.optics)), -1, 0)
     rows, columns = decoder.optics.sensor_shape
@@ -295,7 +308,7 @@ def _lit_share(pose: CameraPose, points: np.ndarray, decoder: LightFieldDecoder)
     return share
 
 
-def _in_field(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray:
+def in_field(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray:
     """Return the dots with at least half of their light on the sensor, bool, shape (n,)."""
     position = _light_px(pose, points, optics)
     rows, columns = optics.sensor_shape

@@ -33,6 +33,8 @@ class DotBoard:
     """Diameter of a dot [mm]."""
     planes_mm: tuple[float, ...]
     """Depth z of each plane [mm]."""
+    mark: tuple[tuple[int, int], ...] = ()
+    """Lattice sites (column, row) without a dot."""
 
     @classmethod
     def from_settings(cls, board: Board) -> DotBoard:
@@ -42,12 +44,21 @@ class DotBoard:
             spacing_mm=board.spacing_mm,
             diameter_mm=board.dot_diameter_mm,
             planes_mm=tuple(board.planes_mm),
+            mark=board.mark,
         )
 
     @property
     def size(self) -> int:
         """Dots on the board."""
         return self.dots[0] * self.dots[1]
+
+    @property
+    def occupied(self) -> np.ndarray:
+        """Sites that hold a dot, bool, shape (rows, columns)."""
+        occupied = np.ones(self.dots[::-1], bool)
+        for column, row in self.mark:
+            occupied[row, column] = False
+        return occupied
 
     def points_mm(self, plane: int, margin: int = 0) -> np.ndarray:
         """Return the world positions of the dots of one plane, row by row, shape (dot, 3) [mm].

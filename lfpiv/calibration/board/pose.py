@@ -195,14 +195,23 @@ class Rectified:
 
 
 class Rectifier:
-    """Carries the raw images of one camera to board planes."""
+    """Carries the raw images of one camera to board planes, through the whole pupil or a share of its radius."""
 
-    def __init__(self, decoder: LightFieldDecoder, half_width_mm: tuple[float, float], diameter_mm: float):
+    def __init__(
+        self,
+        decoder: LightFieldDecoder,
+        half_width_mm: tuple[float, float],
+        diameter_mm: float,
+        *,
+        pupil_share: float = np.inf,
+    ):
         optics = decoder.optics
         self._half_width, self._diameter = half_width_mm, diameter_mm
         stride = max(1, int(optics.microimage_pitch_px / _PIXELS_ACROSS))
         thinned = np.zeros(decoder.coverage.shape, bool)
         thinned[::stride, ::stride] = True
+        if pupil_share < 1:  # a small part of the pupil is few pixels: use all of them
+            thinned = np.hypot(*np.moveaxis(decoder.pupil_mm, -1, 0)) < pupil_share * optics.pupil_radius_mm
         self._seen = thinned & (decoder.coverage > _USED_COVERAGE) & (decoder.gain > 0)
         self._lens_mm = decoder.lattice.centres_mm(decoder.lens_index[self._seen]).astype(np.float32)
         self._pupil_mm = decoder.pupil_mm[self._seen]

@@ -25,9 +25,9 @@ class B16(Frames):
             start = file.read(_BASIC_BYTES + 4)
         if len(start) < _BASIC_BYTES or start[:4] not in (b"PCO-", b"pco-"):
             raise ValueError("no PCO header")
-        _, self._start, columns, rows, extended = struct.unpack("<5i", start[4:_BASIC_BYTES])
-        if self._start < _BASIC_BYTES:
-            raise ValueError(f"a header of {self._start} bytes")
+        size, self._start, columns, rows, extended = struct.unpack("<5i", start[4:_BASIC_BYTES])
+        if self._start < _BASIC_BYTES or size != self._start + 2 * rows * columns:
+            raise ValueError(f"{size} bytes for a header of {self._start} bytes and {rows} x {columns} pixels")
         if extended and start[_BASIC_BYTES:] not in (b"", bytes(4)):
             raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
         super().__init__(image.file, (rows, columns), np.dtype("<u2"), 1)

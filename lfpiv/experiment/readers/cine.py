@@ -37,22 +37,24 @@ class Cine(Frames):
         if kind != b"CI" or version not in (0, 1):
             raise ValueError(f"no cine header, or one of version {version}")
         bitmap = _BITMAP_HEADER.unpack(read_bytes(image.file, bitmap_at, _BITMAP_HEADER.size))
-        _, columns, rows, _, bits, self._packing, _ = bitmap
+        bitmap_bytes, columns, rows, planes, bits, self._packing, _ = bitmap
+        if bitmap_bytes < _BITMAP_HEADER.size or planes != 1 or columns < 1 or rows == 0:
+            raise ValueError(
+                f"a bitmap header of {bitmap_bytes} bytes for {planes} planes of {rows} x {columns} pixels"
+            )
         self._top_down = rows < 0 or self._packing != 0
         super().__init__(image.file, (abs(rows), columns), np.dtype("u1" if bits == 8 else "<u2"), count)
         _require_grey(image, compression, bits, self._packing, setup_at)
         require_plausible(self.shape, 2, self.size)
         self._offsets_at = offsets_at
         self._offset = struct.Struct("<q" if version else "<I")
-        if offsets_at + count * self._offset.size > self.size:
-            raise ValueError(f"the header declares {count} images, the file ends at byte {self.size}")
+        self._require_table()
         self._table = _linear_counts() if self._packing == PACKED_10 else None
 
     def place(self, number: int) -> tuple[int, int]:
         """Return first byte and number of bytes of an image's pixels, behind its annotation."""
-        entry = self._offsets_at + number * self._offset.size
-        (start,) = self._offset.unpack(read_bytes(self.file, entry, self._offset.size))
-        if start < _FILE_HEADER.size or start > self.size:
+        start = self._start(number)
+        if start > self.size or (number and not self._start(0) <= self._start(number - 1) < start):
             raise ValueError(f"image {number} begins at byte {start}, the file ends at byte {self.size}")
         (annotation,) = struct.unpack("<I", read_bytes(self.file, start, 4))
         if annotation < 8 or start + annotation > self.size:
@@ -71,6 +73,17 @@ class Cine(Frames):
             return unpack_12(data).reshape(self.shape)
         stored = np.frombuffer(data, self.dtype).reshape(rows, -1)[:, :columns]
         return stored if self._top_down else stored[::-1]
+
+    def _start(self, number: int) -> int:
+        """Return the first byte of an image's annotation."""
+        entry = self._offsets_at + number * self._offset.size
+        return int(self._offset.unpack(read_bytes(self.file, entry, self._offset.size))[0])
+
+    def _require_table(self) -> None:
+        """Refuse a table of images that does not end before the first of them."""
+        end = self._offsets_at + self.count * self._offset.size
+        if not self.count or end > self.size or not end <= self._start(0) <= self._start(self.count - 1):
+            raise ValueError(f"no table of {self.count} images at byte {self._offsets_at}")
 
     def _lengths(self) -> tuple[int, ...]:
         """Return the sizes that an image's pixels may have: with and without rows filled to four bytes [byte]."""

@@ -124,13 +124,15 @@ _open_files: OpenFiles[Hdf5Images] = OpenFiles(OPEN_STACKS)
 
 def header(image: ImagePath) -> Header:
     """Return the header of an image without reading its pixels."""
-    dataset, _ = _open_files.get(image, Hdf5Images).find(image.part)
+    opened = _open_files.get(image, Hdf5Images)  # named, so that it stays open here
+    dataset, _ = opened.find(image.part)
     return _checked(dataset)
 
 
 def read(image: ImagePath) -> np.ndarray:
     """Return the pixels of an image."""
-    dataset, number = _open_files.get(image, Hdf5Images).find(image.part)
+    opened = _open_files.get(image, Hdf5Images)
+    dataset, number = opened.find(image.part)
     _checked(dataset)
     pixels: np.ndarray = dataset[()] if number is None else dataset[number]
     return pixels

@@ -42,6 +42,8 @@ class Mraw(Frames):
         if rows * columns * self._bits % 8:
             raise ValueError(f"{rows} x {columns} pixels of {self._bits} bits do not fill whole bytes")
         self._length = rows * columns * self._bits // 8
+        if count * self._length < self.size:
+            raise ValueError(f"its header declares {count * self._length} bytes, the file has {self.size}")
 
     def place(self, number: int) -> tuple[int, int]:
         """Return first byte and number of bytes of an image's pixels."""

@@ -84,7 +84,7 @@ class Stack(ABC):
                 raise NotOneImage(f"{self._counted()}; name one behind the file: #0 to #{self.count - 1}")
             return 0
         if not (part.isascii() and part.isdigit() and len(part) < 18):
-            raise NotOneImage(f"a part called {part[:80]!r}; name a {self.noun} by number, counted from 0 (#0)")
+            raise NotOneImage(f"a part called {part[:80]!r}; name one by number, counted from 0 (#0)")
         if not self.holds(int(part)):
             raise NotOneImage(f"{self._counted()}, none of them #{part}; they count from 0")
         return int(part)

@@ -14,6 +14,8 @@ from lfpiv.experiment.readers.stack import Stack
 
 MOST_TAGS = 4096
 """Largest number of entries of a page's directory; tifffile takes more for damage as well."""
+STRIP_FILL = 4
+"""Largest number of bytes that fill up a strip of pixels [byte]."""
 
 
 class TiffStack(Stack):
@@ -99,5 +101,9 @@ class TiffStack(Stack):
         if end == 0 or end > self._size:
             raise ValueError(f"pixel data end at byte {end}, the file at byte {self._size}")
         rows, columns = page.shape
-        require_plausible((rows, columns), page.dtype.itemsize, sum(page.databytecounts))
+        stored, pixels = sum(page.databytecounts), rows * columns * page.dtype.itemsize
+        require_plausible((rows, columns), page.dtype.itemsize, stored)
+        strips = len(page.databytecounts)
+        if page.compression == 1 and not page.is_tiled and not pixels <= stored <= pixels + STRIP_FILL * strips:
+            raise ValueError(f"{stored} bytes of pixels where its directory declares {rows} x {columns} {page.dtype}")
         return Header((int(rows), int(columns)), str(page.dtype))
