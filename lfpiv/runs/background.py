@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 LARGE_SHARE = 0.02
 """Share of an image's light that stands still and is not subtracted, above which a warning is due."""
 LONGEST_SERIES = 32
-"""Largest number of pairs, evenly spread, from which the standing light is estimated."""
+"""Largest number of pairs, evenly spread, from which the standing light is estimated; of instants twice as many."""
 MEDIAN_PAIRS = 7
 """The same for a median, which holds both frames of all pairs in memory."""
 WARNING_PAIRS = 4
@@ -100,9 +100,12 @@ def _images_lost(stamp: Stamp, marks: Marks) -> bool:
 
 
 def series(experiment: Experiment) -> list[int]:
-    """Return the pairs from which the standing light is estimated, evenly spread over all."""
+    """Return the pairs from which the standing light is estimated, evenly spread over all.
+
+    A pair of a time series gives one image: in two successive ones the same particles overlap, which chance does not.
+    """
     longest = {"median": MEDIAN_PAIRS, "none": WARNING_PAIRS}.get(experiment.background, LONGEST_SERIES)
-    return experiment.spread_pairs(longest)
+    return experiment.spread_pairs(longest if experiment.series is None else 2 * longest)
 
 
 def estimate(
@@ -226,7 +229,7 @@ def _read_series(
     series = Series(camera.decoder, 0), Series(camera.decoder, 1)
     kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for pair in pairs:
-        frames = experiment.pair_frames(pair)
+        frames = provenance.background_frames(experiment, pair)
         try:
             images = [experiment.particle_image(camera.name, *frame) for frame in frames]
         except InputError as error:  # the pair fails when it is reconstructed

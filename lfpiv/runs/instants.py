@@ -12,6 +12,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -156,7 +157,7 @@ class Instants:
         path = _light_path(file, self.work.scratch)
         try:
             light = _read_light(file.frame, list(self.work.cameras), path)
-        except (OSError, ValueError, KeyError):  # it is read from the images
+        except (OSError, ValueError, KeyError, BadZipFile):  # it is read from the images
             return None
         self._take(file, path)
         return light
