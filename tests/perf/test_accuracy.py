@@ -173,7 +173,7 @@ def test_imperfect_images_are_measured_and_judged(figures):
 @pytest.mark.slow
 def test_each_instant_of_a_series_is_reconstructed_once_and_judged(figures):
     case = figures["dns_series"]
-    assert case["reconstructed"] == [1] * 6
+    assert case["reconstructed"] == [1] * 4  # instants 2 and 3 have no partner four instants apart
     assert [one["instant"] for one in case["instants"]] == [0, 1]
     for one in case["instants"]:
         assert one["all"] < one["moved"] and one["correlation"] > 0.8
