@@ -65,13 +65,13 @@ def write_report(
         "background": background.section(experiment, calibration),
         "volumes": volumes.section(figures.pairs, vectors, experiment.noun) if vectors else "",
         "vectors": vector_section.section(vectors, experiment.noun),
-        "pairs": pairs.section(figures.pairs, figures.failed) if figures.pairs else "",
+        "pairs": pairs.section(figures.pairs, figures.failed, figures.finished_count) if figures.pairs else "",
         "time": overview.timings(figures),
         "settings": overview.settings_and_versions(figures),
     }
     body = [
         overview.head(experiment, figures),
-        overview.warnings(figures),
+        overview.warnings(figures, experiment.noun),
         overview.contents(sections),
         *sections.values(),
     ]

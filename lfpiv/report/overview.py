@@ -17,10 +17,10 @@ WARNINGS_SHOWN, WARNINGS_MOST = 12, 300
 
 def head(experiment: Experiment, summary: Summary) -> str:
     """Return the title of the page and the main figures of the run."""
-    finished, failed = len(summary.pairs), len(summary.failed)
-    cards = [(f"{finished:,}", f"image {'pair' if finished == 1 else 'pairs'} finished")]
+    finished, failed = summary.finished_count, summary.failed_count
+    cards = [(f"{finished:,}", f"{_noun(experiment)}{'' if finished == 1 else 's'} finished")]
     if failed:
-        cards.append((f"{failed:,}", f"image {'pair' if failed == 1 else 'pairs'} failed"))
+        cards.append((f"{failed:,}", f"{_noun(experiment)}{'' if failed == 1 else 's'} failed"))
     if finished:
         cards.append((percent(summary.valid_fraction), "valid vectors"))
         uncertainty = [pair.uncertainty_voxel for pair in summary.pairs if pair.uncertainty_voxel is not None]
@@ -47,9 +47,15 @@ def head(experiment: Experiment, summary: Summary) -> str:
     )
 
 
-def warnings(summary: Summary) -> str:
-    """List the failed pairs, then the warnings."""
-    failed = [f"Pair {failure.pair} failed: {failure.reason}" for failure in summary.failed]
+def _noun(experiment: Experiment) -> str:
+    return "image pair" if experiment.series is None else experiment.noun
+
+
+def warnings(summary: Summary, noun: str = "pair") -> str:
+    """List the failed pairs, or instants as `noun` says, then the warnings."""
+    failed = [f"{noun.capitalize()} {failure.pair} failed: {failure.reason}" for failure in summary.failed]
+    unnamed = summary.failed_count - len(failed)
+    failed += [f"{unnamed:,} more {noun}s failed"] if unnamed else []
     texts = [*failed, *summary.warnings]
     if not texts:
         return ""
@@ -104,10 +110,11 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         (
             "Board",
             f"{board.dots[0]} × {board.dots[1]} dots, {board.spacing_mm:g} mm apart, in {len(board.planes_mm)} planes "
-            f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm",
+            f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm"
+            + (f", with a mark of {len(board.mark)} places without a dot" if board.mark else ""),
         ),
         ("Axes", _axes(experiment)),
-        ("Image pairs", f"{len(summary.pairs):,} of {experiment.pairs:,} finished"),
+        ("Image pairs", f"{summary.finished_count:,} of {experiment.pairs:,} finished"),
         ("Motion passes", _motion(summary)),
         ("Weights", _weights(summary.weights)),
         ("Cameras against each other", _agreement(summary.weights)),

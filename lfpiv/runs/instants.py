@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import logging
 import traceback
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 from zipfile import BadZipFile
@@ -58,6 +59,9 @@ class InstantWork(Protocol):
 
     def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
         """Reconstruct one instant."""
+
+    def write(self, write: Callable[[], None], *, large: bool = False) -> None:
+        """Start to write a result of the present pair."""
 
 
 class Failure(Exception):
@@ -161,11 +165,11 @@ class Instants:
         light = self.work.read_light(file)
         found = _Instant(file.frame, self.work.reconstruct(light, progress), light)
         if self.work.keep_volumes:
-            file.write(found.volume)
+            self.work.write(partial(file.write, found.volume), large=True)
         if file.frame.number in self.stored and self.work.scratch is not None:
             _write_light(light, _light_path(file, self.work.scratch))
             if not self.work.keep_volumes:
-                file.within(self.work.scratch).write(found.volume)
+                self.work.write(partial(file.within(self.work.scratch).write, found.volume), large=True)
         return found
 
     def _compared(self, first: _Instant, second: _Instant) -> Sequence[Warning]:
