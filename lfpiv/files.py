@@ -20,6 +20,21 @@ from lfpiv.errors import StorageError
 MIB = 1 << 20
 
 
+def size_text(size: int) -> str:
+    """Return a size [byte] as text, in the largest unit of which it has at least one.
+
+    Examples
+    --------
+    >>> from lfpiv.files import size_text
+    >>> size_text(3 << 29), size_text(700), size_text(5 << 50)
+    ('1.5 GiB', '700 bytes', '5120.0 TiB')
+    """
+    for unit, power in (("TiB", 40), ("GiB", 30), ("MiB", 20), ("KiB", 10)):
+        if size >= 1 << power:
+            return f"{size / (1 << power):.1f} {unit}"
+    return f"{size} bytes"
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a scratch path in the folder of `path`; rename it to `path` at the end, remove it on any failure.

@@ -10,11 +10,16 @@ import contextlib
 import enum
 import json
 import logging
+import math
 import string
+from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
+
+from lfpiv import records
+from lfpiv.records import RecordError
 
 NAMED_PAIRS = 5
 """Largest number of pairs that a sentence names one by one."""
@@ -250,44 +255,57 @@ class Warning:
     """Numbers and names that the sentence shows."""
     pairs: tuple[int, ...] = ()
     """Numbers of the pairs it concerns; empty where it concerns no pair in particular."""
+    instants: tuple[int, ...] = ()
+    """Numbers of the instants of a series that it concerns, in place of pairs."""
 
     @property
     def sentence(self) -> str:
         """Sentence for people: subject, pairs and text."""
-        heads = [part for part in (self.subject, name_pairs(self.pairs)) if part]
+        heads = [part for part in (self.subject, name_pairs(self.pairs), name_pairs(self.instants, "instant")) if part]
         text = _Words().vformat(SENTENCES[self.code], (), self.figures)
         return f"{', '.join(heads)}: {text}" if heads else text
 
     def of_pair(self, pair: int) -> Warning:
-        """Return the same warning about one pair."""
-        return replace(self, pairs=(pair,))
+        """Return the same warning about one pair; one about instants stays as it is."""
+        return self if self.instants else replace(self, pairs=(pair,))
+
+    def by_instant(self) -> Warning:
+        """Return the same warning with its pairs named by their first instants, for a series."""
+        return replace(self, pairs=(), instants=self.pairs) if self.pairs else self
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that a file stores."""
         figures = {name: asdict(value) if isinstance(value, Span) else value for name, value in self.figures.items()}
         stored = {"code": self.code.value, "subject": self.subject, "figures": figures}
-        return stored | {"pairs": list(self.pairs)} if self.pairs else stored
+        numbers = {"pairs": list(self.pairs), "instants": list(self.instants)}
+        return stored | {name: found for name, found in numbers.items() if found}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
-        """Read the form that a file stores; sentences and findings of version 0.1.0 too."""
+        """Read the form that a file stores; sentences and findings of version 0.1.0 too.
+
+        Raises
+        ------
+        RecordError
+            If it has none of these forms, or its figures do not fit its sentence.
+        """
         if isinstance(stored, str):
             return cls(code=Code.OTHER, figures={"text": stored})
-        if "what" in stored:
-            subject = stored["camera"] + (f", frame {stored['frame']}" if stored["frame"] else "")
-            figures = {_FINDING_FIGURES[stored["what"]]: stored["value"]}
-            if stored["what"] == Code.UNEVEN.value:
-                figures["ratio"] = 4.0  # the limit of version 0.1.0
-            return cls(code=Code(stored["what"]), subject=subject, figures=figures)
-        code, pairs = stored["code"], tuple(stored.get("pairs", ()))
-        if code not in {known.value for known in Code}:
-            values = ", ".join(f"{name} = {value}" for name, value in stored["figures"].items())
-            text = f"{code} ({values})" if values else str(code)
-            return cls(code=Code.OTHER, subject=stored["subject"], figures={"text": text}, pairs=pairs)
-        figures = {
-            name: Span(**value) if isinstance(value, dict) else value for name, value in stored["figures"].items()
-        }
-        return cls(code=Code(code), subject=stored["subject"], figures=figures, pairs=pairs)
+        if isinstance(stored, Mapping) and "what" in stored:
+            return _of_finding(records.validate(_Finding, stored))
+        found = records.validate(_Stored, stored)
+        numbers = {"pairs": found.pairs, "instants": found.instants}
+        if found.code not in {known.value for known in Code}:
+            values = ", ".join(f"{name} = {value}" for name, value in found.figures.items())
+            text = f"{found.code} ({values})" if values else found.code
+            return cls(code=Code.OTHER, subject=found.subject, figures={"text": text}, **numbers)
+        figures = {name: math.nan if value is None else value for name, value in found.figures.items()}
+        warning = cls(code=Code(found.code), subject=found.subject, figures=figures, **numbers)
+        try:
+            _ = warning.sentence
+        except (KeyError, ValueError, TypeError, IndexError, AttributeError) as error:
+            raise RecordError(f"figures of the warning {found.code!r} do not fit it ({error})") from None
+        return warning
 
 
 @dataclass(frozen=True)
@@ -296,6 +314,37 @@ class Span:
 
     low: float
     high: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """A warning as files store it."""
+
+    code: str
+    subject: str
+    figures: Mapping[str, Span | int | float | str | bool | Sequence[int | float | str] | None]
+    pairs: tuple[int, ...] = ()
+    instants: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Finding:
+    """A warning as files of version 0.1.0 store it."""
+
+    what: str
+    camera: str
+    frame: str
+    value: float
+
+
+def _of_finding(found: _Finding) -> Warning:
+    if found.what not in _FINDING_FIGURES:
+        raise RecordError(f"unknown finding {found.what!r}")
+    figures = {_FINDING_FIGURES[found.what]: found.value}
+    if found.what == Code.UNEVEN.value:
+        figures["ratio"] = 4.0  # the limit of version 0.1.0
+    subject = found.camera + (f", frame {found.frame}" if found.frame else "")
+    return Warning(code=Code(found.what), subject=subject, figures=figures)
 
 
 class _Words(string.Formatter):
@@ -316,38 +365,123 @@ def to_text(warnings: Iterable[Warning]) -> str:
 
 
 def from_text(text: str) -> tuple[Warning, ...]:
-    """Read the JSON text that an attribute of a file stores."""
-    return tuple(Warning.from_json(stored) for stored in json.loads(text))
+    """Read the JSON text that an attribute of a file stores.
+
+    Raises
+    ------
+    RecordError
+        If it is no list of warnings.
+    """
+    return from_list(records.read_json(text))
+
+
+def from_list(stored: Any) -> tuple[Warning, ...]:
+    """Read the list of warnings that a record holds.
+
+    Raises
+    ------
+    RecordError
+        If it is no list of warnings.
+    """
+    if not isinstance(stored, list):
+        raise RecordError("expected a list of warnings")
+    return tuple(map(Warning.from_json, stored))
+
+
+class Gathering:
+    """Warnings of many pairs, merged as they arrive. Memory: 8 bytes per pair and kind of warning."""
+
+    def __init__(self) -> None:
+        self._groups: dict[tuple[Code, str, tuple[tuple[str, str], ...]], _Group] = {}
+
+    def add(self, warnings: Iterable[Warning]) -> None:
+        """Merge some warnings with those that are there."""
+        for warning in warnings:
+            fixed = ((name, value if isinstance(value, str) else "") for name, value in warning.figures.items())
+            key = (warning.code, warning.subject, tuple(sorted(fixed)))
+            if key not in self._groups:
+                self._groups[key] = _Group(warning)
+            self._groups[key].add(warning)
+
+    def join(self, other: Gathering) -> None:
+        """Merge the warnings of another one with those that are there."""
+        for key, group in other._groups.items():
+            if key in self._groups:
+                self._groups[key].join(group)
+            else:
+                self._groups[key] = group
+
+    def merged(self) -> list[Warning]:
+        """Return the merged warnings, sorted by code."""
+        order = list(Code)
+        return [group.merged() for _, group in sorted(self._groups.items(), key=lambda item: order.index(item[0][0]))]
+
+
+class _Group:
+    """Warnings of equal code, subject and texts."""
+
+    def __init__(self, first: Warning):
+        self.first, self.count = first, 0
+        self.pairs, self.instants = array("q"), array("q")
+        self.spans: dict[str, tuple[Any, Any]] = {}
+        """Figure -> lowest and highest number."""
+        self.unlike = set[str]()
+        """Figures that are no number in some warning."""
+
+    def add(self, warning: Warning) -> None:
+        self.count += 1
+        _extend(self.pairs, warning.pairs)
+        _extend(self.instants, warning.instants)
+        for name in self.first.figures:
+            value = warning.figures[name]
+            if isinstance(value, (int, float)):
+                low, high = self.spans.get(name, (value, value))
+                self.spans[name] = min(low, value), max(high, value)
+            else:
+                self.unlike.add(name)
+
+    def join(self, other: _Group) -> None:
+        self.count += other.count
+        _extend(self.pairs, other.pairs)
+        _extend(self.instants, other.instants)
+        self.unlike |= other.unlike
+        for name, (low, high) in other.spans.items():
+            own = self.spans.get(name, (low, high))
+            self.spans[name] = min(own[0], low), max(own[1], high)
+
+    def merged(self) -> Warning:
+        figures: dict[str, object] = dict(self.first.figures)
+        if self.count > 1:
+            figures |= {name: Span(*span) for name, span in self.spans.items() if name not in self.unlike}
+        pairs, instants = tuple(dict.fromkeys(self.pairs)), tuple(sorted({*self.instants}))
+        return replace(self.first, figures=figures, pairs=pairs, instants=instants)
+
+
+def _extend(known: array[int], numbers: Iterable[int]) -> None:
+    """Add numbers, but not one that equals the last one."""
+    for number in numbers:
+        if not known or number != known[-1]:
+            known.append(number)
 
 
 def gather(warnings: Iterable[Warning]) -> list[Warning]:
     """Merge warnings of equal code, subject and texts: their pairs in one, their numbers as ranges. Sorted by code."""
-    groups: dict[tuple[Code, str, tuple[tuple[str, str], ...]], list[Warning]] = {}
-    for warning in warnings:
-        fixed = ((name, value if isinstance(value, str) else "") for name, value in warning.figures.items())
-        groups.setdefault((warning.code, warning.subject, tuple(sorted(fixed))), []).append(warning)
-    order = list(Code)
-    return [_merged(group) for _, group in sorted(groups.items(), key=lambda item: order.index(item[0][0]))]
+    found = Gathering()
+    found.add(warnings)
+    return found.merged()
 
 
-def _merged(group: Sequence[Warning]) -> Warning:
-    first = group[0]
-    figures: dict[str, object] = {}
-    for name, value in first.figures.items():
-        values = [warning.figures[name] for warning in group]
-        numbers = [number for number in values if isinstance(number, (int, float))]
-        figures[name] = Span(min(numbers), max(numbers)) if len(numbers) == len(group) > 1 else value
-    pairs = dict.fromkeys(pair for warning in group for pair in warning.pairs)
-    return replace(first, figures=figures, pairs=tuple(pairs))
+def name_pairs(pairs: Sequence[int], noun: str = "pair", count: int | None = None) -> str:
+    """Name the first pairs, or what else the noun says, and count the others; empty for none.
 
-
-def name_pairs(pairs: Sequence[int]) -> str:
-    """Name the first pairs and count the others; empty for none."""
-    if not pairs:
+    `count` is the number of all, where `pairs` are the first ones. Default: all are given.
+    """
+    count = len(pairs) if count is None else count
+    if not count:
         return ""
     names = ", ".join(map(str, pairs[:NAMED_PAIRS]))
-    more = f" and {len(pairs) - NAMED_PAIRS} more" if len(pairs) > NAMED_PAIRS else ""
-    return f"pair{'s' if len(pairs) > 1 else ''} {names}{more}"
+    more = f" and {count - NAMED_PAIRS} more" if count > NAMED_PAIRS else ""
+    return f"{noun}{'s' if count > 1 else ''} {names}{more}"
 
 
 _collected: ContextVar[list[Warning] | None] = ContextVar("collected", default=None)

@@ -3,6 +3,7 @@
 Nothing else may call ``ti.init`` or ``wp.init``. A second ``ti.init`` would destroy every live Taichi field.
 """
 
+import atexit
 import contextlib
 import io
 import logging
@@ -11,6 +12,9 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
+
+from lfpiv_kernels import caches
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +62,8 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
         If `request` is none of the three.
     RuntimeError
         If "cuda" was requested and no device is visible, if the runtime already runs on another device, or if it ran
-        when this process was forked: its threads are not in this process.
+        when this process was forked: its threads are not in this process. If no folder for compiled kernels can be
+        written, or the process may not take the address space that Taichi reserves.
     """
     if request not in ("auto", "cpu", "cuda"):
         raise ValueError(f"device: expected 'auto', 'cpu' or 'cuda', got {request!r}.")
@@ -80,11 +85,13 @@ def _start(request: str, threads: int | None) -> Device:
             )
         return _device
 
+    caches.prepare()
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR  # no banner, no notes on compilation
     with _quiet_stderr():  # without a CUDA driver, native code writes whatever the log level
         wp.init()
+    caches.verify_warp(Path(wp.config.kernel_cache_dir))
     if request == "cuda" and not wp.is_cuda_available():
         raise RuntimeError("device: 'cuda' was requested but none is visible; use 'auto' to allow the CPU.")
     kind = "cuda" if request != "cpu" and wp.is_cuda_available() else "cpu"
@@ -93,14 +100,27 @@ def _start(request: str, threads: int | None) -> Device:
 
     import taichi as ti
 
-    with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that log_level does not silence
-        ti.init(
-            arch=ti.cuda if kind == "cuda" else ti.cpu,
-            cpu_max_num_threads=count,
-            log_level=ti.ERROR,
-            offline_cache=True,
-            fast_math=True,
-        )
+    compiled = caches.taichi_folder()
+    caches.verify_taichi(compiled)
+    named = {} if "TI_OFFLINE_CACHE_FILE_PATH" in os.environ else {"offline_cache_file_path": str(compiled)}
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that log_level does not silence
+            ti.init(
+                arch=ti.cuda if kind == "cuda" else ti.cpu,
+                cpu_max_num_threads=count,
+                log_level=ti.ERROR,
+                offline_cache=True,
+                fast_math=True,
+                **named,
+            )
+    except RuntimeError as error:
+        if "memory allocation" not in str(error):
+            raise
+        raise RuntimeError(
+            "device: the kernels need more address space than this process may take: Taichi reserves 1 GiB at its "
+            "start. Raise the limit (`ulimit -v`, in KiB; `ulimit -v unlimited`)."
+        ) from None
+    atexit.register(caches.seal_taichi, compiled, ti.reset)
     _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
     _device = Device(kind, count, reason)
     if hasattr(os, "register_at_fork"):

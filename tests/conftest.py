@@ -6,6 +6,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Tests see the same examples each time. Others: pytest --hypothesis-profile=search --hypothesis-seed=1
+settings.register_profile("suite", derandomize=True, database=None, deadline=None, max_examples=100)
+settings.register_profile("search", database=None, deadline=None, max_examples=5000)
+settings.load_profile("suite")
 
 SAMPLE_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -162,10 +162,10 @@ def test_the_annotated_experiment_shows_every_key_and_its_default():
     shown = ExperimentTable.model_validate(tomllib.loads(uncommented(text)))
     for path, model in models(ExperimentTable):
         part = shown
-        for key in path:
+        for depth, key in enumerate(path, start=1):
             part = getattr(part, key)
-            if isinstance(part, tuple):  # one table of each kind
-                part = next(one for one in part if isinstance(one, model))
+            if isinstance(part, tuple):  # one table of each kind, or the first of those that hold the table sought
+                part = next(one for one in part if depth < len(path) or isinstance(one, model))
         assert part.model_fields_set | ALTERNATIVES >= set(type(part).model_fields), path
         for key, field in model.model_fields.items():
             if not field.is_required() and field.default not in (None, ()) and not isinstance(field.default, BaseModel):

@@ -5,23 +5,25 @@ The mapping of a camera is (x, y, z, u, v) -> (s, t) [mm] (Eqs. 6-7): a network,
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
+from lfpiv import hdf5
+from lfpiv.calibration import stored
 from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
-from lfpiv.errors import InputError
-from lfpiv.geometry.optics import LensLattice, Optics, float_pair
+from lfpiv.errors import DamagedFile, InputError
+from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.microimage_layout import microimages_of
 from lfpiv.lightfield.standing_light import StandingLight
@@ -29,8 +31,11 @@ from lfpiv.warn import Warning
 from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.weights.microimages import Microimages
 
-SCHEMA_VERSION = 1
-"""Version of the calibration file."""
+SCHEMA_VERSION = 2
+"""Version of the calibration file. 2: sealed, see `lfpiv.hdf5`."""
+
+SEALED_SINCE = 2
+"""First version whose files are sealed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -167,8 +172,8 @@ class Calibration:
     board: BoardErrors | None = None
     """Errors of the board that the calibration corrected. None without a board, and in older files."""
 
-    def save(self, path: str | Path) -> None:
-        """Write the calibration to an HDF5 file. Overwrite an older file."""
+    def save(self, path: str | Path | io.BytesIO) -> None:
+        """Write the calibration to an HDF5 file, and seal it. Overwrite an older file."""
         with h5py.File(path, "w") as file:
             file.attrs["schema_version"] = SCHEMA_VERSION
             file.attrs["cameras"] = list(self.cameras)
@@ -176,6 +181,7 @@ class Calibration:
                 _write_camera(file.create_group(f"camera/{name}"), camera)
             if self.board is not None:
                 _write_board(file.create_group("board"), self.board)
+        hdf5.seal(path if isinstance(path, io.BytesIO) else Path(path))
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -195,38 +201,29 @@ def load_calibration(path: str | Path) -> Calibration:
     InputError
         If the file is missing, damaged or of another schema version.
     """
+    path = Path(path)
     try:
-        with h5py.File(path, "r") as file:
-            version = file.attrs.get("schema_version")
-            if version != SCHEMA_VERSION:
-                raise InputError(
-                    f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {version}; "
-                    "calibrate again."
-                )
-            cameras = {name: _read_camera(file[f"camera/{name}"], name) for name in file.attrs["cameras"]}
-            return Calibration(cameras, board=_read_board(file["board"]) if "board" in file else None)
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+        with hdf5.opened(path) as file:
+            _require_schema(file, path)
+            cameras = {
+                name: CalibratedCamera(name=name, **stored.read_camera(file[f"camera/{name}"]))
+                for name in stored.camera_names(file)
+            }
+            return Calibration(cameras, board=stored.read_board(file["board"]) if "board" in file else None)
+    except DamagedFile as error:
+        raise DamagedFile(path, error.reason, "Calibrate again") from None
+    except FileNotFoundError:
         raise InputError(
-            f"{path}: expected a calibration file, could not read it ({error}); calibrate again."
+            f"{path}: expected a calibration file, could not read it: there is no such file; calibrate again."
         ) from None
 
 
 def _write_board(group: h5py.Group, board: BoardErrors) -> None:
     for name, value in vars(board).items():
         if isinstance(value, np.ndarray):
-            group[name] = value
+            group.create_dataset(name, data=value, **hdf5.options(value.shape, zipped=False))
     group.attrs["corrected"] = list(board.corrected)
     group.attrs["warnings"] = json.dumps([warning.to_json() for warning in board.warnings])
-
-
-def _read_board(group: h5py.Group) -> BoardErrors:
-    return BoardErrors(
-        **{name: array[()] for name, array in group.items()},
-        corrected=tuple(map(str, group.attrs["corrected"])),
-        warnings=tuple(Warning.from_json(stored) for stored in json.loads(group.attrs["warnings"])),
-    )
 
 
 def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:
@@ -236,59 +233,30 @@ def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:
         group.attrs[f"lattice.{name}"] = value
     group.attrs["report"] = json.dumps({} if camera.report is None else camera.report.to_json())
     group.attrs["warnings"] = json.dumps([warning.to_json() for warning in camera.warnings])
-    if camera.region_mm is not None:
-        group["region_mm"] = camera.region_mm
-    if camera.test_errors is not None:
-        group["test_errors"] = camera.test_errors
+    for name, value in (("region_mm", camera.region_mm), ("test_errors", camera.test_errors)):
+        if value is not None:
+            group.create_dataset(name, data=value, **hdf5.options(np.shape(value), zipped=False))
     for label, part in (("decoder", camera.decoder), ("dots", camera.dots)):
         if part is not None:
             for item in fields(part):
                 value = getattr(part, item.name)
                 if isinstance(value, np.ndarray):
-                    group.create_dataset(f"{label}/{item.name}", data=value, compression="gzip", compression_opts=1)
+                    group.create_dataset(f"{label}/{item.name}", data=value, **hdf5.options(value.shape))
                 elif isinstance(value, int | float):
                     group.require_group(label).attrs[item.name] = value
-    if camera.network is not None:
-        for name, value in camera.network.to_arrays().items():
-            group[f"network/{name}"] = value
-    if camera.baseline is not None:
-        for name, value in camera.baseline.to_arrays().items():
-            group[f"baseline/{name}"] = value
+    for label, model in (("network", camera.network), ("baseline", camera.baseline)):
+        for name, value in ({} if model is None else model.to_arrays()).items():
+            group.create_dataset(f"{label}/{name}", data=value, **hdf5.options(value.shape, zipped=False))
 
 
-def _read_camera(group: h5py.Group, name: str) -> CalibratedCamera:
-    def values(prefix: str) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for key, value in group.attrs.items():
-            if key.startswith(prefix):
-                found[key[len(prefix) :]] = value.item() if isinstance(value, np.generic) else value
-        return found
-
-    nominal = values("optics.")
-    nominal["sensor_shape"] = tuple(int(n) for n in nominal["sensor_shape"])
-    cell = values("lattice.")
-    cell["origin_mm"] = float_pair(cell["origin_mm"])
-    cell["basis_mm"] = tuple(float_pair(row) for row in cell["basis_mm"])
-    optics, lattice = Optics(**nominal), LensLattice(**cell)
-
-    def arrays(label: str) -> dict[str, Any]:
-        part = group[label]
-        return {key: value[()] for key, value in part.items()} | {
-            key: value.item() for key, value in part.attrs.items()
-        }
-
-    report = json.loads(group.attrs["report"])
-    warnings = json.loads(group.attrs["warnings"]) if "warnings" in group.attrs else report.pop("warnings", [])
-    return CalibratedCamera(
-        name=name,
-        optics=optics,
-        lattice=lattice,
-        decoder=LightFieldDecoder(optics=optics, lattice=lattice, **arrays("decoder")),
-        network=Network.from_arrays(arrays("network")) if "network" in group else None,
-        baseline=ThinLensModel.from_arrays(arrays("baseline")) if "baseline" in group else None,
-        region_mm=group["region_mm"][()] if "region_mm" in group else None,
-        report=LensArrayQuality.from_json(report) if report else None,
-        warnings=tuple(Warning.from_json(stored) for stored in warnings),
-        dots=BoardDots(**arrays("dots")) if "dots" in group else None,
-        test_errors=group["test_errors"][()] if "test_errors" in group else None,
-    )
+def _require_schema(file: h5py.File, path: Path) -> None:
+    """Refuse a file of another schema, and one without the seal that its schema has."""
+    version = np.ravel(file.attrs.get("schema_version", 0))
+    known = version.size == 1 and version.dtype.kind in "iu" and 1 <= version[0] <= SCHEMA_VERSION
+    if not known:
+        found = str(file.attrs.get("schema_version"))[:40]
+        raise InputError(
+            f"{path}: expected a calibration of schema version 1 to {SCHEMA_VERSION}, found {found}; calibrate again."
+        )
+    if version[0] >= SEALED_SINCE and not hdf5.is_sealed(path):
+        raise DamagedFile(path, "it has no seal: it is cut off, or another program changed it")

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-import string
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import os
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import images, nominal_checks
+from lfpiv.experiment import bounds, images, nominal_checks
 from lfpiv.experiment.mask import solid_voxels
+from lfpiv.experiment.patterns import check_length, check_pattern
+from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.experiment.settings import (
     SMALLEST_WINDOW,
     Board,
@@ -21,11 +25,13 @@ from lfpiv.experiment.settings import (
     Compute,
     Correlation,
     ExperimentTable,
+    ExperimentVolume,
     Network,
     Particles,
+    RawImages,
     SelfCalibration,
+    Series,
     Smart,
-    Volume,
 )
 from lfpiv.experiment.toml import read_toml
 from lfpiv.geometry.grid import AXES, Grid
@@ -35,11 +41,11 @@ from lfpiv.geometry.orientation import Orientation
 DECODED_PIXELS = 100_000_000
 """Largest number of pixels of particle images that are decoded before the work starts [pixel]."""
 
-MICROLENS_SHARE = 0.2
-"""Largest focal length of the microlenses over the main lens's image distance; more is a wrong unit."""
+CHECKED_PAIRS = 100
+"""Largest number of pairs whose images `open_experiment` checks, evenly spread over all."""
 
-FEWEST_LENSES = 3
-"""Least number of microlenses along each axis of a sensor; fewer are a wrong pitch or pixel size."""
+LEAST_BYTES_PER_VOXEL = 64
+"""Memory that a run needs at least for each voxel, and again for each voxel and camera [byte]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +64,8 @@ class CameraSetup:
     dark_path: Path | None
     background: str | None = None
     """Path pattern of the background image, relative to the experiment file, or None."""
+    raw: RawImages | None = None
+    """Layout of the camera's files without a header, or None."""
 
     @property
     def nominal_angle_deg(self) -> float | None:
@@ -65,21 +73,34 @@ class CameraSetup:
         return None if self.orientation is None else self.orientation.yaw_deg
 
 
+class Frame(NamedTuple):
+    """One exposure of all cameras: a frame of a pair, or an instant of a series."""
+
+    number: int
+    """Number of the pair, or of the instant."""
+    name: str
+    """Name of the frame in its pair; an instant of a series has that of the first frame."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """An experiment with checked settings and images. Made by `open_experiment`."""
 
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True, extra="forbid")  # workers get it as JSON
+
     path: Path
     name: str
     dt_s: float
-    """Time between the two frames of a pair [s]."""
+    """Time between the two frames of a pair, or between instants k and k + step of a series [s]."""
     cameras: tuple[CameraSetup, ...]
     board: Board
     grid: Grid
     guard_mm: float | tuple[float, float, float] | Literal["auto"]
     """Thickness of the guard layers beyond the grid's faces, one number or (x, y, z) [mm], or "auto"."""
     pairs: int
+    """Number of pairs; the last `step` instants of a series are the first of no pair."""
     frames: tuple[str, str]
+    """Names of the two frames of a pair."""
     smart: Smart
     correlation: Correlation
     network: Network
@@ -91,6 +112,49 @@ class Experiment:
     """True for voxels without fluid, shape (z, y, x); None without a mask."""
     background: str = "none"
     """Estimate of the light that stands still: "auto", "none", "minimum" or "median"."""
+    series: Series | None = None
+    """The time series; None for image pairs."""
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of all pairs, in a series those of their first instants."""
+        first = 0 if self.series is None else self.series.first
+        return range(first, first + self.pairs)
+
+    def instant(self, pair: int, frame: str) -> int:
+        """Return the number of the instant of a series at which a frame of a pair was recorded."""
+        assert self.series is not None
+        return pair + self.series.step * self.frames.index(frame)
+
+    def pair_frames(self, pair: int) -> tuple[Frame, Frame]:
+        """Return both frames of a pair. An instant of a series is the same frame in both its pairs."""
+        first, second = self.frames
+        if self.series is None:
+            return Frame(pair, first), Frame(pair, second)
+        return Frame(pair, first), Frame(pair + self.series.step, first)
+
+    def instant_s(self, instant: int) -> float:
+        """Return the time of an instant of a series after the first one [s]."""
+        assert self.series is not None
+        return (instant - self.series.first) * self.dt_s / self.series.step
+
+    def name_of(self, pair: int) -> str:
+        """Return "pair" or, in a series, "instant" with the number, for messages."""
+        return f"{self.noun} {pair}"
+
+    @property
+    def noun(self) -> str:
+        """What results are numbered by: "pair" or "instant"."""
+        return "pair" if self.series is None else "instant"
+
+    def disjoint(self, pairs: Iterable[int]) -> Iterator[int]:
+        """Yield the pairs that share no image with one yielded before."""
+        seen = set[Frame]()
+        for pair in pairs:
+            frames = self.pair_frames(pair)
+            if seen.isdisjoint(frames):
+                seen.update(frames)
+                yield pair
 
     def camera(self, name: str) -> CameraSetup:
         """Return the camera of that name; raise ValueError for an unknown name."""
@@ -117,7 +181,7 @@ class Experiment:
 
     def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
         """Return a particle image [counts], float32 (rows, columns); raise InputError if it has no contrast."""
-        label, path = _particle_label(name, pair, frame), self.particle_path(name, pair, frame)
+        label, path = self.particle_label(name, pair, frame), self.particle_path(name, pair, frame)
         image = _read(path, label, self.camera(name))
         images.require_contrast(image, path, label)
         return image
@@ -138,12 +202,26 @@ class Experiment:
 
     def particle_path(self, name: str, pair: int, frame: str) -> Path:
         """Return the path of a particle image."""
-        return self.path.parent / self.particle_images.format(camera=name, pair=pair, frame=frame)
+        if self.series is not None:
+            fields: dict[str, Any] = {"instant": self.instant(pair, frame)}
+        else:
+            fields = {"pair": pair, "frame": frame, "image": 2 * pair + self.frames.index(frame)}
+        return self.path.parent / self.particle_images.format(camera=name, **fields)
+
+    def particle_label(self, name: str, pair: int, frame: str) -> str:
+        """Return key, camera and number of a particle image, for messages."""
+        number = f"pair {pair}, frame {frame!r}" if self.series is None else f"instant {self.instant(pair, frame)}"
+        return f"particles.images, camera {name!r}, {number}"
 
     def calibration_paths(self) -> list[Path]:
         """Return the paths of all images that the calibration reads, in a fixed order."""
-        paths = [path for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
-        return paths + [self.board_path(c.name, p) for c in self.cameras for p in range(len(self.board.planes_mm))]
+        return [image.path for image in self.calibration_images()]
+
+    def calibration_images(self) -> list[ImagePath]:
+        """Return all images that the calibration reads, in a fixed order."""
+        found = [split(path, c.raw) for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
+        planes = range(len(self.board.planes_mm))
+        return found + [split(self.board_path(c.name, plane), c.raw) for c in self.cameras for plane in planes]
 
     @property
     def self_calibration_pairs(self) -> list[int]:
@@ -151,21 +229,29 @@ class Experiment:
         return self.spread_pairs(self.self_calibration.pairs)
 
     def spread_pairs(self, count: int) -> list[int]:
-        """Return `count` pairs, evenly spread over all, or all pairs if there are no more."""
+        """Return `count` pairs, evenly spread over all, or all if there are no more; none shares an image with another.
+
+        Pairs of a short series overlap. Then these are fewer.
+        """
         count = min(count, self.pairs)
-        return [(2 * number + 1) * self.pairs // (2 * count) for number in range(count)]
+        spread = (self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count))
+        return list(self.disjoint(spread))
 
     def pair_paths(self, pair: int) -> list[Path]:
         """Return the paths of all images of one pair, in a fixed order."""
-        return [self.particle_path(camera.name, pair, frame) for frame in self.frames for camera in self.cameras]
+        return [path for frame in self.pair_frames(pair) for path in self.frame_paths(frame)]
+
+    def frame_paths(self, frame: Frame) -> list[Path]:
+        """Return the paths of the images of one frame, in the order of the cameras."""
+        return [self.particle_path(camera.name, *frame) for camera in self.cameras]
 
 
 def open_experiment(path: str | Path) -> Experiment:
     """Read an experiment file and check all its keys and images.
 
-    White, dark and board images are decoded, and particle images up to `DECODED_PIXELS`. Of the other particle images
-    the header and the length are checked; DaVis images must exist. `lfpiv.run` checks the particle images by
-    `check_pairs` instead and continues without damaged pairs.
+    White, dark and board images are decoded, and the particle images of up to `CHECKED_PAIRS` pairs, evenly spread, are
+    checked as by `check_pairs`. `lfpiv.run` checks the particle images of all pairs that it does and continues without
+    damaged ones.
 
     Parameters
     ----------
@@ -183,7 +269,7 @@ def open_experiment(path: str | Path) -> Experiment:
         if a nominal camera certainly sees nothing of the volume.
     """
     experiment = read_experiment(path)
-    for _, reason in check_pairs(experiment, range(experiment.pairs)):
+    for _, reason in check_pairs(experiment, experiment.spread_pairs(CHECKED_PAIRS)):
         raise InputError(reason)
     return experiment
 
@@ -200,13 +286,18 @@ def read_experiment(path: str | Path) -> Experiment:
         if not table.board.mark:
             _require_orientation(path, one)
     board, particles = table.board, table.particles
-    _check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
-    fields = {"camera": names, "pair": range(particles.pairs), "frame": particles.frames}
-    _check_pattern(path, "particles.images", particles.images, fields)
+    check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
+    _check_particle_pattern(path, particles, names)
     for one in table.camera:
         if one.background_image is not None:
             _check_background(path, one, particles)
-    grid = _grid(path, table.volume)
+    series = particles.series
+    if series is not None and table.smart.motion_passes:
+        raise InputError(
+            f"{path}: smart.motion_passes: expected 0 for a time series, where each instant is reconstructed once and "
+            f"used in two pairs, found {table.smart.motion_passes}. Set it to 0."
+        )
+    grid = _grid(path, table.volume, len(names))
     _check_windows(path, table.correlation, grid)
     experiment = Experiment(
         path=path,
@@ -216,15 +307,15 @@ def read_experiment(path: str | Path) -> Experiment:
         board=board,
         grid=grid,
         guard_mm=table.volume.guard_mm,
-        pairs=particles.pairs,
+        pairs=particles.count,
         frames=particles.frames,
+        series=series,
         smart=table.smart,
         self_calibration=table.self_calibration,
         correlation=table.correlation,
         network=table.network,
         compute=table.compute,
         particle_images=particles.images,
-        solid=solid_voxels(path, table.volume, grid),
         background=particles.background,
     )
     for camera in experiment.cameras:
@@ -232,7 +323,7 @@ def read_experiment(path: str | Path) -> Experiment:
             nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
             nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
-    return experiment
+    return replace(experiment, solid=solid_voxels(path, table.volume, grid))
 
 
 def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:
@@ -257,7 +348,7 @@ def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[
         try:
             for camera in experiment.cameras:
                 for frame in experiment.frames:
-                    label = _particle_label(camera.name, pair, frame)
+                    label = experiment.particle_label(camera.name, pair, frame)
                     _check_shape(experiment.particle_path(camera.name, pair, frame), label, camera)
             decoded += 2 * sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
             if number == 0 or decoded <= DECODED_PIXELS:
@@ -268,22 +359,15 @@ def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[
             yield pair, str(error)
 
 
-def _check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any]) -> None:
-    """Refuse a path pattern with unknown fields, or with one path for several images."""
-    known = ", ".join("{" + name + "}" for name in fields)
-    try:
-        used = {name for _, name, _, _ in string.Formatter().parse(pattern) if name is not None}
-        if used <= set(fields):
-            pattern.format(**{name: values[0] for name, values in fields.items()})
-    except (ValueError, IndexError) as error:
-        raise InputError(f"{path}: {key}: expected a path with {known}, found {pattern!r} ({error}).") from None
-    if used - set(fields):
-        raise InputError(f"{path}: {key}: expected only {known}, found {{{min(used - set(fields))}}} in {pattern!r}.")
-    for name, values in fields.items():
-        if len(values) > 1 and name not in used:
-            raise InputError(
-                f"{path}: {key}: expected {{{name}}} in the path, since there are {len(values)}, found {pattern!r}."
-            )
+def _check_particle_pattern(path: Path, particles: Particles, cameras: Sequence[str]) -> None:
+    fields: dict[str, Sequence[Any]] = {"camera": cameras}
+    if (series := particles.series) is not None:
+        fields["instant"] = series.numbers
+    elif "{image" in particles.images:
+        fields["image"] = range(2 * particles.count)
+    else:
+        fields |= {"pair": range(particles.count), "frame": particles.frames}
+    check_pattern(path, "particles.images", particles.images, fields)
 
 
 def _require_orientation(path: Path, camera: CameraTable) -> None:
@@ -298,7 +382,12 @@ def _check_background(path: Path, camera: CameraTable, particles: Particles) -> 
     """Refuse a pattern with unknown fields, and an image that `particles.background` would not use."""
     key = f"camera {camera.name!r}, background_image"
     assert camera.background_image is not None
-    _check_pattern(path, key, camera.background_image, {"frame": particles.frames[:1]})
+    if particles.series is not None and "{frame" in camera.background_image:
+        raise InputError(
+            f"{path}: {key}: expected no {{frame}}, because one laser lights all instants of a time series, found "
+            f"{camera.background_image!r}."
+        )
+    check_pattern(path, key, camera.background_image, {"frame": particles.frames[:1]})
     if particles.background in ("minimum", "median"):
         raise InputError(
             f'{path}: {key}: expected particles.background = "auto", which takes this image, found '
@@ -306,17 +395,44 @@ def _check_background(path: Path, camera: CameraTable, particles: Particles) -> 
         )
 
 
-def _grid(path: Path, volume: Volume) -> Grid:
+def _grid(path: Path, volume: ExperimentVolume, cameras: int) -> Grid:
     for axis, size in zip("xyz", volume.size_mm, strict=True):
         if not SMALLEST_WINDOW <= size / volume.voxel_mm + 0.5 < 2**31:
             raise InputError(
                 f"{path}: volume.size_mm: expected {SMALLEST_WINDOW} voxels or more along {axis}, at most 2^31, "
                 f"found {size:g} mm with voxel_mm = {volume.voxel_mm:g}."
             )
-    return Grid.from_extent(centre_mm=volume.centre_mm, size_mm=volume.size_mm, voxel_mm=volume.voxel_mm)
+    grid = Grid.from_extent(centre_mm=volume.centre_mm, size_mm=volume.size_mm, voxel_mm=volume.voxel_mm)
+    guarded = grid if volume.guard_mm == "auto" else grid.padded(grid.layers(volume.guard_mm))
+    if guarded.size > bounds.MOST_VOXELS:
+        raise InputError(
+            f"{path}: volume: expected at most {bounds.MOST_VOXELS:.0e} voxels, guard layers included, found "
+            f"{guarded.size:.1e}. Raise volume.voxel_mm, or shrink volume.size_mm or volume.guard_mm."
+        )
+    needed, machine = LEAST_BYTES_PER_VOXEL * (1 + cameras) * guarded.size, _memory_of_machine()
+    if (volume.mask is not None or volume.solid) and needed > machine:
+        raise InputError(
+            f"{path}: volume: expected voxels that fit into memory, found {guarded.size:.1e}, guard layers included, "
+            f"which need at least {needed / 2**30:,.0f} GiB of {machine / 2**30:,.0f} GiB. Raise volume.voxel_mm, or "
+            "shrink volume.size_mm or volume.guard_mm."
+        )
+    return grid
+
+
+def _memory_of_machine() -> int:
+    """Return the memory of this machine [byte]."""
+    if not hasattr(os, "sysconf"):
+        return sys.maxsize
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
+    farthest = correlation.max_displacement_voxel
+    if farthest is not None and farthest >= max(grid.shape):
+        raise InputError(
+            f"{path}: correlation.max_displacement_voxel: expected less than the volume's {max(grid.shape)} voxels, "
+            f"found {farthest:g}."
+        )
     for window in correlation.windows or ():
         if not isinstance(window, tuple):
             continue  # a single edge is cut to the volume
@@ -330,22 +446,14 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
 
 
 def _camera(path: Path, table: CameraTable) -> CameraSetup:
+    key = f"camera {table.name!r}"
+    for name in ("white_image", "dark_image"):
+        if (image := getattr(table, name)) is not None:
+            check_length(path, f"{key}, {name}", image)
     white_path = path.parent / table.white_image
-    shape = _white_shape(white_path, f"white_image of camera {table.name!r}")
+    shape = _white_shape(white_path, f"white_image of camera {table.name!r}", table.raw)
     optics = table.optics_of(shape)
-    if table.microlens_focal_length_mm > MICROLENS_SHARE * optics.image_distance_mm:
-        raise InputError(
-            f"{path}: camera {table.name!r}, microlens_focal_length_mm: expected far less than the image distance "
-            f"f (1 + |M|) = {optics.image_distance_mm:g} mm, found {table.microlens_focal_length_mm:g}. Are it and "
-            "focal_length_mm in mm?"
-        )
-    pitch_px = optics.microimage_pitch_px
-    if not (math.isfinite(pitch_px) and 2 <= pitch_px <= min(shape) / FEWEST_LENSES):
-        raise InputError(
-            f"{path}: camera {table.name!r}, microlens_pitch_mm: expected microimages of at least 2 pixels, and "
-            f"at least {FEWEST_LENSES} of them across the sensor of {shape} pixels, found {pitch_px:.4g}. "
-            "Check microlens_pitch_mm and pixel_um."
-        )
+    nominal_checks.require_microimages(path, table.name, optics)
     return CameraSetup(
         name=table.name,
         optics=optics,
@@ -354,14 +462,15 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
         white_path=white_path,
         dark_path=None if table.dark_image is None else path.parent / table.dark_image,
         background=table.background_image,
+        raw=table.raw,
     )
 
 
-def _white_shape(path: Path, label: str) -> tuple[int, int]:
-    header = images.read_header(path, label)
+def _white_shape(path: Path, label: str, raw: RawImages | None) -> tuple[int, int]:
+    header = images.read_header(path, label, raw)
     if header is not None:
         return header.shape
-    rows, columns = images.read_image(path, label).shape
+    rows, columns = images.read_image(path, label, raw=raw).shape
     return rows, columns
 
 
@@ -393,7 +502,7 @@ def _check_calibration_images(experiment: Experiment) -> None:
 
 def _read(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
     """Read an image of a camera and reverse its mirroring; refuse another shape than the white image's."""
-    image = images.read_image(path, label, flip=camera.image_flip)
+    image = images.read_image(path, label, flip=camera.image_flip, raw=camera.raw)
     _require_shape(image.shape, path, label, camera)
     return image
 
@@ -403,7 +512,7 @@ def _check_shape(path: Path, label: str, camera: CameraSetup) -> None:
 
     A DaVis image must exist; its content is checked when it is decoded.
     """
-    header = images.read_header(path, label)
+    header = images.read_header(path, label, camera.raw)
     if header is not None:
         _require_shape(header.shape, path, label, camera)
 
@@ -418,7 +527,3 @@ def _require_shape(shape: tuple[int, ...], path: Path, label: str, camera: Camer
 
 def _board_label(camera: str, plane: int) -> str:
     return f"board.images, camera {camera!r}, plane {plane}"
-
-
-def _particle_label(camera: str, pair: int, frame: str) -> str:
-    return f"particles.images, camera {camera!r}, pair {pair}, frame {frame!r}"

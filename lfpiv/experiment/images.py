@@ -1,19 +1,23 @@
-"""Read single-channel camera images (TIFF, PNG, DaVis) as float32, and check their headers without decoding them."""
+"""Read single-channel camera images as float32, and check their headers without decoding them."""
 
 from __future__ import annotations
 
 import contextlib
+import stat
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import davis
-from lfpiv.experiment.davis import NotOneImage
+from lfpiv.experiment.readers import davis
+from lfpiv.experiment.readers.source import SUFFIXES, CannotRead, Header, ImagePath, NotOneImage, split
+from lfpiv.experiment.settings import RawImages
 
-SUFFIXES = (".tif", ".tiff", ".png", *davis.SUFFIXES)
+if TYPE_CHECKING:
+    from lfpiv.experiment.readers.table import Reader
+
 DTYPES = ("uint8", "uint16", "uint32", "int16", "int32", "float32", "float64")
 FLIPS = {
     "none": (slice(None), slice(None)),
@@ -23,28 +27,18 @@ FLIPS = {
 }
 """Index that reverses each ``image_flip``; "horizontal" exchanges left and right."""
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
-
-@dataclass(frozen=True)
-class Header:
-    """Header of an image file."""
-
-    shape: tuple[int, int]
-    """(rows, columns)."""
-    dtype: str
-    """Name of the pixel type."""
-
-
-def read_header(path: Path, label: str) -> Header | None:
-    """Check an image file without decoding its pixels.
+def read_header(path: Path, label: str, raw: RawImages | None = None) -> Header | None:
+    """Check an image without decoding its pixels.
 
     Parameters
     ----------
     path : Path
-        A TIFF, PNG or DaVis image (see `lfpiv.experiment.davis`).
+        An image file, with the part of it behind ``#`` where it holds several images (`lfpiv.experiment.readers`).
     label : str
         Key and camera of the file, for messages.
+    raw : RawImages or None
+        Layout of the files without a header, of the camera.
 
     Returns
     -------
@@ -55,35 +49,24 @@ def read_header(path: Path, label: str) -> Header | None:
     Raises
     ------
     InputError
-        If the file is missing, truncated, unreadable, or not one single-channel image of real numbers.
+        If the file is missing, no regular file, truncated or unreadable, or if the path names something other than one
+        single-channel image of real numbers.
     """
-    place = f"{path} ({label})"
-    file, _ = davis.split_frame(path)
-    if not file.is_file():
-        found = "a folder" if file.is_dir() else "no such file"
-        raise InputError(f"{place}: expected an image file, found {found}. Check the path in the experiment file.")
-    kind = file.suffix.lower()
-    if kind not in SUFFIXES:
-        found = "a file of vectors" if kind in davis.VECTOR_SUFFIXES else repr(file.suffix or "no suffix")
-        raise InputError(
-            f"{place}: expected a TIFF, PNG or DaVis image ({', '.join(SUFFIXES)}), found {found}. "
-            "Convert the image without loss."
-        )
+    place, image = f"{path} ({label})", split(path, raw)
     with _naming(place):
-        if kind in davis.SUFFIXES:
-            davis.check(path, place)
-            return None
-        header = _png_header(path) if kind == ".png" else _tiff_header(path)
-    _require_dtype(header.dtype, place)
+        _require_file(image, place)
+        header = _reader(image).header(image)
+    if header is not None:
+        _require_dtype(header.dtype, place)
     return header
 
 
-def read_image(path: Path, label: str, *, flip: str = "none") -> np.ndarray:
+def read_image(path: Path, label: str, *, flip: str = "none", raw: RawImages | None = None) -> np.ndarray:
     """Read one image.
 
     Parameters
     ----------
-    path, label
+    path, label, raw
         As for `read_header`.
     flip : {"none", "horizontal", "vertical", "both"}
         Mirroring to reverse.
@@ -98,18 +81,18 @@ def read_image(path: Path, label: str, *, flip: str = "none") -> np.ndarray:
     InputError
         If `read_header` refuses the file, or it cannot be decoded or holds values that are not finite.
     """
-    header = read_header(path, label)
-    place = f"{path} ({label})"
+    header = read_header(path, label, raw)
+    place, image = f"{path} ({label})", split(path, raw)
     with _naming(place):
-        pixels = _decode(path, place)
+        pixels = _reader(image).read(image)
     if header is None:
-        _require_dtype(str(pixels.dtype), place)
+        _require_dtype(pixels.dtype.name, place)
     elif pixels.shape != header.shape:
         raise InputError(f"{place}: expected {header.shape} pixels as its header says, found {pixels.shape}.")
-    image = np.ascontiguousarray(pixels[FLIPS[flip]], np.float32)
-    if not np.isfinite(image).all():
+    flipped = np.ascontiguousarray(pixels[FLIPS[flip]], np.float32)
+    if not np.isfinite(flipped).all():
         raise InputError(f"{place}: expected finite grey values, found NaN or infinity. Save the raw counts.")
-    return image
+    return flipped
 
 
 def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
@@ -133,6 +116,8 @@ def _naming(place: str) -> Iterator[None]:
         yield
     except InputError:
         raise
+    except CannotRead as error:
+        raise InputError(f"{place}: {error}") from None
     except NotOneImage as error:
         raise InputError(f"{place}: expected one single-channel image, found {error}.") from None
     except PermissionError:
@@ -144,60 +129,32 @@ def _naming(place: str) -> Iterator[None]:
         ) from None
 
 
+def _require_file(image: ImagePath, place: str) -> None:
+    """Refuse what is no regular file, before it is opened, and what has another suffix than images have."""
+    try:
+        mode = image.file.stat().st_mode
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+        if isinstance(error, PermissionError):
+            raise
+        raise InputError(
+            f"{place}: expected an image file, found no such file. Check the path in the experiment file."
+        ) from None
+    if not stat.S_ISREG(mode):
+        found = "a folder" if stat.S_ISDIR(mode) else "a pipe, socket or device"
+        raise InputError(f"{place}: expected an image file, found {found}. Check the path in the experiment file.")
+    if image.suffix not in SUFFIXES:
+        found = "a file of vectors" if image.suffix in davis.VECTOR_SUFFIXES else repr(image.suffix or "no suffix")
+        raise InputError(
+            f"{place}: expected an image file ({', '.join(SUFFIXES)}), found {found}. Convert the image without loss."
+        )
+
+
+def _reader(image: ImagePath) -> Reader:
+    from lfpiv.experiment.readers.table import READERS
+
+    return READERS[image.suffix]
+
+
 def _require_dtype(dtype: str, place: str) -> None:
     if dtype not in DTYPES:
         raise InputError(f"{place}: expected pixels of type {', '.join(DTYPES)}, found {dtype}. Save raw grey values.")
-
-
-def _tiff_header(path: Path) -> Header:
-    import tifffile
-
-    size = path.stat().st_size
-    if size == 0:
-        raise ValueError("the file is empty")
-    with tifffile.TiffFile(path) as tiff:
-        if len(tiff.pages) != 1:
-            raise NotOneImage(f"{len(tiff.pages)} pages; save one image per file")
-        page = tiff.pages.first
-        end = max(
-            (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0
-        )
-        if len(page.shape) != 2 or page.samplesperpixel != 1:
-            raise NotOneImage(f"pixels of shape {page.shape}, such as a colour image; save raw grey values")
-        meaning = tifffile.PHOTOMETRIC(page.photometric)
-        if meaning is not tifffile.PHOTOMETRIC.MINISBLACK:
-            raise NotOneImage(f"{meaning.name} pixels; save raw grey values, 0 = black")
-        if page.dtype is None:
-            raise ValueError("unknown pixel type")
-        (rows, columns), dtype = page.shape, str(page.dtype)
-    if end == 0 or end > size:
-        raise ValueError(f"pixel data end at byte {end}, the file at byte {size}")
-    return Header((int(rows), int(columns)), dtype)
-
-
-def _png_header(path: Path) -> Header:
-    with path.open("rb") as file:
-        start = file.read(26)
-        file.seek(max(path.stat().st_size - 12, 0))
-        end = file.read(12)
-    if start[:8] != _PNG_SIGNATURE or len(start) < 26:
-        raise ValueError("no PNG signature")
-    if end[4:8] != b"IEND":
-        raise ValueError("the file ends before its end marker")
-    columns, rows = (int.from_bytes(start[at : at + 4], "big") for at in (16, 20))
-    depth, colour = start[24], start[25]
-    if colour != 0:
-        raise NotOneImage("a colour, palette or transparent image; save raw grey values")
-    return Header((rows, columns), "uint16" if depth == 16 else "uint8" if depth == 8 else f"uint{depth}")
-
-
-def _decode(path: Path, place: str) -> np.ndarray:
-    if davis.split_frame(path)[0].suffix.lower() in davis.SUFFIXES:
-        return davis.read(path, place)
-    if path.suffix.lower() == ".png":
-        import imagecodecs
-
-        return imagecodecs.png_decode(path.read_bytes())
-    import tifffile
-
-    return tifffile.imread(path)

@@ -19,6 +19,8 @@ from lfpiv.geometry.volume import solid_shares
 
 VARIABLE = "mask"
 """Name of the mask in a file with several variables."""
+MOST_POINTS = 3 * 10**8
+"""Largest number of points of a file."""
 MOST_SAMPLES = 16
 """Largest number of samples along an edge of a voxel, for files with far smaller spacing."""
 
@@ -63,12 +65,11 @@ _INVERTED = "True, and the side from which a half-space's normal points away, ar
 
 def _inside(solid: HalfSpace | Box, grid: Grid) -> np.ndarray:
     """Return the flags of the voxels whose centres are in a solid, shape (z, y, x)."""
-    z, y, x = np.meshgrid(*(grid.axis_mm(axis) for axis in range(3)), indexing="ij", sparse=True)
-    if isinstance(solid, HalfSpace):
-        away = sum(n * (at - p) for n, at, p in zip(solid.normal, (x, y, z), solid.point_mm, strict=True))
-        return np.asarray(away < 0)
-    near = [abs(at - c) <= s / 2 for at, c, s in zip((x, y, z), solid.centre_mm, solid.size_mm, strict=True)]
-    return np.asarray(near[0] & near[1] & near[2])
+    z, y, x = grid.axis_mm(0), grid.axis_mm(1)[:, None], grid.axis_mm(2)
+    inside = np.empty(grid.shape, bool)
+    for layer, depth in zip(inside, z, strict=True):  # layer by layer: distances take eight times the memory of flags
+        layer[:] = solid.contains(x, y, depth)
+    return inside
 
 
 def read_mask(path: Path, grid: Grid) -> np.ndarray:
@@ -107,11 +108,17 @@ def read_mask(path: Path, grid: Grid) -> np.ndarray:
 
 def _load(path: Path) -> xr.DataArray:
     """Return the mask in a file, its coordinates rising."""
-    if not path.is_file():
-        raise InputError(f"{path}: expected the NetCDF file of volume.mask, found no such file. Check the path.")
     try:
-        stored = xr.load_dataset(path)
-    except (OSError, ValueError) as error:
+        if not path.is_file():
+            raise InputError(f"{path}: expected the NetCDF file of volume.mask, found no such file. Check the path.")
+        with xr.open_dataset(path) as opened:
+            points = sum(variable.size for variable in opened.variables.values())
+            if points > MOST_POINTS:
+                raise InputError(f"{path}: expected at most {MOST_POINTS:.0e} points, found {points:.1e}.")
+            stored = opened.load()
+    except InputError:
+        raise
+    except Exception as error:  # readers raise exceptions of many types on damaged files
         reason = " ".join(str(error).split())[:100]
         raise InputError(f"{path}: expected a NetCDF file, found one that cannot be read ({reason}).") from None
     names = [str(name) for name in stored.data_vars]

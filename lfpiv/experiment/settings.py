@@ -5,21 +5,34 @@ The pages of settings show these sentences (`docs/_ext/tables.py`).
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from lfpiv.experiment import bounds
+from lfpiv.experiment.bounds import (
+    Coordinate,
+    Count,
+    Direction,
+    Flag,
+    FNumber,
+    FocalLength,
+    Interval,
+    Length,
+    Magnification,
+    Memory,
+    Name,
+    PathText,
+    PixelPitch,
+    Point,
+    Seed,
+    Steps,
+    Thickness,
+)
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
-
-# Strict types refuse text and `true` in place of a number; an integer is a number. TOML's lists become tuples.
-Number = Annotated[float, Field(strict=True)]
-Positive = Annotated[float, Field(strict=True, gt=0)]
-Count = Annotated[int, Field(strict=True, ge=1)]
-NonNegative = Annotated[float, Field(strict=True, ge=0)]
-NonNegativeInt = Annotated[int, Field(strict=True, ge=0)]
-Flag = Annotated[bool, Field(strict=True)]
-Point = tuple[Number, Number, Number]
 
 TURNS = 8
 """Turns and mirrors of a square grid."""
@@ -27,7 +40,7 @@ TURNS = 8
 SMALLEST_WINDOW = 4
 """Smallest edge of an interrogation window that holds a correlation peak [voxel]."""
 
-Edge = Annotated[int, Field(strict=True, ge=SMALLEST_WINDOW)]
+Edge = Annotated[int, Field(strict=True, ge=SMALLEST_WINDOW, le=bounds.LARGEST_WINDOW)]
 Window = Edge | tuple[Edge, Edge, Edge]
 
 
@@ -40,7 +53,7 @@ class Table(BaseModel):
 class Smart(Table):
     """Table ``[smart]``: settings of the reconstruction (Eq. 5)."""
 
-    iterations: Count = 40
+    iterations: Steps = 40
     """Largest number of SMART iterations; `tolerance` usually stops them earlier."""
     relaxation: Annotated[float, Field(strict=True, gt=0, le=3)] = 1.0
     """Relaxation mu of Eq. 5; values near 3 diverge."""
@@ -71,14 +84,17 @@ class Smart(Table):
         return self.model_dump(exclude={"motion_passes"})
 
 
+Displacement = Annotated[float, Field(strict=True, gt=0, le=bounds.LARGEST_DISPLACEMENT_VOXEL)]
+
+
 class Correlation(Table):
     """Table ``[correlation]``: settings of the cross-correlation."""
 
-    windows: Annotated[tuple[Window, ...], Field(min_length=1)] | None = None
+    windows: Annotated[tuple[Window, ...], Field(min_length=1, max_length=bounds.MOST_PASSES)] | None = None
     """Window of each pass, one edge or (z, y, x) [voxel]; absent: 32, 16, 12, 12, cut to the volume."""
     overlap: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.5
     """Fraction by which neighbouring windows overlap."""
-    max_displacement_voxel: Positive | None = None
+    max_displacement_voxel: Displacement | None = None
     """Largest displacement that the first pass searches [voxel]; absent: a quarter of its window."""
     smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.5
     """Standard deviation of a Gaussian applied to the volumes before correlation, SMART's sieve included [voxel]; 0
@@ -87,20 +103,31 @@ class Correlation(Table):
     """Exponent applied to the smoothed volumes' intensities before correlation; 1 leaves them unchanged."""
 
 
+Nodes = Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_NODES)]
+
+
 class Network(Table):
     """Table ``[network]``: settings of the mapping of Eqs. 6-7 and of its labels."""
 
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (20,)
+    hidden: Annotated[tuple[Nodes, ...], Field(min_length=1, max_length=bounds.MOST_LAYERS)] = (20,)
     """Number of nodes of each hidden layer."""
-    epochs: Count = 300
+    epochs: Steps = 300
     """Largest number of training epochs; early stopping usually ends the training earlier."""
-    seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    seed: Seed = 0
     """Seed of the random split of the dots and of the initial weights."""
     estimator: Literal["lens_integral", "gaussian"] = "lens_integral"
     """Fit of the dots: a dot integrated over the microlenses, or the Gaussian of the paper."""
     baseline: Literal["none", "thin_lens"] = "thin_lens"
     """Mapping that the network corrects: none, as in the paper, or a thin lens fitted to the same dots, which is more
     accurate between the dots and outside the board."""
+
+    @field_validator("hidden")
+    @classmethod
+    def _trainable(cls, hidden: tuple[int, ...]) -> tuple[int, ...]:
+        layers = (5, *hidden, 2)
+        if sum((before + 1) * after for before, after in itertools.pairwise(layers)) > bounds.MOST_PARAMETERS:
+            raise ValueError(f"a network of at most {bounds.MOST_PARAMETERS} weights and biases")
+        return hidden
 
 
 class Compute(Table):
@@ -115,14 +142,14 @@ class Compute(Table):
     weights_form: Literal["auto", "profiles", "pixels"] = "auto"
     """Storage of footprints: products of profiles (straight rays, square microlenses), single pixels (any optics), or
     for each camera the profiles if they agree with counted rays ("auto")."""
-    memory_gib: Positive | None = None
+    memory_gib: Memory | None = None
     """Memory that the run may use [GiB]; absent: the available memory."""
 
 
 class SelfCalibration(Table):
     """Table ``[self_calibration]``: correction for cameras that moved after the board was recorded."""
 
-    pairs: Annotated[int, Field(strict=True, ge=0)] = 0
+    pairs: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] = 0
     """Number of pairs, evenly spread, whose particles correct the cameras' poses; 0 corrects nothing and warns of
     cameras that moved."""
 
@@ -130,46 +157,32 @@ class SelfCalibration(Table):
 class NominalCamera(Table):
     """Nominal keys of ``[[camera]]``, in experiments and in scenes of the simulator."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=bounds.LONGEST_CAMERA_NAME)]
     """Name of the camera in paths and messages, of letters, digits, '_', '-' and '.'."""
-    focal_length_mm: Positive
+    focal_length_mm: FocalLength
     """Focal length of the main lens [mm]."""
-    magnification: Number
+    magnification: Magnification
     """Magnification of the main lens, other than 0, of either sign."""
-    f_number: Positive
+    f_number: FNumber
     """f-number to which the main lens was set."""
-    microlens_pitch_mm: Positive
+    microlens_pitch_mm: Length
     """Distance between neighbouring microlenses [mm]."""
-    microlens_focal_length_mm: Positive
+    microlens_focal_length_mm: FocalLength
     """Focal length of the microlenses, equal to their distance from the sensor [mm]."""
-    pixel_um: Positive
+    pixel_um: PixelPitch
     """Pixel pitch of the sensor [um]."""
     microlens_layout: Literal["square", "hexagonal"] = "square"
     """Arrangement of the microlenses."""
     nominal_angle_deg: Annotated[float, Field(strict=True, ge=-180, le=180)] | None = None
     """Angle of the camera about y, correct to about 10. It numbers the board's dots and never enters the mapping
     [degree]. Alternative to `nominal_direction`."""
-    nominal_direction: Point | None = None
+    nominal_direction: Direction | None = None
     """Vector (x, y, z) from the origin towards the camera, of any length, correct to about 10 degrees. Rows of the
     picture are normal to the world's y axis; a camera straight above or below has x along its rows."""
     nominal_roll_deg: Annotated[float, Field(strict=True, ge=-180, le=180)] = 0.0
     """Rotation of the camera about its viewing axis, clockwise as seen from behind the camera [degree]."""
     image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Mirroring of the camera's images."""
-
-    @field_validator("magnification")
-    @classmethod
-    def _not_zero(cls, value: float) -> float:
-        if value == 0:
-            raise ValueError("a number other than 0")
-        return value
-
-    @field_validator("nominal_direction")
-    @classmethod
-    def _has_length(cls, value: Point | None) -> Point | None:
-        if value is not None and not any(value):
-            raise ValueError("a direction other than (0, 0, 0)")
-        return value
 
     @model_validator(mode="after")
     def _one_orientation(self) -> NominalCamera:
@@ -200,16 +213,42 @@ class NominalCamera(Table):
         )
 
 
+Pixels = Annotated[int, Field(strict=True, ge=1, le=100_000)]
+
+
+class RawImages(Table):
+    """Table ``[camera.raw]``: layout of the camera's files without a header, ``.raw`` and ``.bin``."""
+
+    shape: tuple[Pixels, Pixels]
+    """Number of rows and columns of an image [pixel]."""
+    dtype: Literal["uint8", "uint16", "uint32", "int16", "int32", "float32", "float64"]
+    """Type of a stored pixel."""
+    byte_order: Literal["little", "big"] = "little"
+    """Order of the bytes of a pixel, least first or last."""
+    header_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**62)] = 0
+    """Length of the file's header [byte]."""
+    frame_header_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
+    """Length of what stands before the pixels of each image [byte]."""
+
+
 class CameraTable(NominalCamera):
     """Table ``[[camera]]``: nominal optics and calibration images of one camera."""
 
-    white_image: Annotated[str, Field(min_length=1)]
+    white_image: PathText
     """Path of an image of an evenly lit white surface."""
-    dark_image: Annotated[str, Field(min_length=1)] | None = None
+    dark_image: PathText | None = None
     """Path of an image with the lens capped; absent: the gaps between microimages give the dark level."""
-    background_image: Annotated[str, Field(min_length=1)] | None = None
+    background_image: PathText | None = None
     """Path, optionally with ``{frame}``, of an image of the scene lit by the laser, without particles; absent: the
     series of image pairs shows what stands still."""
+    raw: RawImages | None = None
+    """Layout of the camera's files without a header; absent: it has none."""
+
+
+Dots = Annotated[int, Field(strict=True, ge=2, le=bounds.MOST_DOTS_ACROSS)]
+
+
+Place = Annotated[int, Field(strict=True, ge=0, lt=bounds.MOST_DOTS_ACROSS)]
 
 
 def _turned(places: tuple[tuple[int, int], ...]) -> list[list[tuple[int, int]]]:
@@ -228,15 +267,15 @@ def _from_corner(places: list[tuple[int, int]]) -> frozenset[tuple[int, int]]:
 class NominalBoard(Table):
     """Keys of ``[board]``, in experiments and in scenes of the simulator."""
 
-    dots: tuple[Annotated[int, Field(strict=True, ge=2)], Annotated[int, Field(strict=True, ge=2)]]
+    dots: tuple[Dots, Dots]
     """Number of dots along x and y."""
-    spacing_mm: Positive
+    spacing_mm: Length
     """Distance between neighbouring dots [mm]."""
-    dot_diameter_mm: Positive
+    dot_diameter_mm: Length
     """Diameter of a dot, less than their distance [mm]."""
-    planes_mm: Annotated[tuple[Number, ...], Field(min_length=2)]
+    planes_mm: Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=bounds.MOST_PLANES)]
     """Depth z of each plane, all different [mm]."""
-    mark: tuple[tuple[NonNegativeInt, NonNegativeInt], ...] = ()
+    mark: Annotated[tuple[tuple[Place, Place], ...], Field(max_length=bounds.MOST_DOTS_ACROSS)] = ()
     """Places (column, row) without a dot, counted from 0 along x and y: a mark that names the dots, so that cameras
     need no nominal orientation. No turn or mirror of the grid may carry it over into itself; three places suffice."""
 
@@ -263,7 +302,7 @@ class NominalBoard(Table):
 class Board(NominalBoard):
     """Table ``[board]``: the dot board and the depths of its planes."""
 
-    images: Annotated[str, Field(min_length=1)]
+    images: PathText
     """Path of the board images with ``{camera}`` and ``{plane}``; planes count from 0."""
 
     @field_validator("planes_mm")
@@ -279,59 +318,90 @@ class Volume(Table):
 
     centre_mm: Point
     """Centre (x, y, z) of the volume [mm]."""
-    size_mm: tuple[Positive, Positive, Positive]
+    size_mm: tuple[Length, Length, Length]
     """Size (x, y, z) of the volume, at least 4 voxels along each axis [mm]."""
-    voxel_mm: Positive
+    voxel_mm: Length
     """Edge of a voxel [mm]."""
-    guard_mm: NonNegative | tuple[NonNegative, NonNegative, NonNegative] | Literal["auto"] = "auto"
+    guard_mm: Thickness | tuple[Thickness, Thickness, Thickness] | Literal["auto"] = "auto"
     """Thickness of the guard layers beyond the volume's faces, one number or (x, y, z), which are reconstructed and cut
     away [mm]; "auto" measures in the particle images how far their light reaches, 0 reconstructs no guard layers."""
 
 
 class HalfSpace(Table):
-    """Table ``[[volume.solid]]`` of kind "half_space": solid behind a plane."""
+    """Solid of kind "half_space": everything behind a plane. Table ``[[volume.solid]]``, in scenes ``[[wall]]``."""
 
-    kind: Literal["half_space"]
+    kind: Literal["half_space"] = "half_space"
     point_mm: Point
     """A point (x, y, z) on the solid's surface [mm]."""
-    normal: Point
+    normal: Direction
     """Direction (x, y, z) from the surface into the fluid, of any length."""
 
-    @field_validator("normal")
-    @classmethod
-    def _has_direction(cls, normal: tuple[float, float, float]) -> tuple[float, float, float]:
-        if not any(normal):
-            raise ValueError("a direction other than (0, 0, 0)")
-        return normal
+    def contains(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Return which points (x, y, z) [mm] are behind the plane; the coordinates are broadcast against each other."""
+        axes = zip(self.normal, (x, y, z), self.point_mm, strict=True)
+        return np.asarray(sum(n * (at - point) for n, at, point in axes) < 0)
 
 
 class Box(Table):
-    """Table ``[[volume.solid]]`` of kind "box": solid inside, its faces normal to x, y, z."""
+    """Solid of kind "box", its faces normal to x, y, z. Table ``[[volume.solid]]``, in scenes ``[[wall]]``."""
 
-    kind: Literal["box"]
+    kind: Literal["box"] = "box"
     centre_mm: Point
     """Centre (x, y, z) of the box [mm]."""
-    size_mm: tuple[Positive, Positive, Positive]
+    size_mm: tuple[Length, Length, Length]
     """Edges (x, y, z) of the box [mm]."""
+
+    def contains(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Return which points (x, y, z) [mm] are within the faces; the coordinates are broadcast against each other."""
+        axes = zip((x, y, z), self.centre_mm, self.size_mm, strict=True)
+        within = [np.abs(at - centre) < size / 2 for at, centre, size in axes]
+        return np.asarray(within[0] & within[1] & within[2])
+
+
+Solid = Annotated[HalfSpace | Box, Field(discriminator="kind")]
 
 
 class ExperimentVolume(Volume):
     """Table ``[volume]`` of an experiment: the voxel grid, and where it holds no fluid."""
 
-    mask: Annotated[str, Field(min_length=1)] | None = None
+    mask: PathText | None = None
     """Path of a NetCDF file, true or 1 where there is solid, over z, y, x with coordinates in mm; absent: none."""
-    solid: tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...] = ()
+    solid: Annotated[tuple[Solid, ...], Field(max_length=bounds.MOST_SOLIDS)] = ()
     """Solids in the volume, each a table."""
 
 
-class Particles(Table):
-    """Table ``[particles]``: the image pairs."""
+class Series(Table):
+    """Instants of a time series, each an image of every camera."""
 
-    images: Annotated[str, Field(min_length=1)]
-    """Path of the particle images with ``{camera}``, ``{pair}`` and ``{frame}``; pairs count from 0."""
-    pairs: Count
-    """Number of image pairs."""
-    frames: tuple[Annotated[str, Field(min_length=1)], Annotated[str, Field(min_length=1)]] = ("a", "b")
+    instants: Annotated[int, Field(strict=True, ge=2, le=bounds.MOST)]
+    """Number of recorded instants."""
+    first: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] = 0
+    """Number of the first instant."""
+    step: Count = 1
+    """Vectors of instant k are measured from instants k and k + step."""
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of all instants."""
+        return range(self.first, self.first + self.instants)
+
+
+class Particles(Table):
+    """Table ``[particles]``: the image pairs, or the time series."""
+
+    images: PathText
+    """Path of the particle images: with ``{camera}``, ``{pair}`` and ``{frame}`` for pairs, which count from 0, or
+    ``{image}``, which is 2 pair for the first and 2 pair + 1 for the second frame; with ``{camera}`` and ``{instant}``
+    for a time series."""
+    pairs: Count | None = None
+    """Number of image pairs; absent for a time series."""
+    instants: Annotated[int, Field(strict=True, ge=2, le=bounds.MOST)] | None = None
+    """Number of instants of a time series, each of which is the second image of one pair and the first of another."""
+    first: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] = 0
+    """Number of the first instant of a time series."""
+    step: Count = 1
+    """Distance of the two instants that are correlated in a time series, ``dt_s`` apart: k and k + step."""
+    frames: tuple[Name, Name] = ("a", "b")
     """Text for ``{frame}`` in the first and second image of a pair."""
     background: Literal["auto", "none", "minimum", "median"] = "auto"
     """Light that stands still, subtracted from the images: that of `background_image`, or what the series of pairs
@@ -344,15 +414,39 @@ class Particles(Table):
             raise ValueError("two different frame names")
         return frames
 
+    @model_validator(mode="after")
+    def _pairs_or_series(self) -> Particles:
+        if (self.pairs is None) == (self.instants is None):
+            raise ValueError("either pairs or instants")
+        if self.instants is None and {"first", "step"} & self.model_fields_set:
+            raise ValueError("first and step only with instants")
+        if self.instants is not None and "frames" in self.model_fields_set:
+            raise ValueError("frames only with pairs; an instant has one image of each camera")
+        if self.instants is not None and self.instants <= self.step:
+            raise ValueError("more instants than step")
+        return self
+
+    @property
+    def count(self) -> int:
+        """Number of pairs; the last `step` instants of a series are the first of no pair."""
+        return self.pairs if self.pairs is not None else (self.instants or 0) - self.step
+
+    @property
+    def series(self) -> Series | None:
+        """The time series; None for image pairs."""
+        if self.instants is None:
+            return None
+        return Series(instants=self.instants, first=self.first, step=self.step)
+
 
 class ExperimentTable(Table):
     """The whole experiment file."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Name
     """Name of the experiment, title of its report."""
-    dt_s: Positive
-    """Time between the two frames of a pair [s]."""
-    camera: Annotated[tuple[CameraTable, ...], Field(min_length=1)]
+    dt_s: Interval
+    """Time between the two frames of a pair, or between instants k and k + step of a time series [s]."""
+    camera: Annotated[tuple[CameraTable, ...], Field(min_length=1, max_length=bounds.MOST_CAMERAS)]
     board: Board
     volume: ExperimentVolume
     particles: Particles

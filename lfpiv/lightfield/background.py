@@ -53,7 +53,10 @@ _GOLDEN = (0.7548776662466927, 0.5698402909980532)  # steps of an even sequence 
 
 @dataclass(eq=False)
 class Series:
-    """Running figures of the images of one camera and one frame. `add` takes one image after the other."""
+    """Running figures of the images of one camera and one frame. `add` takes one image after the other.
+
+    Where one laser lights all images, as in a time series, all are of one frame, and `second` is None below.
+    """
 
     decoder: LightFieldDecoder
     frame: int = 0
@@ -72,7 +75,7 @@ class Series:
     saturated: np.ndarray = field(init=False)
     """Number of images in which a pixel is saturated, uint16."""
 
-    def add(self, light: np.ndarray, noise: float, saturated: np.ndarray) -> None:
+    def add(self, light: np.ndarray, noise: float, saturated: np.ndarray, shift: int | None = None) -> None:
         """Add an image.
 
         Parameters
@@ -83,8 +86,11 @@ class Series:
             Its noise [counts].
         saturated : ndarray, shape (rows, columns), bool
             Its saturated pixels.
+        shift : int, optional
+            Number of its shift. Images of the same particles have the same; default: one for each image.
         """
-        shifted = np.roll(light, lens_shift(self.decoder, 2 * self.count + self.frame), (0, 1))
+        number = 2 * self.count + self.frame if shift is None else shift
+        shifted = np.roll(light, lens_shift(self.decoder, number), (0, 1))
         if self.count == 0:
             self.smallest, self.largest = light.copy(), light.copy()
             self.shifted, self.saturated = shifted, saturated.astype(np.uint16)
@@ -99,8 +105,8 @@ class Series:
 
 
 def recorded_light(images: Sequence[tuple[np.ndarray, float, np.ndarray]], decoder: LightFieldDecoder) -> StandingLight:
-    """Return the standing light in background images of both frames: light, noise and saturated pixels of each."""
-    (first, noise, clipped), (second, _, clipped_too) = images
+    """Return the standing light in background images of one or both frames: light, noise and saturated pixels."""
+    (first, noise, clipped), (second, _, clipped_too) = images[0], images[-1]
     region = first > CLEAR_SIGMA * noise
     return StandingLight(
         light=(first, second), unusable=clipped | clipped_too, found=True, region=region, stray=0.0, ratio=None
@@ -108,10 +114,11 @@ def recorded_light(images: Sequence[tuple[np.ndarray, float, np.ndarray]], decod
 
 
 def median_light(
-    first: Series, second: Series, images: tuple[Sequence[np.ndarray], Sequence[np.ndarray]]
+    first: Series, second: Series | None, images: tuple[Sequence[np.ndarray], Sequence[np.ndarray]]
 ) -> StandingLight:
     """Return the median of each pixel over a series as standing light, with the series' unusable pixels."""
-    one, other = (_median(frames) for frames in images)
+    one = _median(images[0])
+    other = one if second is None else _median(images[1])
     return StandingLight(
         light=(one, other),
         unusable=_unusable(first, second),
@@ -131,17 +138,18 @@ def _median(images: Sequence[np.ndarray]) -> np.ndarray:
     return result
 
 
-def standing_light(first: Series, second: Series, *, everywhere: bool = False) -> StandingLight:
+def standing_light(first: Series, second: Series | None, *, everywhere: bool = False) -> StandingLight:
     """Estimate the standing light of a camera from the series of both frames.
 
     `everywhere` takes the minimum of all pixels, also where it is no brighter than chance.
     """
     decoder = first.decoder
-    pooled, ratio = _pool(first, second)
-    parts = [pooled, pooled] if pooled is not None else [_Minimum.of(first), _Minimum.of(second)]
-    stray = [_stray(one, decoder) for one in (first, second)]
+    pooled, ratio = (None, 1.0) if second is None else _pool(first, second)
+    series = [first] if second is None else [first, second]
+    parts = [_Minimum.of(one) for one in series] if pooled is None else [pooled, pooled]
+    stray = [_stray(one, decoder) for one in series]
     light, region = [], np.zeros(decoder.gain.shape, bool)
-    scales = (1.0, ratio) if pooled is not None else (1.0, 1.0)
+    scales = [1.0] * len(series) if pooled is None else [1.0, ratio]
     for part, smooth, scale in zip(parts, stray, scales, strict=True):
         excess = part.smallest - smooth / np.float32(scale)
         level = np.maximum(excess + part.bias(decoder), 0)
@@ -149,7 +157,7 @@ def standing_light(first: Series, second: Series, *, everywhere: bool = False) -
             stands = np.ones_like(region)
         else:
             stands = _stands(excess, part.shifted - smooth / np.float32(scale), part.noise, decoder)
-            if level.sum(where=stands, dtype=float) < LEAST_STANDING * min(first.light, second.light):
+            if level.sum(where=stands, dtype=float) < LEAST_STANDING * min(one.light for one in series):
                 stands = np.zeros_like(region)
         region |= stands
         light.append(((np.where(stands, level, 0)) * np.float32(scale) + smooth).astype(np.float32))
@@ -158,7 +166,7 @@ def standing_light(first: Series, second: Series, *, everywhere: bool = False) -
         return replace(nothing(decoder), at_rest=True)
     seen = first.smallest.sum(where=region | unusable, dtype=float)
     return StandingLight(
-        light=(light[0], light[1]),
+        light=(light[0], light[-1]),
         unusable=unusable,
         found=bool(region.any() or unusable.any() or any(s.any() for s in stray)),
         region=region,
@@ -252,17 +260,20 @@ def _stray(series: Series, decoder: LightFieldDecoder) -> np.ndarray:
     return light
 
 
-def _unusable(first: Series, second: Series) -> np.ndarray:
+def _unusable(first: Series, second: Series | None) -> np.ndarray:
     """Return pixels that are saturated in most images, or repeat one count in all where noise would change it.
 
     Where noise alone may repeat a dark pixel's count, only bright pixels are meant. One pair alone may show
     resting particles. So its saturated pixels must lie together and fill many microimages.
     """
-    images = first.count + second.count
-    often: np.ndarray = first.saturated + second.saturated > images / 2
-    if images == 2:
+    if second is None:
+        images, saturated, low, high = first.count, first.saturated, first.smallest, first.largest
+    else:
+        images, saturated = first.count + second.count, first.saturated + second.saturated
+        low, high = np.minimum(first.smallest, second.smallest), np.maximum(first.largest, second.largest)
+    often: np.ndarray = saturated > images / 2
+    if images <= 2:
         return _extended(often, first)
-    low, high = np.minimum(first.smallest, second.smallest), np.maximum(first.largest, second.largest)
     stuck: np.ndarray = high == low
     same = 1 / (2 * max(first.noise, 1e-3) * np.sqrt(np.pi))  # chance of two equal counts
     if same >= 1 or same ** (images - 1) * low.size > _STUCK_PIXELS:

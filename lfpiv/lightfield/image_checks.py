@@ -180,7 +180,7 @@ def dark_blocks(first: np.ndarray, second: np.ndarray) -> int:
 
 
 def image_warnings(
-    raw: np.ndarray, light: np.ndarray, decoder: LightFieldDecoder, camera: str, frame: str
+    raw: np.ndarray, light: np.ndarray, decoder: LightFieldDecoder, camera: str, frame: str | None
 ) -> list[Warning]:
     """Warn of misplaced or saturated light in one image.
 
@@ -190,10 +190,12 @@ def image_warnings(
         The image as recorded, and without its dark level [counts].
     decoder : LightFieldDecoder
         The camera's decoder.
-    camera, frame : str
-        Names for the warnings.
+    camera : str
+        Name of the camera, for the warnings.
+    frame : str, optional
+        Name of the frame in its pair; None for an instant of a series.
     """
-    subject = f"{camera}, frame {frame}"
+    subject = _subject(camera, frame)
     found = []
     if (between := gap_light(light, decoder)) > GAP_LIGHT:
         found.append(Warning(code=Code.MISPLACED, subject=subject, figures={"gap_light": between}))
@@ -209,17 +211,24 @@ def uneven_warnings(first: np.ndarray, second: np.ndarray, camera: str) -> list[
     return [Warning(code=Code.UNEVEN, subject=camera, figures=figures)] if parts else []
 
 
-def signal_warnings(structure: Mapping[str, float], frame: str) -> list[Warning]:
-    """Warn of images of one frame with weak particles or none, by the structure per camera."""
+def signal_warnings(structure: Mapping[str, float], frame: str | None) -> list[Warning]:
+    """Warn of images of one frame with weak particles or none, by the structure per camera.
+
+    `frame` is the name of the frame in its pair; None for an instant of a series.
+    """
     return [
         Warning(
             code=Code.EMPTY if value < EMPTY else Code.DIM,
-            subject=f"{camera}, frame {frame}",
+            subject=_subject(camera, frame),
             figures={"structure": max(float(value), 0.0)},
         )
         for camera, value in structure.items()
         if value < NOISE
     ]
+
+
+def _subject(camera: str, frame: str | None) -> str:
+    return camera if frame is None else f"{camera}, frame {frame}"
 
 
 def unmeasured(frames: Iterable[Iterable[Warning]], cameras: int) -> bool:

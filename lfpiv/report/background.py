@@ -35,13 +35,11 @@ def section(experiment: Experiment, calibration: Calibration) -> str:
         ]
         for name, found in cameras.items()
     ]
-    titles = ["camera", "part of the sensor", "unusable pixels", "stray light [counts]", "second frame over first"]
+    heads = ["camera", "part of the sensor", "unusable pixels", "stray light [counts]", "second frame over first"]
     parts = ['<h2 id="background">Light that stands still</h2>']
     for name, found in cameras.items():
-        shown = [
-            _picture(light, found, f"{name}, frame {frame}")
-            for light, frame in zip(found.light, experiment.frames, strict=True)
-        ]
+        titles = [f"{name}, frame {frame}" for frame in experiment.frames] if experiment.series is None else [name]
+        shown = [_picture(light, found, title) for title, light in zip(titles, found.light, strict=False)]
         parts.append(
             markup.figure(
                 shown,
@@ -49,7 +47,7 @@ def section(experiment: Experiment, calibration: Calibration) -> str:
                 "windows and stray light, and no particles. Unusable pixels, bright here, have no weight.",
             )
         )
-    parts.append(markup.table(titles, rows, caption="Light that stands still, by camera"))
+    parts.append(markup.table(heads, rows, caption="Light that stands still, by camera"))
     return "\n".join(parts)
 
 

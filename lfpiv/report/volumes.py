@@ -76,8 +76,8 @@ def _projection_figure(pair: int, first: xr.Dataset) -> str:
     return markup.figure(
         shown,
         f"Brightest voxel along each axis, pair {pair}, frame {frame}. Particles should be round across the "
-        "cameras' mean line of sight, usually z; along it they are longer, the more so the smaller the angle between the "
-        "cameras.",
+        "cameras' mean line of sight, usually z; along it they are longer, the more so the smaller the angle between "
+        "the cameras.",
         table,
     )
 

@@ -4,23 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import json
 import logging
+import operator
 import os
+import re
+import secrets
 import shutil
 import socket
+import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.settings import Series
+from lfpiv.records import RecordError, read_object, validate
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
 FRAME_NAMES = "ab"
 """Names of the two frames in output files, independent of the names of the images."""
+
+MOST_DIGITS = 19
+"""Digits from which on the number in a file's name is no number of a pair."""
+
+_NUMBER = re.compile(r"\d+")
 
 RETIRED = ".outdated"
 """Suffix, in place of ``.nc``, of older results of a pair that failed after its images changed."""
@@ -31,6 +43,8 @@ class Folder:
     """Paths of the files of a run."""
 
     path: Path
+    series: Series | None = None
+    """The time series whose results are here; None for image pairs."""
 
     @property
     def calibration(self) -> Path:
@@ -58,6 +72,11 @@ class Folder:
         return self.path / "summary.json"
 
     @property
+    def pairs(self) -> Path:
+        """Figures of all pairs, a line of JSON each, where they are too many for the summary."""
+        return self.path / "pairs.jsonl"
+
+    @property
     def report(self) -> Path:
         """Report of the run as HTML."""
         return self.path / "report.html"
@@ -73,19 +92,49 @@ class Folder:
         return self.path / ".shared"
 
     def vectors(self, pair: int) -> Path:
-        """Return the path of one pair's vectors."""
-        return self.path / "vectors" / f"pair_{pair:04d}.nc"
+        """Return the path of one pair's vectors; in a series it has the number of the pair's first instant."""
+        name = f"pair_{pair:04d}" if self.series is None else f"instant_{pair:06d}"
+        return self.path / "vectors" / f"{name}.nc"
 
     def volume(self, pair: int, frame: int) -> Path:
-        """Return the path of a pair's volume of frame 0 or 1."""
-        return self.path / "volumes" / f"pair_{pair:04d}_{FRAME_NAMES[frame]}.nc"
+        """Return the path of a pair's volume of frame 0 or 1; two pairs of a series share an instant's volume."""
+        name = f"pair_{pair:04d}_{FRAME_NAMES[frame]}"
+        if self.series is not None:
+            name = f"instant_{pair + frame * self.series.step:06d}"
+        return self.path / "volumes" / f"{name}.nc"
+
+    def stored(self, numbers: range, *, vectors: bool, volumes: bool) -> bytearray:
+        """Return for each pair 1 if all its files are there, 0 otherwise. This lists folders and opens no file."""
+        wanted: list[Callable[[int], Path]] = [self.vectors] if vectors else []
+        wanted += [functools.partial(self.volume, frame=frame) for frame in (0, 1)] if volumes else []
+        found = bytearray(b"\x01") * len(numbers)
+        for path_of in wanted:
+            listed = self._listed(numbers, path_of)
+            found = bytearray(map(operator.and_, found, listed))
+        return found
+
+    def _listed(self, numbers: range, path_of: Callable[[int], Path]) -> bytearray:
+        """Return for each pair 1 if a file with the name of its result is in the folder of such results."""
+        found, sample = bytearray(len(numbers)), path_of(0)
+        first = int(_NUMBER.search(sample.name)[0])  # type: ignore[index]  # of the second frame of pair 0
+        with contextlib.suppress(OSError), os.scandir(sample.parent) as entries:
+            for entry in entries:
+                match = _NUMBER.search(entry.name)
+                pair = int(match[0]) - first if match and len(match[0]) < MOST_DIGITS else -1
+                if pair in numbers and path_of(pair).name == entry.name:
+                    found[numbers.index(pair)] = 1
+        return found
 
     def sweep(self) -> None:
         """Remove half-written and shared files of a run that was killed. The caller must hold the lock."""
         for place in (self.path, self.vectors(0).parent, self.volume(0, 0).parent):
             for path in place.glob(".*.tmp"):
-                path.unlink(missing_ok=True)
-        shutil.rmtree(self.shared, ignore_errors=True)
+                with contextlib.suppress(OSError):  # a folder is nobody's half-written file
+                    path.unlink(missing_ok=True)
+        if self.shared.is_dir() and not self.shared.is_symlink():
+            shutil.rmtree(self.shared, ignore_errors=True)
+        else:
+            self.shared.unlink(missing_ok=True)  # `rmtree` would wait for a pipe
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
@@ -106,12 +155,30 @@ class Folder:
                 os.close(file)
 
 
+class VectorFiles(Mapping[int, Path]):
+    """Pair -> path of its vectors, for some pairs of a folder; holds no path."""
+
+    def __init__(self, folder: Folder, pairs: Collection[int]):
+        self._folder, self._pairs = folder, pairs
+
+    def __getitem__(self, pair: int) -> Path:
+        if pair not in self._pairs:
+            raise KeyError(pair)
+        return self._folder.vectors(pair)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._pairs)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+
 def _lock(path: Path) -> int | None:
     """Open and lock a file, and return its descriptor; None if the file system has no locks."""
     import fcntl
 
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        file = _open_lock(path)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -138,13 +205,37 @@ def _lock(path: Path) -> int | None:
     return file
 
 
+def _open_lock(path: Path) -> int:
+    """Open a lock file and return its descriptor; refuse at once a folder, a link or a pipe of that name."""
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        if error.errno not in (errno.EISDIR, errno.ELOOP, errno.ENXIO):
+            raise
+        file = None
+    if file is not None and stat.S_ISREG(os.fstat(file).st_mode):
+        return file
+    if file is not None:
+        os.close(file)
+    raise InputError(f"{path}: expected the lock file of a run, found a folder, a link or a pipe. Remove it.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Holder:
+    """Content of a lock file."""
+
+    process: int
+    host: str
+    since: str
+
+
 def _process_name(holder: bytes) -> str:
     """Return the process that holds a lock, from the content of the lock file."""
     try:
-        found = json.loads(holder)
-        return f"process {found['process']} on {found['host']} since {found['since']}"
-    except (ValueError, KeyError, TypeError):  # the holder has not written its name yet
+        found = validate(_Holder, read_object(holder))
+    except RecordError:  # the holder has not written its name yet
         return "another process"
+    return f"process {found.process} on {found.host[:80]} since {found.since[:40]}"
 
 
 def retire(path: Path) -> Path:
@@ -161,7 +252,7 @@ def make_writable(path: Path) -> list[Path]:
                 break
             made.append(parent)
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".write-test-{os.getpid()}"
+        probe = path / f".write-test-{os.getpid()}-{secrets.token_hex(4)}"
         probe.touch()
         probe.unlink()
     except OSError as error:
@@ -178,7 +269,8 @@ def make_writable(path: Path) -> list[Path]:
             raise InputError(
                 f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
             )
-    for place in (folder.calibration, folder.background, folder.summary, folder.report):
+    results = (folder.calibration, folder.self_calibration, folder.background, folder.guard)
+    for place in (*results, folder.summary, folder.report):
         if place.is_dir():
             raise InputError(
                 f"{place}: expected a place for a file, found a folder. Remove it or choose another --out."

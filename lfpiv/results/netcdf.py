@@ -17,13 +17,20 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfpiv.errors import InputError
+from lfpiv import hdf5
+from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import plain, replacing, write_bytes
-from lfpiv.geometry.grid import AXES
+from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.version import versions
 
-SCHEMA_VERSION = 3
-"""Version of the files. 2: the group has its own dimensions. 3: adds ``profile_z``."""
+SCHEMA_VERSION = 4
+"""Version of the files. 2: the group has its own dimensions. 3: adds ``profile_z``. 4: sealed, and states its name."""
+
+SEALED_SINCE = 4
+"""First version whose files are sealed, see `lfpiv.hdf5`."""
+
+FILE = "file"
+"""Attribute with the name under which a file was written: a copy under another name is recognised by it."""
 
 VECTOR_UNITS = {
     "u": "m/s",
@@ -132,10 +139,11 @@ def check_vectors(vectors: xr.Dataset) -> None:
             raise ValueError(f"vectors: expected {name!r} in {unit}, found {vectors[name].attrs.get('units')}.")
     if vectors["valid"].dtype != bool:
         raise ValueError(f"vectors: expected 'valid' to be boolean, found {vectors['valid'].dtype}.")
-    if not vectors.attrs.get("dt_s", 0) > 0:
+    dt_s = np.asarray(vectors.attrs.get("dt_s", 0.0))
+    if dt_s.shape != () or dt_s.dtype.kind not in "fiu" or not 0 < dt_s < np.inf:
         raise ValueError(f"vectors: expected the attribute dt_s > 0, found {vectors.attrs.get('dt_s')}.")
     voxel_mm = np.asarray(vectors.attrs.get("voxel_mm", ()))
-    if voxel_mm.shape != (3,) or voxel_mm.dtype.kind not in "fiu" or not (voxel_mm > 0).all():
+    if voxel_mm.shape != (3,) or voxel_mm.dtype.kind not in "fiu" or not ((voxel_mm > 0) & (voxel_mm < np.inf)).all():
         found = vectors.attrs.get("voxel_mm")
         raise ValueError(f"vectors: expected the attribute voxel_mm, edges (z, y, x) > 0, found {found}.")
     for name, axis, edge_mm in zip("wvu", AXES, voxel_mm, strict=True):
@@ -147,6 +155,63 @@ def check_vectors(vectors: xr.Dataset) -> None:
                 f"vectors: expected {name!r} to be 'displacement_{axis}' times voxel_mm / dt_s, found {wrong.sum()} of "
                 f"{wrong.size} that are not. Change both, or keep what you derive under another name."
             )
+    _check_numbers(vectors)
+
+
+def _check_numbers(vectors: xr.Dataset) -> None:
+    """Refuse axes that do not increase, and valid vectors that are no numbers."""
+    for axis in AXES:
+        _check_axis(vectors[axis])
+    valid = vectors["valid"]
+    for name in "uvw":
+        values = vectors[name]
+        if values.dtype.kind not in "fiu":
+            raise ValueError(f"vectors: expected {name!r} to be numbers, found {values.dtype}.")
+        if wrong := int((valid & ~np.isfinite(values)).sum()):
+            raise ValueError(f"vectors: expected numbers in {name!r} where vectors are valid, {wrong} are not finite.")
+
+
+def _check_places(vectors: xr.Dataset, grid: Grid) -> None:
+    """Refuse vectors beyond the volume, or measured in other voxels."""
+    if not np.allclose(vectors.attrs["voxel_mm"], grid.voxel_mm, rtol=1e-6):
+        raise ValueError(f"vectors: expected voxels of {grid.voxel_mm:g} mm, found {vectors.attrs['voxel_mm']}.")
+    for number, axis in enumerate(AXES):
+        places, voxels = vectors[axis].values, grid.axis_mm(number)
+        if not (voxels[0] - grid.voxel_mm < places[0] and places[-1] < voxels[-1] + grid.voxel_mm):
+            raise ValueError(f"vectors: expected {axis} within the volume, found {places[0]:g} to {places[-1]:g} mm.")
+
+
+def _check_axis(axis: xr.DataArray) -> None:
+    values = axis.values
+    if values.dtype.kind not in "fiu" or not np.isfinite(values).all() or not (np.diff(values) > 0).all():
+        raise ValueError(f"expected the coordinate {axis.name} to increase from value to value, found it otherwise.")
+
+
+def _check_voxels(volume: xr.DataArray, grid: Grid) -> None:
+    """Refuse a volume at another place than the experiment's."""
+    for number, axis in enumerate(AXES):
+        if not np.allclose(volume[axis].values, grid.axis_mm(number), rtol=0, atol=1e-3 * grid.voxel_mm):
+            raise ValueError(f"volume: its voxels lie at other places along {axis} than those of the experiment.")
+
+
+def check_volume(volume: xr.DataArray) -> None:
+    """Check the form of a volume.
+
+    Raises
+    ------
+    ValueError
+        If it does not lie on axes that increase, or an intensity is no number of 0 or more.
+    """
+    if volume.dims != AXES:
+        raise ValueError(f"volume: expected the dimensions (z, y, x), found {volume.dims}.")
+    for axis in AXES:
+        if axis in volume.coords:
+            _check_axis(volume[axis])
+    values = volume.values
+    if values.dtype.kind not in "fiu" or not (values.size and np.isfinite(values.min()) and np.isfinite(values.max())):
+        raise ValueError("volume: expected finite intensities, found others.")
+    if values.min() < 0:
+        raise ValueError(f"volume: expected intensities of 0 or more, found {values.min():g}.")
 
 
 def write_vectors(
@@ -172,25 +237,33 @@ def write_vectors(
     """
     check_vectors(vectors)
     path.parent.mkdir(parents=True, exist_ok=True)
-    groups = {"": _packed(vectors, {**attributes, "versions": versions()})}
+    groups = {"": _packed(vectors, {**attributes, "versions": versions(), FILE: path.name})}
     if reconstruction is not None:
         groups[RECONSTRUCTION] = _packed(reconstruction.rename(_GROUP_AXES), {})
     _write(groups, path)
 
 
-def read_vectors(path: Path) -> xr.Dataset:
-    """Read the vectors of one pair into memory.
+def read_vectors(path: Path, *, grid: Grid | None = None) -> xr.Dataset:
+    """Read the vectors of one pair into memory, verified.
+
+    Parameters
+    ----------
+    path : Path
+    grid : Grid, optional
+        The volume, in which the vectors must lie.
 
     Raises
     ------
     InputError
-        If the file is missing, unreadable, of a newer schema, or no vector dataset.
+        If the file is missing, of a newer schema, damaged, or no vector dataset.
     """
     vectors = _read(path, None)
     try:
         check_vectors(vectors)
+        if grid is not None:
+            _check_places(vectors, grid)
     except ValueError as error:
-        raise InputError(f"{path}: {error} Remove the file and run again.") from None
+        raise DamagedFile(path, str(error)) from None
     return vectors
 
 
@@ -206,28 +279,52 @@ def read_reconstruction(path: Path) -> xr.Dataset | None:
 def write_volume(volume: xr.DataArray, path: Path, *, attributes: Mapping[str, Any]) -> None:
     """Write one volume (z, y, x) [counts] as NetCDF4, atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    _write({"": _packed(volume.rename("intensity").to_dataset(), {**attributes, "versions": versions()})}, path)
+    check_volume(volume)
+    own = {**attributes, "versions": versions(), FILE: path.name}
+    _write({"": _packed(volume.rename("intensity").to_dataset(), own)}, path)
 
 
-def read_volume(path: Path) -> xr.DataArray:
-    """Read one volume into memory.
+def read_volume(path: Path, *, grid: Grid | None = None) -> xr.DataArray:
+    """Read one volume into memory, verified.
+
+    Parameters
+    ----------
+    path : Path
+    grid : Grid, optional
+        The voxels that it must have. A file that declares others is not read.
 
     Raises
     ------
     InputError
-        If the file is missing, unreadable, of a newer schema, or no volume.
+        If the file is missing, of a newer schema, damaged, or no volume.
     """
+    if grid is not None and path.exists():
+        with hdf5.opened(path) as file:
+            if (shape := file["intensity"].shape) != grid.shape:
+                raise DamagedFile(path, f"it has {shape} voxels, the volume {grid.shape}")
     dataset = _read(path, None)
     if "intensity" not in dataset or dataset["intensity"].dims != AXES:
         raise InputError(f"{path}: expected a volume 'intensity' over (z, y, x), found {list(dataset.data_vars)}.")
+    try:
+        check_volume(dataset["intensity"])
+        if grid is not None:
+            _check_voxels(dataset["intensity"], grid)
+    except ValueError as error:
+        raise DamagedFile(path, str(error)) from None
     return dataset["intensity"]
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
-    """Read the attributes of a finished NetCDF or HDF5 file."""
-    import h5py
+    """Read the attributes of a finished NetCDF or HDF5 file.
 
-    with h5py.File(path, "r") as file:
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    DamagedFile
+        If it is damaged.
+    """
+    with hdf5.opened(path, values=False) as file:
         found = dict(file.attrs)
     return {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in found.items()}
 
@@ -245,6 +342,12 @@ def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, A
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
     with replacing(path) as scratch:  # straight to disk: it may be larger than the memory
         _packed(dataset, attributes or {}).to_netcdf(scratch, engine="h5netcdf")
+        hdf5.seal(scratch)
+
+
+def for_file(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
+    """Return a dataset with the attributes and encodings of a file, for writers that write it in parts."""
+    return _packed(dataset, attributes)
 
 
 def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
@@ -252,11 +355,13 @@ def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
     dataset = dataset.copy()
     own = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
     dataset.attrs = {key: _attribute(value) for key, value in own.items()}
-    packed = {"zlib": True, "complevel": 1, "shuffle": True}
+    summed = {"fletcher32": True}
+    packed = {**summed, "zlib": True, "complevel": 1, "shuffle": True}
     for name, item in dataset.variables.items():
         described = {**item.attrs, **_DESCRIPTIONS.get(str(name), {})}
         item.attrs = {key: _attribute(value) for key, value in described.items()}
-        item.encoding = packed if item.ndim >= 2 and item.dtype.kind in "fiub" else {}
+        numbers = item.ndim and item.size and item.dtype.kind in "fiub"
+        item.encoding = {} if not numbers else packed if item.ndim >= 2 else summed
     return dataset
 
 
@@ -269,6 +374,7 @@ def _write(groups: Mapping[str, xr.Dataset], path: Path) -> None:
     with h5netcdf.File(content, "w") as file:
         for group, dataset in groups.items():
             dataset.dump_to_store(H5NetCDFStore(file.create_group(group) if group else file))
+    hdf5.seal(content)
     write_bytes(content.getbuffer(), path)
 
 
@@ -284,17 +390,37 @@ def _attribute(value: Any) -> Any:
 
 
 def _read(path: Path, group: str | None) -> xr.Dataset:
-    if not path.is_file():
-        raise InputError(f"{path}: expected a NetCDF file of a run, found no such file. Run the step that writes it.")
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
     try:
-        dataset = xr.load_dataset(path, engine="h5netcdf", group=group)
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: expected a NetCDF4 file, found {error}. Remove it and run again.") from None
-    require_schema(dataset.attrs.get("schema_version", 0), path)
+        with hdf5.opened(path) as file:
+            require_schema(file.attrs.get("schema_version", 0), path)
+            _check_flags(file if group is None else file[group], path)
+            with h5netcdf.File(file, "r", decode_vlen_strings=True) as opened:  # the verified file, opened once
+                dataset = xr.load_dataset(H5NetCDFStore(opened if group is None else opened[group]))
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: expected a NetCDF file of a run, found no such file. Run the step that writes it."
+        ) from None
+    dataset.attrs.pop(hdf5.SEALED, None)
     return dataset
 
 
-def require_schema(version: int, path: Path) -> None:
-    """Refuse a file of a newer schema, or of none."""
-    if not 1 <= version <= SCHEMA_VERSION:
-        raise InputError(f"{path}: expected schema version 1 to {SCHEMA_VERSION}, found {version}. Update lfpiv.")
+def _check_flags(group: Any, path: Path) -> None:
+    """Refuse flags other than 0 and 1, which reading as a dataset would hide."""
+    for name, item in group.items():
+        if item.attrs.get("dtype") == "bool" and not np.isin(item[()], (0, 1)).all():
+            raise DamagedFile(path, f"{name!r} holds values other than 0 and 1")
+
+
+def require_schema(version: Any, path: Path) -> None:
+    """Refuse a file of a newer schema, or of none, and one without the seal that its schema has."""
+    number = np.ravel(version)
+    whole = int(number[0]) if number.size == 1 and number.dtype.kind in "iu" else 0
+    if not 1 <= whole <= SCHEMA_VERSION:
+        raise InputError(
+            f"{path}: expected schema version 1 to {SCHEMA_VERSION}, found {str(version)[:40]}. Update lfpiv."
+        )
+    if whole >= SEALED_SINCE and not hdf5.is_sealed(path):
+        raise DamagedFile(path, "it has no seal: it is cut off, or another program changed it")

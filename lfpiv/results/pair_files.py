@@ -1,14 +1,15 @@
 """Files of one pair in an output folder: two volumes and the vectors, each with a stamp of its origin.
 
-`PairFiles` checks whether they still fit the experiment, reads and writes them. `PairVolumes` holds two volumes with
-figures and warnings of their images.
+`PairFiles` checks whether they still fit the experiment, reads and writes them. `VolumeFile` does so for the volume of
+one frame; two pairs of a series share the volume of an instant. `PairVolumes` holds two volumes with figures and
+warnings of their images.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,14 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import warn
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.errors import DamagedFile
+from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
-from lfpiv.geometry.grid import NO_LAYERS, Layers
-from lfpiv.results import netcdf, provenance
+from lfpiv.geometry.grid import NO_LAYERS, Grid, Layers
+from lfpiv.records import read_json, validate
+from lfpiv.results import finished, netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
-from lfpiv.results.provenance import Marks, PairStamps, Stamp
+from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.warn import Warning
 
 
@@ -29,33 +32,104 @@ from lfpiv.warn import Warning
 class FrameRecord:
     """Figures and warnings of the images of one frame, stored with its volume."""
 
-    frame: str
-    """Name of the frame in the experiment."""
     structure: Mapping[str, float]
     """Camera -> correlation of near pixels of its image; empty where it was not stored."""
     warnings: tuple[Warning, ...]
-    """Warnings about the images. A warning about both frames is in the record of the first one."""
+    """Warnings about the images. In an image pair a warning about both frames is in the record of the first one."""
     seconds: float
     """Time that reading the images and reconstructing the volume took [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairVolumes:
-    """The volumes of both frames of a pair, and their records."""
+class FrameVolume:
+    """The volume of one frame and its record."""
 
-    volumes: tuple[xr.DataArray, xr.DataArray]
-    """Volumes (z, y, x) [counts]."""
-    records: tuple[FrameRecord, FrameRecord]
+    volume: xr.DataArray
+    """Volume (z, y, x) [counts]."""
+    record: FrameRecord
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairVolumes:
+    """The volumes of both frames of a pair."""
+
+    frames: tuple[FrameVolume, FrameVolume]
+    names: tuple[str, str] = ("a", "b")
+    """Names of the frames in the experiment; those of a series are "a" and "b"."""
+    between: tuple[Warning, ...] = ()
+    """Warnings about both instants of a pair of a series."""
+
+    @property
+    def volumes(self) -> tuple[xr.DataArray, xr.DataArray]:
+        """Both volumes (z, y, x) [counts]."""
+        return self.frames[0].volume, self.frames[1].volume
+
+    @property
+    def records(self) -> tuple[FrameRecord, FrameRecord]:
+        """Records of both volumes."""
+        return self.frames[0].record, self.frames[1].record
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
         """Warnings about the images of both frames."""
-        return self.records[0].warnings + self.records[1].warnings
+        return self.records[0].warnings + self.records[1].warnings + self.between
 
     def condensed(self) -> xr.Dataset:
         """Return projections, profiles and figures of the volumes, as `netcdf.build_reconstruction` does."""
-        volumes = {record.frame: volume for record, volume in zip(self.records, self.volumes, strict=True)}
-        return netcdf.build_reconstruction(volumes, {record.frame: record.structure for record in self.records})
+        volumes = dict(zip(self.names, self.volumes, strict=True))
+        structure = {name: record.structure for name, record in zip(self.names, self.records, strict=True)}
+        return netcdf.build_reconstruction(volumes, structure)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeFile:
+    """Path and stamp of the volume of one frame."""
+
+    frame: Frame
+    path: Path
+    stamp: Stamp
+    origin: Mapping[str, Any]
+    """Attributes that say of what the volume is: pair and frame, or instant and time."""
+    grid: Grid | None = None
+    """Voxels of the volume; None if the file is not compared with them."""
+
+    def marks(self) -> Marks | None:
+        """Return the marks of the file; None if it is missing or cannot be used."""
+        return finished.volume_marks(self.path, self.grid, self.origin.get("frame"))
+
+    def fitting(self) -> Marks | None:
+        """Return the marks of the file; None if it is missing or does not fit."""
+        marks = self.marks()
+        return marks if self.stamp.fits(marks) else None
+
+    def read(self) -> FrameVolume | None:
+        """Read the volume and its record; None if the file is missing, damaged, or does not fit."""
+        if self.fitting() is None:
+            return None
+        try:
+            volume = netcdf.read_volume(self.path, grid=self.grid)
+            return FrameVolume(volume=volume, record=_read_record(volume, self.path))
+        except DamagedFile as error:
+            provenance.reject(Path(error.path), error.reason)
+            return None
+
+    def write(self, found: FrameVolume) -> None:
+        """Write the volume with its record, atomically."""
+        record = found.record
+        attributes = {
+            **self.stamp.attributes,
+            "seconds": record.seconds,
+            "warnings": warn.to_text(record.warnings),
+            **self.origin,
+        }
+        of_images = {"cameras": list(record.structure), "structure": list(record.structure.values())}
+        with writing(self.path):
+            netcdf.write_volume(found.volume.assign_attrs(of_images), self.path, attributes=attributes)
+            self.path.with_suffix(RETIRED).unlink(missing_ok=True)
+
+    def within(self, folder: Path) -> VolumeFile:
+        """Return the file of the same volume in another folder."""
+        return replace(self, path=folder / self.path.name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,9 +138,14 @@ class PairFiles:
 
     pair: int
     vectors: Path
-    volumes: tuple[Path, Path]
+    stamp: Stamp
+    """Stamp of the vectors."""
+    frames: tuple[VolumeFile, VolumeFile]
     """Volumes of the first and of the second frame."""
-    stamps: PairStamps
+    origin: Mapping[str, Any]
+    """Attributes that say of what the vectors are: the pair, or instant, step and time."""
+    grid: Grid | None = None
+    """Voxels of the volumes; None if files are not compared with them."""
 
     @classmethod
     def of(
@@ -85,19 +164,48 @@ class PairFiles:
         has the guard layers of the volumes.
         """
         stamps = provenance.of_pair(experiment, calibration, pair, background=background, guard=guard)
-        volumes = (folder.volume(pair, 0), folder.volume(pair, 1))
-        return cls(pair=pair, vectors=folder.vectors(pair), volumes=volumes, stamps=stamps)
+        frames = experiment.pair_frames(pair)
+        first, second = (
+            VolumeFile(
+                frame=frames[number],
+                path=folder.volume(pair, number),
+                stamp=stamps.volumes[number],
+                origin=_origin(experiment, frames[number]),
+                grid=experiment.grid,
+            )
+            for number in (0, 1)
+        )
+        origin = {"pair": pair} if experiment.series is None else _instant(experiment, pair)
+        return cls(
+            pair=pair,
+            vectors=folder.vectors(pair),
+            stamp=stamps.vectors,
+            frames=(first, second),
+            origin=origin,
+            grid=experiment.grid,
+        )
+
+    @cached_property
+    def vector_marks(self) -> Marks | None:
+        """Marks of the vectors, read once; None if they are missing or cannot be used."""
+        return finished.vectors_marks(self.vectors, self.grid)
 
     def _wanted(self, vectors: bool, volumes: bool) -> Iterator[tuple[Path, Stamp]]:
         if vectors:
-            yield self.vectors, self.stamps.vectors
+            yield self.vectors, self.stamp
         if volumes:
-            yield from ((path, self.stamps.volumes) for path in self.volumes)
+            yield from ((frame.path, frame.stamp) for frame in self.frames)
+
+    def _marks(self, path: Path) -> Marks | None:
+        """Return the marks of one of the files; None if it is missing or cannot be used."""
+        if path == self.vectors:
+            return self.vector_marks
+        return next(frame.marks() for frame in self.frames if frame.path == path)
 
     def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:
         """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""
         for path, stamp in self._wanted(vectors, volumes):
-            marks = provenance.read_marks(path)
+            marks = self._marks(path)
             changes = [] if marks is None else stamp.changes(marks)
             if changes or marks is None:
                 return changes
@@ -105,13 +213,20 @@ class PairFiles:
 
     def fitting_vectors(self) -> Marks | None:
         """Return the marks of the vectors; None if they are missing or do not fit."""
-        marks = provenance.read_marks(self.vectors)
-        return marks if self.stamps.vectors.fits(marks) else None
+        marks = self._marks(self.vectors)
+        return marks if self.stamp.fits(marks) else None
 
     def fitting_volumes(self) -> tuple[Marks, ...] | None:
         """Return the marks of both volumes; None if one is missing or does not fit."""
-        marks = tuple(found for path in self.volumes if (found := provenance.read_marks(path)) is not None)
-        return marks if len(marks) == 2 and all(map(self.stamps.volumes.fits, marks)) else None
+        marks = tuple(found for frame in self.frames if (found := frame.fitting()) is not None)
+        return marks if len(marks) == 2 else None
+
+    def read_volumes(self) -> tuple[FrameVolume, FrameVolume] | None:
+        """Read both volumes and their records; None if one is missing or does not fit."""
+        if self.fitting_volumes() is None:
+            return None
+        first, second = (frame.read() for frame in self.frames)
+        return None if first is None or second is None else (first, second)
 
     def retire_outdated(self) -> Iterator[tuple[Path, Path]]:
         """Rename the results whose images changed; yield old and new paths."""
@@ -122,47 +237,36 @@ class PairFiles:
                     aside = retire(path)
                 yield path, aside
 
-    def read_volumes(self) -> PairVolumes | None:
-        """Read both volumes and their records; None if one is missing or does not fit."""
-        if self.fitting_volumes() is None:
-            return None
-        first, second = (netcdf.read_volume(path) for path in self.volumes)
-        a, b = (_read_record(volume, path) for volume, path in zip((first, second), self.volumes, strict=True))
-        return PairVolumes(volumes=(first, second), records=(a, b))
-
-    def write_volumes(self, pair: PairVolumes) -> None:
-        """Write both volumes with their records, each file atomically."""
-        for volume, record, path in zip(pair.volumes, pair.records, self.volumes, strict=True):
-            attributes = {
-                **self.stamps.volumes.attributes,
-                "seconds": record.seconds,
-                "warnings": warn.to_text(record.warnings),
-                "pair": self.pair,
-                "frame": record.frame,
-            }
-            of_images = {"cameras": list(record.structure), "structure": list(record.structure.values())}
-            with writing(path):
-                netcdf.write_volume(volume.assign_attrs(of_images), path, attributes=attributes)
-                path.with_suffix(RETIRED).unlink(missing_ok=True)
-
     def write_vectors(self, vectors: xr.Dataset, condensed: xr.Dataset, attributes: Mapping[str, Any]) -> None:
         """Write the vectors and the condensed volumes into one file, atomically."""
-        marks = {**self.stamps.vectors.attributes, "pair": self.pair, **attributes}
+        marks = {**self.stamp.attributes, **self.origin, **attributes}
         with writing(self.vectors):
             netcdf.write_vectors(vectors, self.vectors, attributes=marks, reconstruction=condensed)
             self.vectors.with_suffix(RETIRED).unlink(missing_ok=True)
 
 
+def _origin(experiment: Experiment, frame: Frame) -> dict[str, Any]:
+    """Return the attributes that say of what a volume is."""
+    if experiment.series is None:
+        return {"pair": frame.number, "frame": frame.name}
+    return {"instant": frame.number, "time_s": experiment.instant_s(frame.number)}
+
+
+def _instant(experiment: Experiment, instant: int) -> dict[str, Any]:
+    assert experiment.series is not None
+    return {"instant": instant, "step": experiment.series.step, "time_s": experiment.instant_s(instant)}
+
+
 def _read_record(volume: xr.DataArray, path: Path) -> FrameRecord:
     stored = netcdf.read_attributes(path)
-    structure = {}
-    if "structure" in volume.attrs:
-        cameras = volume.attrs["cameras"]
-        names = json.loads(cameras) if isinstance(cameras, str) else cameras
-        structure = dict(zip(names, np.atleast_1d(volume.attrs["structure"]).tolist(), strict=True))
-    return FrameRecord(
-        frame=str(stored["frame"]),
-        structure=structure,
-        warnings=provenance.stored_warnings(stored),
-        seconds=float(stored["seconds"]),
-    )
+    try:
+        cameras = volume.attrs.get("cameras", [])
+        names = read_json(cameras) if isinstance(cameras, str) else cameras
+        values = np.atleast_1d(volume.attrs.get("structure", [])).tolist()
+        return FrameRecord(
+            structure=validate(dict[str, float], dict(zip(names, values, strict=True)) if values else {}),
+            warnings=provenance.stored_warnings(stored),
+            seconds=validate(float, stored.get("seconds")),
+        )
+    except (ValueError, TypeError) as error:
+        raise DamagedFile(path, f"its attributes have another form: {error}") from None

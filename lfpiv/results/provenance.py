@@ -9,7 +9,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,12 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv import files, warn
-from lfpiv.experiment.davis import split_frame
-from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv import files, hdf5, warn
+from lfpiv.errors import DamagedFile
+from lfpiv.experiment import images
+from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
+from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.geometry.grid import NO_LAYERS, Layers
+from lfpiv.records import RecordError, read_json, read_object, validate
 from lfpiv.version import __version__
 from lfpiv.warn import Warning
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +45,10 @@ class Marks:
     """Figures for the summary; None in files without."""
     warnings: tuple[Warning, ...] = ()
     """Warnings about the images it was made from."""
+    frame: str = ""
+    """Frame of a volume, as the experiment names it; empty in other files."""
+    sealed: bool = False
+    """Whether a digest shows that the file is as it was written; files of earlier versions have none."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +76,8 @@ class Stamp:
         if marks.settings_hash == self.hash:
             return []
         try:
-            before = dict(json.loads(marks.depends_on))
-        except (ValueError, TypeError):
+            before = read_object(marks.depends_on)
+        except RecordError:
             return ["settings or images"]
         now = files.plain(self.parts)
         found = []
@@ -90,37 +101,132 @@ class Stamp:
 class PairStamps:
     """Stamps of the results of one pair."""
 
-    volumes: Stamp
+    volumes: tuple[Stamp, Stamp]
+    """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
     vectors: Stamp
 
 
 def read_marks(path: Path) -> Marks | None:
-    """Read the marks of a finished NetCDF or HDF5 file; None if it is missing or cannot be read."""
-    import h5py
+    """Read the marks of a finished NetCDF or HDF5 file, verified; None if it is missing or damaged.
 
+    The log names a damaged file and the reason.
+    """
     try:
-        with h5py.File(path, "r") as file:
-            names = ("settings_hash", "depends_on", "figures", "warnings", "findings")
-            found = {name: str(file.attrs[name]) for name in names if name in file.attrs}
-    except OSError:
+        return require_marks(path)
+    except FileNotFoundError:
         return None
-    return Marks(
-        settings_hash=found.get("settings_hash", ""),
-        depends_on=found.get("depends_on", ""),
-        figures=json.loads(found["figures"]) if "figures" in found else None,
-        warnings=stored_warnings(found),
-    )
+    except DamagedFile as error:
+        reject(path, error.reason)
+        return None
+
+
+def require_marks(path: Path) -> Marks:
+    """Read the marks of a finished file, verified.
+
+    Raises
+    ------
+    FileNotFoundError
+        If it is missing.
+    DamagedFile
+        If its bytes are not those that were written, it is a copy of another file, or its marks have another form.
+    """
+    names = ("settings_hash", "depends_on", "figures", "warnings", "findings", "frame")
+    with hdf5.opened(path, values=False) as file:
+        sealed = hdf5.SEALED in file.attrs
+        found = {name: _text(file.attrs[name], name) for name in names if name in file.attrs}
+        require_name(path, file.attrs)
+    if not sealed:
+        _note_unsealed(path.parent)
+    try:
+        if found.get("depends_on"):
+            read_object(found["depends_on"])
+        return Marks(
+            settings_hash=found.get("settings_hash", ""),
+            depends_on=found.get("depends_on", ""),
+            figures=read_object(found["figures"]) if "figures" in found else None,
+            warnings=stored_warnings(found),
+            frame=found.get("frame", ""),
+            sealed=sealed,
+        )
+    except RecordError as error:
+        raise DamagedFile(path, f"its attributes have another form: {error}") from None
+
+
+def reject(path: Path, reason: str) -> None:
+    """Log that a file is not used, with the reason."""
+    log.warning("%s: damaged or foreign, not used: %s", path, reason)
+
+
+def _text(value: Any, name: str) -> str:
+    if not isinstance(value, str):
+        raise RecordError(f"expected text in {name!r}, found {type(value).__name__}")
+    return value
+
+
+_PAIR_OF_NAME = re.compile(r"pair_(\d+)(?:_[ab])?\.nc")
+
+
+def require_name(path: Path, attributes: Mapping[str, Any]) -> None:
+    """Refuse a file that was written under another name, such as another pair's.
+
+    Raises
+    ------
+    DamagedFile
+        If the attributes of the file name another one.
+    """
+    if foreign := _other_name(path, attributes):
+        raise DamagedFile(path, f"it is {foreign} under another name")
+
+
+def _other_name(path: Path, attributes: Mapping[str, Any]) -> str:
+    """Return what a file was written as, if that is not its name; files of earlier versions state a pair only."""
+    named, match = attributes.get("file"), _PAIR_OF_NAME.fullmatch(path.name)
+    if named is not None:
+        return "" if named == path.name else str(named)[:80]
+    pair = attributes.get("pair")
+    if match is None or pair is None:
+        return ""
+    return "" if np.ndim(pair) == 0 and pair == int(match[1]) else f"pair {str(pair)[:40]}"
+
+
+_noted: set[Path] = set()
+
+
+def _note_unsealed(folder: Path) -> None:
+    """Log once for a folder that its files have no digest."""
+    if folder not in _noted:
+        _noted.add(folder)
+        log.info("%s: files of an earlier version have no digest; damage to them can be seen only in part", folder)
 
 
 def background_content(path: Path) -> str | None:
     """Return the hash of the light in a stored background, whether it fits or not; None if it subtracts nothing."""
     marks = read_marks(path)
-    return None if marks is None or marks.figures is None else marks.figures["content"]
+    content = None if marks is None or marks.figures is None else marks.figures.get("content")
+    return content if isinstance(content, str) else None
+
+
+def background_figures(path: Path) -> tuple[Mapping[str, Mapping[str, float | None]], tuple[Warning, ...]]:
+    """Return the figures of each camera and the warnings of a stored background; empty ones if there is none."""
+    marks = read_marks(path)
+    if marks is None or marks.figures is None:
+        return {}, ()
+    try:
+        return validate(dict[str, dict[str, float | None]], marks.figures.get("cameras")), marks.warnings
+    except RecordError as error:
+        reject(path, f"its figures have another form: {error}")
+        return {}, marks.warnings
 
 
 def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
-    """Read the warnings in the attributes of a file; version 0.1.0 calls them findings."""
-    return warn.from_text(attributes.get("warnings", attributes.get("findings", "[]")))
+    """Read the warnings in the attributes of a file; version 0.1.0 calls them findings.
+
+    Raises
+    ------
+    RecordError
+        If they are no list of warnings.
+    """
+    return warn.from_list(read_json(attributes.get("warnings", attributes.get("findings", "[]"))))
 
 
 def _orientation(camera: CameraSetup) -> float | list[float] | None:
@@ -135,6 +241,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
     """Return the stamp of the calibration."""
     cameras = {
         camera.name: [dataclasses.asdict(camera.optics), _orientation(camera), camera.image_flip]
+        + ([camera.raw.model_dump()] if camera.raw else [])
         for camera in experiment.cameras
     }
     return Stamp(
@@ -143,7 +250,7 @@ def of_calibration(experiment: Experiment) -> Stamp:
             "camera": cameras,
             "board": experiment.board.model_dump(exclude=None if experiment.board.mark else {"mark"}),
             "network": experiment.network.model_dump(),
-            "images": content_hash(experiment.calibration_paths()),
+            "images": content_hash(experiment.calibration_images()),
         }
     )
 
@@ -160,11 +267,16 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
         Pairs from which the light is estimated.
     """
     recorded = {camera.name: camera.background for camera in experiment.cameras}
-    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    paths = [
+        path
+        for pair in pairs
+        for frame in background_frames(experiment, pair)
+        for path in experiment.frame_paths(frame)
+    ]
     images = [
         path
         for name in recorded
-        for frame in experiment.frames
+        for frame in lit_frames(experiment)
         if (path := experiment.background_path(name, frame)) is not None
     ]
     return Stamp(
@@ -178,8 +290,18 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
     )
 
 
+def lit_frames(experiment: Experiment) -> tuple[str, ...]:
+    """Return the names of the frames that lasers of their own light; one laser lights all instants of a series."""
+    return experiment.frames if experiment.series is None else experiment.frames[:1]
+
+
+def background_frames(experiment: Experiment, pair: int) -> tuple[Frame, ...]:
+    """Return the frames of a pair from which standing light is estimated: both, or the first instant of a series."""
+    return experiment.pair_frames(pair)[: len(lit_frames(experiment))]
+
+
 def _existing(paths: Iterable[Path]) -> list[Path]:
-    return [path for path in paths if split_frame(path)[0].is_file()]
+    return [path for path in paths if split(path).file.is_file()]
 
 
 def of_self_calibration(experiment: Experiment, calibration: str, background: str | None = None) -> Stamp | None:
@@ -224,9 +346,28 @@ def of_pair(
     `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
     the guard layers of the volumes.
     """
+    parts, start = _of_light(experiment, calibration, background, guard), experiment.path.parent
+    of_pair = parts | {"images": _identity(experiment.pair_paths(pair), start)}
+    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    if experiment.series is None:
+        volumes = Stamp(of_pair)
+        return PairStamps(volumes=(volumes, volumes), vectors=Stamp(of_pair | of_vectors))
+    first, second = (
+        Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
+        for instant in experiment.pair_frames(pair)
+    )
+    of_vectors["step"] = experiment.series.step
+    return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
+
+
+def _of_light(experiment: Experiment, calibration: str, background: str | None, guard: Layers) -> dict[str, Any]:
+    """Return the parts of the stamp of volumes; the identity of the images is None and to be filled in."""
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
-    parts = {
+    particles: dict[str, Any] = {"images": experiment.particle_images}
+    if experiment.series is None:
+        particles["frames"] = list(experiment.frames)
+    return {
         "calibration": calibration,
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
@@ -235,12 +376,10 @@ def of_pair(
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
-        "particles": {"images": experiment.particle_images, "frames": list(experiment.frames)},
-        "images": _identity(experiment.pair_paths(pair), experiment.path.parent),
+        "particles": particles,
+        "images": None,
         "background": background,
     }
-    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
-    return PairStamps(volumes=Stamp(parts), vectors=Stamp(parts | of_vectors))
 
 
 def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
@@ -258,21 +397,24 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
 def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
     """Return path from `start`, size and time of the last change of images; None if one is missing."""
     try:
-        found = [(path, split_frame(path)[0].stat()) for path in paths]
+        found = [(path, split(path).file.stat()) for path in paths]
     except OSError:
         return None
     return [[os.path.relpath(path, start), status.st_size, status.st_mtime_ns] for path, status in found]
 
 
-def content_hash(paths: Iterable[Path]) -> str:
-    """Hash the bytes of several images, in order, and the frame's number if it is named."""
+def content_hash(sources: Iterable[ImagePath]) -> str:
+    """Hash several images, in order: the bytes of whole files, the grey values of parts of files."""
     digest = hashlib.blake2b(digest_size=16)
-    for path in paths:
-        image, frame = split_frame(path)
-        with image.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-        digest.update(b"end of file" + frame.encode())
+    for source in sources:
+        if source.part:
+            grey = images.read_image(source.path, "part of a file", raw=source.raw)
+            digest.update(repr(grey.shape).encode() + grey.tobytes())
+        else:
+            with source.file.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+        digest.update(b"end of file" + source.part.encode())
     return digest.hexdigest()
 
 

@@ -11,25 +11,28 @@ import io
 import json
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lfpiv import files
-from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv import files, hdf5
+from lfpiv.errors import DamagedFile, InputError
+from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
-from lfpiv.lightfield import background, image_checks
+from lfpiv.lightfield import background, decorrelation, image_checks
 from lfpiv.lightfield.background import Series
 from lfpiv.lightfield.standing_light import StandingLight, nothing
 from lfpiv.progress import StepProgress
-from lfpiv.results import provenance
+from lfpiv.records import RecordError, read_object, validate
+from lfpiv.results import netcdf, provenance
 from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.warn import Code, Warning, to_text, warn
 
 if TYPE_CHECKING:
+    import h5py
+
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.runs.run import Run
 
@@ -38,7 +41,7 @@ log = logging.getLogger(__name__)
 LARGE_SHARE = 0.02
 """Share of an image's light that stands still and is not subtracted, above which a warning is due."""
 LONGEST_SERIES = 32
-"""Largest number of pairs, evenly spread, from which the standing light is estimated."""
+"""Largest number of pairs, evenly spread, from which the standing light is estimated; of instants twice as many."""
 MEDIAN_PAIRS = 7
 """The same for a median, which holds both frames of all pairs in memory."""
 WARNING_PAIRS = 4
@@ -72,13 +75,17 @@ def prepare(run: Run, calibration: Calibration) -> Background:
     experiment, path = run.experiment, run.folder.background
     pairs = series(experiment)
     stamp = provenance.of_background(experiment, run.calibration_stamp.hash, pairs)
-    marks = provenance.read_marks(path)
+    marks, found = provenance.read_marks(path), None
     if marks is not None and marks.figures is not None and (stamp.fits(marks) or _images_lost(stamp, marks)):
-        log.info("background: estimated before from the same images, kept")
-        found = load(path)
-    else:
+        try:
+            found = load(path, calibration)
+            log.info("background: estimated before from the same images, kept")
+        except DamagedFile as error:
+            provenance.reject(path, error.reason)
+            found = None
+    if found is None:
         found = estimate(experiment, calibration.cameras, pairs, run.step("background"))
-        _write(found, path, stamp.attributes)
+        write(found, path, stamp.attributes)
     for warning in found.warnings:
         warn(log, warning)
     return found
@@ -88,14 +95,17 @@ def _images_lost(stamp: Stamp, marks: Marks) -> bool:
     """Return whether all that changed is that some images are missing, because raw data may be deleted."""
     if stamp.changes(marks) != ["images"]:
         return False
-    before = json.loads(marks.depends_on)["images"] or []
+    before = read_object(marks.depends_on).get("images") or []
     return all(image in before for image in files.plain(stamp.parts)["images"] or [])
 
 
 def series(experiment: Experiment) -> list[int]:
-    """Return the pairs from which the standing light is estimated, evenly spread over all."""
+    """Return the pairs from which the standing light is estimated, evenly spread over all.
+
+    A pair of a time series gives one image: in two successive ones the same particles overlap, which chance does not.
+    """
     longest = {"median": MEDIAN_PAIRS, "none": WARNING_PAIRS}.get(experiment.background, LONGEST_SERIES)
-    return experiment.spread_pairs(longest)
+    return experiment.spread_pairs(longest if experiment.series is None else 2 * longest)
 
 
 def estimate(
@@ -106,7 +116,7 @@ def estimate(
     for number, (name, camera) in enumerate(cameras.items()):
         dark = experiment.dark(name)
         if experiment.camera(name).background is not None:
-            images = [experiment.background_image(name, frame) for frame in experiment.frames]
+            images = [experiment.background_image(name, frame) for frame in provenance.lit_frames(experiment)]
             found[name] = background.recorded_light(
                 [_without_dark(image, dark, camera) for image in images if image is not None], camera.decoder
             )
@@ -119,7 +129,7 @@ def estimate(
     warnings = tuple(_warnings(experiment, standing, len(pairs)))
     if experiment.background == "none":
         return Background(figures=figures, warnings=warnings)
-    return Background(standing, _digest(standing), figures, warnings)
+    return Background(standing, content_hash(standing), figures, warnings)
 
 
 def _figures(light: StandingLight) -> dict[str, Any]:
@@ -153,7 +163,13 @@ def _of_series(
     """Estimate the standing light of one camera from pairs; those that cannot be used are left out."""
     median = experiment.background == "median"
     everywhere = experiment.background == "minimum"
-    first, second, kept = _read_series(experiment, camera, dark, pairs, keep=median)
+    chance = experiment.series is not None and not (median or everywhere)
+    apart = _independent_after(experiment, camera, dark, pairs) if chance else 1
+    if apart is None:
+        text = "particles move too little within the series to tell their light from light that stands"
+        log.info("background of %s: %s, nothing is subtracted", camera.name, text)
+        return nothing(camera.decoder)
+    first, second, kept = _read_series(experiment, camera, dark, pairs, apart, keep=median)
     if not first.count:
         return nothing(camera.decoder)
     if median:
@@ -161,10 +177,38 @@ def _of_series(
     else:
         found = background.standing_light(first, second, everywhere=everywhere)
         if found.region.any():  # again, with the images at equal power of the laser
-            first, second, _ = _read_series(experiment, camera, dark, pairs, estimate=found)
+            first, second, _ = _read_series(experiment, camera, dark, pairs, apart, estimate=found)
             found = background.standing_light(first, second, everywhere=everywhere)
-    _log_series(camera.name, found, first.count)
+    _log_series(experiment, camera.name, found, first.count)
     return found
+
+
+def _independent_after(
+    experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, pairs: list[int]
+) -> int | None:
+    """Return the number of instants after which particles are elsewhere; None where the series does not show it."""
+    instants = sorted({frame for pair in pairs for frame in experiment.pair_frames(pair)})
+    overlaps: dict[int, list[float]] = {}
+    for end in (instants[0], instants[-1]):
+        reference = _light(experiment, camera, dark, end)
+        for instant in instants:
+            light = None if instant == end else _light(experiment, camera, dark, instant)
+            if light is not None and reference is not None:
+                overlaps.setdefault(abs(instant.number - end.number), []).append(
+                    decorrelation.overlap(reference, light)
+                )
+    lags = sorted(overlaps)
+    return decorrelation.independent_after(lags, [float(np.mean(overlaps[lag])) for lag in lags])
+
+
+def _light(
+    experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, frame: Frame
+) -> np.ndarray | None:
+    """Return the light of an image; None if it cannot be used."""
+    try:
+        return _without_dark(experiment.particle_image(camera.name, *frame), dark, camera)[0]
+    except InputError:
+        return None
 
 
 def _read_series(
@@ -172,46 +216,53 @@ def _read_series(
     camera: CalibratedCamera,
     dark: np.ndarray | None,
     pairs: list[int],
+    apart: int,
     *,
     keep: bool = False,
     estimate: StandingLight | None = None,
-) -> tuple[Series, Series, tuple[list[np.ndarray], list[np.ndarray]]]:
+) -> tuple[Series, Series | None, tuple[list[np.ndarray], list[np.ndarray]]]:
     """Read the images of one camera; return the series of both frames, and with `keep` all light.
 
-    An `estimate` gives the power of the laser in each image, by which it is divided.
+    All images of a time series are of one frame: one laser lights them. They are independent when they are `apart`
+    instants apart. An `estimate` gives the power of the laser in each image, by which it is divided.
     """
     series = Series(camera.decoder, 0), Series(camera.decoder, 1)
     kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for pair in pairs:
+        frames = provenance.background_frames(experiment, pair)
         try:
-            images = [experiment.particle_image(camera.name, pair, frame) for frame in experiment.frames]
+            images = [experiment.particle_image(camera.name, *frame) for frame in frames]
         except InputError as error:  # the pair fails when it is reconstructed
-            log.debug("background of %s: pair %d is left out: %s", camera.name, pair, error)
+            log.debug("background of %s: %s is left out: %s", camera.name, experiment.name_of(pair), error)
             continue
-        for number, image in enumerate(images):
+        for frame, image in zip(frames, images, strict=True):
+            number = experiment.frames.index(frame.name)
+            shift = None if experiment.series is None else 2 * (frame.number // apart)
             light, noise, saturated = _without_dark(image, dark, camera)
             power = 1.0 if estimate is None else estimate.power(light, number)
-            series[number].add(light / np.float32(power), noise / power, saturated)
+            series[number].add(light / np.float32(power), noise / power, saturated, shift)
             if keep:
                 kept[number].append(light)
-    return *series, kept
+    return series[0], series[1] if experiment.series is None else None, kept
 
 
-def _log_series(name: str, light: StandingLight, pairs: int) -> None:
+def _log_series(experiment: Experiment, name: str, light: StandingLight, count: int) -> None:
+    images = f"{count} {experiment.noun}s"
     if light.at_rest:
         text = "light stands nearly everywhere, as that of particles at rest: nothing is subtracted"
         log.info('background of %s: %s. particles.background = "minimum" subtracts it', name, text)
         return
     if not light.found:
-        log.info("background of %s: nothing stands out in %d pairs, nothing is subtracted", name, pairs)
+        log.info("background of %s: nothing stands out in %s, nothing is subtracted", name, images)
         return
     frames = "both frames" if light.ratio is not None else "each frame"
+    if experiment.series is None:
+        images = f"{frames} of {images}"
     log.info(
-        "background of %s: estimated from %s of %d pairs; light stands in %.1f %% of the sensor, %d pixels are "
+        "background of %s: estimated from %s; light stands in %.1f %% of the sensor, %d pixels are "
         "unusable, stray light of %.1f counts",
         name,
-        frames,
-        pairs,
+        images,
         100 * light.region.mean(),
         np.count_nonzero(light.unusable),
         light.stray,
@@ -227,7 +278,8 @@ def _without_dark(
     return image - np.float32(level), noise, image_checks.saturated_pixels(raw)
 
 
-def _digest(standing: Mapping[str, StandingLight]) -> str | None:
+def content_hash(standing: Mapping[str, StandingLight]) -> str | None:
+    """Return the hash of the light of all cameras; None where nothing is subtracted."""
     if not standing:
         return None
     digest = hashlib.blake2b(digest_size=8)
@@ -237,46 +289,80 @@ def _digest(standing: Mapping[str, StandingLight]) -> str | None:
     return digest.hexdigest()
 
 
-def load(path: Path) -> Background:
-    """Read a background that `prepare` stored.
+@dataclass(frozen=True, kw_only=True)
+class _Light:
+    """Numbers of one camera's standing light, as its file stores them."""
+
+    found: bool
+    stray: float
+    ratio: float | None
+    share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Figures:
+    """Figures of a background, as its file stores them."""
+
+    content: str | None
+    cameras: dict[str, dict[str, float | None]]
+
+
+def load(path: Path, calibration: Calibration) -> Background:
+    """Read a background that `prepare` stored for the cameras of a calibration.
 
     Raises
     ------
     InputError
-        If the file cannot be read.
+        If the file is missing, damaged, or of other cameras.
     """
-    import h5py
-
     try:
-        with h5py.File(path, "r") as file:
-            figures, stored = json.loads(file.attrs["figures"]), provenance.stored_warnings(file.attrs)
-            found = {}
-            for name, group in file.items():
-                first, second = group["light"][()]
-                found[name] = StandingLight(
-                    light=(first, second),
-                    unusable=group["unusable"][()],
-                    region=group["region"][()],
-                    **json.loads(group.attrs["figures"]),
-                )
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: expected a stored background, could not read it ({error}). Remove it.") from None
-    return Background(found, figures["content"], figures["cameras"], stored)
+        with hdf5.opened(path) as file:
+            figures = validate(_Figures, read_object(file.attrs["figures"]))
+            warnings = provenance.stored_warnings(file.attrs)
+            strange = set(file) - set(calibration.cameras)
+            if strange:
+                raise DamagedFile(path, f"it is of other cameras: {', '.join(sorted(strange))}")
+            found = {
+                name: _read_light(file[name], camera.optics.sensor_shape)
+                for name, camera in calibration.cameras.items()
+                if name in file
+            }
+            if content_hash(found) != figures.content:
+                raise DamagedFile(path, "its light is not that of its figures")
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a stored background, found no such file. Run `lfpiv run`.") from None
+    return Background(found, figures.content, figures.cameras, warnings)
 
 
-def _write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
+def _read_light(group: h5py.Group, shape: tuple[int, int]) -> StandingLight:
+    """Read one camera's light; its arrays must have the shape of the sensor."""
+    expected = {"light": ((2, *shape), "f"), "unusable": (shape, "b"), "region": (shape, "b")}
+    for name, (size, kind) in expected.items():
+        if group[name].shape != size or group[name].dtype.kind != kind:
+            raise RecordError(f"{group.name}/{name}: expected {size}, found {group[name].shape} {group[name].dtype}")
+    (first, second), numbers = group["light"][()], validate(_Light, read_object(group.attrs["figures"]))
+    if not (np.isfinite(first).all() and np.isfinite(second).all()):
+        raise RecordError(f"{group.name}/light: expected finite numbers")
+    return StandingLight(
+        light=(first, second), unusable=group["unusable"][()], region=group["region"][()], **asdict(numbers)
+    )
+
+
+def write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
+    """Write a background with the attributes of its stamp, atomically."""
     import h5py
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
     with h5py.File(content, "w") as file:
-        file.attrs.update(attributes)
+        file.attrs.update({**attributes, netcdf.FILE: path.name})
         file.attrs["figures"] = json.dumps({"content": found.content, "cameras": found.figures})
         file.attrs["warnings"] = to_text(found.warnings)
         for name, light in found.cameras.items():
             group = file.create_group(name)
             arrays = {"light": np.stack(light.light), "unusable": light.unusable, "region": light.region}
             for key, value in arrays.items():
-                group.create_dataset(key, data=value, compression="gzip", compression_opts=1)
+                group.create_dataset(key, data=value, **hdf5.options(value.shape))
             group.attrs["figures"] = json.dumps(light.figures)
+    hdf5.seal(content)
     with writing(path):
         files.write_bytes(content.getbuffer(), path)

@@ -1,7 +1,8 @@
 """Distribute pairs: one after the other in this process, or in parallel to worker processes that Dask watches.
 
-If a worker dies, its pair is tried once more, in another worker and after all other pairs. If that worker dies too, the
-pair has failed.
+A worker gets a stretch: one image pair, or pairs of a series that share their instants (`lfpiv.runs.stretches`). If a
+worker dies, its stretch is tried once more, in another worker and after all others. If that worker dies too, the pairs
+of the stretch have failed, but for those that were finished before.
 """
 
 from __future__ import annotations
@@ -11,17 +12,22 @@ import itertools
 import logging
 import os
 import queue
-from collections import deque
-from collections.abc import Generator, Sequence
+from collections import Counter, deque
+from collections.abc import Generator, Iterable, Sequence
+from operator import length_hint
 from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import ClusterError, InputError, StorageError
-from lfpiv.progress import StepProgress, part_of
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.progress import StepProgress
 from lfpiv.runs import cluster_workers, local_workers, worker
 from lfpiv.runs.local_workers import Capacity
 from lfpiv.runs.pair import Outcome, PairWork
+from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut
+from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan
+from lfpiv.warn import name_pairs
 from lfpiv_kernels.runtime import cores
 
 log = logging.getLogger(__name__)
@@ -32,25 +38,40 @@ TICK_S = 0.5
 """Interval at which the state of the cluster is checked and progress is reported [s]."""
 
 
-def sequential(work: PairWork, todo: Sequence[int], progress: StepProgress) -> Generator[Outcome, None, None]:
-    """Do pairs one after the other in this process; yield the outcome of each."""
-    for number, pair in enumerate(todo):
-        step = part_of(progress, number / len(todo), (number + 1) / len(todo))
-        step(0.0)
-        yield work.do(pair, step)
+def sequential(work: PairWork, todo: Iterable[int], progress: StepProgress) -> Generator[Outcome, None, None]:
+    """Do pairs one after the other in this process; yield the outcome of each.
+
+    Pairs are taken from `todo` when their turn comes; those of a series come along its chains. `operator.length_hint`
+    says how many may come.
+    """
+    source = iter(todo)
+    total = max(length_hint(source), 1)
+    before = _kept(todo)
+    progress(0.0)
+    yield from work.do(source, lambda number, fraction: progress((_kept(todo) - before + number + fraction) / total))
+
+
+def _kept(todo: Iterable[int]) -> int:
+    """Return the number of pairs that were passed over because they are finished."""
+    return todo.finished[1] if isinstance(todo, Todo) else 0
+
+
+def _step(experiment: Experiment) -> int | None:
+    return None if experiment.series is None else experiment.series.step
 
 
 def parallel(
-    shared: Path, todo: Sequence[int], workers: Plan | str, progress: StepProgress
+    shared: Path, experiment: Experiment, todo: Iterable[int], workers: Plan | str, progress: StepProgress
 ) -> Generator[Outcome, None, None]:
     """Do pairs in parallel, in any order; yield the outcome of each.
 
     Parameters
     ----------
     shared : Path
-        Folder with everything that the workers need, from `worker.share`.
-    todo : sequence of int
-        Pairs to do.
+        Folder with everything that the workers need, from `task.write_task`.
+    experiment : Experiment
+    todo : iterable of int
+        Pairs to do; each is taken when a worker is free.
     workers : Plan or str
         Processes to start on this machine, or the address of a Dask scheduler whose workers see `shared`.
     progress : callable
@@ -70,120 +91,162 @@ def parallel(
     found = (
         cluster_workers.workers(workers, shared) if isinstance(workers, str) else local_workers.workers(workers, shared)
     )
+    total = max(length_hint(todo), 1)
+    stretches = cut(todo, _step(experiment), CLUSTER_WORKERS if isinstance(workers, str) else workers.workers)
     with found as (client, capacity):
-        yield from Dispatch(client, capacity, shared, todo).outcomes(progress)
+        yield from Dispatch(client, capacity, shared, stretches, total, experiment.noun).outcomes(progress)
 
 
 class Dispatch:
-    """Pairs of a run on their way to and from the workers of a Dask client."""
+    """Stretches of pairs of a run on their way to and from the workers of a Dask client."""
 
-    def __init__(self, client: Any, capacity: Capacity, shared: Path, todo: Sequence[int]):
-        self.client, self.capacity, self.shared = client, capacity, shared
-        self.total, self.done = len(todo), 0
-        self.waiting, self.again = deque(todo), deque[int]()
-        """Pairs to submit now, and after all others."""
-        self.running: dict[str, tuple[Any, int]] = {}
-        """Key of Dask -> future and pair; futures that are not referenced are cancelled."""
-        self.fractions: dict[int, float] = {}
-        """Pair -> finished fraction, as its worker reports it."""
+    def __init__(
+        self,
+        client: Any,
+        capacity: Capacity,
+        shared: Path,
+        todo: Iterable[Stretch],
+        total: int,
+        noun: str = "pair",
+    ):
+        self.client, self.capacity, self.shared, self.noun = client, capacity, shared, noun
+        self.total, self.done = total, 0
+        """Largest number of pairs that may come, and the number of those that were done."""
+        self.coming, self.all_came = iter(todo), False
+        """Stretches to submit after those that wait, and whether there are no more."""
+        self.waiting, self.again = deque[Stretch](), deque[Stretch]()
+        """Stretches to submit now, and after all others."""
+        self.running: dict[str, tuple[Any, Stretch]] = {}
+        """Key of Dask -> future and stretch; futures that are not referenced are cancelled."""
+        self.fractions: dict[str, float] = {}
+        """Key of Dask -> number of finished pairs and parts of one, as its worker reports it."""
         self.tried: set[int] = set()
-        """Pairs whose worker died once."""
+        """First pairs of stretches whose worker died once."""
+        self.beside: Counter[int] = Counter()
+        """Pair at a seam -> number of finished stretches beside it."""
+        self.ready: set[int] = set()
+        """Pairs at seams that can be done; they go first, so that the volumes stored for them can be removed."""
         self.numbers = itertools.count()
         self.arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.topic = f"lfpiv-{shared.name}"
 
     def outcomes(self, progress: StepProgress) -> Generator[Outcome, None, None]:
-        """Submit all pairs and yield their outcomes."""
+        """Submit all stretches and yield the outcomes of their pairs."""
         self.client.subscribe_topic(self.topic, lambda event: self.fractions.update([event[1]]))
         try:
-            while self.done < self.total:
+            while True:
                 self._submit()
+                if self.all_came and not (self.running or self.waiting or self.again):
+                    return
                 progress(self._fraction())
                 try:
                     future = self.arrived.get(timeout=TICK_S)
                 except queue.Empty:
                     continue
-                outcome = self._outcome(future)
-                if outcome is not None:
+                for outcome in self._outcomes(future):
                     self.done += 1
                     yield outcome
         finally:
             with contextlib.suppress(Exception):  # the cluster may be lost
                 self.client.unsubscribe_topic(self.topic)
 
+    def _next(self) -> Stretch | None:
+        """Return the stretch to submit next; None if all are submitted."""
+        if not self.waiting:
+            if (coming := next(self.coming, None)) is not None:
+                return coming
+            self.all_came = True
+            if not self.running:
+                self.waiting, self.again = self.again, self.waiting
+        return self.waiting.popleft() if self.waiting else None
+
     def _submit(self) -> None:
-        """Submit as many waiting pairs as the workers take."""
-        if not self.waiting and not self.running:
-            self.waiting, self.again = self.again, self.waiting
+        """Submit as many waiting stretches as the workers take."""
         room = self.capacity() - len(self.running)
-        while self.waiting and room > 0:
-            pair, room = self.waiting.popleft(), room - 1
-            name = f"{self.topic}-{pair}-{next(self.numbers)}"
-            future = self.client.submit(_in_worker, str(self.shared), pair, self.topic, key=name, pure=False)
-            self.running[name] = future, pair
+        while room > 0 and (stretch := self._next()) is not None:
+            room -= 1
+            first = stretch.pairs[0]
+            name = f"{self.topic}-{first}-{next(self.numbers)}"
+            options = {"priority": 1} if first in self.ready else {}
+            work = str(self.shared), stretch, self.topic, name
+            future = self.client.submit(_in_worker, *work, key=name, pure=False, **options)
+            self.running[name] = future, stretch
             future.add_done_callback(self.arrived.put)
 
     def _fraction(self) -> float:
-        running = sum(self.fractions.get(pair, 0.0) for _, pair in list(self.running.values()))
-        return (self.done + min(running, len(self.running))) / self.total
+        running = ((self.fractions.get(key, 0.0), len(stretch.pairs)) for key, (_, stretch) in self.running.items())
+        return (self.done + sum(min(counts) for counts in running)) / self.total
 
-    def _outcome(self, future: Any) -> Outcome | None:
-        """Return the outcome of a pair that came back; None if the pair is submitted once more."""
+    def _outcomes(self, future: Any) -> Sequence[Outcome]:
+        """Return the outcomes of a stretch that came back; none if it is submitted once more."""
         from distributed import KilledWorker
 
-        _, pair = self.running.pop(future.key)
-        self.fractions.pop(pair, None)
-        result = _fetched(future, pair) if future.status == "finished" else None
+        _, stretch = self.running.pop(future.key)
+        self.fractions.pop(future.key, None)
+        result = _fetched(future, self._name(stretch)) if future.status == "finished" else None
         if result is not None:
-            return _checked(result)
-        if future.status != "error":  # the scheduler forgot the pair when the connection to it broke
-            self.waiting.append(pair)
-            return None
+            outcomes = _checked(result)
+            self._finish(stretch)
+            return outcomes
+        if future.status != "error":  # the scheduler forgot the stretch when the connection to it broke
+            self.waiting.append(stretch)
+            return ()
+        first = stretch.pairs[0]
         if not isinstance(future.exception(), KilledWorker):
-            raise RuntimeError(f"the workers cannot do pair {pair}: {_first_line(future.exception())}")
-        if pair not in self.tried:
-            self.tried.add(pair)
-            self.again.append(pair)
-            log.info("pair %d: its worker died; it is tried once more in another one", pair)
-            return None
-        return Outcome(
-            pair=pair, reason="its worker died, in each of two trials: killed, a crash, or too little memory"
-        )
+            raise RuntimeError(f"the workers cannot do {self._name(stretch)}: {_first_line(future.exception())}")
+        if first not in self.tried:
+            self.tried.add(first)
+            self.again.append(stretch)
+            log.info("%s: its worker died; it is tried once more in another one", self._name(stretch))
+            return ()
+        self._finish(stretch)
+        reason = "its worker died, in each of two trials: killed, a crash, or too little memory"
+        return [Outcome(pair=pair, reason=reason, died=True) for pair in stretch.pairs]
+
+    def _name(self, stretch: Stretch) -> str:
+        return name_pairs(stretch.pairs, self.noun)
+
+    def _finish(self, stretch: Stretch) -> None:
+        """Submit the pairs at the seams of a finished stretch for which the stretch beyond is finished too."""
+        self.beside.update(stretch.seams)
+        for pair in stretch.seams:
+            if self.beside[pair] == 2:
+                del self.beside[pair]
+                self.ready.add(pair)
+                self.waiting.appendleft(Stretch((pair,)))
 
 
-def _fetched(future: Any, pair: int) -> worker.Result | None:
+def _fetched(future: Any, name: str) -> worker.Result | None:
     """Return the result of a finished future; None if the connection to the scheduler broke just now."""
     from distributed import CancelledError, TimeoutError
 
     try:
         found: worker.Result = future.result(timeout=FETCH_S)
     except TimeoutError:
-        raise ClusterError(
-            f"the scheduler does not deliver the result of pair {pair}. {cluster_workers.RESUME}"
-        ) from None
+        raise ClusterError(f"the scheduler does not deliver the result of {name}. {cluster_workers.RESUME}") from None
     except (CancelledError, OSError):
         return None
     return found
 
 
-def _checked(result: worker.Result) -> Outcome:
-    """Log what the worker logged and return the outcome; raise the error that ends the run."""
+def _checked(result: worker.Result) -> Sequence[Outcome]:
+    """Log what the worker logged and return the outcomes; raise the error that ends the run."""
     for name, level, text in result.records:
         logging.getLogger(name).log(level, "%s", text)
-    if result.outcome is None:
+    if result.outcomes is None:
         raise (StorageError if result.storage else InputError)(result.fatal)
-    return result.outcome
+    return result.outcomes
 
 
-def _in_worker(shared: str, pair: int, topic: str) -> worker.Result:
-    """Do one pair in a worker of Dask."""
+def _in_worker(shared: str, stretch: Stretch, topic: str, key: str) -> worker.Result:
+    """Do one stretch in a worker of Dask."""
     from distributed import get_client, get_worker
     from distributed.comm.addressing import get_address_host
 
     here = get_worker()
 
-    def report(pair: int, fraction: float) -> None:
-        here.log_event(topic, (pair, fraction))
+    def report(done: float) -> None:
+        here.log_event(topic, (key, done))
 
     def threads() -> int:
         if here.state.nthreads > 1:
@@ -194,7 +257,7 @@ def _in_worker(shared: str, pair: int, topic: str) -> worker.Result:
         places = list(client.run(_place, workers=near, on_error="return").values())
         return max(granted_cores() // max(places.count(_place()), 1), 1)
 
-    return worker.work_on(Path(shared), pair, report, threads)
+    return worker.work_on(Path(shared), Stretch(*stretch), report, threads)
 
 
 def _place() -> tuple[Any, ...]:

@@ -1,18 +1,19 @@
 """Read particle images: light without background, its noise, and warnings about the images.
 
-`frame_light` takes the calibrated cameras and their dark images, and returns light, noise and warnings of one frame.
-`pair_light` does so for both frames of a pair and compares them.
+`frame_light` takes the calibrated cameras and their dark images, and returns light, noise and warnings of one frame: a
+frame of a pair or an instant of a series. `compare` compares both frames of a pair. `pair_light` does both.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lfpiv.experiment.experiment import Frame
 from lfpiv.lightfield import image_checks
 from lfpiv.lightfield.particle_signal import seen_structure
 from lfpiv.lightfield.standing_light import remains_warnings
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 class FrameLight:
     """Images of one frame and figures measured in them; every mapping is by camera name."""
 
-    frame: str
+    frame: Frame
     images: Mapping[str, np.ndarray]
     """Images without dark image and background, shape (rows, columns), float32 [counts]."""
     noise: Mapping[str, float]
@@ -37,7 +38,7 @@ class FrameLight:
     fingerprints: Mapping[str, bytes]
     """Hash of the recorded pixels."""
     warnings: tuple[Warning, ...]
-    """Warnings about the images; those about both frames of a pair are with the first frame."""
+    """Warnings about the images; from `pair_light` those about both frames are with the first one."""
     seconds: float
     """Time that reading and checking took [s]."""
 
@@ -51,10 +52,12 @@ def frame_light(
     experiment: Experiment,
     cameras: Mapping[str, CalibratedCamera],
     darks: Mapping[str, np.ndarray | None],
-    pair: int,
-    frame: str,
+    frame: Frame,
+    read: Callable[[str, Frame], np.ndarray] | None = None,
 ) -> FrameLight:
-    """Read and check the images of one frame of a pair. `darks` is from `read_darks`.
+    """Read and check the images of one frame of a pair, or of one instant.
+
+    `darks` is from `read_darks`. `read` returns the image of a camera; default: it is read from its file.
 
     Raises
     ------
@@ -62,46 +65,47 @@ def frame_light(
         If an image is missing, damaged, of another shape, or uniform.
     """
     start = time.perf_counter()
+    label = frame.name if experiment.series is None else None
     images, noise, structure, fingerprints, warnings = {}, {}, {}, {}, list[Warning]()
     for name, camera in cameras.items():
-        raw, dark = experiment.particle_image(name, pair, frame), darks[name]
+        raw = experiment.particle_image(name, *frame) if read is None else read(name, frame)
+        dark = darks[name]
         image = raw if dark is None else raw - dark
         level, noise[name] = camera.decoder.background(image)
         light = image - np.float32(level)
         if camera.standing is not None:
-            light, noise[name] = camera.standing.subtract(light, noise[name], experiment.frames.index(frame))
+            light, noise[name] = camera.standing.subtract(light, noise[name], experiment.frames.index(frame.name))
         images[name] = light
         structure[name] = seen_structure(light, camera.decoder)
         fingerprints[name] = image_checks.fingerprint(raw)
         judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
-        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, frame)
+        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, label)
+    warnings += image_checks.signal_warnings(structure, label)
+    if experiment.series is not None:
+        warnings = [replace(warning, instants=(frame.number,)) for warning in warnings]
     return FrameLight(
         frame=frame,
         images=images,
         noise=noise,
         structure=structure,
         fingerprints=fingerprints,
-        warnings=(*warnings, *image_checks.signal_warnings(structure, frame)),
+        warnings=tuple(warnings),
         seconds=time.perf_counter() - start,
     )
 
 
-def pair_light(
-    experiment: Experiment,
-    cameras: Mapping[str, CalibratedCamera],
-    darks: Mapping[str, np.ndarray | None],
-    pair: int,
-) -> tuple[FrameLight, FrameLight]:
-    """Read and check the images of both frames of a pair; the parameters are those of `frame_light`.
+def compare(
+    experiment: Experiment, cameras: Mapping[str, CalibratedCamera], first: FrameLight, second: FrameLight
+) -> tuple[Warning, ...]:
+    """Compare both frames of a pair; return the warnings about both.
 
     Raises
     ------
     InputError
-        As `frame_light`, and if two images are the same, pixel by pixel.
+        If two images are the same, pixel by pixel.
     """
-    first, second = (frame_light(experiment, cameras, darks, pair, frame) for frame in experiment.frames)
     image_checks.require_different(
-        (f"{name}, pair {pair}, frame {one.frame}", fingerprint)
+        (f"{name}, {_name(experiment, one.frame)}", fingerprint)
         for one in (first, second)
         for name, fingerprint in one.fingerprints.items()
     )
@@ -116,4 +120,27 @@ def pair_light(
         if camera.standing is not None
         for warning in remains_warnings(camera.standing, first.images[name], second.images[name], name)
     ]
-    return replace(first, warnings=(*first.warnings, *uneven, *remains)), second
+    return (*uneven, *remains)
+
+
+def pair_light(
+    experiment: Experiment,
+    cameras: Mapping[str, CalibratedCamera],
+    darks: Mapping[str, np.ndarray | None],
+    pair: int,
+    read: Callable[[str, Frame], np.ndarray] | None = None,
+) -> tuple[FrameLight, FrameLight]:
+    """Read and check the images of both frames of a pair; the parameters are those of `frame_light`.
+
+    Raises
+    ------
+    InputError
+        As `frame_light`, and if two images are the same, pixel by pixel.
+    """
+    first, second = (frame_light(experiment, cameras, darks, frame, read) for frame in experiment.pair_frames(pair))
+    between = compare(experiment, cameras, first, second)
+    return replace(first, warnings=(*first.warnings, *between)), second
+
+
+def _name(experiment: Experiment, frame: Frame) -> str:
+    return f"pair {frame.number}, frame {frame.name}" if experiment.series is None else f"instant {frame.number}"

@@ -7,7 +7,6 @@ volume. `decide` measures once per output folder how far light reaches beyond ea
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Iterator, Sequence
@@ -22,6 +21,7 @@ from lfpiv.files import writing
 from lfpiv.geometry.grid import AXES, NO_LAYERS, Layers
 from lfpiv.lightfield.particle_signal import NOISE
 from lfpiv.reconstruction.beyond import FaceLight, light_beyond
+from lfpiv.records import RecordError, digest, read_object, read_text, validate
 from lfpiv.results import provenance
 from lfpiv.results.provenance import Marks
 from lfpiv.runs import memory
@@ -58,23 +58,49 @@ class Guard:
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> Guard:
-        """Read the form that a file stores."""
-        z, y, x = ((int(low), int(high)) for low, high in stored["layers"])
-        return cls(
-            pairs=tuple(stored["pairs"]),
-            faces=tuple(FaceLight(**face) for face in stored["faces"]),
-            layers=(z, y, x),
-            short=bool(stored["short"]),
-        )
+        """Read the form that a file stores.
+
+        Raises
+        ------
+        RecordError
+            If it has another form, or its numbers are out of range.
+        """
+        found = validate(cls, stored)
+        counts = [count for pair in found.layers for count in pair]
+        lengths = [value for face in found.faces for value in (face.reach_mm, face.share, face.guard_mm)]
+        sides = [face for face in found.faces if face.axis not in (0, 1, 2) or face.side not in (0, 1)]
+        if min(counts) < 0 or sides or not np.isfinite(lengths).all():
+            raise RecordError("its layers or faces are out of range")
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """Content of the file."""
+
+    settings_hash: str
+    depends_on: str
+    guard: dict[str, Any]
+    digest: str = ""
+    """Digest of the other entries; empty in files of earlier versions."""
 
 
 def read(folder: Folder) -> tuple[Guard, Marks] | None:
-    """Read the stored outcome, whether it fits or not, and its marks; None if there is none."""
+    """Read the stored outcome, whether it fits or not, and its marks; None if it is missing or damaged.
+
+    The log names a damaged file and the reason.
+    """
     try:
-        stored = json.loads(folder.guard.read_text("utf-8"))
-        marks = Marks(settings_hash=stored["settings_hash"], depends_on=stored["depends_on"])
-        return Guard.from_json(stored["guard"]), marks
-    except (OSError, ValueError, KeyError, TypeError):
+        content = read_object(read_text(folder.guard))
+        found = validate(_Stored, content)
+        if "digest" in content and found.digest != digest(content):
+            raise RecordError("its entries are not those that were written: the digest differs")
+        read_object(found.depends_on)
+        return Guard.from_json(found.guard), Marks(settings_hash=found.settings_hash, depends_on=found.depends_on)
+    except FileNotFoundError:
+        return None
+    except RecordError as error:
+        provenance.reject(folder.guard, str(error))
         return None
 
 
@@ -112,7 +138,8 @@ def decide(
     log.info("light beyond the volume: measured in %.1f s", time.perf_counter() - start)
     stamp = provenance.of_guard(experiment, stamp_hash, guard.pairs, background)
     with writing(folder.guard):
-        files.write_json({**stamp.attributes, "guard": guard.to_json()}, folder.guard)
+        content = {**stamp.attributes, "guard": guard.to_json()}
+        files.write_json({**content, "digest": digest(content)}, folder.guard)
     return guard
 
 
@@ -147,7 +174,7 @@ def _instants(
         try:
             light = pair_light(experiment, calibration.cameras, darks, pair)
         except InputError as error:  # a pair that cannot be used fails when it is reconstructed
-            log.debug("light beyond the volume in pair %d: %s", pair, error)
+            log.debug("light beyond the volume in %s: %s", experiment.name_of(pair), error)
             continue
         if min(min(frame.structure.values()) for frame in light) < NOISE:
             continue

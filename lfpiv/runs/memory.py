@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import LEAST_BYTES_PER_VOXEL, Experiment
 from lfpiv.files import MIB
 
 if TYPE_CHECKING:
@@ -22,14 +22,14 @@ log = logging.getLogger(__name__)
 
 GIB = 1 << 30
 
-BYTES_PER_VOXEL = 64
+BYTES_PER_VOXEL = LEAST_BYTES_PER_VOXEL
 """Least memory per voxel [byte]: two volumes, and the float32 arrays that SMART or the correlation works on."""
 
-BYTES_PER_VOXEL_AND_CAMERA = 64
+BYTES_PER_VOXEL_AND_CAMERA = LEAST_BYTES_PER_VOXEL
 """Ray model of a voxel in one camera [byte]: chief ray, slopes, second-order terms, widths."""
 
-BYTES_PER_PIXEL = 64
-"""Memory per sensor pixel [byte]: images, their light-field blocks, the decoder's arrays."""
+BYTES_PER_PIXEL = 72
+"""Memory per sensor pixel [byte]: images, those of the next pair, light-field blocks, the decoder's arrays."""
 
 BASE_BYTES = GIB // 2
 """Memory of Python, its libraries and compiled kernels [byte]."""

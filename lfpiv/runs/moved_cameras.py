@@ -9,13 +9,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.progress import StepProgress
+from lfpiv.records import validate
 from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes, unlinked, without_still_light
 from lfpiv.selfcalibration.movements import Verdict, fit_movements, self_calibrate
@@ -91,9 +92,14 @@ class SelfCalibrationFigures:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> SelfCalibrationFigures:
-        """Read the form that a file stores."""
-        movements = {name: MovementFigures(**one) for name, one in stored["movements"].items()}
-        return cls(**{**stored, "movements": movements})
+        """Read the form that a file stores.
+
+        Raises
+        ------
+        RecordError
+            If it has another form.
+        """
+        return validate(cls, stored)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +157,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
         return None
     darks, volumes, used = read_darks(experiment), CameraVolumes(weights), list[int]()
     separation, lost, clear = None, list[str](), True
-    for pair in islice(dict.fromkeys([*pairs, *range(experiment.pairs)]), TRIED):
+    for pair in islice(experiment.disjoint(chain(pairs, experiment.numbers)), TRIED):
         try:
             light = _moving_light(experiment, weights.cameras, darks, pair)
             for images in light:
@@ -169,11 +175,12 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
             break
     if separation is None or lost:
         if clear and len(used) >= LEAST_FOR_NOTHING:
-            warn(log, _nothing_in_common(dict.fromkeys(used, lost), len(weights.cameras)))
+            warning = _nothing_in_common(dict.fromkeys(used, lost), len(weights.cameras))
+            warn(log, warning if experiment.series is None else warning.by_instant())
         return None
     disparity, std = (length / experiment.grid.voxel_mm for length in (separation.mm, separation.std_mm))
     text = "cameras show the particles of %s %.2f voxel apart (standard error %.2f)"
-    log.info(text, name_pairs(used), disparity, std)
+    log.info(text, name_pairs(used, experiment.noun), disparity, std)
     if disparity > LARGE_VOXEL and separation.significant:
         warn(log, _apart(disparity, experiment, weights.cameras))
     return CameraDisparity(voxel=round(disparity, 3), std_voxel=round(std, 3), pair=used[0])
@@ -191,7 +198,7 @@ def _moving_light(
     ValueError
         If an image shows no particles.
     """
-    light = [frame_light(experiment, cameras, darks, pair, frame) for frame in experiment.frames]
+    light = [frame_light(experiment, cameras, darks, frame) for frame in experiment.pair_frames(pair)]
     if min(value for one in light for value in one.structure.values()) < NOISE:
         raise ValueError("expected particles, found only noise")
     return without_still_light([one.images for one in light])

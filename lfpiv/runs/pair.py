@@ -1,17 +1,19 @@
-"""The work on one image pair: images to volumes to vectors, and files of both.
+"""The work on pairs: images to volumes to vectors, and files of both.
 
-`PairWork.do` takes the number of a pair and returns its `Outcome`. Volumes that are in the output folder and still fit
-are read instead of reconstructed.
+`PairWork.do` takes a stretch of pairs and yields the `Outcome` of each. Volumes that are in the output folder and still
+fit are read instead of reconstructed. The two frames of an image pair are reconstructed together; the instants of a
+series are each reconstructed once, for both their pairs (`lfpiv.runs.instants`).
 """
 
 from __future__ import annotations
 
 import logging
 import time
-import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv import warn
 from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.experiment.settings import Correlation
 from lfpiv.geometry.grid import Grid, Layers
 from lfpiv.geometry.volume import VIEWS
@@ -29,14 +31,17 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.motion import Motion, PairSolver, unshared_quality
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.folder import Folder
-from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
+from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairFiles, PairVolumes, VolumeFile
 from lfpiv.runs import pair_figures
-from lfpiv.runs.frame_light import FrameLight, pair_light
+from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.guard import with_guard
+from lfpiv.runs.instants import Instants, failure
+from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.warn import FirstOfEachCode
+from lfpiv.warn import FirstOfEachCode, Warning
 
 if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
@@ -46,6 +51,9 @@ RECONSTRUCTED = 0.9
 
 CORRELATED = 0.99
 """Finished fraction of a pair when only its vectors remain to be written."""
+
+PairProgress = Callable[[int, float], None]
+"""Called as ``progress(number, fraction)``: the place of a pair in its stretch, from 0, and its finished fraction."""
 
 NO_PARTICLES = "no particles in the images: none of the vectors counts"
 """Verdict on the vectors of a pair if the images of one frame show only noise."""
@@ -58,6 +66,8 @@ class Outcome:
     pair: int
     reason: str = ""
     """Why the pair failed; empty if it is finished."""
+    died: bool = False
+    """Whether the worker process died, perhaps after it finished the pair."""
     peak_memory_mib: float = 0.0
     """Largest memory that the worker process held so far; 0 for pairs done in the process of the run."""
 
@@ -73,39 +83,87 @@ class PairWork:
     """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
     weights: Weights | None
     """None if all volumes are in the folder."""
+    cameras: Mapping[str, CalibratedCamera]
+    """Cameras that know what stands still in their images; empty if no image is read."""
     darks: Mapping[str, np.ndarray | None]
-    """Dark image of every camera [counts]; empty if all volumes are in the folder."""
+    """Dark image of every camera [counts]; empty if no image is read."""
     keep_volumes: bool
     """Write the volumes."""
     background: str | None = None
     """Hash of the light that is subtracted from the images; None if there is none."""
     vectors: bool = True
     """Correlate the volumes and write the vectors."""
+    scratch: Path | None = None
+    """Folder in which processes store volumes for each other; None for a process by itself."""
     log_first: FirstOfEachCode = field(default_factory=lambda: FirstOfEachCode(log))
 
-    def do(self, pair: int, progress: StepProgress) -> Outcome:
-        """Work on one pair. An error ends this pair only and is returned as its outcome.
+    def do(self, pairs: Iterable[int], progress: PairProgress, *, stored: Collection[int] = ()) -> Iterator[Outcome]:
+        """Work on pairs, one after the other; yield the outcome of each.
+
+        An error ends one pair only and is returned as its outcome. `stored` are the instants of a series whose volumes
+        other processes need.
 
         Raises
         ------
         StorageError
             If a result cannot be written; then no other pair could be written either.
         """
+        instants = None if self.experiment.series is None else Instants(self, stored)
+        computed: _Computed | None = None
+        try:
+            for number, (pair, coming) in enumerate(_with_next(pairs)):
+                self._read_ahead(pair, coming)
+                found = self._compute(pair, instants, partial(progress, number))
+                if computed is not None:
+                    yield computed.outcome()
+                computed = found
+            if computed is not None:
+                yield computed.outcome()
+        finally:
+            self.writer.wait()
+            self.images.start(())
+        if instants is not None:
+            instants.clear()
+
+    def _compute(self, pair: int, instants: Instants | None, progress: StepProgress) -> _Computed:
+        """Compute the results of one pair and start to write them."""
+        self.written.clear()
         try:
             # sums of BLAS depend on its number of threads; the numbers must not depend on the number of workers
             with threadpool_limits(1):
-                self._do(pair, progress)
+                self._do(pair, instants, progress)
         except StorageError:
             raise
-        except MemoryError:
-            return Outcome(pair=pair, reason="out of memory: use fewer workers, larger voxels or a smaller volume")
-        except ValueError as error:
-            return Outcome(pair=pair, reason=" ".join(str(error).split()))
         except Exception as error:  # an error in one pair must not end the others
-            log.debug("pair %d: %s", pair, traceback.format_exc())
-            return Outcome(pair=pair, reason=f"unexpected {type(error).__name__}: {' '.join(str(error).split())}")
-        progress(1.0)
-        return Outcome(pair=pair)
+            return _Computed(pair=pair, reason=str(failure(error)), written=tuple(self.written), progress=progress)
+        return _Computed(pair=pair, reason="", written=tuple(self.written), progress=progress)
+
+    def _read_ahead(self, pair: int, coming: int | None) -> None:
+        """Start to read the images of the coming pair whose volumes are not in the folder."""
+        frames: list[Frame] = []
+        if coming is not None and self.weights is not None:
+            both = enumerate(self.experiment.pair_frames(coming))
+            frames = [frame for number, frame in both if not self.folder.volume(coming, number).exists()]
+        self.images.start(frames, self.experiment.pair_frames(pair))
+
+    def write(self, write: Callable[[], None], *, large: bool = False) -> None:
+        """Start to write a result of the present pair. `large` ones are written before the next reconstruction."""
+        self.written.append(self.writer.start(write, large=large))
+
+    @cached_property
+    def images(self) -> ReadAhead:
+        """Images that are read while others are reconstructed."""
+        return ReadAhead(self.experiment)
+
+    @cached_property
+    def writer(self) -> Writer:
+        """Thread that writes results."""
+        return Writer()
+
+    @cached_property
+    def written(self) -> list[Future[None]]:
+        """Results of the present pair that are being written."""
+        return []
 
     @cached_property
     def solver(self) -> PairSolver:
@@ -123,8 +181,9 @@ class PairWork:
             mask=with_guard(self.experiment, self.guard).solid,
         )
 
-    def _do(self, pair: int, progress: StepProgress) -> None:
-        files = PairFiles.of(
+    def files(self, pair: int) -> PairFiles:
+        """Return the files of a pair with the stamps that they must have."""
+        return PairFiles.of(
             self.experiment,
             self.calibration_hash,
             self.folder,
@@ -132,50 +191,114 @@ class PairWork:
             background=self.background,
             guard=self.guard,
         )
-        volumes = files.read_volumes()
-        if volumes is None:
-            volumes = self._reconstruct(files, part_of(progress, 0.0, RECONSTRUCTED))
-            if self.keep_volumes:
-                files.write_volumes(volumes)
+
+    def _do(self, pair: int, instants: Instants | None, progress: StepProgress) -> None:
+        files = self.files(pair)
+        if files.outdated(vectors=self.vectors, volumes=self.keep_volumes) is None:
+            return  # by a worker that died afterwards
+        if instants is None:
+            volumes = self._pair_volumes(files, part_of(progress, 0.0, RECONSTRUCTED))
+        elif self.vectors:
+            volumes = instants.volumes(files, part_of(progress, 0.0, RECONSTRUCTED))
+        else:
+            instants.keep(files, progress)
+            return
         if self.vectors:
             progress(RECONSTRUCTED)
             self._correlate(files, volumes, progress)
 
-    def _reconstruct(self, files: PairFiles, progress: StepProgress) -> PairVolumes:
+    def _pair_volumes(self, files: PairFiles, progress: StepProgress) -> PairVolumes:
+        """Read the volumes of an image pair, or reconstruct both together."""
+        frames = files.read_volumes()
+        if frames is None:
+            frames = self._reconstruct_pair(files, progress)
+            if self.keep_volumes:
+                for file, found in zip(files.frames, frames, strict=True):
+                    self.write(partial(file.write, found), large=True)
+        return PairVolumes(frames=frames, names=self.experiment.frames)
+
+    def _reconstruct_pair(self, files: PairFiles, progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
         if self.weights is None:
             raise InputError(
-                f"{files.volumes[0]}: expected the two volumes of pair {files.pair} made with the present "
+                f"{files.frames[0].path}: expected the two volumes of pair {files.pair} made with the present "
                 "settings, found none. Run `lfpiv reconstruct` first."
             )
-        light = pair_light(self.experiment, self.weights.cameras, self.darks, files.pair)
-        self.log_first(warning.of_pair(files.pair) for frame in light for warning in frame.warnings)
+        light = pair_light(self.experiment, self.cameras, self.darks, files.pair, self.images.image)
+        self.writer.wait_large()
+        self._log(files.pair, [warning for frame in light for warning in frame.warnings])
         start = time.perf_counter()
         guarded = _reconstruct_frames(self.solver, light, files.pair, progress)
-        grid, padded = self.experiment.grid, self.weights.grid
-        volumes = _without_guard(guarded[0], grid, padded), _without_guard(guarded[1], grid, padded)
         seconds = (time.perf_counter() - start) / 2
         first, second = (
-            FrameRecord(
-                frame=frame.frame,
-                structure=frame.structure,
-                warnings=frame.warnings,
-                seconds=seconds + frame.seconds,
-            )
-            for frame in light
+            self._frame_volume(volume, frame, seconds) for volume, frame in zip(guarded, light, strict=True)
         )
-        return PairVolumes(volumes=volumes, records=(first, second))
+        return first, second
+
+    def read_light(self, file: VolumeFile) -> FrameLight:
+        """Read and check the images of an instant whose volume is to be reconstructed.
+
+        Raises
+        ------
+        InputError
+            If an image cannot be used, or there are no weights because all volumes should be in the folder.
+        """
+        if self.weights is None:
+            raise InputError(
+                f"{file.path}: expected the volume of instant {file.frame.number} made with the present settings, "
+                "found none. Run `lfpiv reconstruct` first."
+            )
+        return self.light_again(file.frame)
+
+    def light_again(self, instant: Frame) -> FrameLight:
+        """Read the images of an instant, also if its volume is known; raise InputError if that is not possible."""
+        if not self.cameras:
+            raise InputError(f"instant {instant.number}: no image is read in this step.")
+        return frame_light(self.experiment, self.cameras, self.darks, instant, self.images.image)
+
+    def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one instant of a series.
+
+        Raises
+        ------
+        InputError
+            If its images cannot be reconstructed.
+        """
+        instant = light.frame.number
+        self._log(instant, light.warnings)
+        self.writer.wait_large()
+        start = time.perf_counter()
+        try:
+            found = self.solver.smart.solve(light.images, floor=light.noise, progress=progress)
+        except ValueError as error:
+            raise InputError(f"instant {instant}: {error}") from error
+        seconds = time.perf_counter() - start
+        log.info("instant %d: reconstructed in %.1f s", instant, seconds)
+        return self._frame_volume(found.to_dataarray(), light, seconds)
+
+    def _frame_volume(self, guarded: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
+        """Return a volume without its guard layers, with its record."""
+        assert self.weights is not None
+        volume = _without_guard(guarded, self.experiment.grid, self.weights.grid)
+        record = FrameRecord(structure=light.structure, warnings=light.warnings, seconds=seconds + light.seconds)
+        return FrameVolume(volume=volume, record=record)
+
+    def _log(self, pair: int, warnings: Iterable[Warning]) -> None:
+        """Log the first warning of each code about a pair or an instant."""
+        found = [warning.of_pair(pair) for warning in warnings]
+        self.log_first(found if self.experiment.series is None else [warning.by_instant() for warning in found])
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment, start = self.experiment, time.perf_counter()
         vectors = correlate(*volumes.volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
         vectors = _without_unmeasured(_with_motion(vectors, volumes), volumes)
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
-        vectors.attrs["reconstruction_s"] = sum(record.seconds for record in volumes.records)
+        vectors.attrs["reconstruction_s"] = self._reconstruction_s(files.pair, volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         condensed = volumes.condensed()
         figures = pair_figures.measure(vectors, condensed, volumes.warnings)
+        self._log(files.pair, volumes.between)
         if figures.lost_unseeded > 0:
-            self.log_first([figures.unseeded_warning(files.pair)])
+            self._log(files.pair, [figures.unseeded_warning(files.pair)])
         progress(CORRELATED)
         attributes = {
             "experiment": experiment.name,
@@ -183,8 +306,59 @@ class PairWork:
             "correlation": experiment.correlation.model_dump(),
             "figures": figures.to_json(),
         }
-        files.write_vectors(vectors, condensed, attributes)
-        log.info("pair %d: %.0f %% of the vectors valid", files.pair, 100 * figures.valid_fraction)
+
+        def write() -> None:
+            files.write_vectors(vectors, condensed, attributes)
+            name = experiment.name_of(files.pair)
+            log.info("%s: %.0f %% of the vectors valid", name, 100 * figures.valid_fraction)
+
+        self.write(write)
+
+    def _reconstruction_s(self, pair: int, volumes: PairVolumes) -> float:
+        """Return the time that the volumes of a pair took [s].
+
+        In a series the second instant counts, and the first one only if it is the second of no other pair: the sum over
+        all pairs then counts each instant once.
+        """
+        first, second = (record.seconds for record in volumes.records)
+        series = self.experiment.series
+        return second if series is not None and pair - series.step in self.experiment.numbers else first + second
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Computed:
+    """A pair whose results are computed and perhaps not written yet."""
+
+    pair: int
+    reason: str
+    """Why it failed; empty if it did not."""
+    written: tuple[Future[None], ...]
+    """Its results that are being written."""
+    progress: StepProgress
+
+    def outcome(self) -> Outcome:
+        """Wait until the results are written and return the outcome; raise StorageError if they cannot be written."""
+        reason = self.reason
+        for future in self.written:
+            try:
+                future.result()
+            except StorageError:
+                raise
+            except Exception as error:  # such as values that no file may hold
+                reason = reason or str(failure(error))
+        if not reason:
+            self.progress(1.0)
+        return Outcome(pair=self.pair, reason=reason)
+
+
+def _with_next(pairs: Iterable[int]) -> Iterator[tuple[int, int | None]]:
+    """Yield each pair with the one that comes after it, None for the last one."""
+    source = iter(pairs)
+    present = next(source, None)
+    while present is not None:
+        coming = next(source, None)
+        yield present, coming
+        present = coming
 
 
 def _reconstruct_frames(

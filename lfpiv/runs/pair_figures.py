@@ -5,19 +5,23 @@ The summary of thousands of pairs is built from these figures, without reading t
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from lfpiv import files
+from lfpiv import files, warn
 from lfpiv.reconstruction.motion import Motion
+from lfpiv.records import RecordError, validate
 from lfpiv.results import netcdf
 from lfpiv.results.provenance import Marks
 from lfpiv.warn import Code, Warning
+
+log = logging.getLogger(__name__)
 
 ByFrame = Mapping[str, Mapping[str, float]]
 """Frame -> camera -> figure."""
@@ -103,13 +107,19 @@ class PairFigures:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> PairFigures:
-        """Read the form that a file stores; the findings of version 0.1.0 are warnings."""
-        known = {name: stored[name] for name in cls.__dataclass_fields__ if name in stored}
-        known["warnings"] = tuple(map(Warning.from_json, stored.get("warnings", stored.get("findings", ()))))
-        known["velocity_m_per_s"] = {name: Spread(**one) for name, one in stored["velocity_m_per_s"].items()}
-        if "motion" in known:
-            known["motion"] = MotionFigures(**known["motion"])
-        return cls(**known)
+        """Read the form that a file stores; the findings of version 0.1.0 are warnings.
+
+        Raises
+        ------
+        RecordError
+            If it has another form.
+        """
+        warnings = warn.from_list(stored.get("warnings", stored.get("findings", [])))
+        found = replace(validate(cls, {**stored, "warnings": []}), warnings=warnings)
+        shares = (found.valid_fraction, found.finite_fraction, found.seen_fraction, found.masked_fraction)
+        if not all(0 <= share <= 1 for share in shares):
+            raise RecordError(f"expected shares from 0 to 1, found {shares}")
+        return found
 
 
 _OPTIONAL = ("motion", "residual", *netcdf.OF_IMAGES, "stop")
@@ -118,7 +128,10 @@ _OPTIONAL = ("motion", "residual", *netcdf.OF_IMAGES, "stop")
 def read_figures(path: Path, marks: Marks) -> PairFigures:
     """Return the figures of a finished pair from the marks of its vectors; files without figures are measured."""
     if marks.figures is not None:
-        return PairFigures.from_json(marks.figures)
+        try:
+            return PairFigures.from_json(marks.figures)
+        except RecordError as error:
+            log.warning("%s: its figures have another form, measured again: %s", path, error)
     measured = measure(netcdf.read_vectors(path), netcdf.read_reconstruction(path), marks.warnings)
     return PairFigures.from_json(files.plain(measured.to_json()))
 

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lfpiv import files
-from lfpiv.errors import InputError
+from lfpiv import files, hdf5
+from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import MIB, writing
+from lfpiv.records import RecordError, validate
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import background, guard, memory, moved_cameras
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
@@ -27,6 +28,7 @@ from lfpiv.warn import Code, Warning, collected, warn
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
+    from lfpiv.experiment.experiment import Experiment
     from lfpiv.runs.run import Run
     from lfpiv.weights.operator import Weights
 
@@ -56,14 +58,40 @@ def load_calibration(run: Run) -> Calibrated:
     from lfpiv.calibration.camera import load_calibration
 
     path = run.folder.calibration
-    if not run.calibration_stamp.fits(provenance.read_marks(path)):
+    try:
+        fits = run.calibration_stamp.fits(provenance.require_marks(path))
+    except FileNotFoundError:
+        fits = False
+    except DamagedFile as error:
+        raise DamagedFile(path, error.reason, "Run `lfpiv calibrate` or `lfpiv run`, which make it again") from None
+    if not fits:
         raise InputError(
             f"{path}: expected the calibration of this experiment, found none that fits. "
             "Run `lfpiv calibrate` or `lfpiv run` first."
         )
+    calibration = load_calibration(path)
+    _require_cameras(calibration, run.experiment, path)
+    try:
+        seconds = validate(float, netcdf.read_attributes(path).get("seconds"))
+    except RecordError as error:
+        raise DamagedFile(path, f"seconds: {error}", "Calibrate again") from None
     log.info("calibration: finished before with the same settings, kept")
-    seconds = float(netcdf.read_attributes(path)["seconds"])
-    return Calibrated(calibration=load_calibration(path), seconds=seconds, reused=True)
+    return Calibrated(calibration=calibration, seconds=seconds, reused=True)
+
+
+def _require_cameras(calibration: Calibration, experiment: Experiment, path: Path) -> None:
+    """Refuse a stored calibration whose cameras have other names or optics than those of the experiment."""
+    stated = {camera.name: camera.optics for camera in experiment.cameras}
+    found = {name: camera.optics for name, camera in calibration.cameras.items()}
+    if found != stated:
+        raise DamagedFile(path, "its cameras are not those of the experiment", "Calibrate again")
+
+
+def with_standing_light(run: Run, calibration: Calibration) -> Calibration:
+    """Return a calibration with the standing light in the folder, if the results of the run depend on one."""
+    if run.background is None:
+        return calibration
+    return background.load(run.folder.background, calibration).seen_by(calibration)
 
 
 def calibrate(run: Run) -> Calibrated:
@@ -72,8 +100,11 @@ def calibrate(run: Run) -> Calibrated:
 
     marks = provenance.read_marks(run.folder.calibration)
     if run.calibration_stamp.fits(marks):
-        return load_calibration(run)
-    if marks is not None:
+        try:
+            return load_calibration(run)
+        except DamagedFile as error:
+            provenance.reject(run.folder.calibration, error.reason)
+    elif marks is not None:
         log.info("%s changed: calibration made again", ", ".join(run.calibration_stamp.changes(marks)))
     start = time.perf_counter()
     calibration = calibrate(run.experiment, progress=run.step("calibration"))
@@ -92,8 +123,13 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
     path = run.folder.self_calibration
     marks = provenance.read_marks(path)
     if marks is not None and marks.figures is not None and stamp.fits(marks):
-        log.info("self-calibration: finished before with the same settings, kept")
-        return _with_standing(load_calibration(path), calibration), SelfCalibrationFigures.from_json(marks.figures)
+        try:
+            corrected, figures = load_calibration(path), SelfCalibrationFigures.from_json(marks.figures)
+            _require_cameras(corrected, run.experiment, path)
+            log.info("self-calibration: finished before with the same settings, kept")
+            return _with_standing(corrected, calibration), figures
+        except (DamagedFile, RecordError) as error:
+            provenance.reject(path, error.reason if isinstance(error, DamagedFile) else str(error))
     corrected, figures = moved_cameras.correct(run.experiment, calibration, run.step("self-calibration"))
     _write(corrected, path, {**stamp.attributes, "figures": json.dumps(figures.to_json())})
     return corrected, figures
@@ -174,8 +210,9 @@ def _write(calibration: Calibration, path: Path, attributes: Mapping[str, Any]) 
     import h5py
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
-    calibration.save(content)  # type: ignore[arg-type]  # HDF5 takes files too
+    calibration.save(content)
     with h5py.File(content, "a") as opened:
-        opened.attrs.update(attributes)
+        opened.attrs.update({**attributes, netcdf.FILE: path.name})
+    hdf5.seal(content)  # last: attributes are sealed too
     with writing(path):
         files.write_bytes(content.getbuffer(), path)

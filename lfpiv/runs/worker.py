@@ -1,7 +1,7 @@
-"""Work of a worker process: one pair at a time, with weights that all processes of a machine share.
+"""Work of a worker process: one stretch of pairs at a time, with weights that all processes of a machine share.
 
-The run writes a task into a folder with `share`. A worker opens it once and uses it for all its pairs. It gets the
-names of that folder and of a pair, and returns a `Result`.
+The run writes a task into a folder (`lfpiv.runs.task`). A worker opens it once and uses it for all its pairs. It gets
+the name of that folder and a stretch, and returns a `Result`.
 """
 
 from __future__ import annotations
@@ -9,9 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-import pickle
-import secrets
-import shutil
 import socket
 import threading
 import time
@@ -20,13 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import Experiment
-from lfpiv.files import writing
-from lfpiv.progress import StepProgress
-from lfpiv.results.folder import Folder
 from lfpiv.runs import background, memory
 from lfpiv.runs.frame_light import read_darks
-from lfpiv.runs.pair import CORRELATED, Outcome, PairWork
+from lfpiv.runs.pair import CORRELATED, Outcome, PairProgress, PairWork
+from lfpiv.runs.stretches import Stretch
+from lfpiv.runs.task import TASK, WEIGHTS, read_task
 from lfpiv.version import __version__
 from lfpiv_kernels import runtime
 
@@ -35,29 +30,13 @@ log = logging.getLogger(__name__)
 REPORT_EVERY_S = 0.5
 """Shortest interval between two progress reports of a worker [s]."""
 
-_TASK, _WEIGHTS = "task.pickle", "weights"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """Settings of a run for its workers."""
-
-    version: str
-    work: PairWork
-    """Without weights and dark images, which the workers read from files."""
-    weights: str | None
-    """Hash of the weights' content; None if no volume has to be reconstructed."""
-    device: str
-    threads: int | None
-    """CPU threads of each worker; None for as many as its cluster grants."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Result of the work on a pair in a worker."""
+    """Result of the work on a stretch in a worker."""
 
-    outcome: Outcome | None
-    """None if no pair can be done; `fatal` says why."""
+    outcomes: tuple[Outcome, ...] | None
+    """Of all its pairs; None if no pair can be done; `fatal` says why."""
     fatal: str = ""
     storage: bool = False
     """Whether the reason is that results cannot be written."""
@@ -65,60 +44,7 @@ class Result:
     """Log records: logger, level, text."""
 
 
-def share(work: PairWork, device: str, threads: int | None) -> Path:
-    """Write the task and the weights into the run's folder; return the folder for `work_on`.
-
-    Raises
-    ------
-    StorageError
-        If there is no space for them.
-    """
-    from lfpiv.weights.storage import save_weights
-
-    shared = work.folder.shared.absolute() / secrets.token_hex(8)
-    with writing(shared):
-        shared.mkdir(parents=True)
-        need = 0 if work.weights is None else work.weights.memory_bytes
-        free = shutil.disk_usage(shared).free
-        if need > free:
-            raise StorageError(
-                f"{shared}: workers share the weights as files of {need / memory.GIB:.1f} GiB, "
-                f"{free / memory.GIB:.1f} GiB are free there. Make room, or use one worker."
-            )
-    task = Task(
-        version=__version__,
-        work=dataclasses.replace(
-            work,
-            experiment=_absolute(work.experiment),
-            folder=Folder(work.folder.path.absolute()),
-            weights=None,
-            darks={},
-        ),
-        weights=None if work.weights is None else save_weights(work.weights, shared / _WEIGHTS),
-        device=device,
-        threads=threads,
-    )
-    with writing(shared / _TASK):
-        (shared / _TASK).write_bytes(pickle.dumps(task))
-    return shared
-
-
-def _absolute(experiment: Experiment) -> Experiment:
-    """Return the experiment with absolute paths, for processes that run in another folder."""
-    cameras = tuple(
-        dataclasses.replace(
-            camera,
-            white_path=camera.white_path.absolute(),
-            dark_path=None if camera.dark_path is None else camera.dark_path.absolute(),
-        )
-        for camera in experiment.cameras
-    )
-    return dataclasses.replace(experiment, path=experiment.path.absolute(), cameras=cameras)
-
-
-# --- in the worker
-
-_busy = threading.Lock()  # kernels and their scratch memory can be used by one pair at a time
+_busy = threading.Lock()  # kernels and their scratch memory can be used by one stretch at a time
 _opened: dict[Path, PairWork] = {}
 _stopped: set[Path] = set()
 
@@ -127,34 +53,34 @@ class _Stopped(BaseException):
     """The run ended. No Exception, so that it is not taken for a failure of the pair."""
 
 
-def work_on(shared: Path, pair: int, report: Callable[[int, float], None], threads: Callable[[], int]) -> Result:
-    """Do one pair of the task in the folder `shared`.
+def work_on(shared: Path, stretch: Stretch, report: Callable[[float], None], threads: Callable[[], int]) -> Result:
+    """Do a stretch of pairs of the task in the folder `shared`.
 
     Parameters
     ----------
     shared : Path
-        From `share`.
-    pair : int
-        Number of the pair.
+        From `task.write_task`.
+    stretch : Stretch
+        Pairs to do.
     report : callable
-        Called as ``report(pair, fraction)``, at most once in `REPORT_EVERY_S`.
+        Called with the number of finished pairs, and parts of one, at most once in `REPORT_EVERY_S`.
     threads : callable
         Returns the CPU threads that this worker may use if the task does not say.
     """
     with _busy, _captured_logs() as records:
         try:
             work = _open(shared, threads)
-            done = work.do(pair, _throttled(shared, pair, report))
+            done = list(work.do(stretch.pairs, _throttled(shared, report), stored=stretch.stored))
         except _Stopped:
-            return Result(outcome=None, fatal="stopped")
+            return Result(outcomes=None, fatal="stopped")
         except (StorageError, InputError) as error:
-            return Result(outcome=None, fatal=str(error), storage=isinstance(error, StorageError))
-        outcome = dataclasses.replace(done, peak_memory_mib=memory.peak_mib())
-        return Result(outcome=outcome, records=tuple(records))
+            return Result(outcomes=None, fatal=str(error), storage=isinstance(error, StorageError))
+        outcomes = (dataclasses.replace(outcome, peak_memory_mib=memory.peak_mib()) for outcome in done)
+        return Result(outcomes=tuple(outcomes), records=tuple(records))
 
 
 def release(shared: Path) -> None:
-    """Forget a task and stop the work on its present pair."""
+    """Forget a task and stop the work on its present stretch."""
     _stopped.add(shared)
     _opened.pop(shared, None)
 
@@ -167,7 +93,7 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
 
     where = f"{shared}, worker on {socket.gethostname()}"
     try:
-        task: Task = pickle.loads((shared / _TASK).read_bytes())
+        task = read_task(shared)
     except OSError as error:
         raise InputError(
             f"{where}: expected the folder of the run ({error.strerror}). All workers must see it under the same path: "
@@ -179,32 +105,32 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
         runtime.start(task.device, threads=task.threads or threads())
     except (RuntimeError, ValueError) as error:
         raise InputError(f"{where}: {error}") from None
-    work = task.work
-    if task.weights is not None:
+    work = task.work(shared)
+    if task.weights is not None or work.experiment.series is not None:
         calibration = load_calibration(work.folder.calibration)
         if work.background is not None:
-            calibration = background.load(work.folder.background).seen_by(calibration)
-        cameras = calibration.cameras
-        weights = open_weights(shared / _WEIGHTS, cameras, task.weights)
-        work = dataclasses.replace(work, weights=weights, darks=read_darks(work.experiment))
+            calibration = background.load(work.folder.background, calibration).seen_by(calibration)
+        work = dataclasses.replace(work, cameras=calibration.cameras, darks=read_darks(work.experiment))
+    if task.weights is not None:
+        work = dataclasses.replace(work, weights=open_weights(shared / WEIGHTS, work.cameras, task.weights))
     _opened.clear()  # the task of an earlier run
     _opened[shared] = work
     return work
 
 
-def _throttled(shared: Path, pair: int, report: Callable[[int, float], None]) -> StepProgress:
-    """Return the progress of a pair: it reports at intervals, and stops the work if the run ended."""
+def _throttled(shared: Path, report: Callable[[float], None]) -> PairProgress:
+    """Return the progress of a stretch: it reports at intervals, and stops the work if the run ended."""
     last = -REPORT_EVERY_S
 
-    def progress(fraction: float) -> None:
+    def progress(number: int, fraction: float) -> None:
         nonlocal last
         if shared in _stopped:
             raise _Stopped
         if time.monotonic() - last >= REPORT_EVERY_S or fraction == CORRELATED:
             last = time.monotonic()
-            if not (shared / _TASK).exists():  # the run died, and the next run removed its folder
+            if not (shared / TASK).exists():  # the run died, and the next run removed its folder
                 raise _Stopped
-            report(pair, fraction)
+            report(number + fraction)
 
     return progress
 

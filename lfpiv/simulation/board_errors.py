@@ -9,19 +9,20 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from lfpiv.experiment.settings import NonNegative, Table
+from lfpiv.experiment.bounds import Thickness
+from lfpiv.experiment.settings import Table
 
 
 class BoardErrors(Table):
     """Table ``[board.errors]``: what differs from the board that the experiment file states. Bright dots only."""
 
-    stage_z_sd_mm: NonNegative = 0.0
+    stage_z_sd_mm: Thickness = 0.0
     """Standard deviation of each plane's depth [mm]."""
-    stage_xy_sd_mm: NonNegative = 0.0
+    stage_xy_sd_mm: Thickness = 0.0
     """Standard deviation of each plane's shift along x and along y [mm]."""
     tilt_sd_deg: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
     """Standard deviation of each plane's tilt about x and about y [degree]."""
-    dot_sd_mm: NonNegative = 0.0
+    dot_sd_mm: Thickness = 0.0
     """Standard deviation of each dot's place on the board along x and along y, equal in all planes [mm]."""
     missing_share: Annotated[float, Field(strict=True, ge=0, le=0.5)] = 0.0
     """Share of the dots that are missing, the same in all planes."""

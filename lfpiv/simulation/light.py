@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from lfpiv.experiment.settings import NonNegative, Number, Point, Positive, Table
+from lfpiv.experiment.bounds import Coordinate, Direction, Length, NonNegative
+from lfpiv.experiment.settings import Table
 
 Pulses = tuple[NonNegative, NonNegative]
 LogSd = Annotated[float, Field(strict=True, ge=0, le=2)]
@@ -55,29 +56,23 @@ class Brightness(Table):
 class Sheet(Table):
     """Table ``[sheet]``: the light sheet of the two pulses.
 
-    A list of two values states first and second pulse; one value holds for both. The sheet lights particles only.
-    Bright surfaces and stray light through the lens follow the pulses' power.
+    A list of two values states first and second pulse; one value holds for both. In a time series the two pulses take
+    turns, the first one at the first instant. The sheet lights particles only. Bright surfaces and stray light through
+    the lens follow the pulses' power.
     """
 
     profile: Literal["even", "top_hat", "gaussian"] = "even"
     """Profile across the sheet: even everywhere, even inside the thickness, or Gaussian."""
-    thickness_mm: Positive | tuple[Positive, Positive] | None = None
+    thickness_mm: Length | tuple[Length, Length] | None = None
     """Thickness: the width of a top hat, the width between 1/e^2 of the middle of a Gaussian [mm]."""
-    position_mm: Number | tuple[Number, Number] = 0.0
+    position_mm: Coordinate | tuple[Coordinate, Coordinate] = 0.0
     """Position of the sheet's middle along `direction`, from the world's origin [mm]."""
-    direction: Point = (0.0, 0.0, 1.0)
+    direction: Direction = (0.0, 0.0, 1.0)
     """Direction across the sheet (x, y, z), of any length."""
     power: Pulses = (1.0, 1.0)
     """Power of the first and the second pulse."""
     power_sd: Annotated[float, Field(strict=True, ge=0, le=0.3)] = 0.0
-    """Standard deviation of each pulse's power from pair to pair, relative to its mean."""
-
-    @field_validator("direction")
-    @classmethod
-    def _has_length(cls, value: Point) -> Point:
-        if not any(value):
-            raise ValueError("a direction other than (0, 0, 0)")
-        return value
+    """Standard deviation of each pulse's power from pair to pair or instant to instant, relative to its mean."""
 
     @model_validator(mode="after")
     def _thickness_fits_profile(self) -> Sheet:
@@ -143,7 +138,7 @@ class StrayLight(Table):
     in both frames."""
     variation: Annotated[float, Field(strict=True, ge=0, le=0.5)] = 0.0
     """Standard deviation of the slow variation over the sensor, relative to the mean."""
-    length_mm: Positive = 2.0
+    length_mm: Length = 2.0
     """Length of the variation on the sensor: the inverse of its standard wave number [mm/rad]."""
 
     def fields(
@@ -198,3 +193,16 @@ def frame_light(
     power = sheet.powers(rng)
     lit = np.stack([power[pulse] * sheet.light(at, pulse) for pulse, at in enumerate(at_frames)])
     return FrameLight(power, brightness[:, None] * lit)
+
+
+def pulse_light(
+    sheet: Sheet | None, brightness: np.ndarray, at_mm: np.ndarray, pulse: int, rng: np.random.Generator
+) -> tuple[float, np.ndarray]:
+    """Return the power of a pulse, and the brightness of particles in each camera, shape (cameras, particle).
+
+    Parameters as of `frame_light`; `at_mm` (particle, 3) are the positions in the light of the pulse, 0 or 1 [mm].
+    """
+    if sheet is None:
+        return 1.0, brightness
+    power = float(sheet.powers(rng)[pulse])
+    return power, brightness * power * sheet.light(at_mm, pulse)

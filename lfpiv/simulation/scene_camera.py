@@ -6,15 +6,22 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from lfpiv.experiment.settings import Count, Flag, NominalCamera, NonNegative, Number, Point, Positive, Table
+from lfpiv.experiment import bounds
+from lfpiv.experiment.bounds import Angle, Coordinate, Direction, Flag, Length, Point, Thickness
+from lfpiv.experiment.settings import NominalCamera, Table
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.geometry.orientation import Orientation, camera_rotation
 from lfpiv.simulation.sensor import Sensor
 from lfpiv_kernels.rendering import real_optics
 
-Pair = tuple[Number, Number]
+LARGEST_BLUR_PX = 100.0
+"""Largest standard deviation of a sensor's point spread function [pixel]."""
+
+Pair = tuple[Coordinate, Coordinate]
+Side = Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SIDE_PX)]
+Blur = Annotated[float, Field(strict=True, ge=0, le=LARGEST_BLUR_PX)]
 Pitches = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Index = Annotated[float, Field(strict=True, ge=1, le=4)]
 Drift = Annotated[float, Field(strict=True, ge=-0.05, le=0.05)]
@@ -36,21 +43,14 @@ class Window(Table):
 
     point_mm: Point
     """A point of the surface on the particles' side (x, y, z) [mm]."""
-    normal: Point
+    normal: Direction
     """Normal of the surfaces (x, y, z), of any length and sign."""
-    thickness_mm: NonNegative
+    thickness_mm: Thickness
     """Thickness [mm]; 0 for an interface, such as the free surface of a liquid."""
     index: Index
     """Refractive index of the plate (about 1.46 fused silica, 1.52 crown glass, 1.49 acrylic)."""
     medium_index: Index = 1.0
     """Refractive index of the medium around the particles (1.333 water); only in the window next to them."""
-
-    @field_validator("normal")
-    @classmethod
-    def _has_length(cls, value: Point) -> Point:
-        if not any(value):
-            raise ValueError("a direction other than (0, 0, 0)")
-        return value
 
 
 def _as_list(value: Any) -> Any:
@@ -63,7 +63,12 @@ def _next_to_particles_first(windows: tuple[Window, ...]) -> tuple[Window, ...]:
     return windows
 
 
-Windows = Annotated[tuple[Window, ...], BeforeValidator(_as_list), AfterValidator(_next_to_particles_first)]
+Windows = Annotated[
+    tuple[Window, ...],
+    Field(max_length=bounds.MOST_SOLIDS),
+    BeforeValidator(_as_list),
+    AfterValidator(_next_to_particles_first),
+]
 
 
 class Aberrations(Table):
@@ -107,37 +112,37 @@ class Moved(Table):
 
     shift_mm: Point = (0.0, 0.0, 0.0)
     """Shift of the point in focus at the sensor's centre (x, y, z) [mm]."""
-    yaw_deg: Number = 0.0
+    yaw_deg: Angle = 0.0
     """Increase of the camera's angle about y, or with `nominal_direction` about its own y axis [degree]."""
-    pitch_deg: Number = 0.0
+    pitch_deg: Angle = 0.0
     """Increase of the rotation about the camera's x axis [degree]."""
-    roll_deg: Number = 0.0
+    roll_deg: Angle = 0.0
     """Increase of the rotation about the camera's z axis [degree]."""
 
 
 class SceneCamera(NominalCamera):
     """Table ``[[camera]]``: nominal optics for the experiment file, and the truth, which is not in that file."""
 
-    sensor_width_px: Count
+    sensor_width_px: Side
     """Columns of the sensor."""
-    sensor_height_px: Count
+    sensor_height_px: Side
     """Rows of the sensor."""
-    true_yaw_deg: Number | None = None
+    true_yaw_deg: Angle | None = None
     """True camera angle about y, or with `nominal_direction` the departure from it, about the camera's y axis [degree];
     absent: as stated."""
-    true_pitch_deg: Number = 0.0
+    true_pitch_deg: Angle = 0.0
     """Right-handed rotation about the camera's x axis, after the yaw [degree]."""
-    true_roll_deg: Number = 0.0
+    true_roll_deg: Angle = 0.0
     """Right-handed rotation about the camera's z axis, after the pitch, beside `nominal_roll_deg` [degree]."""
     true_offset_mm: Point = (0.0, 0.0, 0.0)
     """World point in focus at the sensor's centre (x, y, z) [mm], through the windows if there are any."""
-    true_array_roll_deg: Number = 0.0
+    true_array_roll_deg: Angle = 0.0
     """Rotation of the microlens array on the sensor [degree]."""
     true_array_offset_mm: Pair = (0.0, 0.0)
     """Centre (s, t) of a lens, relative to the sensor's centre [mm]."""
-    true_microlens_pitch_mm: Positive | None = None
+    true_microlens_pitch_mm: Length | None = None
     """True pitch of the array [mm]; absent: the nominal one."""
-    blur_px: NonNegative = 0.4
+    blur_px: Blur = 0.4
     """Standard deviation of the sensor's Gaussian point spread function [pixel]."""
     vignetting: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
     """Fraction of the light lost in the sensor's corners. The loss grows with the square of the distance."""

@@ -8,16 +8,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, field_validator
 
-from lfpiv.experiment.settings import Point, Positive, Table
+from lfpiv.experiment import bounds
+from lfpiv.experiment.bounds import Direction, Length, Point, Positive
+from lfpiv.experiment.settings import Box, HalfSpace, Solid, Table
 from lfpiv.simulation.light import Pulses
 
 Edges = Literal["sharp", "gaussian"]
-
-
-def _direction(value: Point) -> Point:
-    if not any(value):
-        raise ValueError("a direction other than (0, 0, 0)")
-    return value
 
 
 class Surface(Table):
@@ -28,13 +24,13 @@ class Surface(Table):
 
     centre_mm: Point
     """Centre of the patch (x, y, z) [mm]."""
-    normal: Point = (0.0, 0.0, 1.0)
+    normal: Direction = (0.0, 0.0, 1.0)
     """Normal of the plane (x, y, z), of any length."""
-    along: Point = (1.0, 0.0, 0.0)
+    along: Direction = (1.0, 0.0, 0.0)
     """Direction of the patch's length; its part along the normal is left out."""
-    length_mm: Positive
+    length_mm: Length
     """Length: from edge to edge, or standard deviation of a Gaussian [mm]."""
-    width_mm: Positive
+    width_mm: Length
     """Width across the length: from edge to edge, or standard deviation of a Gaussian [mm]."""
     edges: tuple[Edges, Edges] = ("sharp", "sharp")
     """Ends of the light along the length and along the width."""
@@ -42,8 +38,6 @@ class Surface(Table):
     """Level of a pixel of a microlens that only the brightest part of the patch lights [count]."""
     power: Pulses | None = None
     """Light in the first and the second frame; absent: the power of the sheet's pulses."""
-
-    _has_direction = field_validator("normal", "along")(_direction)
 
     @field_validator("along")
     @classmethod
@@ -77,43 +71,7 @@ class Surface(Table):
         return sheet if self.power is None else np.asarray(self.power, float)
 
 
-class HalfSpace(Table):
-    """Table ``[[wall]]`` with ``kind = "half_space"``: everything behind a plane is solid."""
-
-    kind: Literal["half_space"] = "half_space"
-    point_mm: Point
-    """A point of the wall's surface (x, y, z) [mm]."""
-    normal: Point
-    """Normal of the surface, out of the wall into the fluid (x, y, z), of any length."""
-
-    _has_direction = field_validator("normal")(_direction)
-
-    def contains(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return which points (n, 3) [mm] are in the wall, shape (n,)."""
-        inside: np.ndarray = (np.asarray(points_mm, float) - self.point_mm) @ np.asarray(self.normal, float) < 0
-        return inside
-
-
-class Box(Table):
-    """Table ``[[wall]]`` with ``kind = "box"``: a solid box along the axes."""
-
-    kind: Literal["box"] = "box"
-    centre_mm: Point
-    """Centre of the box (x, y, z) [mm]."""
-    size_mm: tuple[Positive, Positive, Positive]
-    """Size of the box (x, y, z) [mm]."""
-
-    def contains(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return which points (n, 3) [mm] are in the box, shape (n,)."""
-        inside = np.abs(np.asarray(points_mm, float) - self.centre_mm) < np.divide(self.size_mm, 2)
-        every: np.ndarray = np.logical_and.reduce(inside, axis=1)
-        return every
-
-
-Wall = Annotated[HalfSpace | Box, Field(discriminator="kind")]
-
-
-WALLS = ("half_space", "box")
+KINDS = ("half_space", "box")
 """Kinds of walls."""
 
 
@@ -123,14 +81,14 @@ def _as_list(value: Any) -> Any:
 
 def _known_walls(value: Any) -> Any:
     walls = _as_list(value)
-    if any(isinstance(wall, Mapping) and wall.get("kind") not in WALLS for wall in walls):
-        raise ValueError(f"a wall with kind = {' or '.join(map(repr, WALLS))}")
+    if any(isinstance(wall, Mapping) and wall.get("kind") not in KINDS for wall in walls):
+        raise ValueError(f"a wall with kind = {' or '.join(map(repr, KINDS))}")
     return walls
 
 
-Walls = Annotated[tuple[Wall, ...], BeforeValidator(_known_walls)]
+Walls = Annotated[tuple[Solid, ...], Field(max_length=bounds.MOST_SOLIDS), BeforeValidator(_known_walls)]
 """Solid regions without particles. They hide nothing behind them."""
-Surfaces = Annotated[tuple[Surface, ...], BeforeValidator(_as_list)]
+Surfaces = Annotated[tuple[Surface, ...], Field(max_length=bounds.MOST_SOLIDS), BeforeValidator(_as_list)]
 
 
 def solid(walls: tuple[HalfSpace | Box, ...] | None, points_mm: np.ndarray) -> np.ndarray:
@@ -149,5 +107,5 @@ def solid(walls: tuple[HalfSpace | Box, ...] | None, points_mm: np.ndarray) -> n
     """
     inside = np.zeros(len(points_mm), bool)
     for wall in walls or ():
-        inside |= wall.contains(points_mm)
+        inside |= wall.contains(*np.asarray(points_mm, float).T)
     return inside

@@ -17,7 +17,9 @@ from pydantic import Field, model_validator
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import brentq
 
-from lfpiv.experiment.settings import Count, Positive, Table
+from lfpiv.experiment import bounds
+from lfpiv.experiment.bounds import Count, Length
+from lfpiv.experiment.settings import Table
 
 SPECTRUM_NODES = 4000
 """Number of tabulated wave numbers, evenly spaced in their logarithm."""
@@ -42,13 +44,13 @@ class Turbulence(Table):
     longitudinal integral length scale, which is 3 pi / 4 times the mean of 1/k over the energy.
     """
 
-    rms_mm: Positive
+    rms_mm: Length
     """Root mean square of each component of the fluctuating displacement [mm]."""
-    integral_scale_mm: Positive
+    integral_scale_mm: Length
     """Longitudinal integral length scale [mm]."""
-    smallest_mm: Positive = 0.5
+    smallest_mm: Length = 0.5
     """Shortest wavelength [mm]."""
-    modes: Count = Field(default=300, ge=20)
+    modes: Count = Field(default=300, ge=20, le=bounds.MOST_MODES)
     """Number of Fourier modes. More modes come closer to a Gaussian random field, at proportional cost."""
 
     @model_validator(mode="after")

@@ -66,10 +66,7 @@ def save_weights(weights: Weights, folder: Path) -> str:
             return value
         array = np.ascontiguousarray(value)
         np.save(folder / f"{name}.npy", array)
-        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
-        content = array.reshape(-1).view(np.uint8)
-        for first in range(0, len(content), _HASHED_BYTES):
-            digest.update(content[first : first + _HASHED_BYTES].tobytes())
+        _add(digest, f"{name}.npy", array)
         return f"{name}.npy"
 
     with writing(folder / _HEADER):
@@ -101,7 +98,7 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
     cameras : mapping of str to CalibratedCamera
         The cameras that the weights were built for.
     content : str, optional
-        Hash that `save_weights` returned. Weights with another hash are refused.
+        Hash that `save_weights` returned. The arrays are read once to compare it. Without it they are not verified.
 
     Returns
     -------
@@ -117,44 +114,64 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
         header = json.loads(path.read_text("utf-8"))
         if header["schema_version"] != SCHEMA_VERSION:
             raise ValueError(f"schema version {header['schema_version']}")
-        if content not in (None, header["content"]):
-            raise ValueError("weights of another run")
         if list(header["cameras"]) != list(cameras):
             raise ValueError(f"cameras {', '.join(header['cameras'])}")
         grid = Grid(**{name: _tuple(value) for name, value in header["grid"].items()})
-        blocks = {name: _take(Blocks, folder, entry) for name, entry in header["cameras"].items()}
-        camera_sums = np.load(folder / header["camera_sums"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        arrays: dict[str, np.ndarray] = {}
+        camera_sums = _map(folder, header["camera_sums"], arrays)
+        blocks = {name: _take(Blocks, folder, entry, arrays) for name, entry in header["cameras"].items()}
+        if content not in (None, _content(arrays)):
+            raise ValueError("weights of another run")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
     stored = StoredGrid(grid, _tuple(header["order"]))
     projectors = {name: Projector(part) for name, part in blocks.items()}
-    return Weights(stored, cameras, projectors, header["method"], camera_sums=camera_sums)
+    return Weights(stored, cameras, projectors, header["method"], camera_sums=np.array(camera_sums))
+
+
+def _content(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return the hash of arrays by the names of their files."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name, array in arrays.items():
+        _add(digest, name, array)
+    return digest.hexdigest()
+
+
+def _add(digest: Any, name: str, array: np.ndarray) -> None:
+    """Add an array and the name of its file to a hash, piece by piece."""
+    digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+    content = array.reshape(-1).view(np.uint8)
+    for first in range(0, len(content), _HASHED_BYTES):
+        digest.update(content[first : first + _HASHED_BYTES].tobytes())
 
 
 _PARTS = {"microimages": Microimages}
 """Fields of `Blocks` that are dataclasses."""
 
 
-def _take(kind: type, folder: Path, entry: Mapping[str, Any]) -> Any:
-    """Make a dataclass from its entry of the header; arrays stay in their files."""
+def _take(kind: type, folder: Path, entry: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Any:
+    """Make a dataclass from its entry of the header; arrays stay in their files, and are noted in `arrays`."""
     values = {}
     for field in dataclasses.fields(kind):
         value = entry[field.name]
         if isinstance(value, dict):
-            values[field.name] = _take(_PARTS[field.name], folder, value)
+            values[field.name] = _take(_PARTS[field.name], folder, value, arrays)
         elif isinstance(value, str) and value.endswith(".npy"):
-            values[field.name] = _map(folder / value)
+            values[field.name] = _map(folder, value, arrays)
         else:
             values[field.name] = _tuple(value)
     return kind(**values)
 
 
-def _map(path: Path) -> np.ndarray:
+def _map(folder: Path, name: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    if Path(name).name != name:
+        raise ValueError(f"a file {name!r} elsewhere")
     try:
-        array: np.ndarray = np.load(path, mmap_mode="r")
+        array: np.ndarray = np.load(folder / name, mmap_mode="r", allow_pickle=False)
     except ValueError:  # an empty array cannot be mapped
-        array = np.load(path)
-    return np.asarray(array)
+        array = np.load(folder / name, allow_pickle=False)
+    arrays[name] = np.asarray(array)
+    return arrays[name]
 
 
 def _tuple(value: Any) -> Any:

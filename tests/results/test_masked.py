@@ -98,5 +98,5 @@ def test_another_mask_makes_another_volume(tiny_experiment):
     for z in (0.3, 0.25):
         tiny_experiment.write_text(text.replace("[particles]", box.format(z=z) + "\n[particles]"))
         stamps.append(provenance.of_pair(open_experiment(tiny_experiment), "", 0))
-    assert len({stamp.volumes.hash for stamp in stamps}) == 3
-    assert "mask" in stamps[1].volumes.changes(provenance.Marks(**stamps[2].volumes.attributes))
+    assert len({stamp.volumes[0].hash for stamp in stamps}) == 3
+    assert "mask" in stamps[1].volumes[0].changes(provenance.Marks(**stamps[2].volumes[0].attributes))

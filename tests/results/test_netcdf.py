@@ -5,10 +5,11 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from support.stored import rewrite, unseal
 
 from lfpiv.errors import InputError
 from lfpiv.results import netcdf, provenance
-from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
+from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes, VolumeFile
 from lfpiv.warn import Code, Warning
 
 
@@ -47,7 +48,7 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
     back = netcdf.read_vectors(path)
     xr.testing.assert_equal(back, written)
     assert back["valid"].dtype == bool and back["w"].attrs["units"] == "m/s"
-    assert provenance.read_marks(path) == provenance.Marks(settings_hash="0123")
+    assert provenance.read_marks(path) == provenance.Marks(settings_hash="0123", sealed=True)
     assert json.loads(back.attrs["smart"]) == {"iterations": 2}
     condensed = netcdf.read_reconstruction(path)
     np.testing.assert_array_equal(condensed["projection_y"].values[1], pair["b"].values.max(1))
@@ -61,6 +62,15 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["pair_0000.nc", "volume.nc"]
 
 
+def test_flags_that_are_no_flags_are_refused(tmp_path):
+    """Reading as a dataset turns every number but 0 into True."""
+    path = tmp_path / "pair.nc"
+    netcdf.write_vectors(vectors(), path, attributes={})
+    rewrite(path, lambda file: file["valid"].__setitem__(0, 7), sealed=True)
+    with pytest.raises(InputError, match="other than 0 and 1"):
+        netcdf.read_vectors(path)
+
+
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_files_of_earlier_versions_are_read(tmp_path, version):
     """1: the group shares its axes' names with the vectors; 2: no profile over the depth."""
@@ -72,6 +82,7 @@ def test_files_of_earlier_versions_are_read(tmp_path, version):
     older.assign_attrs(schema_version=version).rename(names).to_netcdf(
         path, mode="a", group="reconstruction", engine="h5netcdf"
     )
+    unseal(path)
     xr.testing.assert_equal(netcdf.read_vectors(path), vectors())
     xr.testing.assert_equal(netcdf.read_reconstruction(path), older)
 
@@ -82,13 +93,14 @@ def test_what_is_known_of_the_images_travels_with_the_volumes(tmp_path):
         one.attrs |= {"camera_gain": [1.0, 0.4], "light_outside": [0.25, values[1]]}
         structure = dict(zip(("left", "right"), values, strict=True))
         doubt = Warning(code=Code.SATURATED, subject=f"left, frame {frame}", figures={"share": 0.1})
-        records.append(FrameRecord(frame=frame, structure=structure, warnings=(doubt,), seconds=2.0))
-    pair = PairVolumes(volumes=tuple(volumes), records=tuple(records))
-    stamps = provenance.PairStamps(volumes=provenance.Stamp({"volume": 1}), vectors=provenance.Stamp({}))
-    paths = (tmp_path / "a.nc", tmp_path / "b.nc")
-    files = PairFiles(pair=0, vectors=tmp_path / "pair.nc", volumes=paths, stamps=stamps)
-    files.write_volumes(pair)
-    stored = files.read_volumes()
+        record = FrameRecord(structure=structure, warnings=(doubt,), seconds=2.0)
+        records.append(FrameVolume(volume=one, record=record))
+    pair, stored = PairVolumes(frames=tuple(records)), []
+    for name, found in zip("ab", pair.frames, strict=True):
+        file = VolumeFile(frame=(0, name), path=tmp_path / name, stamp=provenance.Stamp({"volume": 1}), origin={})
+        file.write(found)
+        stored.append(file.read())
+    stored = PairVolumes(frames=tuple(stored))
     assert stored.records == pair.records
     condensed = stored.condensed()
     assert condensed["structure"].sel(frame="a", camera="right") == 0.01

@@ -40,8 +40,8 @@ def test_results_with_guard_layers_are_others(experiment):
     plain, guarded = (
         provenance.of_pair(experiment, "c", 0, guard=one) for one in (NO_LAYERS, ((1, 2), (0, 0), (0, 0)))
     )
-    marks = provenance.Marks(**plain.volumes.attributes)
-    assert guarded.volumes.changes(marks) == ["guard"] and plain.volumes.fits(marks)
+    marks = provenance.Marks(**plain.volumes[0].attributes)
+    assert guarded.volumes[0].changes(marks) == ["guard"] and plain.volumes[0].fits(marks)
 
 
 def test_a_warning_names_the_face_and_whether_layers_hold_the_light(experiment):

@@ -165,7 +165,7 @@ def test_each_setting_concerns_what_depends_on_it(small_run, tmp_path, case):
     of_pair = provenance.of_pair(experiment, wanted.hash, 1, guard=measured.layers)
     marks = {
         "calibration": (small_run.out / "calibration.h5", wanted),
-        "volumes": (small_run.out / "volumes" / "pair_0001_b.nc", of_pair.volumes),
+        "volumes": (small_run.out / "volumes" / "pair_0001_b.nc", of_pair.volumes[1]),
         "vectors": (small_run.out / "vectors" / "pair_0001.nc", of_pair.vectors),
     }
     differ = {name: stamp.changes(provenance.read_marks(path)) for name, (path, stamp) in marks.items()}
@@ -177,7 +177,7 @@ def test_a_new_image_concerns_its_pair_alone_and_a_lost_one_none(small_run, tmp_
 
     def unfinished():
         with open_run(experiment, out, None, None) as run:
-            return run.unfinished(volumes=True).pairs
+            return list(run.unfinished(volumes=True))
 
     assert unfinished() == []
     images = sorted((tmp_path / "data").rglob("*0002*"))
@@ -253,8 +253,8 @@ def test_a_failure_leaves_no_part_and_no_other_pair_undone(small_run, tmp_path, 
 def numbered(read):
     """Volumes that know their pair."""
 
-    def read_numbered(path):
-        volume = read(path)
+    def read_numbered(path, **options):
+        volume = read(path, **options)
         volume.attrs["pair"] = int(path.stem.split("_")[1])
         return volume
 

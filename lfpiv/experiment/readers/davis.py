@@ -9,71 +9,43 @@ from __future__ import annotations
 
 import functools
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lfpiv.errors import InputError
+from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage
 
-SUFFIXES = (".im7", ".imx")
-"""Suffixes of image files."""
 VECTOR_SUFFIXES = (".vc7", ".vec")
 """Suffixes of vector files."""
 
 _FRAME = re.compile(r"(?:(?P<camera>\d+)\.)?(?P<frame>\d+)")
 
 
-class NotOneImage(Exception):
-    """The file holds something other than one single-channel image, which the text names."""
-
-
-def split_frame(path: Path) -> tuple[Path, str]:
-    """Split the path of an image into its file and the frame in it, "" where no frame is named.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from lfpiv.experiment.davis import split_frame
-    >>> [str(part) for part in split_frame(Path("left/B00001.im7#1"))]
-    ['left/B00001.im7', '1']
-    >>> [str(part) for part in split_frame(Path("left#1.tif"))]  # a name like any other
-    ['left#1.tif', '']
-    """
-    name, mark, frame = path.name.rpartition("#")
-    if mark and Path(name).suffix.lower() in SUFFIXES:
-        return path.with_name(name), frame
-    return path, ""
-
-
-def check(path: Path, place: str) -> None:
+def header(image: ImagePath) -> None:
     """Check a DaVis image without decoding it: a buffer is decoded with all its frames.
 
     Raises
     ------
-    InputError
+    CannotRead
         If the extra ``davis`` is missing.
     NotOneImage
         If the text behind ``#`` cannot name a frame.
     ValueError
         If the file is empty.
     """
-    file, fragment = split_frame(path)
-    _library(place)
-    _named_frame(fragment)
-    if file.stat().st_size == 0:
+    _library()
+    _named_frame(image.part)
+    if image.file.stat().st_size == 0:
         raise ValueError("the file is empty")
 
 
-def read(path: Path, place: str) -> np.ndarray:
+def read(image: ImagePath) -> np.ndarray:
     """Read one frame of a DaVis image buffer.
 
     Parameters
     ----------
-    path : Path
+    image : ImagePath
         The file, with the frame behind ``#`` where it holds several.
-    place : str
-        Name of the image in messages.
 
     Returns
     -------
@@ -82,16 +54,15 @@ def read(path: Path, place: str) -> np.ndarray:
 
     Raises
     ------
-    InputError
+    CannotRead
         If the extra ``davis`` is missing.
     NotOneImage
         If there is no such frame, or it is not one image of grey values.
     """
-    file, fragment = split_frame(path)
-    library = _library(place)
-    status = file.stat()
-    buffer = _buffer(library, str(file), status.st_mtime_ns, status.st_size)
-    number = _frame_number(fragment, len(buffer))
+    library = _library()
+    status = image.file.stat()
+    buffer = _buffer(library, str(image.file), status.st_mtime_ns, status.st_size)
+    number = _frame_number(image.part, len(buffer))
     frame = buffer[number]
     if "PIXEL" not in frame.components:
         raise NotOneImage(f"frame {number} without pixels, such as a vector field")
@@ -110,13 +81,13 @@ def read(path: Path, place: str) -> np.ndarray:
     return float(scale.offset) + float(scale.slope) * pixels.astype(float)
 
 
-def _library(place: str) -> Any:
+def _library() -> Any:
     try:
         import lvpyio
     except ImportError as error:
         found = "found none" if isinstance(error, ModuleNotFoundError) else f"found one that does not load ({error})"
-        raise InputError(
-            f"{place}: LaVision images are read by the package lvpyio, {found}. Install the extra davis with "
+        raise CannotRead(
+            f"LaVision images are read by the package lvpyio, {found}. Install the extra davis with "
             "pip install 'lfpiv[davis]', or save the images as TIFF in DaVis."
         ) from None
     return lvpyio

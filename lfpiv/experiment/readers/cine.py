@@ -1,0 +1,124 @@
+"""Read Vision Research's .cine recordings of Phantom cameras.
+
+The layout is Vision Research's "Cine File Format". Numbers are stored least byte first. Images of 8 and 16 bits are
+stored from the bottom row, as bitmaps are, unless their height is negative; packed images of 10 and 12 bits from the
+top. Packed 10-bit codes are turned into linear 12-bit counts by the table of that document, which the package
+cine-handler of the extra ``phantom`` holds.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+import numpy as np
+
+from lfpiv.experiment.readers.mraw import unpack_12
+from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage, require_plausible
+from lfpiv.experiment.readers.stack import Frames, read_bytes
+
+PACKED_10, PACKED_12 = 256, 1024
+"""Values of ``biCompression`` for packed pixels."""
+JPEG, UNINTERPOLATED = 1, 2
+"""Values of the file header's ``Compression``; 0 is grey, and the last one is grey too without a colour filter."""
+SETUP_MARK_AT = 140
+"""Place of ``Mark`` and ``Length`` in the SETUP structure, whose length depends on the software [byte]."""
+COLOUR_FILTER_AT = 808
+"""Place of ``CFA`` in the SETUP structure [byte]."""
+
+_FILE_HEADER = struct.Struct("<2sHHHiIiIIIIQ")
+_BITMAP_HEADER = struct.Struct("<IiiHHII")
+
+
+class Cine(Frames):
+    """Images of a .cine recording, numbered from the first one that is stored."""
+
+    def __init__(self, image: ImagePath):
+        head = read_bytes(image.file, 0, _FILE_HEADER.size)
+        kind, _, compression, version, _, _, _, count, bitmap_at, setup_at, offsets_at, _ = _FILE_HEADER.unpack(head)
+        if kind != b"CI" or version not in (0, 1):
+            raise ValueError(f"no cine header, or one of version {version}")
+        bitmap = _BITMAP_HEADER.unpack(read_bytes(image.file, bitmap_at, _BITMAP_HEADER.size))
+        bitmap_bytes, columns, rows, planes, bits, self._packing, _ = bitmap
+        if bitmap_bytes < _BITMAP_HEADER.size or planes != 1 or columns < 1 or rows == 0:
+            raise ValueError(
+                f"a bitmap header of {bitmap_bytes} bytes for {planes} planes of {rows} x {columns} pixels"
+            )
+        self._top_down = rows < 0 or self._packing != 0
+        super().__init__(image.file, (abs(rows), columns), np.dtype("u1" if bits == 8 else "<u2"), count)
+        _require_grey(image, compression, bits, self._packing, setup_at)
+        require_plausible(self.shape, 2, self.size)
+        self._offsets_at = offsets_at
+        self._offset = struct.Struct("<q" if version else "<I")
+        self._require_table()
+        self._table = _linear_counts() if self._packing == PACKED_10 else None
+
+    def place(self, number: int) -> tuple[int, int]:
+        """Return first byte and number of bytes of an image's pixels, behind its annotation."""
+        start = self._start(number)
+        if start > self.size or (number and not self._start(0) <= self._start(number - 1) < start):
+            raise ValueError(f"image {number} begins at byte {start}, the file ends at byte {self.size}")
+        (annotation,) = struct.unpack("<I", read_bytes(self.file, start, 4))
+        if annotation < 8 or start + annotation > self.size:
+            raise ValueError(f"image {number} has an annotation of {annotation} bytes")
+        (length,) = struct.unpack("<I", read_bytes(self.file, start + annotation - 4, 4))
+        if length not in self._lengths():
+            raise ValueError(f"image {number} has {length} bytes, expected {self._lengths()[0]}")
+        return start + annotation, length
+
+    def decode(self, data: bytes) -> np.ndarray:
+        """Return the pixels of an image from their bytes, the upper row first."""
+        rows, columns = self.shape
+        if self._table is not None:
+            return self._table(data).reshape(self.shape)
+        if self._packing == PACKED_12:
+            return unpack_12(data).reshape(self.shape)
+        stored = np.frombuffer(data, self.dtype).reshape(rows, -1)[:, :columns]
+        return stored if self._top_down else stored[::-1]
+
+    def _start(self, number: int) -> int:
+        """Return the first byte of an image's annotation."""
+        entry = self._offsets_at + number * self._offset.size
+        return int(self._offset.unpack(read_bytes(self.file, entry, self._offset.size))[0])
+
+    def _require_table(self) -> None:
+        """Refuse a table of images that does not end before the first of them."""
+        end = self._offsets_at + self.count * self._offset.size
+        if not self.count or end > self.size or not end <= self._start(0) <= self._start(self.count - 1):
+            raise ValueError(f"no table of {self.count} images at byte {self._offsets_at}")
+
+    def _lengths(self) -> tuple[int, ...]:
+        """Return the sizes that an image's pixels may have: with and without rows filled to four bytes [byte]."""
+        rows, columns = self.shape
+        if self._packing:
+            return (rows * columns * (10 if self._packing == PACKED_10 else 12) // 8,)
+        row = columns * self.dtype.itemsize
+        return (rows * row, rows * (row + -row % 4))
+
+
+def _require_grey(image: ImagePath, compression: int, bits: int, packing: int, setup_at: int) -> None:
+    """Refuse recordings of other than single-channel raw counts."""
+    if compression == JPEG or packing not in (0, PACKED_10, PACKED_12):
+        raise NotOneImage("compressed images; save the recording as raw cine")
+    if bits not in (8, 16):
+        raise NotOneImage(f"pixels of {bits} bits, such as a colour image; save raw grey values")
+    if compression == UNINTERPOLATED:
+        mark, setup_bytes = struct.unpack("<2sH", read_bytes(image.file, setup_at + SETUP_MARK_AT, 4))
+        if mark == b"ST" and setup_bytes >= COLOUR_FILTER_AT + 4:
+            (colour_filter,) = struct.unpack("<I", read_bytes(image.file, setup_at + COLOUR_FILTER_AT, 4))
+            if colour_filter & 0xFFFFFF:  # the last byte names the sensor head
+                raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
+
+
+def _linear_counts() -> Callable[[bytes], np.ndarray]:
+    """Return the function that unpacks 10-bit codes and turns them into linear counts."""
+    try:
+        from cine_reader import unpack_10bit_numpy
+    except ImportError as error:
+        found = "found none" if isinstance(error, ModuleNotFoundError) else f"found one that does not load ({error})"
+        raise CannotRead(
+            f"packed 10-bit images are read with the package cine-handler, {found}. Install the extra phantom with "
+            "pip install 'lfpiv[phantom]', or save the recording with 16 bits."
+        ) from None
+    unpack: Callable[[bytes], np.ndarray] = unpack_10bit_numpy
+    return unpack

@@ -1,0 +1,102 @@
+"""Read Photron's .mraw recordings, whose header lies beside them: text (.cih) or XML (.cihx)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage, require_plausible
+from lfpiv.experiment.readers.stack import Frames
+
+HEADER_BYTES = 1 << 20
+"""Largest part of a header that is read [byte]."""
+
+_XML_KEYS = {
+    "Total Frame": "totalFrame",
+    "Image Width": "width",
+    "Image Height": "height",
+    "Color Bit": "bit",
+    "File Format": "fileFormat",
+}
+"""Elements of the XML header by the keys of the text header."""
+
+
+class Mraw(Frames):
+    """Images of a recording, one after the other: of 8 or 16 bits, or of 12 bits, two in three bytes."""
+
+    def __init__(self, image: ImagePath, header: Mapping[str, str]):
+        rows, columns, count, self._bits = (
+            _number(header, key) for key in ("Image Height", "Image Width", "Total Frame", "Color Bit")
+        )
+        if (form := header.get("File Format", "mraw").lower()) != "mraw":
+            raise NotOneImage(f"a recording saved as {form}; save it as MRAW")
+        if header.get("Color Type", "Mono").lower() != "mono" or self._bits not in (8, 12, 16):
+            raise NotOneImage(
+                f"{header.get('Color Type', 'Mono')} pixels of {self._bits} bits; expected 8, 12 or 16 bits"
+            )
+        super().__init__(image.file, (rows, columns), np.dtype("u1" if self._bits == 8 else "<u2"), count)
+        require_plausible(self.shape, 2, self.size)
+        if rows * columns * self._bits % 8:
+            raise ValueError(f"{rows} x {columns} pixels of {self._bits} bits do not fill whole bytes")
+        self._length = rows * columns * self._bits // 8
+        if count * self._length < self.size:
+            raise ValueError(f"its header declares {count * self._length} bytes, the file has {self.size}")
+
+    def place(self, number: int) -> tuple[int, int]:
+        """Return first byte and number of bytes of an image's pixels."""
+        return number * self._length, self._length
+
+    def decode(self, data: bytes) -> np.ndarray:
+        """Return the pixels of an image from their bytes."""
+        return unpack_12(data).reshape(self.shape) if self._bits == 12 else super().decode(data)
+
+
+def open_mraw(image: ImagePath) -> Mraw:
+    """Open a recording with the header beside it."""
+    for suffix, parse in ((".cihx", _xml_entries), (".cih", _text_entries)):
+        beside = _beside(image.file, suffix)
+        if beside is not None:
+            with beside.open("rb") as file:
+                return Mraw(image, parse(file.read(HEADER_BYTES).decode("utf-8", "replace")))
+    raise CannotRead(
+        f"expected the header of the recording beside it, {image.file.with_suffix('.cih').name} or .cihx, found none. "
+        "Copy it too."
+    )
+
+
+def unpack_12(data: bytes) -> np.ndarray:
+    """Return counts of 12 bits, of which two are packed in three bytes, the highest bits first."""
+    first, middle, last = np.frombuffer(data, np.uint8).reshape(-1, 3).T.astype(np.uint16)
+    return np.stack([first << 4 | middle >> 4, (middle & 15) << 8 | last], axis=1).ravel()
+
+
+def _beside(file: Path, suffix: str) -> Path | None:
+    """Return the file of another suffix, in small or capital letters; None if there is no regular one."""
+    return next((path for end in (suffix, suffix.upper()) if (path := file.with_suffix(end)).is_file()), None)
+
+
+def _text_entries(text: str) -> dict[str, str]:
+    """Return the entries of a text header, "key : value" in each line."""
+    lines = (line.split(" : ", 1) for line in text.splitlines())
+    return {entry[0].strip(): entry[1].strip() for entry in lines if len(entry) == 2}
+
+
+def _xml_entries(text: str) -> dict[str, str]:
+    """Return the entries of an XML header, which stands between other bytes, under the keys of the text header."""
+    found = {}
+    for key, name in _XML_KEYS.items():
+        if match := re.search(rf"<{name}>([^<]*)</{name}>", text):
+            found[key] = match[1].strip()
+    if match := re.search(r"<colorInfo>.*?<type>([^<]*)</type>.*?</colorInfo>", text, re.DOTALL):
+        found["Color Type"] = match[1].strip()
+    return found
+
+
+def _number(header: Mapping[str, str], key: str) -> int:
+    text = header.get(key, "")
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise ValueError(f"its header has {key} = {text[:40]!r}")
+    return int(text)

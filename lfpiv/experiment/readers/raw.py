@@ -1,0 +1,34 @@
+"""Read images from files without a header of their own, whose layout the experiment file states."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lfpiv.experiment.readers.source import CannotRead, ImagePath
+from lfpiv.experiment.readers.stack import Frames
+
+
+class Raw(Frames):
+    """Images one after the other, after a header of known length and each after one of known length."""
+
+    def __init__(self, image: ImagePath):
+        layout = image.raw
+        if layout is None:
+            raise CannotRead(
+                "expected the layout of a file without a header, found no table raw of its camera. State shape and "
+                "dtype in [camera.raw]."
+            )
+        super().__init__(image.file, layout.shape, np.dtype(layout.dtype).newbyteorder(layout.byte_order), 0)
+        self._start = layout.header_bytes + layout.frame_header_bytes
+        self._length = layout.shape[0] * layout.shape[1] * self.dtype.itemsize
+        self._step = layout.frame_header_bytes + self._length
+        self._count, rest = divmod(self.size - layout.header_bytes, self._step)
+        if rest or self._count < 1:
+            raise CannotRead(
+                f"expected {layout.header_bytes} bytes and a multiple of {self._step} bytes, an image with its header, "
+                f"found {self.size} bytes. Correct [camera.raw], or copy the file again."
+            )
+
+    def place(self, number: int) -> tuple[int, int]:
+        """Return first byte and number of bytes of an image's pixels."""
+        return self._start + number * self._step, self._length

@@ -1,0 +1,116 @@
+"""Say which image is meant: a file, a part of it, and what is known of it without decoding."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lfpiv.experiment.settings import RawImages
+
+STACK_SUFFIXES = (".h5", ".hdf5")
+"""Suffixes of files whose parts have names with ``/``."""
+SUFFIXES = (
+    *(".tif", ".tiff", ".png", ".im7", ".imx", *STACK_SUFFIXES),
+    *(".cine", ".mraw", ".b16", ".raw", ".bin"),
+)
+"""Suffixes of image files."""
+
+LARGEST_IMAGE = 10**9
+"""Largest number of pixels of an image that is decoded [pixel]; no sensor has as many."""
+LARGEST_EXPANSION = 2000
+"""Largest size of pixels over that of their compressed form; deflate reaches 1032, LZW about 1400."""
+SMALL_IMAGE = 1 << 26
+"""Size of pixels that may be decoded from a compressed form of any size [byte]."""
+
+
+class NotOneImage(Exception):
+    """The file holds something other than the one single-channel image asked for; the text names what it holds."""
+
+
+class CannotRead(Exception):
+    """The file cannot be read by this installation or with these settings; the text is a sentence and the way out."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """Header of an image."""
+
+    shape: tuple[int, int]
+    """(rows, columns)."""
+    dtype: str
+    """Name of the pixel type."""
+
+
+@dataclass(frozen=True)
+class ImagePath:
+    """An image: its file, its part of the file, and the layout of a file without a header."""
+
+    file: Path
+    part: str = ""
+    """Text behind ``#``; "" where none is named."""
+    raw: RawImages | None = None
+    """Layout of the files without a header, of the camera that recorded the image."""
+
+    @property
+    def path(self) -> Path:
+        """File and part as one path."""
+        return Path(f"{self.file}#{self.part}") if self.part else self.file
+
+    @property
+    def suffix(self) -> str:
+        """Suffix of the file in small letters."""
+        return self.file.suffix.lower()
+
+
+def split(path: Path, raw: RawImages | None = None) -> ImagePath:
+    """Split the path of an image into its file and the part of it behind ``#``.
+
+    A ``#`` counts where the text before it ends in the suffix of an image file, and the text behind it does not.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from lfpiv.experiment.readers.source import split
+    >>> for path in ("left/B00001.im7#1", "run.h5#images/00012", "left#1.tif"):
+    ...     image = split(Path(path))
+    ...     print(image.file.as_posix(), repr(image.part))
+    left/B00001.im7 '1'
+    run.h5 'images/00012'
+    left#1.tif ''
+    """
+    text = str(path)
+    at = text.find("#")
+    while at >= 0:
+        file, part = text[:at], text[at + 1 :]
+        suffix = Path(file).suffix.lower()
+        if suffix in SUFFIXES and Path(part).suffix.lower() not in SUFFIXES:
+            if suffix in STACK_SUFFIXES or "/" not in part:
+                return ImagePath(Path(file), part, raw)
+        at = text.find("#", at + 1)
+    return ImagePath(path, "", raw)
+
+
+def require_plausible(shape: tuple[int, ...], item_bytes: int, stored_bytes: int) -> None:
+    """Refuse an image whose declared size its stored bytes cannot hold, before memory is allocated for it.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Declared shape [pixel].
+    item_bytes : int
+        Size of a pixel [byte].
+    stored_bytes : int
+        Size of its compressed form in the file [byte].
+
+    Raises
+    ------
+    ValueError
+        If it has more than `LARGEST_IMAGE` pixels, or expands by more than `LARGEST_EXPANSION`.
+    """
+    pixels = 1
+    for size in shape:
+        pixels *= int(size)
+    if pixels <= 0 or pixels > LARGEST_IMAGE:
+        raise ValueError(f"the header declares {' x '.join(str(size) for size in shape)} pixels")
+    if pixels * item_bytes > SMALL_IMAGE + LARGEST_EXPANSION * stored_bytes:
+        raise ValueError(f"{stored_bytes} stored bytes cannot hold the {pixels} pixels that the header declares")

@@ -1,0 +1,357 @@
+"""Trust in HDF5 and NetCDF4 files: `seal` a file when it is complete, `opened` verifies it before it is read.
+
+The seal is a line behind the last byte that HDF5 uses. It holds a digest of all bytes before it, so of every value,
+name and attribute. HDF5 ignores what follows its end, and cuts it off when a program changes the file. Verifying reads
+the bytes once, in parts, and parses nothing that has not been found whole.
+
+A file of an earlier version has no seal. Its structure is checked all the same: nothing may lie outside the file,
+and no array may be larger than its stored bytes can make it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import math
+import os
+import time
+from collections.abc import Iterator
+from io import FileIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lfpiv.errors import DamagedFile, InputError
+from lfpiv.records import RecordError, open_regular
+
+if TYPE_CHECKING:
+    import h5py
+
+SEALED = "seal"
+"""Attribute of the root of a sealed file. It tells a file that lost its seal from one of an earlier version."""
+
+ALGORITHM = "blake2b-256"
+
+LARGEST_RATIO = 1032
+"""Largest ratio of deflate: a stored byte makes at most so many."""
+
+LARGEST_COUNT = 10_000
+"""Largest number of objects in a file, and of attributes of an object."""
+
+BLOCK_BYTES = 1 << 20
+"""Bytes read at once while a digest is computed."""
+
+SETTLED_S = 2.0
+"""Age of the last change from which size and times of a file identify its content, as clocks of file systems tick."""
+
+_MARK = f"\nlfpiv {SEALED} 1 {ALGORITHM} ".encode()
+_SEAL_BYTES = len(_MARK) + 64 + 1
+_DIMENSION = b"This is a netCDF dimension but not a netCDF variable"  # such a dataset has a length and no values
+
+
+def options(shape: tuple[int, ...], *, zipped: bool = True) -> dict[str, Any]:
+    """Return the options of ``create_dataset`` for an array: a checksum of each chunk, and compression.
+
+    Scalars and empty arrays have no chunks, hence neither.
+    """
+    if not math.prod(shape) or not shape:
+        return {}
+    return {"fletcher32": True} | ({"compression": "gzip", "compression_opts": 1} if zipped else {})
+
+
+def seal(target: Path | io.BytesIO) -> None:
+    """Append the digest of a complete HDF5 file. Remove an older seal.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    import h5py
+
+    text = f"{ALGORITHM} of all bytes before the last {_SEAL_BYTES}, which state it"
+    with h5py.File(target, "r+") as file:
+        if file.attrs.get(SEALED) != text:
+            file.attrs[SEALED] = text
+    with contextlib.ExitStack() as stack:
+        content: Any = target if isinstance(target, io.BytesIO) else stack.enter_context(target.open("r+b"))
+        end = _end(content)
+        content.truncate(end)
+        digest = _digest(content, end)
+        content.seek(end)
+        content.write(_MARK + digest + b"\n")
+
+
+def is_sealed(path: str | Path) -> bool:
+    """Return whether a file ends in a seal, right or wrong, without reading the rest of it.
+
+    Raises
+    ------
+    DamagedFile
+        If it is no regular file.
+    """
+    with _regular(path) as file:
+        return _stated(file) is not None
+
+
+@contextlib.contextmanager
+def opened(path: str | Path, *, values: bool = True) -> Iterator[h5py.File]:
+    """Verify a file and open it to read.
+
+    A file is verified once by a process, and again after it changed.
+
+    Parameters
+    ----------
+    path : str or Path
+    values : bool
+        Whether arrays are read. If only attributes are, the structure of a sealed file is not checked.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    DamagedFile
+        If it is no regular file, its seal is wrong, its structure is not allowed, or anything fails while it is read.
+    """
+    import h5py
+
+    key, sealed = _check_seal(path)
+    with _converted(path), h5py.File(path, "r") as file:
+        _require_seal(file, sealed)
+        if (values or not sealed) and -key not in _known:
+            check_structure(file, os.path.getsize(path))
+            _remember(-key)
+        yield file
+
+
+@contextlib.contextmanager
+def glanced(path: str | Path) -> Iterator[h5py.File]:
+    """Open a file to read attributes and axes, without computing its digest: for thousands of files.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    DamagedFile
+        If it is no regular file, it lost its seal, or anything fails while it is read.
+    """
+    import h5py
+
+    sealed = is_sealed(path)
+    with _converted(path), h5py.File(path, "r") as file:
+        _require_seal(file, sealed)
+        yield file
+
+
+@contextlib.contextmanager
+def _converted(path: str | Path) -> Iterator[None]:
+    """Convert whatever h5py and readers make of damaged bytes."""
+    try:
+        yield
+    except (FileNotFoundError, InputError):
+        raise
+    except Exception as error:
+        raise DamagedFile(path, f"{type(error).__name__}: {error}") from None
+
+
+def _require_seal(file: h5py.File, sealed: bool) -> None:
+    if not sealed and SEALED in file.attrs:
+        raise DamagedFile(file.filename, "it lost its seal: it is cut off, or another program changed it")
+
+
+def verify(path: str | Path) -> None:
+    """Verify a file as `opened` does."""
+    with opened(path):
+        pass
+
+
+# -- the seal ----------------------------------------------------------------------------------------------------------
+
+
+def _regular(path: str | Path) -> FileIO:
+    try:
+        return open_regular(path)
+    except RecordError as error:
+        raise DamagedFile(path, str(error)) from None
+
+
+def _check_seal(path: str | Path) -> tuple[int, bool]:
+    """Check that the bytes of a file are those of its seal; return the key to remember it, and whether it is sealed."""
+    with _regular(path) as file:
+        status = os.fstat(file.fileno())
+        key = _key(path, status)
+        try:
+            stated = _stated(file)
+            if key not in _known and stated is not None and _digest(file, status.st_size - _SEAL_BYTES) != stated:
+                raise DamagedFile(path, "its bytes are not those that were written: the digest differs")
+        except OSError as error:
+            raise DamagedFile(path, (error.strerror or str(error)).lower()) from None
+    _remember(key)
+    return key, stated is not None
+
+
+def _stated(file: Any) -> bytes | None:
+    """Return the digest that the seal of a file states; None without a seal."""
+    size = file.seek(0, os.SEEK_END)
+    if size < _SEAL_BYTES:
+        return None
+    file.seek(size - _SEAL_BYTES)
+    found = file.read(_SEAL_BYTES)
+    return found[len(_MARK) : -1] if found[: len(_MARK)] == _MARK and found[-1:] == b"\n" else None
+
+
+def _end(file: Any) -> int:
+    """Return the number of bytes without a seal."""
+    sealed = _stated(file) is not None
+    return int(file.seek(0, os.SEEK_END)) - (_SEAL_BYTES if sealed else 0)
+
+
+def _digest(file: Any, end: int) -> bytes:
+    digest = hashlib.blake2b(digest_size=32)
+    file.seek(0)
+    while end > 0 and (block := file.read(min(BLOCK_BYTES, end))):
+        digest.update(block)
+        end -= len(block)
+    return digest.hexdigest().encode()
+
+
+# -- once per process --------------------------------------------------------------------------------------------------
+
+MOST_KNOWN = 50_000
+"""Largest number of keys that are kept; a file whose key was dropped is verified again."""
+
+_known: set[int] = set()
+"""Keys of files with the right seal, and negative keys of files with the right structure."""
+
+
+def _key(path: str | Path, status: os.stat_result) -> int:
+    """Return a number above 0 that changes with the file; 0 if it changed so recently that its times may not show it.
+
+    A number for each file keeps 100,000 of them in a few MiB.
+    """
+    if not time.time() - max(status.st_mtime, status.st_ctime) > SETTLED_S:
+        return 0
+    times = status.st_mtime_ns, status.st_ctime_ns
+    return abs(hash((os.fspath(path), status.st_dev, status.st_ino, status.st_size, *times)))
+
+
+def file_key(path: str | Path) -> int:
+    """Return a number that identifies a file and its content by name, size and times; 0 while they do not."""
+    return _key(path, os.stat(path))
+
+
+def _remember(key: int) -> None:
+    if len(_known) >= MOST_KNOWN:
+        _known.clear()
+    if key:
+        _known.add(key)
+
+
+# -- the structure -----------------------------------------------------------------------------------------------------
+
+
+def check_structure(file: h5py.File, size: int) -> None:
+    """Refuse what a result never holds: links that leave the file or go in circles, and arrays larger than their bytes.
+
+    Parameters
+    ----------
+    file : h5py.File
+    size : int
+        Size of the file [byte].
+
+    Raises
+    ------
+    DamagedFile
+        The message names the object.
+    """
+    import h5py
+
+    seen: set[int] = set()
+    waiting: list[tuple[str, Any]] = [("/", h5py.h5g.open(file.id, b"/"))]
+    while waiting:
+        name, item = waiting.pop()
+        address = int(h5py.h5o.get_info(item).addr)
+        if address in seen:
+            raise DamagedFile(file.filename, f"{name} is linked twice")
+        seen.add(address)
+        if len(seen) > LARGEST_COUNT:
+            raise DamagedFile(file.filename, f"it has more than {LARGEST_COUNT} objects")
+        reason = _wrong_attributes(item, size)
+        if not reason and isinstance(item, h5py.h5d.DatasetID):
+            reason = _wrong_dataset(item)
+        if reason:
+            raise DamagedFile(file.filename, f"{name}: {reason}")
+        if isinstance(item, h5py.h5g.GroupID):
+            waiting += _members(file.filename, name, item)
+
+
+def _members(path: str, name: str, group: Any) -> list[tuple[str, Any]]:
+    """Return names and identifiers of what a group holds."""
+    import h5py
+
+    count = group.get_num_objs()
+    if count > LARGEST_COUNT:
+        raise DamagedFile(path, f"{name} holds more than {LARGEST_COUNT} objects")
+    found = []
+    for member in list(group):
+        full = f"{name.rstrip('/')}/{member.decode('utf-8', 'replace')}"
+        if group.links.get_info(member).type != h5py.h5l.TYPE_HARD:
+            raise DamagedFile(path, f"{full} is a link to another place")
+        item = h5py.h5o.open(group, member)
+        if not isinstance(item, (h5py.h5g.GroupID, h5py.h5d.DatasetID)):
+            raise DamagedFile(path, f"{full} is neither a group nor an array")
+        found.append((full, item))
+    return found
+
+
+def _wrong_attributes(item: Any, size: int) -> str:
+    """Return what is wrong with the attributes of an object; empty if nothing is."""
+    import h5py
+
+    count = h5py.h5a.get_num_attrs(item)
+    if count > LARGEST_COUNT:
+        return f"{count} attributes"
+    for number in range(count):
+        attribute = h5py.h5a.open(item, index=number)
+        if math.prod(attribute.shape or ()) * attribute.get_type().get_size() > size:
+            return f"attribute {attribute.name.decode('utf-8', 'replace')!r} is larger than the file"
+    return ""
+
+
+def _wrong_dataset(dataset: Any) -> str:
+    """Return what is wrong with the storage of an array; empty if nothing is."""
+    import h5py
+
+    created, shape = dataset.get_create_plist(), dataset.shape
+    if dataset.get_space().get_simple_extent_type() == h5py.h5s.NULL:
+        return ""
+    layout = created.get_layout()
+    if created.get_external_count() or layout not in (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED):
+        return "its values lie in other files"
+    filters = {created.get_filter(number)[0] for number in range(created.get_nfilters())}
+    if filters - {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}:
+        return "it is packed by an unknown filter"
+    declared, stored = math.prod(shape) * dataset.get_type().get_size(), dataset.get_storage_size()
+    if stored == 0 and declared and _is_dimension(dataset):
+        return ""
+    if layout == h5py.h5d.CHUNKED and declared:
+        chunks = created.get_chunk()
+        expected = math.prod(-(-length // chunk) for length, chunk in zip(shape, chunks, strict=True))
+        if any(chunk > length for length, chunk in zip(shape, chunks, strict=True)):
+            return f"chunks of {chunks} exceed its shape {shape}"
+        if (found := dataset.get_num_chunks()) != expected:
+            return f"only {found} of {expected} chunks are stored"
+    ratio = LARGEST_RATIO if h5py.h5z.FILTER_DEFLATE in filters else 1
+    if declared > ratio * stored:
+        return f"{declared} bytes are declared, {stored} are stored"
+    return ""
+
+
+def _is_dimension(dataset: Any) -> bool:
+    """Return whether a dataset only states the length of a dimension, as NetCDF stores one without coordinate."""
+    import h5py
+
+    if not h5py.h5a.exists(dataset, b"NAME"):
+        return False
+    value = h5py.Dataset(dataset).attrs["NAME"]
+    return bytes(value if isinstance(value, bytes) else str(value).encode()).startswith(_DIMENSION)

@@ -1,0 +1,204 @@
+"""The task of a run for its workers: data in a folder that only this user can write, never code.
+
+The task is a JSON file; weights and mask are arrays beside it. The name of the folder holds the digest of the task, and
+the task those of the arrays. The run sends this name to its workers, so a worker refuses what somebody has changed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import secrets
+import shutil
+import stat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import PydanticSerializationError
+
+from lfpiv.errors import InputError, StorageError
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.files import size_text, writing
+from lfpiv.geometry.grid import Layers
+from lfpiv.results.folder import Folder
+from lfpiv.runs.pair import PairWork
+from lfpiv.version import __version__
+
+TASK, WEIGHTS, SOLID, INSTANTS = "task.json", "weights", "solid.npy", "instants"
+"""Names in the folder of a task."""
+
+DIGEST_CHARACTERS = 32
+"""Characters of the task's digest in the name of its folder."""
+
+
+class Task(BaseModel):
+    """Settings of a run for its workers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    version: str
+    experiment: Experiment
+    """Without its mask, which is a file."""
+    solid: str | None
+    """Digest of the mask; None without one."""
+    folder: Folder
+    calibration_hash: str
+    guard: Layers
+    keep_volumes: bool
+    background: str | None
+    vectors: bool
+    weights: str | None
+    """Digest of the weights; None if no volume has to be reconstructed."""
+    device: str
+    threads: int | None
+    """CPU threads of each worker; None for as many as its cluster grants."""
+
+    def work(self, shared: Path) -> PairWork:
+        """Return the work on each pair, without weights and images, of a task that was read from a folder.
+
+        Raises
+        ------
+        InputError
+            If the mask is not the one of the task.
+        """
+        experiment = self.experiment
+        if self.solid is not None:
+            experiment = dataclasses.replace(experiment, solid=_read_solid(shared / SOLID, self.solid))
+        return PairWork(
+            experiment=experiment,
+            folder=self.folder,
+            calibration_hash=self.calibration_hash,
+            guard=self.guard,
+            weights=None,
+            cameras={},
+            darks={},
+            keep_volumes=self.keep_volumes,
+            background=self.background,
+            vectors=self.vectors,
+            scratch=None if experiment.series is None else shared / INSTANTS,
+        )
+
+
+def write_task(work: PairWork, device: str, threads: int | None) -> Path:
+    """Write the task, the weights and the mask into the run's folder; return the folder.
+
+    Raises
+    ------
+    StorageError
+        If there is no space for them.
+    InputError
+        If the folder belongs to somebody else, or a path is no text in UTF-8.
+    """
+    from lfpiv.weights.storage import save_weights
+
+    root, token = work.folder.shared.absolute(), secrets.token_hex(4)
+    scratch = root / f".{token}"
+    with writing(scratch):
+        _make_private(root)
+        scratch.mkdir(mode=0o700)
+        _require_space(scratch, 0 if work.weights is None else work.weights.memory_bytes)
+    experiment, solid = _absolute(work.experiment), work.experiment.solid
+    with writing(scratch / SOLID):
+        if solid is not None:
+            np.save(scratch / SOLID, solid, allow_pickle=False)
+    task = Task(
+        version=__version__,
+        experiment=dataclasses.replace(experiment, solid=None),
+        solid=None if solid is None else _digest((scratch / SOLID).read_bytes()),
+        folder=dataclasses.replace(work.folder, path=work.folder.path.absolute()),
+        calibration_hash=work.calibration_hash,
+        guard=work.guard,
+        keep_volumes=work.keep_volumes,
+        background=work.background,
+        vectors=work.vectors,
+        weights=None if work.weights is None else save_weights(work.weights, scratch / WEIGHTS),
+        device=device,
+        threads=threads,
+    )
+    try:
+        content = task.model_dump_json().encode()
+    except (PydanticSerializationError, UnicodeEncodeError):
+        raise InputError(
+            f"{experiment.path}: expected paths that are text in UTF-8, which workers need. Rename the folder."
+        ) from None
+    shared = root / f"{_digest(content)}-{token}"
+    with writing(shared):
+        (scratch / TASK).write_bytes(content)
+        scratch.rename(shared)
+    return shared
+
+
+def read_task(shared: Path) -> Task:
+    """Read the task of a run from its folder.
+
+    Raises
+    ------
+    OSError
+        If the folder or the task cannot be read.
+    InputError
+        If the task is not the one that the run wrote, or is of another version.
+    """
+    content = (shared / TASK).read_bytes()
+    if _digest(content) != shared.name.partition("-")[0]:
+        raise InputError(f"{shared / TASK}: expected the task of this run, found one that was changed since.")
+    try:
+        return Task.model_validate_json(content)
+    except ValidationError:
+        raise InputError(f"{shared / TASK}: expected the task of lfpiv {__version__}, found another form.") from None
+
+
+def _make_private(root: Path) -> None:
+    """Make a folder that only this user can use; refuse one of another user, and a link."""
+    root.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        root.mkdir(mode=0o700)
+        return
+    except FileExistsError:
+        about = os.lstat(root)
+    owner: Any = getattr(os, "geteuid", lambda: about.st_uid)()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != owner:
+        found = f"one of user {about.st_uid}" if stat.S_ISDIR(about.st_mode) else "a link or a file"
+        raise InputError(
+            f"{root}: expected a folder of this user, in which the workers share files, found {found}. Remove it, or "
+            "choose another --out."
+        )
+    root.chmod(0o700)
+
+
+def _require_space(folder: Path, need: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if need > free:
+        raise StorageError(
+            f"{folder}: workers share the weights as files of {size_text(need)}, {size_text(free)} are free there. "
+            "Make room, or use one worker."
+        )
+
+
+def _read_solid(path: Path, digest: str) -> np.ndarray:
+    try:
+        if _digest(path.read_bytes()) != digest:
+            raise ValueError("its content was changed")
+        solid: np.ndarray = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected the mask of this run, found none that fits ({error}).") from None
+    return solid
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:DIGEST_CHARACTERS]
+
+
+def _absolute(experiment: Experiment) -> Experiment:
+    """Return the experiment with absolute paths, for processes that run in another folder."""
+    cameras = tuple(
+        dataclasses.replace(
+            camera,
+            white_path=camera.white_path.absolute(),
+            dark_path=None if camera.dark_path is None else camera.dark_path.absolute(),
+        )
+        for camera in experiment.cameras
+    )
+    return dataclasses.replace(experiment, path=experiment.path.absolute(), cameras=cameras)

@@ -1,0 +1,122 @@
+"""A time series made of the images of `small_run`, and the work on it without the steps before."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import h5py
+from distributed import KilledWorker
+
+from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.settings import Series
+from lfpiv.results.folder import Folder
+from lfpiv.runs import dispatch, guard
+from lfpiv.runs.pair import PairWork
+from lfpiv.runs.stretches import cut
+from lfpiv.runs.worker import Result
+from lfpiv.weights.operator import build_weights
+
+FIRST = 3
+"""Number of the first instant."""
+
+
+def write_series(small_run, folder: Path) -> Path:
+    """Write the images of the small run's pairs one after the other as instants; return the experiment file.
+
+    Instants 3 and 4 are the frames of pair 0, 5 and 6 those of pair 1. Between pairs the particles are others.
+    """
+    file = small_run.images(folder)
+    pairs = read_experiment(file)
+    for pair in pairs.numbers:
+        for number, frame in enumerate(pairs.frames):
+            for camera in pairs.cameras:
+                path = folder / f"run/{camera.name}/{FIRST + 2 * pair + number:05d}.tif"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                pairs.particle_path(camera.name, pair, frame).rename(path)
+    text = file.read_text()
+    head, particles = text.split("[particles]\n")
+    rest = particles.split("\n\n", 1)[1]
+    keys = f'images = "run/{{camera}}/{{instant:05d}}.tif"\ninstants = {2 * pairs.pairs}\nfirst = {FIRST}\n\n'
+    file.write_text(f"{head}[particles]\n{keys}{rest}")
+    return file
+
+
+def make_work(small_run, file: Path, out: Path) -> PairWork:
+    """Return the work on all pairs of a series, with the calibration and the guard layers of the small run."""
+    from lfpiv.calibration.camera import load_calibration
+
+    out.mkdir()
+    shutil.copy2(small_run.out / "calibration.h5", out)
+    experiment = read_experiment(file)
+    measured, _ = guard.read(Folder(small_run.out))
+    calibration = load_calibration(out / "calibration.h5")
+    with h5py.File(out / "calibration.h5") as stored:
+        stamp = stored.attrs["settings_hash"]
+    return PairWork(
+        experiment=experiment,
+        folder=Folder(out, experiment.series),
+        calibration_hash=stamp,
+        guard=measured.layers,
+        weights=build_weights(calibration, guard.with_guard(experiment, measured.layers).grid),
+        cameras=calibration.cameras,
+        darks={camera.name: None for camera in experiment.cameras},
+        keep_volumes=False,
+    )
+
+
+def changed(work: PairWork, out: Path, *, step: int = 1, instants: int = 6, **settings) -> PairWork:
+    """Return the work on the first instants, with another step or output folder."""
+    series = Series(instants=instants, first=work.experiment.series.first, step=step)
+    experiment = dataclasses.replace(work.experiment, series=series, pairs=series.instants - step)
+    return dataclasses.replace(work, experiment=experiment, folder=Folder(out, series), **settings)
+
+
+class Processes:
+    """A client of Dask whose workers do their stretches at once, in this process; `deaths` tells when one dies.
+
+    `deaths` maps the first pair of a stretch to a list: after how many pairs a worker dies of it, at each trial.
+    """
+
+    def __init__(self, work: PairWork, deaths=None):
+        self.work, self.deaths, self.submitted = work, {key: list(value) for key, value in (deaths or {}).items()}, []
+
+    def submit(self, function, shared, stretch, topic, name, *, key, pure, **options):
+        self.submitted.append(stretch)
+        deaths = self.deaths.get(stretch.pairs[0], [])
+        left, outcomes = deaths.pop(0) if deaths else None, []
+        for outcome in self.work.do(stretch, lambda number, fraction: None):
+            outcomes.append(outcome)
+            if len(outcomes) == left:
+                return Done(key, "error", None)
+        return Done(key, "finished", Result(outcomes=tuple(outcomes)))
+
+    def subscribe_topic(self, topic, handler):
+        pass
+
+    def unsubscribe_topic(self, topic):
+        pass
+
+
+class Done:
+    """A future that is done."""
+
+    def __init__(self, key, status, result):
+        self.key, self.status, self.found = key, status, result
+
+    def result(self, timeout):
+        return self.found
+
+    def exception(self):
+        return KilledWorker(self.key, None, 0)
+
+    def add_done_callback(self, call):
+        call(self)
+
+
+def in_processes(work: PairWork, workers: int, deaths=None):
+    """Do all pairs in stretches for several workers; return their outcomes by pair, and the client."""
+    client = Processes(work, deaths)
+    todo = list(work.experiment.numbers)
+    stretches = cut(todo, work.experiment.series.step, workers)
+    found = dispatch.Dispatch(client, lambda: workers, Path("shared"), stretches, len(todo), "instant")
+    return {outcome.pair: outcome for outcome in found.outcomes(lambda fraction: None)}, client
