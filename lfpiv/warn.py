@@ -175,7 +175,10 @@ SENTENCES: Mapping[Code, str] = {
     Code.SEEN_BY_ONE: (
         "about {share:percent} % of the volume is seen by fewer than two cameras; vectors there are not valid: {where}"
     ),
-    Code.ONE_CAMERA: "one camera hardly resolves depth: do not rely on w, displacement_z and their validation",
+    Code.ONE_CAMERA: (
+        "one camera hardly resolves depth: do not rely on velocities along its line of sight (w, displacement_z for a "
+        "camera on the z axis), nor on their validation"
+    ),
     Code.LIGHT_GUARDED: (
         "particles are lit beyond the face {face} of the volume, up to {reach_mm:.2g} mm ({share:percent} % of the "
         "volume's light): guard layers of {guard_mm:.2g} mm are reconstructed there and cut away"

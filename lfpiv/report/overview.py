@@ -124,7 +124,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
 
 
 def _orientation(camera: CameraSetup) -> str:
-    return "" if camera.orientation is None else f" {camera.orientation}".replace("-", "−")
+    return " in any orientation" if camera.orientation is None else f" {camera.orientation}".replace("-", "−")
 
 
 def _axes(experiment: Experiment) -> str:

@@ -77,8 +77,9 @@ def _projection_figure(name: str, first: xr.Dataset) -> str:
     )
     return markup.figure(
         shown,
-        f"Brightest voxel along each axis, {name}, frame {frame}. Particles should be round in x and y; along z "
-        "they are longer, the more so the smaller the angle between the cameras.",
+        f"Brightest voxel along each axis, {name}, frame {frame}. Particles should be round across the "
+        "cameras' mean line of sight, usually z; along it they are longer, the more so the smaller the angle between "
+        "the cameras.",
         table,
     )
 

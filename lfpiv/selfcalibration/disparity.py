@@ -57,6 +57,8 @@ FLATTEST = 1e-3
 """Least curvature of a peak, as a share of the largest one."""
 NEARLY_PARALLEL = 0.3
 """Singular value of two lines of sight below which they count as parallel: about 25 degrees between them."""
+LEVEL = 0.1
+"""Square of the sine below which the lines of sight count as normal to y: 18 degrees."""
 SIGNIFICANT = 1.5
 """Least ratio of a peak to the highest coefficient with one volume mirrored, which is due to chance."""
 
@@ -235,8 +237,11 @@ def _disparity(
     if near_mm is not None:
         centre, reach = np.rint(near_mm[::-1] / grid.voxel_mm).astype(int), NEAR_VOXEL + FIT_REACH
     coefficient = masked_correlation(first, second, window, centre=centre, reach=reach)
-    mirrored_window = _mirror(window, grid.shape)
-    mirrored = masked_correlation(first, [np.flip(volume) for volume in second], mirrored_window, centre, reach)
+    axes = (
+        (1,) if slanted[1, 1] < LEVEL else (0, 1, 2)
+    )  # mirrors that keep the lines of sight: along y, or in the middle
+    mirrored_window = _mirror(window, grid.shape, axes)
+    mirrored = masked_correlation(first, [np.flip(volume, axes) for volume in second], mirrored_window, centre, reach)
     coefficient, mirrored = (_along(values, slanted) for values in (coefficient, mirrored))
     lags = np.indices(coefficient.shape).reshape(3, -1) - reach + centre[:, None]
     searched = np.linalg.norm(slanted @ lags[::-1], axis=0) <= SLANT_VOXEL
@@ -292,9 +297,12 @@ def _peak(around: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     return axes @ np.clip(along, -FIT_REACH, FIT_REACH), axes * sizes @ axes.T
 
 
-def _mirror(window: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """Return the window of the same voxels in a volume mirrored in its middle, which keeps all lines of sight."""
-    return tuple(slice(n - part.stop, n - part.start) for part, n in zip(window, shape, strict=True))
+def _mirror(window: tuple[slice, ...], shape: tuple[int, ...], axes: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return the window of the same voxels in a volume that is mirrored along axes."""
+    return tuple(
+        slice(n - part.stop, n - part.start) if axis in axes else part
+        for axis, (part, n) in enumerate(zip(window, shape, strict=True))
+    )
 
 
 def masked_correlation(

@@ -8,6 +8,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment import images
 from lfpiv.experiment.experiment import ExperimentTable, open_experiment
 from lfpiv.experiment.settings import Compute, Correlation, Network, Smart
+from lfpiv.geometry.orientation import Orientation
 
 
 def edit(file, old, new):
@@ -286,3 +287,52 @@ def test_grey_values_are_read_as_they_are(tmp_path, dtype, byteorder):
 def test_an_unknown_camera_is_answered_with_the_known_ones(tiny_experiment):
     with pytest.raises(ValueError, match="camera: expected one of left, right, got 'middle'"):
         open_experiment(tiny_experiment).white("middle")
+
+
+def changed(path, *pairs):
+    text = path.read_text("utf-8")
+    for old, new in pairs:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text, "utf-8")
+    return path
+
+
+def test_a_camera_is_oriented_by_a_direction_and_a_roll(tiny_experiment):
+    left = "nominal_angle_deg = 30.0"
+    experiment = open_experiment(
+        changed(tiny_experiment, (left, "nominal_direction = [0, 2, 2]\nnominal_roll_deg = 90.0"))
+    )
+    above, other = (camera.orientation for camera in experiment.cameras)
+    assert (above.pitch_deg, above.roll_deg) == (pytest.approx(45.0), 90.0)
+    assert other == Orientation(-30.0) and experiment.cameras[1].nominal_angle_deg == -30.0
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ("", "camera 'left': expected nominal_angle_deg.*or nominal_direction.*found neither"),
+        ("nominal_angle_deg = 3\nnominal_direction = [0, 0, 1]", "either nominal_angle_deg or nominal_direction"),
+        ("nominal_direction = [0, 0, 0]", "nominal_direction: expected a direction other than"),
+        ("nominal_direction = [0, 1, 0]", "camera 'left': expected a camera that sees.*80 degrees.*at 90 degrees"),
+        ("nominal_direction = [0, 4, 1]", "board.spacing_mm: expected dots about two microlenses apart.*76 degrees"),
+    ],
+)
+def test_an_orientation_that_cannot_be_is_refused(tiny_experiment, stated, message):
+    with pytest.raises(InputError, match=message):
+        open_experiment(changed(tiny_experiment, ("nominal_angle_deg = 30.0", stated)))
+
+
+def test_a_marked_board_needs_no_orientations(tiny_experiment):
+    angles = [(f"nominal_angle_deg = {angle}\n", "\n") for angle in ("30.0", "-30.0")]
+    marked = changed(tiny_experiment, *angles, ("planes_mm", "mark = [[1, 1], [2, 1], [1, 3]]\nplanes_mm"))
+    assert all(camera.orientation is None for camera in open_experiment(marked).cameras)
+    for wrong, message in (
+        ("[[1, 1], [3, 1], [2, 3]]", "board.mark: expected places that no turn or mirror"),
+        ("[[1, 1], [2, 1], [1, 5]]", "a mark of places on the board"),
+    ):
+        text = marked.read_text("utf-8").replace("[[1, 1], [2, 1], [1, 3]]", wrong)
+        other = marked.with_name("wrong.toml")
+        other.write_text(text, "utf-8")
+        with pytest.raises(InputError, match=message):
+            open_experiment(other)
