@@ -16,10 +16,11 @@ from support.vector_sets import random_vectors
 import lfpiv
 from lfpiv import records
 from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Frame
 from lfpiv.records import RecordError
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import Folder, make_writable
-from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
+from lfpiv.results.pair_files import FrameRecord, FrameVolume, VolumeFile
 from lfpiv.runs import background, guard, summary
 from lfpiv.runs.background import Background
 from lfpiv.runs.guard import Guard
@@ -233,14 +234,15 @@ def vectors_file(folder):
     return path
 
 
-def volumes_files(folder):
+def volume_file(folder):
     volume = abs(random_vectors(0)["u"]).astype(np.float32)
-    record = FrameRecord(frame="a", structure={"left": 0.5}, warnings=(WARNING,), seconds=1.0)
+    record = FrameRecord(structure={"left": 0.5}, warnings=(WARNING,), seconds=1.0)
+    frame = Frame(name="a", number=0)
+    origin = {"pair": 0, "frame": "a"}
     stamp = provenance.Stamp({"volume": 1})
-    paths = (folder / "pair_0000_a.nc", folder / "pair_0000_b.nc")
-    files = PairFiles(pair=0, vectors=folder / "none.nc", volumes=paths, stamps=provenance.PairStamps(stamp, stamp))
-    files.write_volumes(PairVolumes(volumes=(volume, volume), records=(record, record)))
-    return files
+    file = VolumeFile(frame=frame, path=folder / "pair_0000_a.nc", stamp=stamp, origin=origin)
+    file.write(FrameVolume(volume=volume, record=record))
+    return file
 
 
 def set_attribute(name, value):
@@ -257,7 +259,7 @@ def set_attribute(name, value):
     return change
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(
         [
@@ -297,11 +299,11 @@ def test_attributes_of_vectors_in_any_form(tmp_path, name, value):
     value=ATTRIBUTES,
 )
 def test_attributes_of_volumes_in_any_form(tmp_path, name, value):
-    files = volumes_files(tmp_path)
-    assert files.read_volumes() is not None
-    rewrite(files.volumes[1], set_attribute(name, value), sealed=True)
-    found = files.read_volumes()
-    assert found is None or isinstance(found.records[1].seconds, float)
+    file = volume_file(tmp_path)
+    assert file.read() is not None
+    rewrite(file.path, set_attribute(name, value), sealed=True)
+    found = file.read()
+    assert found is None or isinstance(found.record.seconds, float)
 
 
 CALIBRATION_ATTRIBUTES = [
