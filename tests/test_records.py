@@ -28,6 +28,9 @@ from lfpiv.runs.moved_cameras import MovementFigures, SelfCalibrationFigures
 from lfpiv.runs.pair_figures import MotionFigures, PairFigures, Spread
 from lfpiv.warn import Code, Warning
 
+FEWER = settings(max_examples=settings().max_examples // 3, suppress_health_check=[HealthCheck.function_scoped_fixture])
+"""For tests that write and read a file for each example."""
+
 DEPTH = 1000
 """Nesting of hostile JSON, as many as Python's stack of calls."""
 
@@ -175,7 +178,7 @@ SUMMARY = {
 }
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(changed=mutations(SUMMARY))
 def test_an_earlier_summary_of_any_form_is_used_or_left_out(tmp_path, changed):
     path = tmp_path / "summary.json"
@@ -259,7 +262,7 @@ def set_attribute(name, value):
     return change
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(
     name=st.sampled_from(
         [
@@ -291,7 +294,7 @@ def test_attributes_of_vectors_in_any_form(tmp_path, name, value):
             assert path.name in str(error)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(
     name=st.sampled_from(
         ["schema_version", "depends_on", "warnings", "frame", "seconds", "cameras", "structure", "file"]
@@ -313,7 +316,7 @@ CALIBRATION_ATTRIBUTES = [
 ]  # fmt: skip
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(name=st.sampled_from(CALIBRATION_ATTRIBUTES), value=ATTRIBUTES)
 def test_attributes_of_calibrations_in_any_form(tmp_path, calibration_file, name, value):
     path = shutil.copy(calibration_file, tmp_path / "calibration.h5")
@@ -324,7 +327,7 @@ def test_attributes_of_calibrations_in_any_form(tmp_path, calibration_file, name
         assert "calibration.h5" in str(error)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(name=st.sampled_from(["figures", "warnings", "left/figures"]), value=ATTRIBUTES)
 def test_attributes_of_backgrounds_in_any_form(tmp_path, name, value):
     calibration, path = small_calibration(), tmp_path / "background.h5"
