@@ -18,6 +18,9 @@ from lfpiv.results import netcdf
 from lfpiv.runs import background
 from lfpiv.runs.background import Background
 
+FEWER = settings(max_examples=settings().max_examples // 3, suppress_health_check=[HealthCheck.function_scoped_fixture])
+"""For tests that write and read a file for each example."""
+
 QUICK_S = 2.0
 """Time within which what is no file of ours must be refused [s]: it neither waits nor reads."""
 
@@ -91,7 +94,7 @@ def damaged(content, damage):
     return bytes(changed)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(data=st.data())
 def test_every_damage_to_a_sealed_file_is_noticed(stored, data):
     path, content, read = stored
@@ -107,7 +110,7 @@ def test_every_damage_to_a_sealed_file_is_noticed(stored, data):
         path.write_bytes(content)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(data=st.data())
 def test_damage_to_a_file_of_an_earlier_version_is_refused_or_read_but_no_unexpected_error(stored, data):
     path, content, read = stored

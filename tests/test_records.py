@@ -16,16 +16,20 @@ from support.vector_sets import random_vectors
 import lfpiv
 from lfpiv import records
 from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Frame
 from lfpiv.records import RecordError
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import Folder, make_writable
-from lfpiv.results.pair_files import FrameRecord, PairFiles, PairVolumes
+from lfpiv.results.pair_files import FrameRecord, FrameVolume, VolumeFile
 from lfpiv.runs import background, guard, summary
 from lfpiv.runs.background import Background
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.moved_cameras import MovementFigures, SelfCalibrationFigures
 from lfpiv.runs.pair_figures import MotionFigures, PairFigures, Spread
 from lfpiv.warn import Code, Warning
+
+FEWER = settings(max_examples=settings().max_examples // 3, suppress_health_check=[HealthCheck.function_scoped_fixture])
+"""For tests that write and read a file for each example."""
 
 DEPTH = 1000
 """Nesting of hostile JSON, as many as Python's stack of calls."""
@@ -174,7 +178,7 @@ SUMMARY = {
 }
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(changed=mutations(SUMMARY))
 def test_an_earlier_summary_of_any_form_is_used_or_left_out(tmp_path, changed):
     path = tmp_path / "summary.json"
@@ -233,14 +237,15 @@ def vectors_file(folder):
     return path
 
 
-def volumes_files(folder):
+def volume_file(folder):
     volume = abs(random_vectors(0)["u"]).astype(np.float32)
-    record = FrameRecord(frame="a", structure={"left": 0.5}, warnings=(WARNING,), seconds=1.0)
+    record = FrameRecord(structure={"left": 0.5}, warnings=(WARNING,), seconds=1.0)
+    frame = Frame(name="a", number=0)
+    origin = {"pair": 0, "frame": "a"}
     stamp = provenance.Stamp({"volume": 1})
-    paths = (folder / "pair_0000_a.nc", folder / "pair_0000_b.nc")
-    files = PairFiles(pair=0, vectors=folder / "none.nc", volumes=paths, stamps=provenance.PairStamps(stamp, stamp))
-    files.write_volumes(PairVolumes(volumes=(volume, volume), records=(record, record)))
-    return files
+    file = VolumeFile(frame=frame, path=folder / "pair_0000_a.nc", stamp=stamp, origin=origin)
+    file.write(FrameVolume(volume=volume, record=record))
+    return file
 
 
 def set_attribute(name, value):
@@ -257,7 +262,7 @@ def set_attribute(name, value):
     return change
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
+@FEWER
 @given(
     name=st.sampled_from(
         [
@@ -289,7 +294,7 @@ def test_attributes_of_vectors_in_any_form(tmp_path, name, value):
             assert path.name in str(error)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(
     name=st.sampled_from(
         ["schema_version", "depends_on", "warnings", "frame", "seconds", "cameras", "structure", "file"]
@@ -297,11 +302,11 @@ def test_attributes_of_vectors_in_any_form(tmp_path, name, value):
     value=ATTRIBUTES,
 )
 def test_attributes_of_volumes_in_any_form(tmp_path, name, value):
-    files = volumes_files(tmp_path)
-    assert files.read_volumes() is not None
-    rewrite(files.volumes[1], set_attribute(name, value), sealed=True)
-    found = files.read_volumes()
-    assert found is None or isinstance(found.records[1].seconds, float)
+    file = volume_file(tmp_path)
+    assert file.read() is not None
+    rewrite(file.path, set_attribute(name, value), sealed=True)
+    found = file.read()
+    assert found is None or isinstance(found.record.seconds, float)
 
 
 CALIBRATION_ATTRIBUTES = [
@@ -311,7 +316,7 @@ CALIBRATION_ATTRIBUTES = [
 ]  # fmt: skip
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(name=st.sampled_from(CALIBRATION_ATTRIBUTES), value=ATTRIBUTES)
 def test_attributes_of_calibrations_in_any_form(tmp_path, calibration_file, name, value):
     path = shutil.copy(calibration_file, tmp_path / "calibration.h5")
@@ -322,7 +327,7 @@ def test_attributes_of_calibrations_in_any_form(tmp_path, calibration_file, name
         assert "calibration.h5" in str(error)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@FEWER
 @given(name=st.sampled_from(["figures", "warnings", "left/figures"]), value=ATTRIBUTES)
 def test_attributes_of_backgrounds_in_any_form(tmp_path, name, value):
     calibration, path = small_calibration(), tmp_path / "background.h5"

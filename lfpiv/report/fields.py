@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import matplotlib
 import numpy as np
 import xarray as xr
 
-from lfpiv.errors import InputError
+from lfpiv import hdf5
 from lfpiv.geometry.grid import AXES
 from lfpiv.results import netcdf
 from lfpiv.velocity import derived
@@ -100,12 +99,9 @@ def survey(vectors: Mapping[int, Path]) -> Survey:
 
 def _read_velocity(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Read velocity (component, z, y, x) [m/s], validity and axes [mm] directly from HDF5, faster than as a dataset."""
-    try:
-        with h5py.File(path, "r") as file:
-            velocity = np.stack([file[name][()] for name in "uvw"]).astype(float)
-            return velocity, file["valid"][()].astype(bool), {axis: file[axis][()] for axis in "zyx"}
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: expected a file of vectors, found {error}. Remove it and run again.") from None
+    with hdf5.opened(path) as file:
+        velocity = np.stack([file[name][()] for name in "uvw"]).astype(float)
+        return velocity, file["valid"][()].astype(bool), {axis: file[axis][()] for axis in "zyx"}
 
 
 def evenly(items: Sequence[int], most: int) -> list[int]:

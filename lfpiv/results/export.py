@@ -6,7 +6,6 @@ A file appears under its name only when it is complete. Existing files are repla
 from __future__ import annotations
 
 import enum
-import json
 import logging
 import math
 import os
@@ -25,7 +24,8 @@ from lfpiv.experiment.settings import Series
 from lfpiv.files import replacing, writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import netcdf, stores
+from lfpiv.records import read_object
+from lfpiv.results import netcdf, provenance, stores
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.reader import open_results
 from lfpiv.results.stacked_files import INSTANT, PAIR, TIME_ATTRIBUTES, StackedFiles
@@ -243,7 +243,7 @@ def _write_vti(
 
 def _same_origin(volume: Path, vectors: Path) -> bool:
     """Return whether a volume and vectors were made from equal settings and images, as far as both files state them."""
-    one, other = (json.loads(netcdf.read_attributes(path).get("depends_on", "{}")) for path in (volume, vectors))
+    one, other = (read_object(provenance.require_marks(path).depends_on or "{}") for path in (volume, vectors))
     known = (name for name in one.keys() & other.keys() if name != "images" or None not in (one[name], other[name]))
     return all(one[name] == other[name] for name in known)
 

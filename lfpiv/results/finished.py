@@ -28,7 +28,7 @@ def vectors_marks(path: Path, grid: Grid | None = None) -> Marks | None:
     try:
         netcdf.read_vectors(path, grid=grid)
     except InputError as error:
-        _refuse(path, error)
+        refuse(path, error)
         return None
     _remember(path)
     return marks
@@ -40,12 +40,12 @@ def volume_marks(path: Path, grid: Grid | None = None, frame: str | None = None)
     if marks is None or marks.sealed or _is_checked(path):
         return marks
     if frame is not None and marks.frame not in ("", frame):
-        _refuse(path, DamagedFile(path, f"it is the volume of frame {marks.frame!r}, not of {frame!r}"))
+        refuse(path, DamagedFile(path, f"it is the volume of frame {marks.frame!r}, not of {frame!r}"))
         return None
     try:
         netcdf.read_volume(path, grid=grid)
     except InputError as error:
-        _refuse(path, error)
+        refuse(path, error)
         return None
     _remember(path)
     return marks
@@ -80,7 +80,8 @@ def require_vectors(path: Path) -> None:
         _remember(path)
 
 
-def _refuse(path: Path, error: InputError) -> None:
+def refuse(path: Path, error: InputError) -> None:
+    """Log that a file is not used, with the reason."""
     provenance.reject(path, error.reason if isinstance(error, DamagedFile) else str(error))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import warn
-from lfpiv.errors import DamagedFile
+from lfpiv.errors import DamagedFile, InputError
 from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import NO_LAYERS, Grid, Layers
@@ -109,8 +109,8 @@ class VolumeFile:
         try:
             volume = netcdf.read_volume(self.path, grid=self.grid)
             return FrameVolume(volume=volume, record=_read_record(volume, self.path))
-        except DamagedFile as error:
-            provenance.reject(Path(error.path), error.reason)
+        except InputError as error:
+            finished.refuse(self.path, error)
             return None
 
     def write(self, found: FrameVolume) -> None:

@@ -186,7 +186,7 @@ def _other_name(path: Path, attributes: Mapping[str, Any]) -> str:
     pair = attributes.get("pair")
     if match is None or pair is None:
         return ""
-    return "" if np.ndim(pair) == 0 and pair == int(match[1]) else f"pair {str(pair)[:40]}"
+    return "" if np.array_equal(np.ravel(pair), [int(match[1])]) else f"pair {str(pair)[:40]}"
 
 
 _noted: set[Path] = set()

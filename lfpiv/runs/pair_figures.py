@@ -114,6 +114,8 @@ class PairFigures:
         RecordError
             If it has another form.
         """
+        if not isinstance(stored, Mapping):
+            raise RecordError("expected the figures of a pair")
         warnings = warn.from_list(stored.get("warnings", stored.get("findings", [])))
         found = replace(validate(cls, {**stored, "warnings": []}), warnings=warnings)
         shares = (found.valid_fraction, found.finite_fraction, found.seen_fraction, found.masked_fraction)

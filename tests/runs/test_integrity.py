@@ -1,0 +1,164 @@
+"""Forged, damaged and foreign results in a folder: named, and made again with the same numbers."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from support.small_run import PAIRS, same_vectors
+from support.stored import rewrite, unseal
+
+import lfpiv
+from lfpiv.errors import DamagedFile
+from lfpiv.results.provenance import read_marks
+from lfpiv.runs import pipeline
+
+
+def change(name, apply):
+    def forge(path):
+        rewrite(path, lambda file: file[name].__setitem__(..., apply(file[name][()])))
+
+    return forge
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+def doubled(path):
+    change("u", lambda values: 2 * values)(path)
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-3000])
+
+
+def of_pair(number):
+    def forge(path):
+        shutil.copy2(path.with_name(f"pair_{number:04d}.nc"), path)
+
+    return forge
+
+
+@pytest.fixture
+def out(small_run, tmp_path):
+    return small_run.results(tmp_path / "out")
+
+
+def rejected(caplog):
+    """Return the names of the files that the log names as damaged or foreign, each once."""
+    lines = [message for message in caplog.messages if "damaged or foreign, not used" in message]
+    return sorted({line.split(": damaged")[0].rsplit("/", 1)[1] for line in lines})
+
+
+def test_forged_vectors_are_named_and_made_again(small_run, out, caplog):
+    """The volumes are whole, so that only the correlation is done again."""
+    reference = small_run.out
+    forgeries = {0: doubled, 1: of_pair(2), 3: flip}
+    for pair, forge in forgeries.items():
+        forge(out / "vectors" / f"pair_{pair:04d}.nc")
+    with pytest.raises(DamagedFile, match=r"pair_000[013]\.nc"):
+        lfpiv.open_results(out).u.load()
+    with pytest.raises(DamagedFile, match=r"pair_0000\.nc.*Run `lfpiv run`, which makes it again"):
+        pipeline.report(small_run.experiment, out)
+    caplog.clear()
+    with caplog.at_level("INFO", "lfpiv"):
+        summary = pipeline.correlate(small_run.experiment, out)
+    assert rejected(caplog) == [f"pair_{pair:04d}.nc" for pair in forgeries]
+    assert len(summary["pairs"]) == PAIRS and not summary["failed"]
+    assert same_vectors(out, reference) == PAIRS
+    caplog.clear()
+    assert len(pipeline.correlate(small_run.experiment, out)["pairs"]) == PAIRS
+    assert not rejected(caplog)
+
+
+@pytest.mark.parametrize(
+    ("name", "apply"),
+    [
+        ("u", lambda values: values * np.nan),
+        ("valid", lambda values: 0 * values + 7),
+        ("x", lambda values: values[::-1]),
+        ("z", lambda values: values + 100.0),
+        ("u", lambda values: 2 * values),
+    ],
+    ids=["not a number", "flags of sevens", "reversed axis", "beyond the volume", "doubled"],
+)
+def test_nonsense_in_a_file_of_an_earlier_version_is_made_again(small_run, out, caplog, name, apply):
+    """Such a file has no digest; what is in it must make sense."""
+    path = out / "vectors" / "pair_0001.nc"
+    unseal(path, version=3)
+    change(name, apply)(path)
+    pipeline.correlate(small_run.experiment, out)
+    assert rejected(caplog) == ["pair_0001.nc"]
+    assert same_vectors(out, small_run.out) == PAIRS
+
+
+def test_a_folder_of_an_earlier_version_stays_whole(small_run, out, caplog):
+    for path in [*out.glob("*/*.nc"), *out.glob("*.h5")]:
+        unseal(path, version=1 if path.suffix == ".h5" else 3)
+    written = {path: path.stat().st_mtime_ns for path in [*out.glob("*/*.nc"), *out.glob("*.h5")]}
+    with caplog.at_level("INFO", "lfpiv"):
+        assert len(pipeline.correlate(small_run.experiment, out)["pairs"]) == PAIRS
+    assert {path: path.stat().st_mtime_ns for path in written} == written and not rejected(caplog)
+    noted = [message for message in caplog.messages if "have no digest" in message]
+    assert len(noted) == len(set(noted)) > 0
+    assert lfpiv.open_results(out).u.load().sizes["pair"] == PAIRS
+
+
+def test_volumes_of_other_pairs_and_frames_are_not_correlated(small_run, out, caplog):
+    shutil.rmtree(out / "vectors")
+    volumes = out / "volumes"
+    shutil.copy2(volumes / "pair_0000_b.nc", volumes / "pair_0000_a.nc")
+    shutil.copy2(volumes / "pair_0002_a.nc", volumes / "pair_0001_a.nc")
+    change("intensity", lambda values: 0 * values)(volumes / "pair_0002_b.nc")
+    for name in ("a", "b"):  # an earlier version states pair and frame alone
+        unseal(volumes / f"pair_0003_{name}.nc", version=3)
+    shutil.copy2(volumes / "pair_0003_b.nc", volumes / "pair_0003_a.nc")
+    with pytest.raises(lfpiv.InputError, match="expected the two volumes"):
+        pipeline.correlate(small_run.experiment, out)
+    assert rejected(caplog) == [
+        f"pair_000{pair}_{frame}.nc" for pair, frame in ((0, "a"), (1, "a"), (2, "b"), (3, "a"))
+    ]
+
+
+def swap_cameras(path):
+    rewrite(path, lambda file: [file.move(f"camera/{one}", f"camera/{other}") for one, other in SWAPS])
+
+
+SWAPS = (("left", "kept"), ("right", "left"), ("kept", "right"))
+
+
+def link(path):
+    def change(file):
+        del file["camera/left"]
+        file["camera/left"] = h5py.ExternalLink("other.h5", "/camera/left")
+
+    rewrite(path, change)
+
+
+@pytest.mark.parametrize("forge", [swap_cameras, link, flip, cut])
+def test_a_forged_calibration_is_refused_where_it_is_not_made(small_run, out, forge):
+    path = out / "calibration.h5"
+    forge(path)
+    for step in (pipeline.correlate, pipeline.report):
+        with pytest.raises(DamagedFile, match=r"calibration\.h5.*make it again"):
+            step(small_run.experiment, out)
+    assert read_marks(path) is None
+
+
+@pytest.mark.slow
+def test_a_run_mends_a_folder_with_equal_numbers(small_run, out, caplog):
+    """Calibration, background, guard layers, a volume and vectors at once."""
+    for name in ("calibration.h5", "background.h5", "guard.json"):
+        flip(out / name)
+    flip(out / "volumes" / "pair_0001_b.nc")
+    doubled(out / "vectors" / "pair_0001.nc")
+    summary = pipeline.run(small_run.experiment, out, keep_volumes=True)
+    wanted = {"calibration.h5", "background.h5", "guard.json", "pair_0001.nc"}
+    assert wanted <= set(rejected(caplog)) and not summary["failed"]
+    assert same_vectors(out, small_run.out) == PAIRS
+    caplog.clear()
+    pipeline.run(small_run.experiment, out, keep_volumes=True)
+    assert not rejected(caplog)
