@@ -7,10 +7,14 @@ The same command again goes on where an interrupted one stopped. The exit status
 
 import argparse
 import logging
+import os
 import subprocess
 import sys
+import tempfile
 
+import dask.config
 from dask_jobqueue import SLURMCluster
+from distributed.security import Security
 
 import lfpiv
 
@@ -30,16 +34,31 @@ def main() -> int:
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
 
-    with SLURMCluster(
-        cores=arguments.cores,
-        processes=1,
-        memory=arguments.memory,
-        queue=arguments.queue,
-        walltime=arguments.walltime,
-        job_extra_directives=arguments.directive,
-        log_directory=arguments.logs,
-        worker_extra_args=["--nthreads", "1"],  # a worker does one pair at a time, with all cores of its job
-    ) as cluster:
+    # a certificate for this run: nobody else on the network can send work, which is code, to scheduler and workers
+    security = Security.temporary()
+    tls = {
+        "ca-file": security.tls_ca_file,
+        "client": {"key": security.tls_client_key, "cert": security.tls_client_cert},
+    }
+    dask.config.set({"distributed.comm.require-encryption": True, "distributed.comm.tls": tls})
+    os.makedirs(arguments.logs, exist_ok=True)
+    private = tempfile.TemporaryDirectory(prefix=".tls-", dir=arguments.logs)  # only this user can read it
+
+    with (
+        private as folder,
+        SLURMCluster(
+            cores=arguments.cores,
+            processes=1,
+            memory=arguments.memory,
+            queue=arguments.queue,
+            walltime=arguments.walltime,
+            job_extra_directives=arguments.directive,
+            log_directory=arguments.logs,
+            security=security,
+            shared_temp_directory=os.path.abspath(folder),
+            worker_extra_args=["--nthreads", "1"],  # a worker does one pair at a time, with all cores of its job
+        ) as cluster,
+    ):
         # a refused job would only be a line in the log, and the run would wait for workers
         test = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
         if test.returncode:
