@@ -10,7 +10,6 @@ import logging
 import os
 import subprocess
 import sys
-import tempfile
 
 import dask.config
 from dask_jobqueue import SLURMCluster
@@ -36,29 +35,23 @@ def main() -> int:
 
     # a certificate for this run: nobody else on the network can send work, which is code, to scheduler and workers
     security = Security.temporary()
-    tls = {
-        "ca-file": security.tls_ca_file,
-        "client": {"key": security.tls_client_key, "cert": security.tls_client_cert},
-    }
-    dask.config.set({"distributed.comm.require-encryption": True, "distributed.comm.tls": tls})
-    os.makedirs(arguments.logs, exist_ok=True)
-    private = tempfile.TemporaryDirectory(prefix=".tls-", dir=arguments.logs)  # only this user can read it
+    tls = {"ca-file": security.tls_ca_file, "client.key": security.tls_client_key, "client.cert": security.tls_client_cert}
+    dask.config.set({f"distributed.comm.tls.{name}": value for name, value in tls.items()})
+    private = os.path.join(os.path.abspath(arguments.logs), ".tls")  # files of the certificate, until the run's end
+    os.makedirs(private, mode=0o700, exist_ok=True)
 
-    with (
-        private as folder,
-        SLURMCluster(
-            cores=arguments.cores,
-            processes=1,
-            memory=arguments.memory,
-            queue=arguments.queue,
-            walltime=arguments.walltime,
-            job_extra_directives=arguments.directive,
-            log_directory=arguments.logs,
-            security=security,
-            shared_temp_directory=os.path.abspath(folder),
-            worker_extra_args=["--nthreads", "1"],  # a worker does one pair at a time, with all cores of its job
-        ) as cluster,
-    ):
+    with SLURMCluster(
+        cores=arguments.cores,
+        processes=1,
+        memory=arguments.memory,
+        queue=arguments.queue,
+        walltime=arguments.walltime,
+        job_extra_directives=arguments.directive,
+        log_directory=arguments.logs,
+        security=security,
+        shared_temp_directory=private,
+        worker_extra_args=["--nthreads", "1"],  # a worker does one pair at a time, with all cores of its job
+    ) as cluster:
         # a refused job would only be a line in the log, and the run would wait for workers
         test = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
         if test.returncode:
