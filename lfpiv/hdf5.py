@@ -217,6 +217,9 @@ def _digest(file: Any, end: int) -> bytes:
 
 # -- once per process --------------------------------------------------------------------------------------------------
 
+MOST_KNOWN = 50_000
+"""Largest number of keys that are kept; a file whose key was dropped is verified again."""
+
 _known: set[int] = set()
 """Keys of files with the right seal, and negative keys of files with the right structure."""
 
@@ -238,6 +241,8 @@ def file_key(path: str | Path) -> int:
 
 
 def _remember(key: int) -> None:
+    if len(_known) >= MOST_KNOWN:
+        _known.clear()
     if key:
         _known.add(key)
 

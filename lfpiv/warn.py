@@ -12,6 +12,7 @@ import json
 import logging
 import math
 import string
+from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
@@ -384,35 +385,100 @@ def from_list(stored: Any) -> tuple[Warning, ...]:
     return tuple(map(Warning.from_json, stored))
 
 
+class Gathering:
+    """Warnings of many pairs, merged as they arrive. Memory: 8 bytes per pair and kind of warning."""
+
+    def __init__(self) -> None:
+        self._groups: dict[tuple[Code, str, tuple[tuple[str, str], ...]], _Group] = {}
+
+    def add(self, warnings: Iterable[Warning]) -> None:
+        """Merge some warnings with those that are there."""
+        for warning in warnings:
+            fixed = ((name, value if isinstance(value, str) else "") for name, value in warning.figures.items())
+            key = (warning.code, warning.subject, tuple(sorted(fixed)))
+            if key not in self._groups:
+                self._groups[key] = _Group(warning)
+            self._groups[key].add(warning)
+
+    def join(self, other: Gathering) -> None:
+        """Merge the warnings of another one with those that are there."""
+        for key, group in other._groups.items():
+            if key in self._groups:
+                self._groups[key].join(group)
+            else:
+                self._groups[key] = group
+
+    def merged(self) -> list[Warning]:
+        """Return the merged warnings, sorted by code."""
+        order = list(Code)
+        return [group.merged() for _, group in sorted(self._groups.items(), key=lambda item: order.index(item[0][0]))]
+
+
+class _Group:
+    """Warnings of equal code, subject and texts."""
+
+    def __init__(self, first: Warning):
+        self.first, self.count = first, 0
+        self.pairs, self.instants = array("q"), array("q")
+        self.spans: dict[str, tuple[Any, Any]] = {}
+        """Figure -> lowest and highest number."""
+        self.unlike = set[str]()
+        """Figures that are no number in some warning."""
+
+    def add(self, warning: Warning) -> None:
+        self.count += 1
+        _extend(self.pairs, warning.pairs)
+        _extend(self.instants, warning.instants)
+        for name in self.first.figures:
+            value = warning.figures[name]
+            if isinstance(value, (int, float)):
+                low, high = self.spans.get(name, (value, value))
+                self.spans[name] = min(low, value), max(high, value)
+            else:
+                self.unlike.add(name)
+
+    def join(self, other: _Group) -> None:
+        self.count += other.count
+        _extend(self.pairs, other.pairs)
+        _extend(self.instants, other.instants)
+        self.unlike |= other.unlike
+        for name, (low, high) in other.spans.items():
+            own = self.spans.get(name, (low, high))
+            self.spans[name] = min(own[0], low), max(own[1], high)
+
+    def merged(self) -> Warning:
+        figures: dict[str, object] = dict(self.first.figures)
+        if self.count > 1:
+            figures |= {name: Span(*span) for name, span in self.spans.items() if name not in self.unlike}
+        pairs, instants = tuple(dict.fromkeys(self.pairs)), tuple(sorted({*self.instants}))
+        return replace(self.first, figures=figures, pairs=pairs, instants=instants)
+
+
+def _extend(known: array[int], numbers: Iterable[int]) -> None:
+    """Add numbers, but not one that equals the last one."""
+    for number in numbers:
+        if not known or number != known[-1]:
+            known.append(number)
+
+
 def gather(warnings: Iterable[Warning]) -> list[Warning]:
     """Merge warnings of equal code, subject and texts: their pairs in one, their numbers as ranges. Sorted by code."""
-    groups: dict[tuple[Code, str, tuple[tuple[str, str], ...]], list[Warning]] = {}
-    for warning in warnings:
-        fixed = ((name, value if isinstance(value, str) else "") for name, value in warning.figures.items())
-        groups.setdefault((warning.code, warning.subject, tuple(sorted(fixed))), []).append(warning)
-    order = list(Code)
-    return [_merged(group) for _, group in sorted(groups.items(), key=lambda item: order.index(item[0][0]))]
+    found = Gathering()
+    found.add(warnings)
+    return found.merged()
 
 
-def _merged(group: Sequence[Warning]) -> Warning:
-    first = group[0]
-    figures: dict[str, object] = {}
-    for name, value in first.figures.items():
-        values = [warning.figures[name] for warning in group]
-        numbers = [number for number in values if isinstance(number, (int, float))]
-        figures[name] = Span(min(numbers), max(numbers)) if len(numbers) == len(group) > 1 else value
-    pairs = dict.fromkeys(pair for warning in group for pair in warning.pairs)
-    instants = sorted({instant for warning in group for instant in warning.instants})
-    return replace(first, figures=figures, pairs=tuple(pairs), instants=tuple(instants))
+def name_pairs(pairs: Sequence[int], noun: str = "pair", count: int | None = None) -> str:
+    """Name the first pairs, or what else the noun says, and count the others; empty for none.
 
-
-def name_pairs(pairs: Sequence[int], noun: str = "pair") -> str:
-    """Name the first pairs, or what else the noun says, and count the others; empty for none."""
-    if not pairs:
+    `count` is the number of all, where `pairs` are the first ones. Default: all are given.
+    """
+    count = len(pairs) if count is None else count
+    if not count:
         return ""
     names = ", ".join(map(str, pairs[:NAMED_PAIRS]))
-    more = f" and {len(pairs) - NAMED_PAIRS} more" if len(pairs) > NAMED_PAIRS else ""
-    return f"{noun}{'s' if len(pairs) > 1 else ''} {names}{more}"
+    more = f" and {count - NAMED_PAIRS} more" if count > NAMED_PAIRS else ""
+    return f"{noun}{'s' if count > 1 else ''} {names}{more}"
 
 
 _collected: ContextVar[list[Warning] | None] = ContextVar("collected", default=None)

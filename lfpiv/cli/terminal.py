@@ -205,7 +205,8 @@ def print_vectors(summary: dict[str, Any], out: Path) -> None:
     for pair in pairs[:LISTED_PAIRS]:
         say(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.0f} % valid vectors")
     if len(pairs) > LISTED_PAIRS:
-        say(f"{len(pairs)} {_noun(summary)}s in all, {100 * summary['valid_fraction']:.0f} % valid vectors on average")
+        count, share = summary.get("pairs_finished", len(pairs)), 100 * summary["valid_fraction"]
+        say(f"{count} {_noun(summary)}s in all, {share:.0f} % valid vectors on average")
 
 
 def print_failed(summary: dict[str, Any], where: TextIO) -> None:
@@ -214,8 +215,10 @@ def print_failed(summary: dict[str, Any], where: TextIO) -> None:
     for item in failed[:LISTED_PAIRS]:
         say(f"failed: {_noun(summary)} {item['pair']}: {item['reason']}", file=where)
     total, earlier = summary["experiment"]["pairs"], len(summary["failed"]) - len(failed)
+    unnamed = summary.get("pairs_failed", len(summary["failed"])) - len(summary["failed"])
     if failed:
-        say(f"{len(failed)} of {total} {_noun(summary)}s failed; the same command tries them again", file=where)
+        count = len(failed) + unnamed
+        say(f"{count} of {total} {_noun(summary)}s failed; the same command tries them again", file=where)
     if earlier:
         say(f"{earlier} of {total} {_noun(summary)}s failed in earlier runs and were not tried in this one", file=where)
 

@@ -65,7 +65,7 @@ def write_report(
         "background": background.section(experiment, calibration),
         "volumes": volumes.section(figures.pairs, vectors) if vectors else "",
         "vectors": vector_section.section(vectors),
-        "pairs": pairs.section(figures.pairs, figures.failed) if figures.pairs else "",
+        "pairs": pairs.section(figures.pairs, figures.failed, figures.finished_count) if figures.pairs else "",
         "time": overview.timings(figures),
         "settings": overview.settings_and_versions(figures),
     }

@@ -11,6 +11,7 @@ import gzip
 import json
 import logging
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,7 +74,7 @@ def survey(vectors: Mapping[int, Path]) -> Survey:
     InputError
         If a file that is read cannot be read or holds no vectors.
     """
-    chosen = evenly(list(vectors), MOST_READ)
+    chosen = evenly(array("q", vectors), MOST_READ)
     first = netcdf.read_vectors(vectors[chosen[0]])
     most = max(min(MOST_VECTORS // min(first["u"].size, MOST_IN_FIELD) - 2, MOST_SHOWN), 1)
     shown = {pair: netcdf.read_vectors(vectors[pair]) for pair in evenly(chosen, most)}

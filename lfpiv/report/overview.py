@@ -17,7 +17,7 @@ WARNINGS_SHOWN, WARNINGS_MOST = 12, 300
 
 def head(experiment: Experiment, summary: Summary) -> str:
     """Return the title of the page and the main figures of the run."""
-    finished, failed = len(summary.pairs), len(summary.failed)
+    finished, failed = summary.finished_count, summary.failed_count
     cards = [(f"{finished:,}", f"image {'pair' if finished == 1 else 'pairs'} finished")]
     if failed:
         cards.append((f"{failed:,}", f"image {'pair' if failed == 1 else 'pairs'} failed"))
@@ -50,6 +50,8 @@ def head(experiment: Experiment, summary: Summary) -> str:
 def warnings(summary: Summary) -> str:
     """List the failed pairs, then the warnings."""
     failed = [f"Pair {failure.pair} failed: {failure.reason}" for failure in summary.failed]
+    unnamed = summary.failed_count - len(failed)
+    failed += [f"{unnamed:,} more pairs failed"] if unnamed else []
     texts = [*failed, *summary.warnings]
     if not texts:
         return ""
@@ -104,10 +106,11 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         (
             "Board",
             f"{board.dots[0]} × {board.dots[1]} dots, {board.spacing_mm:g} mm apart, in {len(board.planes_mm)} planes "
-            f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm",
+            f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm"
+            + (f", with a mark of {len(board.mark)} places without a dot" if board.mark else ""),
         ),
         ("Axes", _axes(experiment)),
-        ("Image pairs", f"{len(summary.pairs):,} of {experiment.pairs:,} finished"),
+        ("Image pairs", f"{summary.finished_count:,} of {experiment.pairs:,} finished"),
         ("Motion passes", _motion(summary)),
         ("Weights", _weights(summary.weights)),
         ("Cameras against each other", _agreement(summary.weights)),

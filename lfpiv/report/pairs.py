@@ -74,7 +74,7 @@ def _known(reduce: Callable[[np.ndarray], SupportsFloat], values: np.ndarray) ->
     return float(reduce(values)) if values.size else float("nan")
 
 
-def section(pairs: Sequence[PairFigures], failures: Sequence[Failure]) -> str:
+def section(pairs: Sequence[PairFigures], failures: Sequence[Failure], finished: int | None = None) -> str:
     """Return the section on all pairs, as HTML.
 
     Parameters
@@ -83,12 +83,14 @@ def section(pairs: Sequence[PairFigures], failures: Sequence[Failure]) -> str:
         Finished pairs; at least one.
     failures : sequence of Failure
         Pairs without result, marked in the charts.
+    finished : int, optional
+        Number of all finished pairs, where `pairs` is an evenly chosen part of them. Default: all are given.
     """
     pairs = sorted(pairs, key=lambda pair: pair.number)
     groups = group(pairs)
     failed = [failure.pair for failure in failures]
     single = bool((groups.pairs == 1).all())
-    parts = ['<h2 id="pairs">All pairs</h2>', markup.paragraph(_overview(pairs, failed))]
+    parts = ['<h2 id="pairs">All pairs</h2>', markup.paragraph(_overview(pairs, failed, finished or len(pairs)))]
     table = _table(groups, single)
     if len(pairs) == 1:
         return "\n".join([*parts, table])
@@ -99,7 +101,7 @@ def section(pairs: Sequence[PairFigures], failures: Sequence[Failure]) -> str:
     if not single:
         caption = (
             f"Each pair's figures over its valid vectors; {groups.pairs.max()} neighbouring pairs are merged: "
-            "lines are their mean, bands reach from the lowest to the highest. summary.json holds every pair."
+            "lines are their mean, bands reach from the lowest to the highest."
         )
     if failed:
         caption += " Marks on the lower edge: failed pairs."
@@ -107,10 +109,11 @@ def section(pairs: Sequence[PairFigures], failures: Sequence[Failure]) -> str:
     return "\n".join(parts)
 
 
-def _overview(pairs: Sequence[PairFigures], failed: Sequence[int]) -> str:
+def _overview(pairs: Sequence[PairFigures], failed: Sequence[int], finished: int) -> str:
     """Count the pairs and state their mean and lowest valid share."""
     shares = np.array([pair.valid_fraction for pair in pairs])
-    text = f"{markup.count(len(pairs), 'pair')} finished"
+    text = f"{markup.count(finished, 'pair')} finished"
+    text += f", of which {len(pairs):,}, evenly chosen, are shown here" if len(pairs) < finished else ""
     text += f", {markup.count(len(failed), 'pair')} failed" if failed else ""
     if len(pairs) == 1:
         return f"{text}: statistics over pairs need two or more."

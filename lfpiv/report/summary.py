@@ -120,7 +120,22 @@ class Summary(_Figures):
     calibration: dict[str, CameraFigures]
     weights: WeightFigures = WeightFigures()
     pairs: tuple[PairFigures, ...]
+    """Finished pairs; of very many an evenly chosen part."""
+    pairs_finished: int | None = None
+    """Number of all finished pairs; None in summaries that list all."""
     failed: tuple[Failure, ...] = ()
+    pairs_failed: int | None = None
+    """Number of all failed pairs; None in summaries that list all."""
     valid_fraction: float | None
     warnings: tuple[str, ...]
     reused: tuple[str, ...]
+
+    @property
+    def finished_count(self) -> int:
+        """Number of all finished pairs."""
+        return len(self.pairs) if self.pairs_finished is None else self.pairs_finished
+
+    @property
+    def failed_count(self) -> int:
+        """Number of all failed pairs."""
+        return len(self.failed) if self.pairs_failed is None else self.pairs_failed

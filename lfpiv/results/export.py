@@ -1,4 +1,4 @@
-"""`export_results`: write vectors of a run in formats of other programs: ParaView (vti), one NetCDF file, CSV, pivpy.
+"""`export_results`: write vectors of a run in formats of other programs: ParaView (vti), NetCDF, Zarr, CSV, pivpy.
 
 A file appears under its name only when it is complete. Existing files are replaced as a whole.
 """
@@ -21,12 +21,14 @@ from pyevtk.hl import imageToVTK
 from pyevtk.vtk import VtkGroup
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.settings import Series
 from lfpiv.files import replacing, writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import netcdf
+from lfpiv.results import netcdf, stores
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.reader import open_results
+from lfpiv.results.stacked_files import INSTANT, PAIR, TIME_ATTRIBUTES, StackedFiles
 from lfpiv.velocity import derived
 from lfpiv.version import versions
 
@@ -39,7 +41,6 @@ CSV_DIGITS = 9
 """Significant digits in text, enough for single precision."""
 
 _MM_PER_M = 1000.0
-_TIME = "first frame of the pair after that of pair 0"  # description of times in seconds
 
 
 class Format(enum.Enum):
@@ -47,6 +48,7 @@ class Format(enum.Enum):
 
     VTI = "one .vti image per pair and one per stored volume, with .pvd collections over the pairs: ParaView, pyvista"
     NETCDF = "vectors.nc, one NetCDF4 file over all pairs: xarray, MATLAB"
+    ZARR = "vectors.zarr, one Zarr store over all pairs, to which a later export adds what is new: xarray, dask"
     CSV = "one table per pair, a row per vector, units in the header"
     PIVPY = "one NetCDF file per depth, planes of u and v over all pairs: pivpy"
 
@@ -67,7 +69,7 @@ def export_results(
     ----------
     folder : str or Path
         Folder of the run.
-    to : {"vti", "netcdf", "csv", "pivpy"}
+    to : {"vti", "netcdf", "zarr", "csv", "pivpy"}
         The format, see `Format` and docs/conventions.md.
     out : str or Path, optional
         Folder to write to. Default: `FOLDER` inside `folder`.
@@ -76,8 +78,8 @@ def export_results(
     depth_mm : float, optional
         For "pivpy": only the plane of vectors nearest to this z [mm]. Default: all planes.
     interval_s : float, optional
-        Time between the first frames of successive pairs [s], which makes times in "vti", "netcdf" and "pivpy" seconds.
-        Default: the number of the pair is used as time.
+        Time between the first frames of successive pairs [s], which makes times in "vti", "netcdf", "zarr" and "pivpy"
+        seconds. Default: the number of the pair is used as time. The times of a time series are known.
     progress : callable, optional
         Called as ``progress("export", fraction)``.
 
@@ -120,6 +122,9 @@ def export_results(
         raise InputError(f"depth: expected with pivpy only, whose files are planes, found it with {to}. Leave it out.")
     if interval_s is not None and not (math.isfinite(interval_s) and interval_s > 0):
         raise InputError(f"interval: expected a time above 0 s between pairs, found {interval_s!r}.")
+    files = StackedFiles(Path(folder), pairs)
+    if interval_s is not None and files.dimension == INSTANT:
+        raise InputError("interval: expected for image pairs only; the times of a time series are known. Leave it out.")
     results = open_results(folder, pairs=pairs)
     planes = results["z"].values if depth_mm is None else _nearest(results["z"], depth_mm)
     target = Path(folder) / FOLDER if out is None else Path(out)
@@ -131,9 +136,12 @@ def export_results(
     try:
         with writing(target):
             if form is Format.VTI:
-                return _write_vti(results, Folder(Path(folder)), target, interval_s, step)
-            if form is Format.NETCDF:
-                return _write_netcdf(results, target, interval_s, step)
+                return _write_vti(results, _folder(Path(folder), files), target, interval_s, step)
+            if form in (Format.NETCDF, Format.ZARR):
+                write = stores.write_netcdf if form is Format.NETCDF else stores.write_zarr
+                path = target / ("vectors.nc" if form is Format.NETCDF else "vectors.zarr")
+                write(files, path, {"versions": versions()}, interval_s, step)
+                return [path]
             if form is Format.CSV:
                 return _write_csv(results, target, step)
             return _write_pivpy(results, planes, target, interval_s, step)
@@ -141,6 +149,14 @@ def export_results(
         for path in made:
             if path.is_dir() and not any(path.iterdir()):
                 path.rmdir()
+
+
+def _folder(path: Path, files: StackedFiles) -> Folder:
+    """Return the folder of the run with the names of its results."""
+    if files.dimension == PAIR:
+        return Folder(path)
+    first, step = int(files.numbers[0]), int(files.first.attrs.get("step", 1))
+    return Folder(path, Series(instants=len(files) + step, first=first, step=step))
 
 
 def _nearest(depths: xr.DataArray, depth_mm: float) -> np.ndarray:
@@ -156,16 +172,30 @@ def _nearest(depths: xr.DataArray, depth_mm: float) -> np.ndarray:
 
 
 def _times(results: xr.Dataset, interval_s: float | None) -> np.ndarray:
-    """Return the time of each pair [s], or its number if the interval is not known."""
+    """Return the time of each instant [s], or of each pair, or its number if the interval is not known."""
+    if INSTANT in results.dims:
+        return np.asarray(results["time"].values)
     return results["pair"].values * (1.0 if interval_s is None else interval_s)
+
+
+def _along(results: xr.Dataset) -> str:
+    """Return the dimension over the results, which is also the first part of the files' names."""
+    return INSTANT if INSTANT in results.dims else PAIR
+
+
+def _stem(results: xr.Dataset, number: int) -> str:
+    """Return the name of the files of a pair, or of an instant and the one `step` after it, without suffix."""
+    return f"instant_{number:06d}" if INSTANT in results.dims else f"pair_{number:04d}"
 
 
 def _each_pair(results: xr.Dataset, progress: StepProgress) -> Iterator[tuple[int, xr.Dataset]]:
     """Load and yield one pair after the other."""
-    total = results.sizes["pair"]
+    along = _along(results)
+    total = results.sizes[along]
     for done in range(total):
         progress(done / total)
-        yield int(results["pair"][done]), results.isel(pair=done, drop=True).load()
+        one = results.isel({along: done}, drop=True).drop_vars("time", errors="ignore")
+        yield int(results[along][done]), one.load()
     progress(1.0)
 
 
@@ -175,14 +205,14 @@ def _each_pair(results: xr.Dataset, progress: StepProgress) -> Iterator[tuple[in
 def _write_vti(
     results: xr.Dataset, folder: Folder, target: Path, interval_s: float | None, progress: StepProgress
 ) -> list[Path]:
-    times = dict(zip(results["pair"].values.tolist(), _times(results, interval_s).tolist(), strict=True))
+    times = dict(zip(results[_along(results)].values.tolist(), _times(results, interval_s).tolist(), strict=True))
     collections: dict[str, dict[Path, float]] = {}
     mismatched: list[Path] = []
     for pair, vectors in _each_pair(results, progress):
-        path = target / f"pair_{pair:04d}.vti"
+        path = target / f"{_stem(results, pair)}.vti"
         _write_image(_vector_arrays(vectors), vectors, path)
         collections.setdefault("vectors", {})[path] = times[pair]
-        for frame, name in enumerate(FRAME_NAMES):
+        for frame, name in enumerate(FRAME_NAMES if folder.series is None else FRAME_NAMES[:1]):
             stored = folder.volume(pair, frame)
             if not stored.is_file():
                 continue
@@ -191,8 +221,11 @@ def _write_vti(
                 continue
             volume = netcdf.read_volume(stored)
             path = target / f"volume_{pair:04d}_{name}.vti"
+            if folder.series is not None:
+                path = target / f"volume_{pair:06d}.vti"
             _write_image({"intensity": volume.values}, volume, path)
-            collections.setdefault(f"volumes_{name}", {})[path] = times[pair]
+            kind = f"volumes_{name}" if folder.series is None else "volumes"
+            collections.setdefault(kind, {})[path] = times[pair]
     if mismatched:
         log.warning(
             "%s%s: not exported, made with other settings or images than the vectors. Run `lfpiv run` with "
@@ -264,17 +297,6 @@ def _write_collection(files: dict[Path, float], path: Path) -> None:
 # -- NetCDF, text, pivpy -----------------------------------------------------------------------------------------------
 
 
-def _write_netcdf(results: xr.Dataset, target: Path, interval_s: float | None, progress: StepProgress) -> list[Path]:
-    path = target / "vectors.nc"
-    if interval_s is not None:
-        attributes = {"units": "s", "standard_name": "time", "long_name": _TIME}
-        results = results.assign_coords(time=("pair", _times(results, interval_s), attributes))
-    progress(0.0)
-    netcdf.write_dataset(results, path, attributes={"versions": versions()})
-    progress(1.0)
-    return [path]
-
-
 def _write_csv(results: xr.Dataset, target: Path, progress: StepProgress) -> list[Path]:
     written = []
     for pair, vectors in _each_pair(results, progress):
@@ -283,7 +305,7 @@ def _write_csv(results: xr.Dataset, target: Path, progress: StepProgress) -> lis
         titles = [str(name) if units[name] == "1" else f"{name} [{units[name]}]" for name in names]
         flags = {name: vectors[name].astype(np.uint8) for name, item in vectors.data_vars.items() if item.dtype == bool}
         table = vectors.assign(flags).to_dataframe(dim_order=list(AXES))
-        path = target / f"pair_{pair:04d}.csv"
+        path = target / f"{_stem(results, pair)}.csv"
         with replacing(path) as scratch:
             table.reset_index().to_csv(
                 scratch, columns=names, header=titles, index=False, float_format=f"%.{CSV_DIGITS}g", encoding="utf-8"
@@ -307,22 +329,24 @@ def _write_pivpy(
 
 def _plane(results: xr.Dataset, interval_s: float | None) -> xr.Dataset:
     """Return one plane of vectors in pivpy's form: dims y, x, t, velocities in mm/s because lengths are in mm."""
-    dims = ("y", "x", "t")
+    dims, along = ("y", "x", "t"), _along(results)
     names = {"u": "u", "v": "v", "w": "velocity_z"}  # pivpy keeps derived scalars in w
     variables: dict[str, Any] = {}
     for name, variable in names.items():
-        values = results[name].transpose("y", "x", "pair").values.astype(float) * _MM_PER_M
+        values = results[name].transpose("y", "x", along).values.astype(float) * _MM_PER_M
         standard = {"standard_name": f"{name}_velocity"} if name == variable else {}
         text = f"velocity along {derived.COMPONENTS[name]}"
         variables[variable] = (dims, values, {"units": "mm/s", "long_name": text, **standard})
-    flags = results["valid"].transpose("y", "x", "pair").values.astype(float)
+    flags = results["valid"].transpose("y", "x", along).values.astype(float)
     if "masked" in results:
-        flags[results["masked"].transpose("y", "x", "pair").values] = -1
+        flags[results["masked"].transpose("y", "x", along).values] = -1
     text = "1: measured, 0: replaced, -1: masked"
     variables["chc"] = (dims, flags, {"standard_name": "validity_flag", "long_name": text})
     time = {"units": "frame", "long_name": "number of the pair"}
     if interval_s is not None:
-        time = {"units": "s", "long_name": _TIME}
+        time = {"units": "s", "long_name": stores.PAIR_TIME_ATTRIBUTES["long_name"]}
+    elif along == INSTANT:
+        time = {"units": "s", "long_name": TIME_ATTRIBUTES["long_name"]}
     coordinates = {
         "x": ("x", results["x"].values, {"units": "mm"}),
         "y": ("y", results["y"].values, {"units": "mm"}),
@@ -331,7 +355,7 @@ def _plane(results: xr.Dataset, interval_s: float | None) -> xr.Dataset:
     }
     attributes = {
         "delta_t": float(results.attrs["dt_s"]),
-        "files": [f"pair_{number:04d}.nc" for number in results["pair"].values],
+        "files": [f"{_stem(results, number)}.nc" for number in results[along].values.tolist()],
         "pivpy_schema_version": "1",
     }
     return xr.Dataset(variables, coordinates, attributes)

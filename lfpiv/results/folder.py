@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import json
 import logging
+import operator
 import os
+import re
 import secrets
 import shutil
 import socket
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +28,11 @@ log = logging.getLogger(__name__)
 
 FRAME_NAMES = "ab"
 """Names of the two frames in output files, independent of the names of the images."""
+
+MOST_DIGITS = 19
+"""Digits from which on the number in a file's name is no number of a pair."""
+
+_NUMBER = re.compile(r"\d+")
 
 RETIRED = ".outdated"
 """Suffix, in place of ``.nc``, of older results of a pair that failed after its images changed."""
@@ -64,6 +72,11 @@ class Folder:
         return self.path / "summary.json"
 
     @property
+    def pairs(self) -> Path:
+        """Figures of all pairs, a line of JSON each, where they are too many for the summary."""
+        return self.path / "pairs.jsonl"
+
+    @property
     def report(self) -> Path:
         """Report of the run as HTML."""
         return self.path / "report.html"
@@ -90,15 +103,38 @@ class Folder:
             name = f"instant_{pair + frame * self.series.step:06d}"
         return self.path / "volumes" / f"{name}.nc"
 
+    def stored(self, numbers: range, *, vectors: bool, volumes: bool) -> bytearray:
+        """Return for each pair 1 if all its files are there, 0 otherwise. This lists folders and opens no file."""
+        wanted: list[Callable[[int], Path]] = [self.vectors] if vectors else []
+        wanted += [functools.partial(self.volume, frame=frame) for frame in (0, 1)] if volumes else []
+        found = bytearray(b"\x01") * len(numbers)
+        for path_of in wanted:
+            listed = self._listed(numbers, path_of)
+            found = bytearray(map(operator.and_, found, listed))
+        return found
+
+    def _listed(self, numbers: range, path_of: Callable[[int], Path]) -> bytearray:
+        """Return for each pair 1 if a file with the name of its result is in the folder of such results."""
+        found, sample = bytearray(len(numbers)), path_of(0)
+        first = int(_NUMBER.search(sample.name)[0])  # type: ignore[index]  # of the second frame of pair 0
+        with contextlib.suppress(OSError), os.scandir(sample.parent) as entries:
+            for entry in entries:
+                match = _NUMBER.search(entry.name)
+                pair = int(match[0]) - first if match and len(match[0]) < MOST_DIGITS else -1
+                if pair in numbers and path_of(pair).name == entry.name:
+                    found[numbers.index(pair)] = 1
+        return found
+
     def sweep(self) -> None:
         """Remove half-written and shared files of a run that was killed. The caller must hold the lock."""
         for place in (self.path, self.vectors(0).parent, self.volume(0, 0).parent):
             for path in place.glob(".*.tmp"):
                 with contextlib.suppress(OSError):  # a folder is nobody's half-written file
                     path.unlink(missing_ok=True)
-        shutil.rmtree(self.shared, ignore_errors=True)
-        with contextlib.suppress(OSError):  # a file or a link in its place
-            self.shared.unlink()
+        if self.shared.is_dir() and not self.shared.is_symlink():
+            shutil.rmtree(self.shared, ignore_errors=True)
+        else:
+            self.shared.unlink(missing_ok=True)  # `rmtree` would wait for a pipe
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
@@ -117,6 +153,24 @@ class Folder:
                 with contextlib.suppress(OSError):  # while locked: no other run has the file open and locked
                     self.lock.unlink()
                 os.close(file)
+
+
+class VectorFiles(Mapping[int, Path]):
+    """Pair -> path of its vectors, for some pairs of a folder; holds no path."""
+
+    def __init__(self, folder: Folder, pairs: Collection[int]):
+        self._folder, self._pairs = folder, pairs
+
+    def __getitem__(self, pair: int) -> Path:
+        if pair not in self._pairs:
+            raise KeyError(pair)
+        return self._folder.vectors(pair)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._pairs)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
 
 
 def _lock(path: Path) -> int | None:

@@ -345,6 +345,11 @@ def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, A
         hdf5.seal(scratch)
 
 
+def for_file(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
+    """Return a dataset with the attributes and encodings of a file, for writers that write it in parts."""
+    return _packed(dataset, attributes)
+
+
 def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
     """Return a dataset with the attributes and the compression that it has in a file."""
     dataset = dataset.copy()

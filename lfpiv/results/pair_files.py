@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -184,6 +185,11 @@ class PairFiles:
             grid=experiment.grid,
         )
 
+    @cached_property
+    def vector_marks(self) -> Marks | None:
+        """Marks of the vectors, read once; None if they are missing or cannot be used."""
+        return finished.vectors_marks(self.vectors, self.grid)
+
     def _wanted(self, vectors: bool, volumes: bool) -> Iterator[tuple[Path, Stamp]]:
         if vectors:
             yield self.vectors, self.stamp
@@ -193,7 +199,7 @@ class PairFiles:
     def _marks(self, path: Path) -> Marks | None:
         """Return the marks of one of the files; None if it is missing or cannot be used."""
         if path == self.vectors:
-            return finished.vectors_marks(path, self.grid)
+            return self.vector_marks
         return next(frame.marks() for frame in self.frames if frame.path == path)
 
     def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:

@@ -14,6 +14,7 @@ import os
 import queue
 from collections import Counter, deque
 from collections.abc import Generator, Iterable, Sequence
+from operator import length_hint
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,9 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import StepProgress
 from lfpiv.runs import cluster_workers, local_workers, worker
 from lfpiv.runs.local_workers import Capacity
-from lfpiv.runs.pair import Outcome, PairProgress, PairWork
-from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut, whole
+from lfpiv.runs.pair import Outcome, PairWork
+from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut
+from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan
 from lfpiv.warn import name_pairs
 from lfpiv_kernels.runtime import cores
@@ -36,18 +38,22 @@ TICK_S = 0.5
 """Interval at which the state of the cluster is checked and progress is reported [s]."""
 
 
-def sequential(work: PairWork, todo: Sequence[int], progress: StepProgress) -> Generator[Outcome, None, None]:
-    """Do pairs one after the other in this process; yield the outcome of each. A series goes along its chains."""
-    done = 0
+def sequential(work: PairWork, todo: Iterable[int], progress: StepProgress) -> Generator[Outcome, None, None]:
+    """Do pairs one after the other in this process; yield the outcome of each.
+
+    Pairs are taken from `todo` when their turn comes; those of a series come along its chains. `operator.length_hint`
+    says how many may come.
+    """
+    source = iter(todo)
+    total = max(length_hint(source), 1)
+    before = _kept(todo)
     progress(0.0)
-    for stretch in whole(todo, _step(work.experiment)):
-        yield from work.do(stretch, _counted(progress, done, len(todo)))
-        done += len(stretch.pairs)
+    yield from work.do(source, lambda number, fraction: progress((_kept(todo) - before + number + fraction) / total))
 
 
-def _counted(progress: StepProgress, done: int, total: int) -> PairProgress:
-    """Return the progress of a stretch of a step of which some pairs are done."""
-    return lambda number, fraction: progress((done + number + fraction) / total)
+def _kept(todo: Iterable[int]) -> int:
+    """Return the number of pairs that were passed over because they are finished."""
+    return todo.finished[1] if isinstance(todo, Todo) else 0
 
 
 def _step(experiment: Experiment) -> int | None:
@@ -55,7 +61,7 @@ def _step(experiment: Experiment) -> int | None:
 
 
 def parallel(
-    shared: Path, experiment: Experiment, todo: Sequence[int], workers: Plan | str, progress: StepProgress
+    shared: Path, experiment: Experiment, todo: Iterable[int], workers: Plan | str, progress: StepProgress
 ) -> Generator[Outcome, None, None]:
     """Do pairs in parallel, in any order; yield the outcome of each.
 
@@ -64,8 +70,8 @@ def parallel(
     shared : Path
         Folder with everything that the workers need, from `task.write_task`.
     experiment : Experiment
-    todo : sequence of int
-        Pairs to do.
+    todo : iterable of int
+        Pairs to do; each is taken when a worker is free.
     workers : Plan or str
         Processes to start on this machine, or the address of a Dask scheduler whose workers see `shared`.
     progress : callable
@@ -85,9 +91,10 @@ def parallel(
     found = (
         cluster_workers.workers(workers, shared) if isinstance(workers, str) else local_workers.workers(workers, shared)
     )
+    total = max(length_hint(todo), 1)
     stretches = cut(todo, _step(experiment), CLUSTER_WORKERS if isinstance(workers, str) else workers.workers)
     with found as (client, capacity):
-        yield from Dispatch(client, capacity, shared, stretches, len(todo), experiment.noun).outcomes(progress)
+        yield from Dispatch(client, capacity, shared, stretches, total, experiment.noun).outcomes(progress)
 
 
 class Dispatch:
@@ -104,8 +111,9 @@ class Dispatch:
     ):
         self.client, self.capacity, self.shared, self.noun = client, capacity, shared, noun
         self.total, self.done = total, 0
-        self.coming = iter(todo)
-        """Stretches to submit after those that wait."""
+        """Largest number of pairs that may come, and the number of those that were done."""
+        self.coming, self.all_came = iter(todo), False
+        """Stretches to submit after those that wait, and whether there are no more."""
         self.waiting, self.again = deque[Stretch](), deque[Stretch]()
         """Stretches to submit now, and after all others."""
         self.running: dict[str, tuple[Any, Stretch]] = {}
@@ -126,8 +134,10 @@ class Dispatch:
         """Submit all stretches and yield the outcomes of their pairs."""
         self.client.subscribe_topic(self.topic, lambda event: self.fractions.update([event[1]]))
         try:
-            while self.done < self.total:
+            while True:
                 self._submit()
+                if self.all_came and not (self.running or self.waiting or self.again):
+                    return
                 progress(self._fraction())
                 try:
                     future = self.arrived.get(timeout=TICK_S)
@@ -145,6 +155,7 @@ class Dispatch:
         if not self.waiting:
             if (coming := next(self.coming, None)) is not None:
                 return coming
+            self.all_came = True
             if not self.running:
                 self.waiting, self.again = self.again, self.waiting
         return self.waiting.popleft() if self.waiting else None

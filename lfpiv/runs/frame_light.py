@@ -7,7 +7,7 @@ frame of a pair or an instant of a series. `compare` compares both frames of a p
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -53,8 +53,11 @@ def frame_light(
     cameras: Mapping[str, CalibratedCamera],
     darks: Mapping[str, np.ndarray | None],
     frame: Frame,
+    read: Callable[[str, Frame], np.ndarray] | None = None,
 ) -> FrameLight:
-    """Read and check the images of one frame of a pair, or of one instant. `darks` is from `read_darks`.
+    """Read and check the images of one frame of a pair, or of one instant.
+
+    `darks` is from `read_darks`. `read` returns the image of a camera; default: it is read from its file.
 
     Raises
     ------
@@ -65,7 +68,8 @@ def frame_light(
     label = frame.name if experiment.series is None else None
     images, noise, structure, fingerprints, warnings = {}, {}, {}, {}, list[Warning]()
     for name, camera in cameras.items():
-        raw, dark = experiment.particle_image(name, *frame), darks[name]
+        raw = experiment.particle_image(name, *frame) if read is None else read(name, frame)
+        dark = darks[name]
         image = raw if dark is None else raw - dark
         level, noise[name] = camera.decoder.background(image)
         light = image - np.float32(level)
@@ -124,6 +128,7 @@ def pair_light(
     cameras: Mapping[str, CalibratedCamera],
     darks: Mapping[str, np.ndarray | None],
     pair: int,
+    read: Callable[[str, Frame], np.ndarray] | None = None,
 ) -> tuple[FrameLight, FrameLight]:
     """Read and check the images of both frames of a pair; the parameters are those of `frame_light`.
 
@@ -132,7 +137,7 @@ def pair_light(
     InputError
         As `frame_light`, and if two images are the same, pixel by pixel.
     """
-    first, second = (frame_light(experiment, cameras, darks, frame) for frame in experiment.pair_frames(pair))
+    first, second = (frame_light(experiment, cameras, darks, frame, read) for frame in experiment.pair_frames(pair))
     between = compare(experiment, cameras, first, second)
     return replace(first, warnings=(*first.warnings, *between)), second
 

@@ -10,8 +10,10 @@ import logging
 import traceback
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -130,11 +132,11 @@ class Instants:
         light = self.work.read_light(file)
         found = _Instant(file.frame, self.work.reconstruct(light, progress), light)
         if self.work.keep_volumes:
-            file.write(found.volume)
+            self.work.write(partial(file.write, found.volume), large=True)
         if file.frame.number in self.stored and self.work.scratch is not None:
             _write_light(light, _light_path(file, self.work.scratch))
             if not self.work.keep_volumes:
-                file.within(self.work.scratch).write(found.volume)
+                self.work.write(partial(file.within(self.work.scratch).write, found.volume), large=True)
         return found
 
     def _compared(self, first: _Instant, second: _Instant) -> Sequence[Warning]:
@@ -156,7 +158,7 @@ class Instants:
         path = _light_path(file, self.work.scratch)
         try:
             light = _read_light(file.frame, list(self.work.cameras), path)
-        except (OSError, ValueError, KeyError):  # it is read from the images
+        except (OSError, ValueError, KeyError, BadZipFile):  # it is read from the images
             return None
         self._take(file, path)
         return light

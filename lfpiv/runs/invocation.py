@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from lfpiv.runs.moved_cameras import CameraDisparity, SelfCalibrationFigures
@@ -80,11 +80,40 @@ class Workers:
     """Largest memory that one of several workers held."""
 
 
+MOST_FAILED = 10_000
+"""Largest number of failed pairs whose reasons are kept; the others are counted."""
+
+
+class Tried:
+    """Outcomes of the pairs that an invocation tried: one byte per pair, and the reasons of the failed ones."""
+
+    def __init__(self, numbers: range = range(0)):
+        self._numbers, self._tried = numbers, bytearray(len(numbers))
+        self.failed: dict[int, str] = {}
+        """Pair -> why it failed, of the first `MOST_FAILED`."""
+        self.failures = 0
+        """Number of all failed pairs."""
+        self.peak_memory_mib = 0.0
+        """Largest memory that a worker process held."""
+
+    def add(self, outcome: Outcome) -> None:
+        """Keep the outcome of one pair."""
+        self._tried[self._numbers.index(outcome.pair)] = 1
+        self.peak_memory_mib = max(self.peak_memory_mib, outcome.peak_memory_mib)
+        if outcome.reason:
+            self.failures += 1
+            if len(self.failed) < MOST_FAILED:
+                self.failed[outcome.pair] = outcome.reason
+
+    def __contains__(self, pair: int) -> bool:
+        return pair in self._numbers and bool(self._tried[self._numbers.index(pair)])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Invocation:
     """Results of one invocation."""
 
-    outcomes: Sequence[Outcome] = ()
+    tried: Tried = field(default_factory=Tried)
     """Outcomes of the pairs that were tried."""
     weights: WeightsFigures | None = None
     """None if no weights were built."""
@@ -94,8 +123,3 @@ class Invocation:
     """Results of earlier invocations, named for the summary."""
     warnings: Sequence[Warning] = ()
     """Warnings of the run itself; warnings about results are stored with the results."""
-
-    @property
-    def failed(self) -> dict[int, str]:
-        """Pair -> why it failed."""
-        return {outcome.pair: outcome.reason for outcome in self.outcomes if outcome.reason}

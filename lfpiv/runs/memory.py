@@ -28,8 +28,8 @@ BYTES_PER_VOXEL = LEAST_BYTES_PER_VOXEL
 BYTES_PER_VOXEL_AND_CAMERA = LEAST_BYTES_PER_VOXEL
 """Ray model of a voxel in one camera [byte]: chief ray, slopes, second-order terms, widths."""
 
-BYTES_PER_PIXEL = 64
-"""Memory per sensor pixel [byte]: images, their light-field blocks, the decoder's arrays."""
+BYTES_PER_PIXEL = 72
+"""Memory per sensor pixel [byte]: images, those of the next pair, light-field blocks, the decoder's arrays."""
 
 BASE_BYTES = GIB // 2
 """Memory of Python, its libraries and compiled kernels [byte]."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -35,7 +36,7 @@ from lfpiv.runs import pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.guard import with_guard
 from lfpiv.runs.instants import Instants, failure
-from lfpiv.runs.stretches import Stretch
+from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.warn import FirstOfEachCode, Warning
 
@@ -96,23 +97,37 @@ class PairWork:
     """Folder in which processes store volumes for each other; None for a process by itself."""
     log_first: FirstOfEachCode = field(default_factory=lambda: FirstOfEachCode(log))
 
-    def do(self, stretch: Stretch, progress: PairProgress) -> Iterator[Outcome]:
-        """Work on the pairs of a stretch, one after the other; yield the outcome of each.
+    def do(self, pairs: Iterable[int], progress: PairProgress, *, stored: Collection[int] = ()) -> Iterator[Outcome]:
+        """Work on pairs, one after the other; yield the outcome of each.
 
-        An error ends one pair only and is returned as its outcome.
+        An error ends one pair only and is returned as its outcome. `stored` are the instants of a series whose volumes
+        other processes need.
 
         Raises
         ------
         StorageError
             If a result cannot be written; then no other pair could be written either.
         """
-        instants = None if self.experiment.series is None else Instants(self, stretch.stored)
-        for number, pair in enumerate(stretch.pairs):
-            yield self._outcome(pair, instants, partial(progress, number))
+        instants = None if self.experiment.series is None else Instants(self, stored)
+        computed: _Computed | None = None
+        try:
+            for number, (pair, coming) in enumerate(_with_next(pairs)):
+                self._read_ahead(pair, coming)
+                found = self._compute(pair, instants, partial(progress, number))
+                if computed is not None:
+                    yield computed.outcome()
+                computed = found
+            if computed is not None:
+                yield computed.outcome()
+        finally:
+            self.writer.wait()
+            self.images.start(())
         if instants is not None:
             instants.clear()
 
-    def _outcome(self, pair: int, instants: Instants | None, progress: StepProgress) -> Outcome:
+    def _compute(self, pair: int, instants: Instants | None, progress: StepProgress) -> _Computed:
+        """Compute the results of one pair and start to write them."""
+        self.written.clear()
         try:
             # sums of BLAS depend on its number of threads; the numbers must not depend on the number of workers
             with threadpool_limits(1):
@@ -120,9 +135,35 @@ class PairWork:
         except StorageError:
             raise
         except Exception as error:  # an error in one pair must not end the others
-            return Outcome(pair=pair, reason=str(failure(error)))
-        progress(1.0)
-        return Outcome(pair=pair)
+            return _Computed(pair=pair, reason=str(failure(error)), written=tuple(self.written), progress=progress)
+        return _Computed(pair=pair, reason="", written=tuple(self.written), progress=progress)
+
+    def _read_ahead(self, pair: int, coming: int | None) -> None:
+        """Start to read the images of the coming pair whose volumes are not in the folder."""
+        frames: list[Frame] = []
+        if coming is not None and self.weights is not None:
+            both = enumerate(self.experiment.pair_frames(coming))
+            frames = [frame for number, frame in both if not self.folder.volume(coming, number).exists()]
+        self.images.start(frames, self.experiment.pair_frames(pair))
+
+    def write(self, write: Callable[[], None], *, large: bool = False) -> None:
+        """Start to write a result of the present pair. `large` ones are written before the next reconstruction."""
+        self.written.append(self.writer.start(write, large=large))
+
+    @cached_property
+    def images(self) -> ReadAhead:
+        """Images that are read while others are reconstructed."""
+        return ReadAhead(self.experiment)
+
+    @cached_property
+    def writer(self) -> Writer:
+        """Thread that writes results."""
+        return Writer()
+
+    @cached_property
+    def written(self) -> list[Future[None]]:
+        """Results of the present pair that are being written."""
+        return []
 
     @cached_property
     def solver(self) -> PairSolver:
@@ -173,7 +214,7 @@ class PairWork:
             frames = self._reconstruct_pair(files, progress)
             if self.keep_volumes:
                 for file, found in zip(files.frames, frames, strict=True):
-                    file.write(found)
+                    self.write(partial(file.write, found), large=True)
         return PairVolumes(frames=frames, names=self.experiment.frames)
 
     def _reconstruct_pair(self, files: PairFiles, progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
@@ -182,7 +223,8 @@ class PairWork:
                 f"{files.frames[0].path}: expected the two volumes of pair {files.pair} made with the present "
                 "settings, found none. Run `lfpiv reconstruct` first."
             )
-        light = pair_light(self.experiment, self.cameras, self.darks, files.pair)
+        light = pair_light(self.experiment, self.cameras, self.darks, files.pair, self.images.image)
+        self.writer.wait_large()
         self._log(files.pair, [warning for frame in light for warning in frame.warnings])
         start = time.perf_counter()
         guarded = _reconstruct_frames(self.solver, light, files.pair, progress)
@@ -211,7 +253,7 @@ class PairWork:
         """Read the images of an instant, also if its volume is known; raise InputError if that is not possible."""
         if not self.cameras:
             raise InputError(f"instant {instant.number}: no image is read in this step.")
-        return frame_light(self.experiment, self.cameras, self.darks, instant)
+        return frame_light(self.experiment, self.cameras, self.darks, instant, self.images.image)
 
     def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
         """Reconstruct one instant of a series.
@@ -223,6 +265,7 @@ class PairWork:
         """
         instant = light.frame.number
         self._log(instant, light.warnings)
+        self.writer.wait_large()
         start = time.perf_counter()
         try:
             found = self.solver.smart.solve(light.images, floor=light.noise, progress=progress)
@@ -263,9 +306,13 @@ class PairWork:
             "correlation": experiment.correlation.model_dump(),
             "figures": figures.to_json(),
         }
-        files.write_vectors(vectors, condensed, attributes)
-        name = experiment.name_of(files.pair)
-        log.info("%s: %.0f %% of the vectors valid", name, 100 * figures.valid_fraction)
+
+        def write() -> None:
+            files.write_vectors(vectors, condensed, attributes)
+            name = experiment.name_of(files.pair)
+            log.info("%s: %.0f %% of the vectors valid", name, 100 * figures.valid_fraction)
+
+        self.write(write)
 
     def _reconstruction_s(self, pair: int, volumes: PairVolumes) -> float:
         """Return the time that the volumes of a pair took [s].
@@ -276,6 +323,42 @@ class PairWork:
         first, second = (record.seconds for record in volumes.records)
         series = self.experiment.series
         return second if series is not None and pair - series.step in self.experiment.numbers else first + second
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Computed:
+    """A pair whose results are computed and perhaps not written yet."""
+
+    pair: int
+    reason: str
+    """Why it failed; empty if it did not."""
+    written: tuple[Future[None], ...]
+    """Its results that are being written."""
+    progress: StepProgress
+
+    def outcome(self) -> Outcome:
+        """Wait until the results are written and return the outcome; raise StorageError if they cannot be written."""
+        reason = self.reason
+        for future in self.written:
+            try:
+                future.result()
+            except StorageError:
+                raise
+            except Exception as error:  # such as values that no file may hold
+                reason = reason or str(failure(error))
+        if not reason:
+            self.progress(1.0)
+        return Outcome(pair=self.pair, reason=reason)
+
+
+def _with_next(pairs: Iterable[int]) -> Iterator[tuple[int, int | None]]:
+    """Yield each pair with the one that comes after it, None for the last one."""
+    source = iter(pairs)
+    present = next(source, None)
+    while present is not None:
+        coming = next(source, None)
+        yield present, coming
+        present = coming
 
 
 def _reconstruct_frames(

@@ -6,8 +6,9 @@ Each function opens a run on an output folder, does the unfinished work, and ret
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import dataclass, replace
+from operator import length_hint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +17,11 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
 from lfpiv.runs import dispatch, local_workers, memory, rig, task, worker_plan
 from lfpiv.runs.frame_light import read_darks
-from lfpiv.runs.invocation import Invocation, WeightsFigures, Workers
+from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import Outcome, PairWork
 from lfpiv.runs.rig import Prepared
 from lfpiv.runs.run import Run, open_run
+from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
@@ -84,16 +86,15 @@ def run(
     if scheduler is not None and workers is not None:
         raise InputError("--workers, --scheduler: expected one of them: a cluster has workers of its own.")
     with open_run(experiment, out, device, progress, pairs) as current:
-        todo = current.unfinished(volumes=keep_volumes)
-        checked = _check(current, todo.pairs, workers, scheduler)
+        checked = _check(current, current.unfinished(volumes=keep_volumes), workers, scheduler)
         calibrated = rig.calibrate(current)
         before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
         if not current.has_light_of(before):
             todo = current.unfinished(volumes=keep_volumes, quiet=True)
-            checked = _check(current, todo.pairs, workers, scheduler)
+            checked = _check(current, todo, workers, scheduler)
         calibrated = replace(calibrated, calibration=prepared.board)
         done = _process(current, prepared, checked, keep_volumes)
-        return current.finish(calibrated, replace(done, reused=todo.reused), report=True)
+        return current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
 
 
 def calibrate(
@@ -118,19 +119,17 @@ def reconstruct(
 ) -> dict[str, Any]:
     """Reconstruct the volumes of some pairs into ``volumes/``; calibrate first if necessary. Return the summary."""
     with open_run(experiment, out, device, progress, pairs) as current:
-        todo = current.unfinished(vectors=False, volumes=True)
-        checked = _check(current, todo.pairs, 1, None)
+        checked = _check(current, current.unfinished(vectors=False, volumes=True), 1, None)
         calibrated = rig.calibrate(current)
         before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
         if not current.has_light_of(before):
-            todo = current.unfinished(vectors=False, volumes=True, quiet=True)
-            checked = _check(current, todo.pairs, 1, None)
-        done = Invocation(outcomes=checked.failed)
-        if checked.pairs:
-            weights, figures = rig.build_weights(current, prepared, checked.pairs)
+            checked = _check(current, current.unfinished(vectors=False, volumes=True, quiet=True), 1, None)
+        done = Invocation(tried=checked.failed or Tried(current.numbers))
+        if checked.failed is None and (first := checked.todo.ahead()):
+            weights, figures = rig.build_weights(current, prepared, first)
             work = _work(current, weights, keep_volumes=True, vectors=False)
-            done = Invocation(outcomes=_sequential(current, work, checked.pairs), weights=figures)
-        return current.finish(calibrated, replace(done, reused=todo.reused), report=False)
+            done = Invocation(tried=_sequential(current, work, checked.todo), weights=figures)
+        return current.finish(calibrated, _with_reused(current, done, checked.todo, "volumes"), report=False)
 
 
 def correlate(
@@ -151,16 +150,16 @@ def correlate(
     with open_run(experiment, out, device, progress, pairs) as current:
         calibrated = rig.load_calibration(current)
         todo = current.unfinished()
-        if todo.pairs and not any(map(current.has_volumes, todo.pairs)):
-            first = todo.pairs[0]
+        if (known := todo.ahead()) and not current.has_some_volumes():
+            first = known[0]
             raise InputError(
                 f"{current.folder.volume(first, 0)}: expected the two volumes of {current.experiment.name_of(first)} "
                 "made with the present settings, found none. Run `lfpiv reconstruct` first."
             )
         calibration = rig.with_standing_light(current, calibrated.calibration)
         work = _work(current, None, keep_volumes=False, calibration=calibration)
-        outcomes = _sequential(current, work, todo.pairs)
-        return current.finish(calibrated, Invocation(outcomes=outcomes, reused=todo.reused), report=False)
+        done = Invocation(tried=_sequential(current, work, todo))
+        return current.finish(calibrated, _with_reused(current, done, todo, "vectors"), report=False)
 
 
 def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, Any]:
@@ -182,45 +181,48 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
 class _Checked:
     """Pairs to do, after all checks."""
 
-    pairs: list[int]
-    failed: list[Outcome]
-    """Outcomes of all pairs if none can be done; empty otherwise."""
+    todo: Todo
+    failed: Tried | None
+    """Outcomes of all pairs if none can be done; None otherwise."""
     workers: Plan | str
     """Processes of this machine, or the address of a Dask scheduler."""
 
 
-def _check(current: Run, todo: list[int], workers: int | None, scheduler: str | None) -> _Checked:
+def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None) -> _Checked:
     """Check images, memory and workers before any work, and start to preload worker processes."""
     gpus = worker_plan.visible_gpus() if current.device.kind == "cuda" else ()
-    planned = worker_plan.plan(len(todo), workers, current.device, gpus)
-    pairs, failed = current.check_images(todo) if todo else ([], [])
-    if pairs:
+    some = bool(todo.ahead())
+    planned = worker_plan.plan(length_hint(todo), workers, current.device, gpus)
+    failed = current.check_images(todo) if some else None
+    if some and failed is None:
         guarded = current.guarded_experiment
-        needed = 0 if all(map(current.has_volumes, pairs)) else memory.weights_bytes(guarded)
+        needed = memory.weights_bytes(guarded) if current.need_weights(todo) else 0
         if workers is None:
             planned = worker_plan.fit_installation(planned, current.device)
             planned = worker_plan.fit_memory(planned, guarded, needed, current.device)
         worker_plan.require_memory(guarded, needed, 1 if scheduler else planned.workers)
-    if pairs and planned.workers > 1 and not scheduler:
-        local_workers.start_preloading(planned.kind)
-    return _Checked(pairs=pairs, failed=failed, workers=scheduler or planned)
+        if planned.workers > 1 and not scheduler:
+            local_workers.start_preloading(planned.kind)
+    return _Checked(todo=todo, failed=failed, workers=scheduler or planned)
 
 
 def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: bool) -> Invocation:
     """Do the pairs in this process or in several; the weights are built once for all of them."""
-    todo, workers = checked.pairs, checked.workers
-    if not todo:
-        return Invocation(outcomes=checked.failed)
+    todo, workers = checked.todo, checked.workers
+    if checked.failed is not None:
+        return Invocation(tried=checked.failed)
+    if not todo.ahead():
+        return Invocation(tried=Tried(current.numbers))
     weights: Weights | None = None
     figures: WeightsFigures | None = None
-    if not all(map(current.has_volumes, todo)):
-        weights, figures = rig.build_weights(current, prepared, todo)
+    if current.need_weights(todo):
+        weights, figures = rig.build_weights(current, prepared, todo.ahead())
         if isinstance(workers, Plan):
             guarded = current.guarded_experiment
             workers = worker_plan.fit_memory(workers, guarded, weights.memory_bytes, current.device)
     work = _work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration)
     if isinstance(workers, Plan) and workers.workers == 1:
-        return Invocation(outcomes=_sequential(current, work, todo), weights=figures)
+        return Invocation(tried=_sequential(current, work, todo), weights=figures)
     if isinstance(workers, Plan):
         used = Workers(count=workers.workers, threads=workers.threads)
     else:
@@ -228,11 +230,20 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     device = current.device.kind if isinstance(workers, Plan) else current.device_request
     shared = task.write_task(work, device, used.threads)
     del work, weights  # the workers map them from files; the memory may not have room for both
-    outcomes = _collect(
+    tried = _collect(
         current, dispatch.parallel(shared, current.experiment, todo, workers, current.step(_step_name(current)))
     )
-    peak_mib = max(outcome.peak_memory_mib for outcome in outcomes)
-    return Invocation(outcomes=outcomes, weights=figures, workers=replace(used, peak_memory_mib=peak_mib or None))
+    return Invocation(
+        tried=tried, weights=figures, workers=replace(used, peak_memory_mib=tried.peak_memory_mib or None)
+    )
+
+
+def _with_reused(current: Run, done: Invocation, todo: Todo, kind: str) -> Invocation:
+    """Return the results of an invocation with the names of the pairs that were finished before."""
+    first, count = todo.finished
+    names = tuple(f"{kind} of {current.experiment.name_of(pair)}" for pair in sorted(first))
+    more = (f"{kind} of {count - len(first)} more {current.experiment.noun}s",) if count > len(first) else ()
+    return replace(done, reused=names + more)
 
 
 def _step_name(current: Run) -> str:
@@ -265,13 +276,17 @@ def _work(
     )
 
 
-def _sequential(current: Run, work: PairWork, todo: Sequence[int]) -> list[Outcome]:
-    return _collect(current, dispatch.sequential(work, todo, current.step(_step_name(current)))) if todo else []
+def _sequential(current: Run, work: PairWork, todo: Todo) -> Tried:
+    if not todo.ahead():
+        return Tried(current.numbers)
+    return _collect(current, dispatch.sequential(work, todo, current.step(_step_name(current))))
 
 
-def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> list[Outcome]:
+def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> Tried:
     """Record the outcomes of all pairs as they arrive."""
+    tried = Tried(current.numbers)
     with contextlib.closing(outcomes):  # ends the workers if the run is interrupted
-        found = [current.record(outcome) for outcome in outcomes]
+        for outcome in outcomes:
+            current.record(outcome, tried)
     current.progress(_step_name(current), 1.0)
-    return found
+    return tried

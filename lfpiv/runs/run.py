@@ -7,6 +7,7 @@ the results of all steps.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import time
 from collections.abc import Iterator, Sequence
@@ -18,20 +19,22 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv import files
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment, check_pairs, read_experiment
+from lfpiv.experiment.experiment import CHECKED_PAIRS, Experiment, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.results import finished, provenance
-from lfpiv.results.folder import Folder, make_writable
+from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
 from lfpiv.runs import guard, memory, pair_figures, summary
+from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.guard import Guard
-from lfpiv.runs.invocation import Calibrated, Invocation, Workers
+from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
 from lfpiv.runs.pair import Outcome
 from lfpiv.runs.summary import Contents, EarlierSummary
-from lfpiv.warn import NAMED_PAIRS, Warning, collected, name_pairs
+from lfpiv.runs.todo import Todo
+from lfpiv.warn import NAMED_PAIRS, Gathering, Warning, collected, name_pairs
 from lfpiv_kernels import runtime
 
 log = logging.getLogger(__name__)
@@ -82,6 +85,7 @@ def open_run(
                 start_s=start_s,
                 calibration_stamp=provenance.of_calibration(experiment),
                 earlier=summary.read(folder.summary),
+                finished=FinishedPairs(experiment.numbers, folder.path),
                 background=provenance.background_content(folder.background),
                 guard=None if (measured := guard.read(folder)) is None else measured[0],
             )
@@ -103,15 +107,6 @@ def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> ran
     return range(first, after)
 
 
-@dataclass(frozen=True)
-class Todo:
-    """Unfinished pairs of an invocation, and the results that it reuses."""
-
-    pairs: list[int]
-    reused: tuple[str, ...]
-    """Results of earlier invocations, named for the summary."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Run:
     """One invocation on one experiment and one output folder."""
@@ -129,6 +124,8 @@ class Run:
     start_s: float
     calibration_stamp: Stamp
     earlier: EarlierSummary
+    finished: FinishedPairs
+    """Figures of the finished pairs that this invocation met so far."""
     background: str | None = None
     """Hash of the light that is subtracted from the images; None if there is none."""
     guard: Guard | None = None
@@ -169,45 +166,77 @@ class Run:
 
     def unfinished(self, *, vectors: bool = True, volumes: bool = False, quiet: bool = False) -> Todo:
         """Find the selected pairs whose vectors or volumes are missing or do not fit; log changes unless `quiet`."""
-        changed: dict[str, list[int]] = {}
-        for pair in self.numbers:
-            changes = self.files(pair).outdated(vectors=vectors, volumes=volumes)
-            if changes is not None:
-                changed.setdefault(", ".join(changes), []).append(pair)
-        todo = sorted(pair for pairs in changed.values() for pair in pairs)
-        finished = sorted({*self.numbers}.difference(todo))
-        if finished and not quiet:
-            text = "%d of %d %ss: finished before with the same settings, kept"
-            log.info(text, len(finished), len(self.numbers), self.experiment.noun)
-        for reason, pairs in changed.items():
-            if reason and not quiet:
-                log.info("%s changed: %s made again", reason, name_pairs(pairs, self.experiment.noun))
-        kind = "vectors" if vectors else "volumes"
-        return Todo(todo, tuple(f"{kind} of {self.experiment.name_of(pair)}" for pair in finished))
+        self.finished.clear()
 
-    def check_images(self, todo: Sequence[int]) -> tuple[list[int], list[Outcome]]:
-        """Log pairs whose images cannot be used; return the pairs to do, and outcomes if none can be done.
+        def changes(pair: int) -> list[str] | None:
+            found = self.files(pair)
+            changed = found.outdated(vectors=vectors, volumes=volumes)
+            if changed is None:
+                self._keep(found)
+            return changed
 
-        If some pairs can be done, all are tried, and the others fail when their turn comes.
+        stored = self.folder.stored(self.numbers, vectors=vectors, volumes=volumes)
+        step = 1 if self.experiment.series is None else self.experiment.series.step
+        todo = Todo(self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun)
+        todo.quiet = quiet
+        return todo
+
+    def _keep(self, found: PairFiles) -> None:
+        """Keep the figures of a pair's vectors for the summary, if they fit."""
+        if (marks := found.fitting_vectors()) is not None:
+            self.finished.add(found.pair, pair_figures.read_figures(found.vectors, marks))
+
+    def has_some_volumes(self) -> bool:
+        """Return whether a selected pair has both volumes and they fit."""
+        stored = self.folder.stored(self.numbers, vectors=False, volumes=True)
+        return any(self.has_volumes(pair) for pair, there in zip(self.numbers, stored, strict=True) if there)
+
+    def need_weights(self, todo: Todo) -> bool:
+        """Return whether a pair to do has no volumes that fit."""
+        if not all(map(self.has_volumes, todo.ahead())):
+            return True
+        if todo.whole:
+            return False
+        stored = self.folder.stored(self.numbers, vectors=False, volumes=True)
+        return not all(stored) or not all(map(self.has_volumes, self.numbers))
+
+    def check_images(self, todo: Todo) -> Tried | None:
+        """Check the images of the next pairs and log those that cannot be used; None if the pairs can be tried.
+
+        If some pairs can be done, all are tried, and the others fail when their turn comes. If none of the pairs to do
+        can be done, return their outcomes.
 
         Raises
         ------
         InputError
             If the first pair cannot be used and no finished pair shows that the experiment file is right.
         """
-        bad = dict(check_pairs(self.experiment, [pair for pair in todo if not self.has_volumes(pair)]))
-        if bad and todo[0] in bad and not any(map(self._is_finished, self.experiment.numbers)):
+        known = todo.ahead()
+        bad = dict(check_pairs(self.experiment, [pair for pair in known if not self.has_volumes(pair)]))
+        whole = todo.whole and len(bad) == len(known)
+        if bad and known[0] in bad and not self._has_results():
             noun = self.experiment.noun
-            others = f" To do the {noun}s after it, use --pairs {todo[0] + 1}:." if len(bad) < len(todo) else ""
-            raise InputError(bad[todo[0]] + others)
-        if len(bad) == len(todo):
-            return [], [self.record(Outcome(pair=pair, reason=reason)) for pair, reason in bad.items()]
+            others = "" if whole else f" To do the {noun}s after it, use --pairs {known[0] + 1}:."
+            raise InputError(bad[known[0]] + others)
+        if whole:
+            tried = Tried(self.numbers)
+            for pair, reason in bad.items():
+                self.record(Outcome(pair=pair, reason=reason), tried)
+            return tried
         for reason in list(bad.values())[:NAMED_PAIRS]:
             log.error("%s The other %ss will be done.", reason, self.experiment.noun)
         if len(bad) > NAMED_PAIRS:
             names = name_pairs(list(bad), self.experiment.noun)
             log.error("%d %ss have images that cannot be used: %s", len(bad), self.experiment.noun, names)
-        return list(todo), []
+        return None
+
+    def _has_results(self) -> bool:
+        """Return whether some pair of the experiment is finished; of many pairs with files the first are examined."""
+        numbers = self.experiment.numbers
+        vectors = self.folder.stored(numbers, vectors=True, volumes=False)
+        volumes = self.folder.stored(numbers, vectors=False, volumes=True)
+        stored = (pair for pair, one, other in zip(numbers, vectors, volumes, strict=True) if one or other)
+        return any(map(self._is_finished, itertools.islice(stored, CHECKED_PAIRS)))
 
     def _is_finished(self, pair: int) -> bool:
         found = self.files(pair)
@@ -221,17 +250,23 @@ class Run:
         InputError
             If a file is damaged, or is another one's copy.
         """
-        finished.require([self.folder.background, *map(self.folder.vectors, self.experiment.numbers)])
+        numbers = self.experiment.numbers
+        stored = self.folder.stored(numbers, vectors=True, volumes=False)
+        vectors = (self.folder.vectors(pair) for pair, there in zip(numbers, stored, strict=True) if there)
+        finished.require(itertools.chain([self.folder.background], vectors))
 
-    def record(self, outcome: Outcome) -> Outcome:
-        """Log the failure of a pair, rename its results from earlier images, and return the outcome."""
-        if outcome.died and self.files(outcome.pair).fitting_vectors() is not None:
-            return replace(outcome, reason="")  # its worker died after it
+    def record(self, outcome: Outcome, tried: Tried) -> None:
+        """Keep the outcome of a pair and its figures. Log a failure, and rename the results from earlier images."""
+        files = self.files(outcome.pair)
+        if not outcome.reason or outcome.died:
+            self._keep(files)
+        if outcome.died and outcome.pair in self.finished:
+            outcome = replace(outcome, reason="")  # its worker died after it
+        tried.add(outcome)
         if outcome.reason:
             log.error("%s failed and is left out: %s", self.experiment.name_of(outcome.pair), outcome.reason)
-            for path, aside in self.files(outcome.pair).retire_outdated():
+            for path, aside in files.retire_outdated():
                 log.warning("%s: made of other images than there are now; renamed %s", path, aside.name)
-        return outcome
 
     def finish(self, calibrated: Calibrated, done: Invocation, *, report: bool) -> dict[str, Any]:
         """Write summary.json about all results in the folder, and optionally report.html; return the summary."""
@@ -243,13 +278,14 @@ class Run:
             warnings=tuple(self.warnings),
             workers=done.workers or Workers(count=1, threads=self.device.threads),
         )
-        result = summary.build(self.experiment, self.device, calibrated, contents, done, self.earlier)
+        with writing(self.folder.pairs):
+            result = summary.build(self.experiment, self.device, calibrated, contents, done, self.earlier, self.folder)
         result |= self._usage(done, result["timings_s"])
         if report:
             from lfpiv.report import write_report
 
             start = time.perf_counter()
-            vectors = {pair: self.folder.vectors(pair) for pair in contents.vectors}
+            vectors = VectorFiles(self.folder, contents.vectors)
             with writing(self.folder.report):
                 write_report(self.experiment, calibrated.calibration, result, vectors, self.folder.report)
             result |= self._usage(done, result["timings_s"] | {"report": time.perf_counter() - start})
@@ -259,16 +295,19 @@ class Run:
 
     def _contents(self) -> Contents:
         """Read the figures of all finished pairs of the experiment, from the attributes of their files."""
-        vectors, volumes = {}, {}
-        for pair in self.experiment.numbers:
+        numbers, volumes = self.experiment.numbers, Gathering()
+        with_vectors = self.folder.stored(numbers, vectors=True, volumes=False)
+        with_volumes = self.folder.stored(numbers, vectors=False, volumes=True)
+        for pair, one, both in zip(numbers, with_vectors, with_volumes, strict=True):
+            if not (one or both) or pair in self.finished:
+                continue
             found = self.files(pair)
-            if (marks := found.fitting_vectors()) is not None:
-                vectors[pair] = pair_figures.read_figures(found.vectors, marks)
-            elif (both := found.fitting_volumes()) is not None:
-                volumes[pair] = both[0].warnings + both[1].warnings
+            self._keep(found)
+            if pair not in self.finished and (frames := found.fitting_volumes()) is not None:
+                volumes.add(warning.of_pair(pair) for frame in frames for warning in frame.warnings)
         light, warnings = provenance.background_figures(self.folder.background)
         return Contents(
-            vectors=vectors,
+            vectors=self.finished,
             volumes=volumes,
             background=light,
             background_warnings=warnings,

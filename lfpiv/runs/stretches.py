@@ -9,7 +9,8 @@ of their instant at the seam, and the pair is correlated from the two files afte
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from operator import length_hint
 from typing import NamedTuple
 
 MOST_INSTANTS = 16
@@ -31,46 +32,42 @@ class Stretch(NamedTuple):
     """Pairs at the seams, which can be done when this stretch and the one beyond the seam are done."""
 
 
-def chains(todo: Sequence[int], step: int) -> Iterator[list[int]]:
-    """Yield the parts of a series that hang together: pairs k, k + step, k + 2 step, ... as long as all are to do."""
-    for rest in range(step):
-        chain = list[int]()
-        for pair in todo:
-            if pair % step != rest:
-                continue
-            if chain and pair != chain[-1] + step:
-                yield chain
-                chain = []
-            chain.append(pair)
-        if chain:
-            yield chain
+def cut(todo: Iterable[int], step: int | None, workers: int) -> Iterator[Stretch]:
+    """Yield stretches for several processes: single pairs if `step` is None, else parts of the chains of a series.
 
-
-def whole(todo: Sequence[int], step: int | None) -> Iterator[Stretch]:
-    """Yield the stretches for one process: whole chains of a series, or single pairs if `step` is None."""
+    Pairs are taken from `todo` as they are needed, in the order k, k + step, k + 2 step, ... The pairs at seams are in
+    no stretch; each is named by the two beside it.
+    """
     if step is None:
         yield from (Stretch((pair,)) for pair in todo)
-    else:
-        yield from (Stretch(tuple(chain)) for chain in chains(todo, step))
-
-
-def cut(todo: Sequence[int], step: int | None, workers: int) -> Iterator[Stretch]:
-    """Yield stretches for several processes. The pairs at seams are in none; each is named by the two beside it."""
-    if step is None:
-        yield from whole(todo, None)
         return
-    most = max(min(MOST_INSTANTS, -(-len(todo) // (LEAST_STRETCHES * workers))), 2)
-    for chain in chains(todo, step):
-        yield from _cut(chain, step, most)
+    source = iter(todo)
+    most = max(min(MOST_INSTANTS, -(-length_hint(source) // (LEAST_STRETCHES * workers))), 2)
+    chain, before = list[int](), list[int]()  # pairs that are not handed out yet, and the pair at the seam before them
+    for pair in source:
+        if chain and pair != chain[-1] + step:
+            yield from _cut(chain, step, most, before)
+            chain, before = [], []
+        chain.append(pair)
+        if len(chain) == most + 2:  # two instants or more are left for the next stretch
+            yield _stretch(chain, 0, most, step, before)
+            chain, before = chain[most:], [chain[most - 1]]
+    if chain:
+        yield from _cut(chain, step, most, before)
 
 
-def _cut(chain: Sequence[int], step: int, most: int) -> Iterator[Stretch]:
-    """Cut a chain into stretches of at most `most` instants, of nearly equal length and two instants or more."""
+def _cut(chain: Sequence[int], step: int, most: int, before: Sequence[int]) -> Iterator[Stretch]:
+    """Cut the end of a chain into stretches of at most `most` instants, of nearly equal length and two or more."""
     instants = len(chain) + 1
     count = max(min(-(-instants // most), instants // 2), 1)
     edges = [number * instants // count for number in range(count + 1)]
     for first, after in itertools.pairwise(edges):
-        left = [chain[first - 1]] if first > 0 else []
-        right = [chain[after - 1]] if after < instants else []
-        stored = [pair + step for pair in left] + right
-        yield Stretch(tuple(chain[first : after - 1]), tuple(stored), (*left, *right))
+        yield _stretch(chain, first, after, step, before)
+
+
+def _stretch(chain: Sequence[int], first: int, after: int, step: int, before: Sequence[int]) -> Stretch:
+    """Return the stretch of the instants `first` to `after` - 1 of a chain."""
+    left = [chain[first - 1]] if first > 0 else list(before)
+    right = [chain[after - 1]] if after <= len(chain) else []
+    stored = [pair + step for pair in left] + right
+    return Stretch(tuple(chain[first : after - 1]), tuple(stored), (*left, *right))

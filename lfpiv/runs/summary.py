@@ -6,8 +6,10 @@ the file, with equal warnings about several pairs merged into one.
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +29,7 @@ from lfpiv.runs.invocation import Calibrated, Invocation
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.velocity.cross_correlation import Verdict
-from lfpiv.warn import Code, Warning, from_list, gather
+from lfpiv.warn import Code, Gathering, Warning, from_list, gather
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -41,6 +43,9 @@ SCHEMA_VERSION = 1
 CORRECTION_RAYS = 4000
 """Number of rays for the network's part in the mapping."""
 
+MOST_LISTED = 10_000
+"""Largest number of pairs with an entry in the summary, and that a warning names. ``pairs.jsonl`` lists more."""
+
 LARGE_RESIDUAL = 0.75
 """Residual of a volume above which its vectors are doubtful. Clear images have 0.3 to 0.5, dim ones up to 0.6."""
 
@@ -51,8 +56,8 @@ class Contents:
 
     vectors: Mapping[int, PairFigures]
     """Pair -> figures of its vectors."""
-    volumes: Mapping[int, tuple[Warning, ...]]
-    """Pair with volumes and no vectors -> warnings about its images."""
+    volumes: Gathering
+    """Warnings about the images of pairs that have volumes and no vectors."""
     background: Mapping[str, Any] = field(default_factory=dict)
     """Camera -> figures of the light that stands still in its images."""
     background_warnings: tuple[Warning, ...] = ()
@@ -137,16 +142,20 @@ def build(
     contents: Contents,
     done: Invocation,
     earlier: EarlierSummary,
+    folder: Folder,
 ) -> dict[str, Any]:
     """Build the content of ``summary.json`` without ``timings_s.total`` and ``peak_memory_mib``, which the run adds.
 
     ``timings_s`` is the time that the results took, also those of earlier invocations. ``warnings`` are
-    sentences for people. ``warning_records`` are the same warnings, in the same order, with code and figures.
+    sentences for people. ``warning_records`` are the same warnings, in the same order, with code and figures. Of more
+    than `MOST_LISTED` finished pairs that many are in ``pairs``, evenly chosen. This writes the file ``pairs.jsonl``
+    with all of them.
     """
     reports = {name: _report(camera, experiment.grid) for name, camera in calibrated.calibration.cameras.items()}
     weights = done.weights.to_json() if done.weights else dict(earlier.weights)
-    warnings = _warnings(experiment, calibrated, contents, done, weights)
-    pairs, names = contents.vectors.values(), Folder(Path(), experiment.series)
+    pairs = _survey(contents, folder)
+    warnings = _warnings(experiment, calibrated, contents, done, weights, pairs.warnings)
+    failed = _failures(experiment, contents, done, earlier)
     return {
         "schema_version": SCHEMA_VERSION,
         **_settings(experiment),
@@ -157,25 +166,89 @@ def build(
             "calibration": calibrated.seconds,
             "network_training": sum(float(report.get("training_s", 0.0)) for report in reports.values()),
             "weights": done.weights.seconds if done.weights else earlier.weights_s,
-            "reconstruction": sum(figures.reconstruction_s for figures in pairs),
-            "correlation": sum(figures.correlation_s for figures in pairs),
+            "reconstruction": pairs.totals["reconstruction_s"],
+            "correlation": pairs.totals["correlation_s"],
         },
         "calibration": reports,
         "board": {} if calibrated.calibration.board is None else calibrated.calibration.board.to_json(),
         "weights": weights,
         "background": dict(contents.background),
         "guard": _guard(experiment, contents.guard),
-        "pairs": [
-            {"pair": pair, "file": names.vectors(pair).name, **figures.to_json()}
-            for pair, figures in contents.vectors.items()
-        ],
-        "failed": _failures(experiment, contents, done, earlier),
-        "valid_fraction": _mean(figures.valid_fraction for figures in pairs),
-        "finite_fraction": _mean(figures.finite_fraction for figures in pairs),
+        "pairs_finished": pairs.count,
+        "pairs_file": folder.pairs.name if pairs.count > MOST_LISTED else None,
+        "pairs": pairs.listed,
+        "pairs_failed": len(failed) + max(done.tried.failures - len(done.tried.failed), 0),
+        "failed": failed,
+        "valid_fraction": pairs.mean("valid_fraction"),
+        "finite_fraction": pairs.mean("finite_fraction"),
         "warnings": list(warnings),
-        "warning_records": [warning.to_json() for warning in warnings.values()],
+        "warning_records": [_record(warning) for warning in warnings.values()],
         "reused": list(done.reused),
     }
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Survey:
+    """What the summary states of all finished pairs."""
+
+    count: int
+    listed: list[dict[str, Any]]
+    """Entries of the pairs, of at most `MOST_LISTED`."""
+    totals: Mapping[str, float]
+    """Figure -> its sum over all pairs."""
+    warnings: Sequence[Warning]
+
+    def mean(self, name: str) -> float | None:
+        """Return the mean of a figure over all pairs; None without pairs."""
+        return self.totals[name] / self.count if self.count else None
+
+
+def _survey(contents: Contents, folder: Folder) -> _Survey:
+    """Go through the figures of all finished pairs once. If they are too many for the summary, write them to a file."""
+    total, images, vectors = len(contents.vectors), Gathering(), Gathering()
+    totals, listed = dict.fromkeys(_SUMMED, 0.0), []
+    with _lines(folder.pairs if total > MOST_LISTED else None) as write:
+        for place, (pair, figures) in enumerate(contents.vectors.items()):
+            entry = {"pair": pair, "file": folder.vectors(pair).name, **figures.to_json()}
+            write(entry)
+            if total <= MOST_LISTED or place in (0, total - 1) or _is_sampled(place, total):
+                listed.append(entry)
+            images.add(warning.of_pair(pair) for warning in figures.warnings)
+            vectors.add(_of_pair(pair, figures))
+            for name in totals:
+                totals[name] += getattr(figures, name)
+    if total <= MOST_LISTED:
+        folder.pairs.unlink(missing_ok=True)
+    images.join(contents.volumes)
+    return _Survey(count=total, listed=listed, totals=totals, warnings=[*images.merged(), *vectors.merged()])
+
+
+def _is_sampled(place: int, total: int) -> bool:
+    """Return whether an item is among `MOST_LISTED` - 2 evenly chosen ones between the first and the last."""
+    most = MOST_LISTED - 1
+    return place * most // total != (place - 1) * most // total
+
+
+_SUMMED = ("reconstruction_s", "correlation_s", "valid_fraction", "finite_fraction")
+
+
+@contextlib.contextmanager
+def _lines(path: Path | None) -> Iterator[Callable[[Any], object]]:
+    """Yield a function that writes values as lines of JSON into a file, which appears when all are written."""
+    if path is None:
+        yield lambda value: None
+        return
+    with files.replacing(path) as scratch, scratch.open("w", encoding="utf-8") as file:
+        yield lambda value: file.write(json.dumps(files.plain(value), allow_nan=False) + "\n")
+
+
+def _record(warning: Warning) -> dict[str, Any]:
+    """Return the form of a warning in the summary; it names the first `MOST_LISTED` pairs and counts all."""
+    stored = warning.to_json()
+    for name in ("pairs", "instants"):
+        if (count := len(stored.get(name, ()))) > MOST_LISTED:
+            stored |= {name: stored[name][:MOST_LISTED], f"{name}_count": count}
+    return stored
 
 
 def _settings(experiment: Experiment) -> dict[str, Any]:
@@ -196,17 +269,20 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
 
 
 def _warnings(
-    experiment: Experiment, calibrated: Calibrated, contents: Contents, done: Invocation, weights: Mapping[str, Any]
+    experiment: Experiment,
+    calibrated: Calibrated,
+    contents: Contents,
+    done: Invocation,
+    weights: Mapping[str, Any],
+    of_pairs: Sequence[Warning],
 ) -> dict[str, Warning]:
     """Collect all warnings by their sentences, each once."""
-    images = {pair: figures.warnings for pair, figures in contents.vectors.items()} | dict(contents.volumes)
     found = [
         *rig_warnings(calibrated.calibration, experiment.grid),
         *guard.warnings(experiment, contents.guard),
         *map(Warning.from_json, weights.get("warnings", ())),
         *contents.background_warnings,
-        *image_warnings(images),
-        *pair_warnings(contents.vectors),
+        *of_pairs,
         *done.warnings,
     ]
     by_sentence: dict[str, Warning] = {}
@@ -238,36 +314,37 @@ def image_warnings(pairs: Mapping[int, Iterable[Warning]]) -> list[Warning]:
 
 def pair_warnings(pairs: Mapping[int, PairFigures]) -> list[Warning]:
     """Return the warnings about volumes and vectors of finished pairs, given the figures of each pair."""
-    found = []
-    for pair, figures in pairs.items():
-        if figures.stop is not None and SmartStop.DIVERGED.value in figures.stop.values():
-            found.append(Warning(code=Code.DIVERGED, pairs=(pair,), figures={"verdict": SmartStop.DIVERGED.value}))
-        residual = max((history[-1] for history in (figures.residual or {}).values() if history), default=0.0)
-        if residual > LARGE_RESIDUAL:
-            found.append(Warning(code=Code.UNEXPLAINED, pairs=(pair,), figures={"residual": residual}))
-        motion = figures.motion
-        if motion is not None and not motion.followed:
-            shares = motion.valid_fraction
-            words = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion.verdict}
-            found.append(Warning(code=Code.MOTION_LOST, pairs=(pair,), figures=words))
-        if figures.verdict != Verdict.GOOD.value:
-            words = {"share": figures.valid_share, "verdict": figures.verdict}
-            found.append(Warning(code=Code.FEW_VALID, pairs=(pair,), figures=words))
-        if figures.lost_unseeded > 0:
-            found.append(figures.unseeded_warning(pair))
-    return gather(found)
+    return gather(warning for pair, figures in pairs.items() for warning in _of_pair(pair, figures))
+
+
+def _of_pair(pair: int, figures: PairFigures) -> Iterator[Warning]:
+    """Yield the warnings about volumes and vectors of a pair."""
+    if figures.stop is not None and SmartStop.DIVERGED.value in figures.stop.values():
+        yield Warning(code=Code.DIVERGED, pairs=(pair,), figures={"verdict": SmartStop.DIVERGED.value})
+    residual = max((history[-1] for history in (figures.residual or {}).values() if history), default=0.0)
+    if residual > LARGE_RESIDUAL:
+        yield Warning(code=Code.UNEXPLAINED, pairs=(pair,), figures={"residual": residual})
+    motion = figures.motion
+    if motion is not None and not motion.followed:
+        shares = motion.valid_fraction
+        words = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion.verdict}
+        yield Warning(code=Code.MOTION_LOST, pairs=(pair,), figures=words)
+    if figures.verdict != Verdict.GOOD.value:
+        few = {"share": figures.valid_share, "verdict": figures.verdict}
+        yield Warning(code=Code.FEW_VALID, pairs=(pair,), figures=few)
+    if figures.lost_unseeded > 0:
+        yield figures.unseeded_warning(pair)
 
 
 def _failures(
     experiment: Experiment, contents: Contents, done: Invocation, earlier: EarlierSummary
 ) -> list[dict[str, Any]]:
     """List the pairs that failed; those of earlier invocations are marked unless they were tried or finished since."""
-    tried_or_finished = {*(outcome.pair for outcome in done.outcomes), *contents.vectors}
-    entries = [{"pair": pair, "reason": reason} for pair, reason in done.failed.items()]
+    entries: list[dict[str, Any]] = [{"pair": pair, "reason": reason} for pair, reason in done.tried.failed.items()]
     entries += [
         {"pair": pair, "reason": reason, "earlier": True}
         for pair, reason in earlier.failed.items()
-        if pair in experiment.numbers and pair not in tried_or_finished
+        if pair in experiment.numbers and pair not in done.tried and pair not in contents.vectors
     ]
     return sorted(entries, key=lambda entry: entry["pair"])
 
@@ -293,8 +370,3 @@ def network_correction(camera: CalibratedCamera, grid: Grid) -> float | None:
     pupil = random_on_pupil(camera.optics.pupil_radius_mm, CORRECTION_RAYS, rng)
     correction = camera.network(np.hstack([points, pupil]))
     return float(np.sqrt((correction**2).sum(1).mean()) / camera.lattice.pitch_mm)
-
-
-def _mean(values: Iterable[float]) -> float | None:
-    values = list(values)
-    return float(np.mean(values)) if values else None

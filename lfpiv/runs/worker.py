@@ -70,7 +70,7 @@ def work_on(shared: Path, stretch: Stretch, report: Callable[[float], None], thr
     with _busy, _captured_logs() as records:
         try:
             work = _open(shared, threads)
-            done = list(work.do(stretch, _throttled(shared, report)))
+            done = list(work.do(stretch.pairs, _throttled(shared, report), stored=stretch.stored))
         except _Stopped:
             return Result(outcomes=None, fatal="stopped")
         except (StorageError, InputError) as error:

@@ -1,12 +1,16 @@
 """Statistics over pairs: mean and its standard error, RMS, Reynolds stresses, turbulent kinetic energy.
 
-Vectors are datasets as `lfpiv.open_results` opens: ``u``, ``v``, ``w`` [m/s] over pair, z, y, x [mm]. At each position
+Vectors are datasets as `lfpiv.open_results` opens: ``u``, ``v``, ``w`` [m/s] over pair, or over instant for a time
+series, z, y, x [mm]. At each position
 only vectors that are finite and valid (``valid`` true, or all without such a flag) are used. A result is NaN where too
 few vectors remain. Fluctuations are deviations from the mean over the pairs. They contain the measurement noise: noise
-of standard deviation s in u adds s^2 to ``uu``. Dask arrays stay lazy, except in `standard_error`.
+of standard deviation s in u adds s^2 to ``uu``. Dask arrays stay lazy, except in `standard_error`. Of other arrays that
+are read from files, at most `BLOCK_BYTES` are in memory.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 import xarray as xr
@@ -20,6 +24,12 @@ STRESSES = ("uu", "vv", "ww", "uv", "uw", "vw")
 LARGEST_PART = 0.75
 """Largest part of all products between pairs that enters the summed correlation, nearest pairs first."""
 
+BLOCK_BYTES = 1 << 28
+"""Largest size of velocities that are read at once, in double precision [byte], if one pair is not larger."""
+
+DIMENSIONS = ("pair", "instant")
+"""Dimensions over which statistics are taken: of image pairs, and of a time series."""
+
 _TRANSFORM_SIZE = 1 << 22  # numbers in one Fourier transform
 
 
@@ -29,7 +39,7 @@ def mean(vectors: xr.Dataset) -> xr.Dataset:
     Parameters
     ----------
     vectors : Dataset
-        ``u``, ``v``, ``w`` [m/s] over pair, z, y, x [mm]; optionally ``valid``.
+        ``u``, ``v``, ``w`` [m/s] over pair or instant, z, y, x [mm]; optionally ``valid``.
 
     Returns
     -------
@@ -40,7 +50,7 @@ def mean(vectors: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     ValueError
-        If the dimension pair is missing, or components or coordinates are missing or in another unit.
+        If the dimension pair or instant is missing, or components or coordinates are missing or in another unit.
 
     Examples
     --------
@@ -54,11 +64,10 @@ def mean(vectors: xr.Dataset) -> xr.Dataset:
     >>> average.u.values.tolist(), average.pairs_counted.values.tolist()
     ([[[2.0, 6.0]]], [[[3, 2]]])
     """
-    measured = _measured(vectors)
-    result = _mean(measured)
+    result, count = _mean(vectors)
     for name, axis in COMPONENTS.items():
         result[name].attrs = {"units": "m/s", "long_name": f"mean velocity along {axis}"}
-    result["pairs_counted"] = _count(measured).assign_attrs(units="1", long_name="number of pairs that count")
+    result["pairs_counted"] = count.assign_attrs(units="1", long_name="number of pairs that count")
     result["valid"] = (result["pairs_counted"] > 0).assign_attrs(long_name="measured in some pair")
     return _with_axes(result, vectors)
 
@@ -110,15 +119,18 @@ def reynolds_stresses(vectors: xr.Dataset) -> xr.Dataset:
     >>> stresses.uv.item(), stresses.uv.attrs["units"]
     (-2.0, 'm^2/s^2')
     """
-    measured = _measured(vectors)
-    fluctuation = measured - _mean(measured)
-    freedom = _count(measured) - 1
-    freedom = freedom.where(freedom > 0)
+    average, count = _mean(vectors)
+    freedom = (count - 1).where(count > 1)
+    products: dict[str, xr.DataArray] = {}
+    for measured, along in _parts(vectors):
+        fluctuation = measured - average
+        for name in STRESSES:
+            part = (fluctuation[name[0]] * fluctuation[name[1]]).sum(along, skipna=True)
+            products[name] = products[name] + part if name in products else part
     fields = {}
     for name in STRESSES:
-        products = (fluctuation[name[0]] * fluctuation[name[1]]).sum("pair", skipna=True)
         attributes = {"units": "m^2/s^2", "long_name": f"Reynolds stress over density, mean of {name[0]}' {name[1]}'"}
-        fields[name] = (products / freedom).assign_attrs(attributes)
+        fields[name] = (products[name] / freedom).assign_attrs(attributes)
     return _with_axes(xr.Dataset(fields), vectors)
 
 
@@ -156,7 +168,8 @@ def standard_error(vectors: xr.Dataset) -> xr.Dataset:
     for it. The sum ends where the correlation is no longer positive, and no term exceeds the one before [1]_.
 
     The estimate is too small for series that are not much longer than their correlation (docs/notebook/velocity.md).
-    One component of all pairs is held in memory.
+    At most `BLOCK_BYTES` are in memory: all pairs at some of the positions. So files of single pairs are read several
+    times if all do not fit; a store of ``lfpiv export`` is read once.
 
     Parameters and errors are those of `mean`.
 
@@ -183,15 +196,24 @@ def standard_error(vectors: xr.Dataset) -> xr.Dataset:
     >>> round(error.item(), 4), error.attrs["pairs_per_independent"]  # sqrt(4 / 3 / 4)
     (0.5774, 1.0)
     """
-    measured, fields = _measured(vectors), {}
-    order = np.asarray(vectors["pair"]) if "pair" in vectors.coords else np.arange(vectors.sizes["pair"])
+    along = _dimension(vectors)
+    order = np.asarray(vectors[along]) if along in vectors.coords else np.arange(vectors.sizes[along])
     if order.dtype.kind not in "iu" or len(np.unique(order)) < len(order):
-        raise ValueError("vectors: expected whole numbers as coordinate pair, each once, found others.")
+        raise ValueError(f"vectors: expected whole numbers as coordinate {along}, each once, found others.")
+    fields = {}
+    sums = {name: _Autocovariance(order - order.min()) for name in COMPONENTS}
+    field = xr.zeros_like(vectors["u"].isel({along: 0}, drop=True), float).transpose(*AXES).compute()
+    scatter = {name: field.copy() for name in COMPONENTS}
+    for rows in _rows(vectors):
+        measured = _measured(vectors.isel(rows)).compute()
+        for name in COMPONENTS:
+            series = measured[name].transpose(along, *AXES)
+            sums[name].add(series.values)
+            count = series.count(along)
+            scatter[name][rows] = (series.std(along, ddof=1) / np.sqrt(count.where(count > 1))).where(count > 1)
     for name, axis in COMPONENTS.items():
-        series = measured[name].transpose("pair", ...).compute()
-        count = series.count("pair")
-        shared, factor = _correlated(series.values, order)
-        error = (series.std("pair", ddof=1) * np.sqrt(factor / count.where(count > 1))).where(count > 1)
+        shared, factor = _correlated(sums[name])
+        error = scatter[name] * np.sqrt(factor)
         error.attrs = {
             "units": "m/s",
             "long_name": f"standard error of the mean velocity along {axis}",
@@ -201,30 +223,61 @@ def standard_error(vectors: xr.Dataset) -> xr.Dataset:
     return _with_axes(xr.Dataset(fields), vectors)
 
 
-def _measured(vectors: xr.Dataset) -> xr.Dataset:
-    """Return velocities in double precision, NaN where they are not used."""
+def _dimension(vectors: xr.Dataset) -> str:
+    """Return the dimension over the pairs or instants."""
     check_velocity(vectors)
-    short = [name for name in COMPONENTS if "pair" not in vectors[name].dims]
-    if short:
+    found = [name for name in DIMENSIONS if name in vectors["u"].dims]
+    if len(found) != 1 or not all(found[0] in vectors[name].dims for name in COMPONENTS):
+        short = next(name for name in COMPONENTS if not set(found[:1] or DIMENSIONS) & set(vectors[name].dims))
         raise ValueError(
-            f"vectors: expected {short[0]} over pair, z, y, x, found it over {vectors[short[0]].dims}. "
+            f"vectors: expected {short} over pair, z, y, x, or over instant, found it over {vectors[short].dims}. "
             "Open all pairs of a run with `lfpiv.open_results`."
         )
+    return found[0]
+
+
+def _measured(vectors: xr.Dataset) -> xr.Dataset:
+    """Return velocities in double precision, NaN where they are not used."""
     velocity = vectors[list(COMPONENTS)].astype(float)
     velocity = velocity.drop_vars([name for name in velocity.coords if name not in velocity.dims])
     used = (velocity["u"] + velocity["v"] + velocity["w"]).notnull()
     if "valid" in vectors:
-        used = used & vectors["valid"].astype(bool).drop_vars("valid", errors="ignore")
+        flags = vectors["valid"].astype(bool)
+        used = used & flags.drop_vars([name for name in flags.coords if name not in flags.dims])
     return velocity.where(used)
 
 
-def _count(measured: xr.Dataset) -> xr.DataArray:
-    return measured["u"].count("pair")
+def _parts(vectors: xr.Dataset) -> Iterator[tuple[xr.Dataset, str]]:
+    """Yield parts of the pairs as `_measured` returns them, with their dimension. Dask arrays are one part."""
+    along = _dimension(vectors)
+    total = vectors.sizes[along]
+    each = sum(vectors[name].size for name in COMPONENTS) * 8 // max(total, 1)
+    length = total if vectors.chunks else max(BLOCK_BYTES // max(each, 1), 1)
+    for start in range(0, total, length) if total > length else (0,):
+        yield _measured(vectors.isel({along: slice(start, start + length)})), along
 
 
-def _mean(measured: xr.Dataset) -> xr.Dataset:
-    count = _count(measured)
-    return measured.sum("pair", skipna=True) / count.where(count > 0)
+def _rows(vectors: xr.Dataset) -> Iterator[dict[str, slice]]:
+    """Yield indices of parts of the positions along z and y, of which all pairs fit into a block."""
+    layers, rows = vectors.sizes["z"], vectors.sizes["y"]
+    row = sum(vectors[name].size for name in COMPONENTS) * 8 // (layers * rows)
+    most = max(BLOCK_BYTES // max(row, 1), 1)  # rows of vectors along x
+    high, wide = max(most // rows, 1), min(most, rows)
+    for z in range(0, layers, high):
+        for y in range(0, rows, wide):
+            yield {"z": slice(z, z + high), "y": slice(y, y + wide)}
+
+
+def _mean(vectors: xr.Dataset) -> tuple[xr.Dataset, xr.DataArray]:
+    """Return the mean velocity and the number of pairs that are used at each position."""
+    total: xr.Dataset | None = None
+    count: xr.DataArray | None = None
+    for measured, along in _parts(vectors):
+        part, used = measured.sum(along, skipna=True), measured["u"].count(along)
+        total = part if total is None else total + part
+        count = used if count is None else count + used
+    assert total is not None and count is not None
+    return total / count.where(count > 0), count
 
 
 def _with_axes(result: xr.Dataset, vectors: xr.Dataset) -> xr.Dataset:
@@ -234,12 +287,33 @@ def _with_axes(result: xr.Dataset, vectors: xr.Dataset) -> xr.Dataset:
     return result
 
 
-def _correlated(series: np.ndarray, order: np.ndarray) -> tuple[float, float]:
-    """Return 1 + 2 sum (n_k / n) rho_k, and n times the variance of the mean over the observed variance about it.
+class _Autocovariance:
+    """Sums of products of deviations from the mean over pairs 0, 1, ... apart and over all positions."""
 
-    `series` (pair, ...) is one component, NaN where it is not used. `order` holds the numbers of the pairs.
-    """
-    products, pairs, positions = _autocovariance(series.reshape(len(series), -1), order - order.min())
+    def __init__(self, place: np.ndarray):
+        self.place, length = place, int(place.max()) + 1
+        self.products, self.pairs = np.zeros(length), np.zeros(length)
+        """Sums, and the number of products in each."""
+        self.positions = 0
+        """Positions with at least two pairs."""
+
+    def add(self, series: np.ndarray) -> None:
+        """Add one component (pair, ...) at some positions, NaN where it is not used."""
+        series, length = series.reshape(len(series), -1), len(self.products)
+        step = max(1, _TRANSFORM_SIZE // length)
+        for start in range(0, series.shape[1], step):
+            part = series[:, start : start + step]
+            used = np.isfinite(part)
+            used &= used.sum(0) > 1
+            means = np.where(used, part, 0).sum(0) / np.maximum(used.sum(0), 1)
+            self.products += _lagged_sums(np.where(used, part - means, 0), self.place, length)
+            self.pairs += _lagged_sums(used, self.place, length)
+            self.positions += int(used.any(0).sum())
+
+
+def _correlated(found: _Autocovariance) -> tuple[float, float]:
+    """Return 1 + 2 sum (n_k / n) rho_k, and n times the variance of the mean over the observed variance about it."""
+    products, pairs, positions = found.products, found.pairs, found.positions
     if not products[0] > 0:
         return 1.0, 1.0
     occurs = pairs > 0.5  # distances that the gaps do not remove
@@ -256,26 +330,6 @@ def _correlated(series: np.ndarray, order: np.ndarray) -> tuple[float, float]:
     variance = observed[0] + mean_variance
     total = (share * (observed + mean_variance))[:stop].sum() / variance
     return float(total), float(total * variance * (count - 1) / (count * observed[0]))
-
-
-def _autocovariance(series: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Sum the products of deviations from the mean over pairs 0, 1, ... apart and over all positions.
-
-    `series` has shape (pair, position). Return the sums, the number of products in each, and the number of positions
-    with at least two pairs.
-    """
-    length = int(place.max()) + 1
-    step = max(1, _TRANSFORM_SIZE // length)
-    products, pairs, positions = np.zeros(length), np.zeros(length), 0
-    for start in range(0, series.shape[1], step):
-        part = series[:, start : start + step]
-        used = np.isfinite(part)
-        used &= used.sum(0) > 1
-        means = np.where(used, part, 0).sum(0) / np.maximum(used.sum(0), 1)
-        products += _lagged_sums(np.where(used, part - means, 0), place, length)
-        pairs += _lagged_sums(used, place, length)
-        positions += int(used.any(0).sum())
-    return products, pairs, positions
 
 
 def _lagged_sums(values: np.ndarray, place: np.ndarray, length: int) -> np.ndarray:

@@ -177,7 +177,7 @@ def test_a_new_image_concerns_its_pair_alone_and_a_lost_one_none(small_run, tmp_
 
     def unfinished():
         with open_run(experiment, out, None, None) as run:
-            return run.unfinished(volumes=True).pairs
+            return list(run.unfinished(volumes=True))
 
     assert unfinished() == []
     images = sorted((tmp_path / "data").rglob("*0002*"))

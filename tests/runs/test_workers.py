@@ -24,7 +24,7 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import cluster_workers, dispatch, local_workers, memory, pipeline, worker_plan
 from lfpiv.runs.pair import Outcome
-from lfpiv.runs.stretches import whole
+from lfpiv.runs.stretches import cut
 from lfpiv.runs.worker import Result
 from lfpiv.weights import storage
 from lfpiv_kernels.runtime import Device
@@ -202,7 +202,7 @@ class DeadlyFuture:
 
 def outcomes(client, todo, width=2):
     fractions = []
-    stretches = whole(todo, None)
+    stretches = cut(todo, None, width)
     work = dispatch.Dispatch(client, lambda: width, Path("shared"), stretches, len(todo))
     found = list(work.outcomes(fractions.append))
     assert fractions == sorted(fractions) and fractions[-1] <= 1

@@ -1,0 +1,253 @@
+"""Stores of many pairs or instants: equal to the files, appended to, complete or refused, averaged in parts."""
+
+import importlib.util
+import json
+import shutil
+import tracemalloc
+
+import numpy as np
+import pytest
+import xarray as xr
+from support.vector_sets import DT_S, random_vectors, write_run
+
+import lfpiv
+from lfpiv import statistics
+from lfpiv.results import netcdf, stacked_files, stores
+from lfpiv.velocity import statistics as streaming
+
+NUMBERS = (0, 1, 3, 4, 7, 8, 9)
+STEP = 2
+ROUNDING = 1e-12  # sums in another order
+
+
+def write_series(folder, numbers, **attributes):
+    """Write random vectors of instants of a series, each with its number as seed."""
+    for number in numbers:
+        stamp = {"instant": number, "step": STEP, "time_s": number * DT_S / STEP, "smart": {"iterations": 20}}
+        path = folder / "vectors" / f"instant_{number:06d}.nc"
+        netcdf.write_vectors(random_vectors(number), path, attributes=stamp | attributes)
+
+
+def hide_dask(monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "dask" else find(name))
+
+
+@pytest.fixture(params=["dask", "no dask"])
+def dask(request, monkeypatch):
+    """Open stores and folders with and without dask."""
+    if request.param == "dask":
+        pytest.importorskip("dask")
+    else:
+        hide_dask(monkeypatch)
+    return request.param == "dask"
+
+
+@pytest.fixture(params=["pairs", "series"])
+def run(request, tmp_path):
+    """Return the folder of a run on image pairs, and of one on a time series."""
+    (write_run if request.param == "pairs" else write_series)(tmp_path / "out", NUMBERS)
+    return tmp_path / "out"
+
+
+@pytest.fixture(params=["zarr", "netcdf"])
+def form(request, monkeypatch):
+    """Return a form of store, whose chunks hold two pairs and a part of the volume."""
+    if request.param == "zarr":
+        pytest.importorskip("zarr")
+    monkeypatch.setattr(stores, "CHUNK_PAIRS", 2)
+    monkeypatch.setattr(stores, "CHUNK_BYTES", 500)
+    return request.param
+
+
+def test_a_store_is_the_folder(run, form, dask):
+    (path,) = lfpiv.export_results(run, form)
+    folder, store = lfpiv.open_results(run), lfpiv.open_results(path)
+    assert (store.chunks != {}) == dask
+    xr.testing.assert_equal(store.load(), folder.load())
+    assert {name: np.asarray(value).tolist() for name, value in folder.attrs.items()} == {
+        name: np.asarray(value).tolist() for name, value in store.attrs.items() if name in folder.attrs
+    }
+    along = store.u.dims[0]
+    part = lfpiv.open_results(path, pairs=(2, 8))
+    assert part[along].values.tolist() == [3, 4, 7]
+    with pytest.raises(lfpiv.InputError, match="found 0 to 9"):
+        lfpiv.open_results(path, pairs=(20, None))
+
+
+def test_a_series_has_times_as_the_cf_conventions_want_them(tmp_path, form):
+    write_series(tmp_path, NUMBERS)
+    (path,) = lfpiv.export_results(tmp_path, form)
+    for place in (tmp_path, path):
+        results = lfpiv.open_results(place)
+        assert results.u.dims == ("instant", "z", "y", "x")
+        assert np.allclose(results.time, np.array(NUMBERS) * DT_S / STEP, rtol=ROUNDING, atol=0)
+        assert results.time.attrs["units"] == "s" and results.time.attrs["standard_name"] == "time"
+    with pytest.raises(lfpiv.InputError, match="interval: expected for image pairs only"):
+        lfpiv.export_results(tmp_path, form, interval_s=1.0)
+
+
+def test_a_store_of_pairs_has_times_if_the_interval_is_known(tmp_path, form):
+    write_run(tmp_path, NUMBERS)
+    (path,) = lfpiv.export_results(tmp_path, form, interval_s=0.25)
+    assert lfpiv.open_results(path).time.values.tolist() == [0.25 * number for number in NUMBERS]
+
+
+def test_chunks_suit_a_point_and_a_field(run, form):
+    (path,) = lfpiv.export_results(run, form)
+    chunks = [sizes[0] for sizes in lfpiv.open_results(path).u.chunksizes.values()]
+    assert chunks[0] == 2 and 4 * np.prod(chunks) <= 500 < 8 * np.prod(chunks)
+
+
+def test_an_export_adds_what_is_new_and_changed(run, monkeypatch):
+    pytest.importorskip("zarr")
+    monkeypatch.setattr(stores, "CHUNK_PAIRS", 2)
+    (path,) = lfpiv.export_results(run, "zarr")
+    read = []
+    inner = stacked_files.StackedFiles.read
+    monkeypatch.setattr(
+        stacked_files.StackedFiles,
+        "read",
+        lambda self, place, names: read.append(self.numbers[place]) or inner(self, place, names),
+    )
+    lfpiv.export_results(run, "zarr")
+    assert read == []
+    write = write_run if (run / "vectors" / "pair_0000.nc").exists() else write_series
+    write(run, (12, 13))
+    lfpiv.export_results(run, "zarr")
+    assert read == [12, 13]
+    write(run, (6,))  # between the others
+    lfpiv.export_results(run, "zarr")
+    assert read[2:] == [6, 7, 8, 9, 12, 13]
+    xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(run).load())
+    next(run.glob("vectors/*_*12.nc")).unlink()
+    lfpiv.export_results(run, "zarr")
+    xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(run).load())
+
+
+def test_results_of_other_settings_replace_the_store(tmp_path):
+    pytest.importorskip("zarr")
+    write_run(tmp_path, NUMBERS)
+    (path,) = lfpiv.export_results(tmp_path, "zarr")
+    write_run(tmp_path, NUMBERS[:3], smart={"iterations": 5})
+    lfpiv.export_results(tmp_path, "zarr", pairs=(0, 4))
+    store = lfpiv.open_results(path)
+    assert json.loads(store.attrs["smart"]) == {"iterations": 5} and store.sizes["pair"] == 3
+
+
+def test_a_killed_export_is_no_complete_store_and_goes_on(run, form, monkeypatch):
+    monkeypatch.setattr(stores, "CHUNK_PAIRS", 2)
+    inner = stacked_files.StackedFiles.block
+
+    def fail(self, first, after):
+        if first >= 4:
+            raise KeyboardInterrupt
+        return inner(self, first, after)
+
+    monkeypatch.setattr(stacked_files.StackedFiles, "block", fail)
+    with pytest.raises(KeyboardInterrupt):
+        lfpiv.export_results(run, form)
+    left = list((run / "export").iterdir()) if (run / "export").exists() else []
+    if form == "netcdf":
+        assert left == []
+    else:
+        with pytest.raises(lfpiv.InputError, match=r"expected a complete store.*goes on from there"):
+            lfpiv.open_results(left[0])
+        assert xr.open_zarr(left[0]).sizes[lfpiv.open_results(run).u.dims[0]] == 4
+    first = []
+    monkeypatch.setattr(
+        stacked_files.StackedFiles, "block", lambda self, one, after: first.append(one) or inner(self, one, after)
+    )
+    (path,) = lfpiv.export_results(run, form)
+    assert first[0] == (4 if form == "zarr" else 0)
+    xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(run).load())
+
+
+def test_nothing_else_is_taken_for_a_store_or_removed(tmp_path):
+    pytest.importorskip("zarr")
+    write_run(tmp_path, (0,))
+    with pytest.raises(lfpiv.InputError, match="found another file"):
+        lfpiv.open_results(tmp_path / "vectors" / "pair_0000.nc")
+    (tmp_path / "bad.nc").write_bytes(b"no NetCDF")
+    with pytest.raises(lfpiv.InputError, match=r"bad\.nc: expected a store"):
+        lfpiv.open_results(tmp_path / "bad.nc")
+    mine = tmp_path / "export" / "vectors.zarr"
+    mine.mkdir(parents=True)
+    (mine / "thesis.txt").write_text("years of work")
+    with pytest.raises(lfpiv.InputError, match="found another folder"):
+        lfpiv.export_results(tmp_path, "zarr")
+    assert (mine / "thesis.txt").read_text() == "years of work"
+    (tmp_path / "empty.zarr").mkdir()
+    with pytest.raises(lfpiv.InputError, match=r"empty\.zarr: expected a store"):
+        lfpiv.open_results(tmp_path / "empty.zarr")
+
+
+def test_a_damaged_chunk_is_not_read_in_silence(tmp_path, form):
+    write_run(tmp_path, NUMBERS)
+    (path,) = lfpiv.export_results(tmp_path, form)
+    chunk = path if form == "netcdf" else max((path / "u").glob("[0-9]*"))
+    content = bytearray(chunk.read_bytes())
+    if form == "netcdf":
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            place = file["u"].id.get_chunk_info(0)
+        content[place.byte_offset + place.size // 2] ^= 1
+    else:
+        content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    with pytest.raises((OSError, RuntimeError, ValueError)):
+        lfpiv.open_results(path).u.load()
+
+
+def test_pairs_and_a_series_in_one_folder_are_refused(tmp_path):
+    write_run(tmp_path, (0,))
+    write_series(tmp_path, (1,))
+    with pytest.raises(lfpiv.InputError, match="expected vectors of image pairs or of a time series, found both"):
+        lfpiv.open_results(tmp_path)
+
+
+def test_files_beyond_those_that_are_compared_at_first_are_compared_when_read(tmp_path, monkeypatch):
+    hide_dask(monkeypatch)
+    monkeypatch.setattr(stacked_files, "CHECKED_FILES", 3)
+    write_run(tmp_path, range(8))
+    write_run(tmp_path, (5,), smart={"iterations": 30})
+    results = lfpiv.open_results(tmp_path)  # 0, 3 and 7 are compared
+    assert np.isfinite(results.u.isel(pair=[4, 6])).all()
+    with pytest.raises(lfpiv.InputError, match=r"pair_0005\.nc.*smart\.iterations = 30 instead of 20"):
+        results.u.isel(pair=5).load()
+
+
+@pytest.mark.parametrize("block", [1, 20_000])
+def test_statistics_in_parts_are_those_of_the_whole(run, block, monkeypatch):
+    (path,) = lfpiv.export_results(run, "netcdf")
+    hide_dask(monkeypatch)
+    whole = lfpiv.open_results(run).load()
+    expected = [statistics.mean(whole), statistics.reynolds_stresses(whole), statistics.standard_error(whole)]
+    monkeypatch.setattr(streaming, "BLOCK_BYTES", block)
+    for place in (run, path):
+        results = lfpiv.open_results(place)
+        found = [statistics.mean(results), statistics.reynolds_stresses(results), statistics.standard_error(results)]
+        for one, other in zip(expected, found, strict=True):
+            xr.testing.assert_allclose(one, other, rtol=1e-9, atol=ROUNDING)
+    assert expected[2].standard_error_u.attrs == found[2].standard_error_u.attrs
+
+
+def test_statistics_hold_a_block_and_not_the_run(tmp_path, monkeypatch):
+    """Without dask, 60 files are averaged in much less memory than they take."""
+    hide_dask(monkeypatch)
+    shape, count, block = (16, 32, 32), 60, 4 << 20
+    write_run(tmp_path, (0,), shape=shape)
+    first = tmp_path / "vectors" / "pair_0000.nc"
+    for number in range(1, count):
+        shutil.copy(first, first.with_name(f"pair_{number:04d}.nc"))
+    monkeypatch.setattr(streaming, "BLOCK_BYTES", block)
+    results = lfpiv.open_results(tmp_path)
+    statistics.mean(results.isel(pair=slice(0, 2)))  # imports
+    tracemalloc.start()
+    average = statistics.mean(results)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    whole = 3 * 8 * count * np.prod(shape)
+    assert float(average.pairs_counted.max()) == count
+    assert peak < 4 * block < whole / 1.2

@@ -1,0 +1,114 @@
+"""Images are read and results written beside the computation: same results, errors where they belong."""
+
+import shutil
+import threading
+
+import numpy as np
+import pytest
+from support.small_run import PAIRS, damage, same_vectors
+
+from lfpiv.errors import InputError, StorageError
+from lfpiv.experiment.experiment import Experiment, Frame, open_experiment
+from lfpiv.results.pair_files import PairFiles
+from lfpiv.runs import pipeline
+from lfpiv.runs.side_threads import ReadAhead, Writer
+
+READER, WRITER = "lfpiv images", "lfpiv results"
+
+
+@pytest.fixture
+def readers(monkeypatch):
+    """Record (pair, frame, thread) of each particle image that is read."""
+    found, inner = [], Experiment.particle_image
+
+    def read(self, name, pair, frame):
+        found.append((pair, frame, threading.current_thread().name))
+        return inner(self, name, pair, frame)
+
+    monkeypatch.setattr(Experiment, "particle_image", read)
+    return found
+
+
+def test_images_that_come_are_read_by_a_thread_once_and_forgotten(tiny_experiment, readers):
+    experiment = open_experiment(tiny_experiment)
+    expected = {name: experiment.particle_image(name, 1, "a") for name in ("left", "right")}
+    readers.clear()
+    images, frame, other = ReadAhead(experiment), Frame(1, "a"), Frame(0, "b")
+    images.start([frame, other])
+    for name, image in expected.items():
+        np.testing.assert_array_equal(images.image(name, frame), image)
+    assert all(thread == READER for *_, thread in readers)
+    images.start([Frame(1, "b")], present=[frame])
+    images.image("left", other)  # it was forgotten
+    images.image("left", frame)  # it was taken
+    assert [thread == READER for pair, name, thread in readers if (pair, name) in ((0, "b"), (1, "a"))][-2:] == [
+        False
+    ] * 2
+
+
+def test_an_image_that_cannot_be_read_fails_when_it_is_taken(tiny_experiment):
+    experiment = open_experiment(tiny_experiment)
+    experiment.particle_path("right", 1, "b").unlink()
+    images = ReadAhead(experiment)
+    images.start(experiment.pair_frames(1))
+    assert images.image("left", Frame(1, "a")).ndim == images.image("right", Frame(1, "a")).ndim == 2
+    with pytest.raises(InputError, match="no such file"):
+        images.image("right", Frame(1, "b"))
+
+
+def test_results_are_written_in_order_and_errors_belong_to_their_result():
+    writer, written, go = Writer(), [], threading.Event()
+
+    def fail():
+        raise StorageError("the disk is full")
+
+    first = writer.start(lambda: go.wait(10) and written.append(1), large=True)
+    second, third = writer.start(fail, large=True), writer.start(lambda: written.append(3))
+    assert written == [] and not first.done()
+    go.set()
+    writer.wait_large()
+    assert first.done() and second.done() and first.exception() is None
+    writer.wait()
+    assert written == [1, 3] and third.exception() is None
+    with pytest.raises(StorageError, match="the disk is full"):
+        second.result()
+
+
+@pytest.mark.slow
+def test_a_run_reads_ahead_and_writes_behind_with_the_same_results(small_run, tmp_path, readers, monkeypatch):
+    out = small_run.results(tmp_path / "out")
+    shutil.rmtree(out / "vectors")
+    shutil.rmtree(out / "volumes")
+    writers, inner = set(), PairFiles.write_vectors
+    monkeypatch.setattr(
+        PairFiles, "write_vectors", lambda *args: writers.add(threading.current_thread().name) or inner(*args)
+    )
+    summary = pipeline.run(small_run.experiment, out, keep_volumes=True)
+    assert summary["failed"] == [] and same_vectors(small_run.out, out) == PAIRS
+    assert {pair for pair, _, thread in readers if thread == READER} == set(range(1, PAIRS)) and writers == {WRITER}
+    assert len(list((out / "volumes").iterdir())) == 2 * PAIRS
+
+
+@pytest.mark.slow
+def test_a_damaged_image_fails_its_pair_and_a_full_disk_the_run_at_its_pair(small_run, tmp_path, monkeypatch):
+    file, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+    damage(sorted((file.parent / "particles").rglob("*0002*"))[0])
+    inner = PairFiles.write_vectors
+
+    def full(self, *arguments):
+        if self.pair == 3:
+            raise OSError(28, "No space left on device")
+        inner(self, *arguments)
+
+    monkeypatch.setattr(PairFiles, "write_vectors", full)
+    summary = pipeline.run(file, out)
+    assert [entry["pair"] for entry in summary["failed"]] == [2, 3]
+    assert [entry["pair"] for entry in summary["pairs"]] == [0, 1]
+
+    def storage(self, *arguments):
+        raise StorageError(f"{self.vectors}: cannot be written")
+
+    monkeypatch.setattr(PairFiles, "write_vectors", storage)
+    with pytest.raises(StorageError, match=r"pair_0003\.nc"):
+        pipeline.run(file, out, pairs=(3, None))
+    assert not list(out.rglob("*.tmp")) and not (out / "vectors" / "pair_0003.nc").exists()
