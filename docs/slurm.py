@@ -35,7 +35,8 @@ def main() -> int:
 
     # a certificate for this run: nobody else on the network can send work, which is code, to scheduler and workers
     security = Security.temporary()
-    tls = {"ca-file": security.tls_ca_file, "client.key": security.tls_client_key, "client.cert": security.tls_client_cert}
+    key, certificate = security.tls_client_key, security.tls_client_cert
+    tls = {"ca-file": certificate, "client.key": key, "client.cert": certificate}
     dask.config.set({f"distributed.comm.tls.{name}": value for name, value in tls.items()})
     private = os.path.join(os.path.abspath(arguments.logs), ".tls")  # files of the certificate, until the run's end
     os.makedirs(private, mode=0o700, exist_ok=True)
