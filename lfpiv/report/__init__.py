@@ -63,15 +63,15 @@ def write_report(
         "run": overview.run_facts(experiment, figures),
         "calibration": calibration_section.section(experiment, calibration, figures.calibration),
         "background": background.section(experiment, calibration),
-        "volumes": volumes.section(figures.pairs, vectors) if vectors else "",
-        "vectors": vector_section.section(vectors),
+        "volumes": volumes.section(figures.pairs, vectors, experiment.noun) if vectors else "",
+        "vectors": vector_section.section(vectors, experiment.noun),
         "pairs": pairs.section(figures.pairs, figures.failed, figures.finished_count) if figures.pairs else "",
         "time": overview.timings(figures),
         "settings": overview.settings_and_versions(figures),
     }
     body = [
         overview.head(experiment, figures),
-        overview.warnings(figures),
+        overview.warnings(figures, experiment.noun),
         overview.contents(sections),
         *sections.values(),
     ]

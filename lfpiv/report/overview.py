@@ -18,9 +18,9 @@ WARNINGS_SHOWN, WARNINGS_MOST = 12, 300
 def head(experiment: Experiment, summary: Summary) -> str:
     """Return the title of the page and the main figures of the run."""
     finished, failed = summary.finished_count, summary.failed_count
-    cards = [(f"{finished:,}", f"image {'pair' if finished == 1 else 'pairs'} finished")]
+    cards = [(f"{finished:,}", f"{_noun(experiment)}{'' if finished == 1 else 's'} finished")]
     if failed:
-        cards.append((f"{failed:,}", f"image {'pair' if failed == 1 else 'pairs'} failed"))
+        cards.append((f"{failed:,}", f"{_noun(experiment)}{'' if failed == 1 else 's'} failed"))
     if finished:
         cards.append((percent(summary.valid_fraction), "valid vectors"))
         uncertainty = [pair.uncertainty_voxel for pair in summary.pairs if pair.uncertainty_voxel is not None]
@@ -47,11 +47,15 @@ def head(experiment: Experiment, summary: Summary) -> str:
     )
 
 
-def warnings(summary: Summary) -> str:
-    """List the failed pairs, then the warnings."""
-    failed = [f"Pair {failure.pair} failed: {failure.reason}" for failure in summary.failed]
+def _noun(experiment: Experiment) -> str:
+    return "image pair" if experiment.series is None else experiment.noun
+
+
+def warnings(summary: Summary, noun: str = "pair") -> str:
+    """List the failed pairs, or instants as `noun` says, then the warnings."""
+    failed = [f"{noun.capitalize()} {failure.pair} failed: {failure.reason}" for failure in summary.failed]
     unnamed = summary.failed_count - len(failed)
-    failed += [f"{unnamed:,} more pairs failed"] if unnamed else []
+    failed += [f"{unnamed:,} more {noun}s failed"] if unnamed else []
     texts = [*failed, *summary.warnings]
     if not texts:
         return ""

@@ -63,47 +63,52 @@ _DEPTH_TITLES = (
 )
 
 
-def section(vectors: Mapping[int, pathlib.Path]) -> str:
+def section(vectors: Mapping[int, pathlib.Path], noun: str = "pair") -> str:
     """Return the section on the vectors, as HTML, with the data of its views.
 
     Parameters
     ----------
     vectors : dict
         Pair -> file of its vectors.
+    noun : str
+        What results are numbered by: "pair", or "instant" in a time series.
     """
     if not vectors:
-        return '<h2 id="vectors">Vectors</h2>' + markup.paragraph("No pair is finished yet.")
+        return '<h2 id="vectors">Vectors</h2>' + markup.paragraph(f"No {noun} is finished yet.")
     found = survey(vectors)
     pair, first = next(iter(found.shown.items()))
-    data, thinning = embed(found, {pair: f"pair {pair}" for pair in found.shown})
-    parts = ['<h2 id="vectors">Vectors</h2>', markup.paragraph(_overview(found, len(vectors), thinning, first))]
-    parts += [_slice_view(pair, first), _space_view(pair, first), _displacements(pair, first), data]
+    data, thinning = embed(found, {pair: f"{noun} {pair}" for pair in found.shown})
+    parts = ['<h2 id="vectors">Vectors</h2>', markup.paragraph(_overview(found, len(vectors), thinning, first, noun))]
+    name = f"{noun} {pair}"
+    parts += [_slice_view(name, first), _space_view(name, first), _displacements(name, first), data]
     return "\n".join(parts)
 
 
-def _overview(found: Survey, pairs: int, thinning: int, first: xr.Dataset) -> str:
+def _overview(found: Survey, pairs: int, thinning: int, first: xr.Dataset, noun: str) -> str:
     """State how many vectors a pair has, and which of them the page holds."""
     nz, ny, nx = first["u"].shape
-    text = f"{nx} × {ny} × {nz} vectors (x, y, z) per pair."
+    text = f"{nx} × {ny} × {nz} vectors (x, y, z) per {noun}."
     if len(found.shown) < pairs:
-        text += f" The page holds {len(found.shown)} of {pairs:,} pairs, evenly chosen; all are in the folder vectors."
+        text += (
+            f" The page holds {len(found.shown)} of {pairs:,} {noun}s, evenly chosen; all are in the folder vectors."
+        )
     if found.mean is not None and found.read < pairs:
-        text += f" Mean and fluctuation are those of {found.read} evenly chosen pairs."
+        text += f" Mean and fluctuation are those of {found.read} evenly chosen {noun}s."
     if thinning > 1:
         text += f" Along x and y the views show every {thinning}th vector; the files hold all."
     return text
 
 
-def _slice_view(pair: int, first: xr.Dataset) -> str:
+def _slice_view(name: str, first: xr.Dataset) -> str:
     """Return the view with a slider, its still panels, and a table by depth."""
     still = markup.figure(
         [*slices(first), *slices(first, normal="y", most=1)],
-        f"Pair {pair}: velocity at several depths, and in the middle from the side. Arrows show the components in the "
-        "slice, colour the one across it; pale arrows were replaced after validation; hatched cells are masked.",
+        f"{name.capitalize()}: velocity at several depths, and in the middle from the side. Arrows show the components "
+        "in the slice, colour the one across it; pale arrows were replaced after validation; hatched cells are masked.",
     )
     rows = depth_rows(first)
     table = markup.table(_DEPTH_TITLES, rows, caption="Valid vectors by depth")
-    title = f'By depth: <span id="depth-field">pair {pair}</span>'
+    title = f'By depth: <span id="depth-field">{name}</span>'
     return f"""<h3>Slices</h3>
 <div class="view" id="slices">
 <div class="live">
@@ -146,10 +151,10 @@ def depth_rows(vectors: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-def _space_view(pair: int, first: xr.Dataset) -> str:
+def _space_view(name: str, first: xr.Dataset) -> str:
     """Return the view in space and its still panel."""
     still = markup.figure(
-        [in_space(first)], f"Pair {pair}: the valid vectors, coloured by speed, seen from obliquely above."
+        [in_space(first)], f"{name.capitalize()}: the valid vectors, coloured by speed, seen from obliquely above."
     )
     return f"""<h3>In space</h3>
 <div class="view" id="space">
@@ -171,7 +176,7 @@ to zoom once the view is chosen by a click, a tap or the Tab key; arrow keys tur
 </div>"""
 
 
-def _displacements(pair: int, first: xr.Dataset) -> str:
+def _displacements(name: str, first: xr.Dataset) -> str:
     """Draw and tabulate histograms of the displacements."""
     shown, tables = [], []
     for axis in "xyz":
@@ -186,7 +191,7 @@ def _displacements(pair: int, first: xr.Dataset) -> str:
         )
     return "<h3>Displacements</h3>" + markup.figure(
         shown,
-        f"Pair {pair}: displacements of the valid vectors. Peaks at whole numbers would be peak locking.",
+        f"{name.capitalize()}: displacements of the valid vectors. Peaks at whole numbers would be peak locking.",
         f'<div class="side-by-side">{"".join(tables)}</div>',
     )
 

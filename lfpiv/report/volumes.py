@@ -22,7 +22,7 @@ BAND = (5, 95)
 """Percentiles that bound the range drawn over many volumes."""
 
 
-def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path]) -> str:
+def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], noun: str = "pair") -> str:
     """Return the section on the volumes, as HTML; empty where the first file holds nothing about its volumes.
 
     Parameters
@@ -31,9 +31,11 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path]) -> str:
         Finished pairs.
     vectors : dict
         Pair -> file of its vectors. The volumes of the first pair are shown.
+    noun : str
+        What results are numbered by: "pair", or "instant" in a time series.
     """
     histories = {
-        f"pair {item.number}, {frame}": np.asarray(residual, float)
+        f"{noun} {item.number}, {frame}": np.asarray(residual, float)
         for item in pairs
         for frame, residual in item.residual.items()
         if residual
@@ -42,8 +44,8 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path]) -> str:
     first = netcdf.read_reconstruction(vectors[pair])
     if first is None:
         return ""
-    parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(pair, first)]
-    parts.append(quality_figure(pair, first, histories))
+    parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(f"{noun} {pair}", first)]
+    parts.append(quality_figure(pair, first, histories, noun))
     parts.append(_images(pairs))
     stops = _stops(pairs)
     if stops:
@@ -53,7 +55,7 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path]) -> str:
     return "\n".join(parts)
 
 
-def _projection_figure(pair: int, first: xr.Dataset) -> str:
+def _projection_figure(name: str, first: xr.Dataset) -> str:
     """Draw the largest intensity along each axis, with a table of percentiles."""
     frame = str(first["frame"].values[0])
     names = (("z", "x", "y"), ("y", "x", "z"), ("x", "y", "z"))
@@ -75,7 +77,7 @@ def _projection_figure(pair: int, first: xr.Dataset) -> str:
     )
     return markup.figure(
         shown,
-        f"Brightest voxel along each axis, pair {pair}, frame {frame}. Particles should be round in x and y; along z "
+        f"Brightest voxel along each axis, {name}, frame {frame}. Particles should be round in x and y; along z "
         "they are longer, the more so the smaller the angle between the cameras.",
         table,
     )
@@ -100,7 +102,7 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
     return to_svg(figure, f"Largest intensity of the volume along {along}, over {across} and {up}.")
 
 
-def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray]) -> str:
+def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], noun: str = "pair") -> str:
     """Draw the residuals and the brightness over the depth.
 
     Parameters
@@ -111,6 +113,8 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
         Condensed volumes of that pair, from `netcdf.read_reconstruction`.
     histories : dict
         Volume -> residual per iteration.
+    noun : str
+        As of `section`.
 
     Returns
     -------
@@ -129,7 +133,7 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
         panel, table = _brightness(first, sheet)
         shown.append(panel)
         tables.append(table)
-        captions.append(f"Mean brightness of the planes along z, pair {pair}. {_judgement(profile, sheet)}")
+        captions.append(f"Mean brightness of the planes along z, {noun} {pair}. {_judgement(profile, sheet)}")
     else:
         captions.append("The brightness over the depth is not in the file, which an earlier version wrote.")
     return markup.figure(shown, " ".join(captions), "".join(tables)) if shown else markup.paragraph(captions[0])

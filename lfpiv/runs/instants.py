@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import logging
 import traceback
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 from zipfile import BadZipFile
 
 import numpy as np
@@ -25,10 +25,43 @@ from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, Volume
 from lfpiv.runs.frame_light import FrameLight, compare
 
 if TYPE_CHECKING:
-    from lfpiv.runs.pair import PairWork
+    from lfpiv.calibration.camera import CalibratedCamera
+    from lfpiv.experiment.experiment import Experiment
     from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
+
+
+class InstantWork(Protocol):
+    """The work on one instant, which `lfpiv.runs.pair` does."""
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment of the series."""
+
+    @property
+    def cameras(self) -> Mapping[str, CalibratedCamera]:
+        """Cameras that know what stands still in their images."""
+
+    @property
+    def keep_volumes(self) -> bool:
+        """Whether volumes are written into the output folder."""
+
+    @property
+    def scratch(self) -> Path | None:
+        """Folder in which processes store volumes for each other; None for a process by itself."""
+
+    def read_light(self, file: VolumeFile) -> FrameLight:
+        """Read and check the images of an instant whose volume is to be reconstructed."""
+
+    def light_again(self, instant: Frame) -> FrameLight:
+        """Read the images of an instant, also if its volume is known."""
+
+    def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one instant."""
+
+    def write(self, write: Callable[[], None], *, large: bool = False) -> None:
+        """Start to write a result of the present pair."""
 
 
 class Failure(Exception):
@@ -61,10 +94,10 @@ class _Instant:
 class Instants:
     """The instants of the present pair of a stretch.
 
-    Volumes are taken from the output folder, from another process (`PairWork.scratch`), or reconstructed.
+    Volumes are taken from the output folder, from another process (`InstantWork.scratch`), or reconstructed.
     """
 
-    work: PairWork
+    work: InstantWork
     stored: Collection[int] = ()
     """Instants whose volumes are stored for other processes."""
     held: dict[Frame, _Instant | Failure] = field(default_factory=dict)

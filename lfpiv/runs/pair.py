@@ -195,7 +195,8 @@ class PairWork:
     def _do(self, pair: int, instants: Instants | None, progress: StepProgress) -> None:
         files = self.files(pair)
         if files.outdated(vectors=self.vectors, volumes=self.keep_volumes) is None:
-            return  # by a worker that died afterwards
+            log.info("%s: was finished by a worker that died afterwards", self.experiment.name_of(pair))
+            return
         if instants is None:
             volumes = self._pair_volumes(files, part_of(progress, 0.0, RECONSTRUCTED))
         elif self.vectors:

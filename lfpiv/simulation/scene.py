@@ -320,6 +320,10 @@ def open_scene(path: str | Path) -> Scene:
     scene = read_toml(path, Scene)
     if isinstance(scene.flow, Tracers):
         flow = scene.flow.model_copy(update={"file": str((path.parent / scene.flow.file).absolute())})
-        flow.tracers()  # refuses a missing or unsuitable file before any work
+        # refuse a missing or unsuitable file before any work
+        if flow.series is None:
+            flow.tracers()
+        else:
+            flow.positions()
         scene = scene.model_copy(update={"flow": flow})
     return scene

@@ -5,6 +5,7 @@ import json
 import bench
 import cameras
 import choices
+import dns_series
 import imperfect_scenes
 import imperfections
 import numpy as np
@@ -32,6 +33,15 @@ ROWS = every_row("small") | {"unknown": imperfect_scenes.Row(label="a key of tom
 SAMPLED = 0.05  # relative: statistics of 4,000 draws
 
 
+def write_tracers(path):
+    """Write 5,000 tracers that turn about the middle of a unit cube, at eight instants; return the path."""
+    angle, start = 0.02 * np.arange(8)[:, None], np.random.default_rng(SEED).uniform(-0.5, 0.5, (5000, 3))
+    x = np.cos(angle) * start[:, 0] - np.sin(angle) * start[:, 1]
+    y = np.sin(angle) * start[:, 0] + np.cos(angle) * start[:, 1]
+    np.savez(path, positions=np.stack([x, y, np.broadcast_to(start[:, 2], x.shape)], axis=-1) + 0.5)
+    return path
+
+
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
     """Output folder of the cases on rigs of 2.4 mm."""
@@ -48,6 +58,7 @@ def tiny(tmp_path_factory):
         (imperfect_scenes.SENSOR_PX, (420, 500)),
         (imperfect_scenes.DOTS, (4, 4)),
         (imperfect_scenes.PAIRS, 1),
+        (dns_series.INSTANTS, 6),
     ):
         patch.setitem(table, "small", tiny_value)
     pair = bench.Pair(ppm=PPM)
@@ -61,6 +72,8 @@ def tiny(tmp_path_factory):
         (optics, "DEFAULT", pair),
         (optics, "OPTICS", {key: optics.OPTICS[key] for key in ("window",)}),
         (imperfect_scenes, "rows", lambda scale: {key: ROWS[key] for key in ("ideal", "e20", "half", "unknown")}),
+        (dns_series, "DATA", write_tracers(tmp_path_factory.mktemp("tracers") / "tracers.npz")),
+        (dns_series, "CUBE_MM", 4.0),
         (counting, "VOXELS", 1),  # the check by counted rays has tests of its own
     ):
         patch.setattr(module, name, value)
@@ -155,6 +168,16 @@ def test_imperfect_images_are_measured_and_judged(figures):
     table = case["tables"][0]
     assert [row[0] for row in table["rows"]] == [ROWS[key].label for key in case["rows"]]
     assert table["rows"][1][3] == pytest.approx(dim["all"] / ideal["all"])
+
+
+@pytest.mark.slow
+def test_each_instant_of_a_series_is_reconstructed_once_and_judged(figures):
+    case = figures["dns_series"]
+    assert case["reconstructed"] == [1] * 4  # instants 2 and 3 have no partner four instants apart
+    assert [one["instant"] for one in case["instants"]] == [0, 1]
+    for one in case["instants"]:
+        assert one["all"] < one["moved"] and one["correlation"] > 0.8
+    assert [row[0] for row in case["tables"][0]["rows"]] == ["0", "1", "mean"]
 
 
 @pytest.mark.parametrize("scale", ["small", "paper"])

@@ -155,7 +155,7 @@ def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_ru
     run.communicate()
     assert 0 < len(finished(out)) < PAIRS and worker.poll() is None
     run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
-    shared = wait_for(lambda: not dead.exists() and next((out / ".shared").glob("*"), None), run, "shared weights")
+    shared = wait_for(lambda: not dead.exists() and next((out / ".shared").glob("[!.]*"), None), run, "shared weights")
     wait_for(lambda: workers_of(worker, str(shared)), run, "pair")[0].kill()
     scheduler.send_signal(signal.SIGSTOP)
     time.sleep(HANG_S)

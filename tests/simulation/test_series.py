@@ -312,6 +312,19 @@ def test_scenes_that_are_no_series_are_refused(tmp_path, old, new, message):
     assert message in str(error.value)
 
 
+def test_a_scene_file_names_tracers_relative_to_itself(tracer_file):
+    path, positions = tracer_file
+    flow = 'kind = "tracers"\nfile = "tracers.npz"\nseries = "positions"\nsize_mm = [0.8, 0.8, 0.8]\nas_given = true'
+    text = SMALL_SCENE.replace("pairs = 2", "instants = 4")
+    text = text.replace('kind = "swirl"\npeak_mm = 0.05\ncore_mm = 0.2', flow)
+    (path.parent / "scene.toml").write_text(text)
+    scene = open_scene(path.parent / "scene.toml")
+    assert scene.flow.file == str(path) and scene.flow.positions().shape == positions.shape
+    (path.parent / "scene.toml").write_text(text.replace("tracers.npz", "other.npz"))
+    with pytest.raises(InputError, match=r"other\.npz"):
+        open_scene(path.parent / "scene.toml")
+
+
 def test_tracer_files_that_do_not_suit_are_refused(tracer_file):
     path, _ = tracer_file
     flow = TRACERS | {"file": str(path)}

@@ -71,6 +71,11 @@ def changed(work: PairWork, out: Path, *, step: int = 1, instants: int = 6, **se
     return dataclasses.replace(work, experiment=experiment, folder=Folder(out, series), **settings)
 
 
+def chained(pairs, step: int) -> list[int]:
+    """Return pairs in the order k, k + step, k + 2 step, ..."""
+    return sorted(pairs, key=lambda pair: (pair % step, pair))
+
+
 class Processes:
     """A client of Dask whose workers do their stretches at once, in this process; `deaths` tells when one dies.
 
@@ -84,7 +89,7 @@ class Processes:
         self.submitted.append(stretch)
         deaths = self.deaths.get(stretch.pairs[0], [])
         left, outcomes = deaths.pop(0) if deaths else None, []
-        for outcome in self.work.do(stretch, lambda number, fraction: None):
+        for outcome in self.work.do(stretch.pairs, lambda number, fraction: None, stored=stretch.stored):
             outcomes.append(outcome)
             if len(outcomes) == left:
                 return Done(key, "error", None)
@@ -116,7 +121,7 @@ class Done:
 def in_processes(work: PairWork, workers: int, deaths=None):
     """Do all pairs in stretches for several workers; return their outcomes by pair, and the client."""
     client = Processes(work, deaths)
-    todo = list(work.experiment.numbers)
+    todo = chained(work.experiment.numbers, work.experiment.series.step)
     stretches = cut(todo, work.experiment.series.step, workers)
     found = dispatch.Dispatch(client, lambda: workers, Path("shared"), stretches, len(todo), "instant")
     return {outcome.pair: outcome for outcome in found.outcomes(lambda fraction: None)}, client
