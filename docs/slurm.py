@@ -7,10 +7,13 @@ The same command again goes on where an interrupted one stopped. The exit status
 
 import argparse
 import logging
+import os
 import subprocess
 import sys
 
+import dask.config
 from dask_jobqueue import SLURMCluster
+from distributed.security import Security
 
 import lfpiv
 
@@ -30,6 +33,14 @@ def main() -> int:
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
 
+    # a certificate for this run: nobody else on the network can send work, which is code, to scheduler and workers
+    security = Security.temporary()
+    key, certificate = security.tls_client_key, security.tls_client_cert
+    tls = {"ca-file": certificate, "client.key": key, "client.cert": certificate}
+    dask.config.set({f"distributed.comm.tls.{name}": value for name, value in tls.items()})
+    private = os.path.join(os.path.abspath(arguments.logs), ".tls")  # files of the certificate, until the run's end
+    os.makedirs(private, mode=0o700, exist_ok=True)
+
     with SLURMCluster(
         cores=arguments.cores,
         processes=1,
@@ -38,6 +49,8 @@ def main() -> int:
         walltime=arguments.walltime,
         job_extra_directives=arguments.directive,
         log_directory=arguments.logs,
+        security=security,
+        shared_temp_directory=private,
         worker_extra_args=["--nthreads", "1"],  # a worker does one pair at a time, with all cores of its job
     ) as cluster:
         # a refused job would only be a line in the log, and the run would wait for workers

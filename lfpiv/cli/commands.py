@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import os
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,6 +28,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+
+EXIT_S = 15.0
+"""Longest time that the process may take to end after its work [s]."""
 
 _output = Output()
 """Output options of the present call. `call` resets them."""
@@ -268,7 +273,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         signal.signal(signal.SIGTERM, _terminate)
         if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
             signal.signal(signal.SIGHUP, _terminate)
-    sys.exit(call(arguments))
+    status = call(arguments)
+    last = threading.Timer(EXIT_S, os._exit, (status,))  # threads of a library may wait for something that never comes
+    last.daemon = True
+    last.start()
+    sys.exit(status)
 
 
 def call(arguments: Sequence[str] | None = None) -> int:

@@ -7,6 +7,7 @@ run can send any: TLS on the machine's own interface, with a certificate that is
 from __future__ import annotations
 
 import contextlib
+import datetime
 import logging
 import multiprocessing
 import os
@@ -29,6 +30,9 @@ SET_BACK_S = 10.0
 """Time by which the clock may be set back during a run [s]; Dask's processes wait for as long before they go on."""
 CLOSE_S = 10.0
 """Time that Dask is given to close [s]."""
+
+ROLES = ("client", "scheduler", "worker")
+"""Processes that have a certificate in Dask's settings."""
 
 LOCALHOST = "127.0.0.1"
 """Address on which scheduler and workers listen: other machines do not reach it."""
@@ -160,37 +164,61 @@ def workers(planned: Plan, shared: Path) -> Iterator[tuple[Any, Capacity]]:
 def _security() -> Any:
     """Return a certificate for the processes of one run, which both sides of a connection must show.
 
+    It is that of Dask's ``Security.temporary``, but valid at any time: the clock may be wrong, or set back meanwhile.
+
     Raises
     ------
     InputError
         If the package `cryptography` is not installed.
     """
+    security = import_distributed("--workers").Security
     try:
-        return import_distributed("--workers").Security.temporary()
+        from cryptography import x509
+        from cryptography.hazmat.primitives import hashes, serialization
+        from cryptography.hazmat.primitives.asymmetric import ec
     except ImportError:
         raise InputError(
             "--workers: expected the package `cryptography`, which keeps others from sending work to the processes, "
             "found none. Install it: pip install 'lfpiv[distributed]'."
         ) from None
+    secret = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "lfpiv")])
+    certificate = (
+        x509.CertificateBuilder(subject_name=name, issuer_name=name, public_key=secret.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(datetime.datetime(1970, 1, 1))
+        .not_valid_after(datetime.datetime(9999, 12, 31))
+        .sign(secret, hashes.SHA256())
+        .public_bytes(serialization.Encoding.PEM)
+        .decode()
+    )
+    plain = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    key = secret.private_bytes(*plain).decode()
+    roles = {f"tls_{role}_{kind}": text for role in ROLES for kind, text in (("key", key), ("cert", certificate))}
+    return security(require_encryption=True, tls_ca_file=certificate, **roles)
 
 
 def _start_scheduler(security: Any) -> Any:
     dask = import_distributed("--workers")
-    with interrupts_blocked():
-        return dask.SpecCluster(
-            scheduler={
-                "cls": dask.Scheduler,
-                # Dask must not repeat a pair whose worker died: `dispatch` decides that
-                "options": {
-                    **_listening(security),
-                    "allowed_failures": 0,
-                    "worker_ttl": None,
-                    "dashboard_address": f"{LOCALHOST}:0",
+    try:
+        with interrupts_blocked():
+            return dask.SpecCluster(
+                scheduler={
+                    "cls": dask.Scheduler,
+                    # Dask must not repeat a pair whose worker died: `dispatch` decides that
+                    "options": {
+                        **_listening(security),
+                        "allowed_failures": 0,
+                        "worker_ttl": None,
+                        "dashboard_address": f"{LOCALHOST}:0",
+                    },
                 },
-            },
-            security=security,
-            silence_logs=logging.CRITICAL,
-        )
+                security=security,
+                silence_logs=logging.CRITICAL,
+            )
+    except (RuntimeError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise ClusterError(f"the processes cannot be started ({reason}). The same command tries it again.") from error
 
 
 def _listening(security: Any) -> dict[str, Any]:

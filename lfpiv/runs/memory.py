@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import LEAST_BYTES_PER_VOXEL, Experiment
-from lfpiv.files import MIB
+from lfpiv.files import MIB, size_text
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
@@ -57,7 +57,7 @@ def weights_bytes(experiment: Experiment) -> int:
     cameras, grid, form = _nominal_cameras(experiment), experiment.grid, experiment.compute.weights_form
     weights = estimate_memory(cameras, grid, form)
     if form == "auto" and (most := estimate_memory(cameras, grid, "pixels")) > weights:
-        log.info("memory: %.1f GiB for weights, up to %.1f GiB where rays bend", weights / GIB, most / GIB)
+        log.info("memory: %s for weights, up to %s where rays bend", size_text(weights), size_text(most))
     return weights
 
 

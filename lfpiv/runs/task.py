@@ -1,7 +1,8 @@
 """The task of a run for its workers: data in a folder that only this user can write, never code.
 
-The task is a JSON file; weights and mask are arrays beside it. The name of the folder holds the digest of the task, and
-the task those of the arrays. The run sends this name to its workers, so a worker refuses what somebody has changed.
+The task is a JSON file in a folder; weights and mask are arrays beside it. The name of the folder holds the digest of
+the task, and the task those of the arrays. The run sends this name to its workers, so a worker refuses what somebody
+has changed.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from lfpiv.results.folder import Folder
 from lfpiv.runs.pair import PairWork
 from lfpiv.version import __version__
 
-TASK, WEIGHTS, SOLID, INSTANTS = "task.json", "weights", "solid.npy", "instants"
-"""Names in the folder of a task."""
+TASK, INSTANTS, WEIGHTS, SOLID = "task.json", "instants", "weights", "solid.npy"
+"""Names of the task and of the volumes in its folder, and of the arrays beside that folder."""
 
 DIGEST_CHARACTERS = 32
 """Characters of the task's digest in the name of its folder."""
@@ -66,7 +67,7 @@ class Task(BaseModel):
         """
         experiment = self.experiment
         if self.solid is not None:
-            experiment = dataclasses.replace(experiment, solid=_read_solid(shared / SOLID, self.solid))
+            experiment = dataclasses.replace(experiment, solid=_read_solid(shared.parent / SOLID, self.solid))
         return PairWork(
             experiment=experiment,
             folder=self.folder,
@@ -94,27 +95,27 @@ def write_task(work: PairWork, device: str, threads: int | None) -> Path:
     """
     from lfpiv.weights.storage import save_weights
 
-    root, token = work.folder.shared.absolute(), secrets.token_hex(4)
-    scratch = root / f".{token}"
-    with writing(scratch):
+    root, token = work.folder.shared.absolute(), secrets.token_hex(8)
+    base = root / token
+    with writing(base):
         _make_private(root)
-        scratch.mkdir(mode=0o700)
-        _require_space(scratch, 0 if work.weights is None else work.weights.memory_bytes)
+        base.mkdir(mode=0o700)
+        _require_space(base, 0 if work.weights is None else work.weights.memory_bytes)
     experiment, solid = _absolute(work.experiment), work.experiment.solid
-    with writing(scratch / SOLID):
+    with writing(base / SOLID):
         if solid is not None:
-            np.save(scratch / SOLID, solid, allow_pickle=False)
+            np.save(base / SOLID, solid, allow_pickle=False)
     task = Task(
         version=__version__,
         experiment=dataclasses.replace(experiment, solid=None),
-        solid=None if solid is None else _digest((scratch / SOLID).read_bytes()),
+        solid=None if solid is None else _digest((base / SOLID).read_bytes()),
         folder=dataclasses.replace(work.folder, path=work.folder.path.absolute()),
         calibration_hash=work.calibration_hash,
         guard=work.guard,
         keep_volumes=work.keep_volumes,
         background=work.background,
         vectors=work.vectors,
-        weights=None if work.weights is None else save_weights(work.weights, scratch / WEIGHTS),
+        weights=None if work.weights is None else save_weights(work.weights, base / WEIGHTS),
         device=device,
         threads=threads,
     )
@@ -124,10 +125,10 @@ def write_task(work: PairWork, device: str, threads: int | None) -> Path:
         raise InputError(
             f"{experiment.path}: expected paths that are text in UTF-8, which workers need. Rename the folder."
         ) from None
-    shared = root / f"{_digest(content)}-{token}"
+    shared = base / f"{_digest(content)}-{token}"
     with writing(shared):
-        (scratch / TASK).write_bytes(content)
-        scratch.rename(shared)
+        shared.mkdir(mode=0o700)
+        (shared / TASK).write_bytes(content)
     return shared
 
 

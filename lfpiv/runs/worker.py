@@ -112,7 +112,7 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
             calibration = background.load(work.folder.background, calibration).seen_by(calibration)
         work = dataclasses.replace(work, cameras=calibration.cameras, darks=read_darks(work.experiment))
     if task.weights is not None:
-        work = dataclasses.replace(work, weights=open_weights(shared / WEIGHTS, work.cameras, task.weights))
+        work = dataclasses.replace(work, weights=open_weights(shared.parent / WEIGHTS, work.cameras, task.weights))
     _opened.clear()  # the task of an earlier run
     _opened[shared] = work
     return work

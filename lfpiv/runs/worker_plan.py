@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.files import size_text
 from lfpiv.runs import memory
 from lfpiv.warn import Code, Warning, warn
 from lfpiv_kernels.runtime import Device
@@ -100,9 +101,9 @@ def require_memory(experiment: Experiment, weights: int, workers: int) -> None:
     """
     needed = memory.run_bytes(experiment, weights, workers)
     each = memory.worker_bytes(experiment)
-    text = f"about {needed / memory.GIB:.1f} GiB needed, {weights / memory.GIB:.1f} GiB of it for weights"
+    text = f"about {size_text(needed)} needed, {size_text(weights)} of it for weights"
     if workers > 1:
-        text += f" that {workers} workers share, {each / memory.GIB:.1f} GiB for each worker"
+        text += f" that {workers} workers share, {size_text(each)} for each worker"
     log.info("memory: %s", text)
     fits = memory.fitting_workers(experiment, weights, workers)
     if fits < workers and memory.run_bytes(experiment, weights, 1) <= memory.allowed_bytes(experiment):

@@ -16,9 +16,9 @@ from support.mutations import mutated
 import lfpiv
 from lfpiv.errors import LONGEST_MESSAGE, InputError, printable
 from lfpiv.experiment.experiment import open_experiment, read_experiment
-from lfpiv.experiment.settings import Box, HalfSpace
+from lfpiv.experiment.settings import Box, ExperimentTable, HalfSpace
 from lfpiv.experiment.toml import LARGEST_BYTES
-from lfpiv.simulation.scene import open_scene
+from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.surfaces import solid
 
 LONGEST_S = 2.0
@@ -172,3 +172,32 @@ def test_experiments_and_scenes_have_the_same_solids():
     assert wall.contains(*np.transpose(points)).tolist() == [False, True, False, False, False]
     assert box.contains(*np.transpose(points)).tolist() == [False, False, False, True, True]
     assert solid((wall, box), np.array(points)).tolist() == [False, True, False, True, True]
+
+
+def unbounded(entry, name, definitions, above=frozenset()):
+    """Yield the keys below an entry of a JSON schema whose numbers, texts or lists have no bound."""
+    if "$ref" in entry:
+        table = entry["$ref"].rpartition("/")[2]
+        if table not in above:
+            yield from unbounded(definitions[table], name, definitions, above | {table})
+    for part in (*entry.get("anyOf", ()), *entry.get("oneOf", ()), *entry.get("prefixItems", ())):
+        yield from unbounded(part, name, definitions, above)
+    for key, part in entry.get("properties", {}).items():
+        yield from unbounded(part, f"{name}.{key}", definitions, above)
+    needed = {
+        "array": [{"maxItems"}] if "items" in entry else [],
+        "string": [{"maxLength", "enum", "const"}],
+        "number": [{"minimum", "exclusiveMinimum"}, {"maximum", "exclusiveMaximum"}],
+    }
+    needed["integer"] = needed["number"]
+    if not all(one & set(entry) for one in needed.get(entry.get("type"), [])):
+        yield name
+    if isinstance(entry.get("items"), dict):
+        yield from unbounded(entry["items"], f"{name}[]", definitions, above)
+
+
+@pytest.mark.parametrize("model", [ExperimentTable, Scene])
+def test_every_value_of_a_file_has_bounds(model):
+    """But the magnification, whose magnitude has."""
+    schema = model.model_json_schema()
+    assert set(unbounded(schema, "", schema["$defs"])) == {".camera[].magnification"}

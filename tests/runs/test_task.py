@@ -67,9 +67,9 @@ def test_a_worker_reads_the_work_that_the_run_wrote(work, tmp_path, monkeypatch)
     for name in ("folder", "calibration_hash", "guard", "keep_volumes", "background", "vectors"):
         assert getattr(found, name) == getattr(work, name), name
     assert (found.scratch is None) == (work.experiment.series is None)
-    for path in (shared, shared.parent):
+    for path in (shared, shared.parent, work.folder.shared):
         assert path.stat().st_mode & 0o777 == 0o700
-    assert {path.name for path in shared.parent.iterdir()} == {shared.name}
+    assert list(work.folder.shared.iterdir()) == [shared.parent] and shared.parent.parent == work.folder.shared
 
 
 def test_a_changed_task_is_refused_and_runs_no_code(work, tmp_path):
@@ -90,7 +90,7 @@ def test_a_changed_task_is_refused_and_runs_no_code(work, tmp_path):
     assert not (tmp_path / "ran").exists()
     file.write_bytes(content)
     if work.experiment.solid is not None:
-        np.save(shared / task.SOLID, ~work.experiment.solid)
+        np.save(shared.parent / task.SOLID, ~work.experiment.solid)
         with pytest.raises(InputError, match="mask of this run"):
             task.read_task(shared).work(shared)
 
