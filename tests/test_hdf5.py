@@ -66,7 +66,7 @@ def stored(request, tmp_path_factory):
 
 
 def damages(size):
-    """Strategy of damage to a file of some size: bits flipped, a run of bytes overwritten, the end cut off or longer."""
+    """Strategy of damage to a file: a bit flipped, a run of bytes overwritten, the end cut off or bytes added."""
     place = st.integers(0, size - 1)
     run = st.binary(min_size=1, max_size=600)
     return st.one_of(

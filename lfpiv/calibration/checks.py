@@ -97,7 +97,7 @@ class NominalDifference:
     """Pose and magnification of a camera, fitted to the dots, against the stated ones."""
 
     turn_deg: float
-    """Rotation from the stated pose [degree]."""
+    """Rotation from the stated orientation [degree], nan without one."""
     magnification: float
     """Magnification at the middle of the board."""
 
@@ -122,7 +122,7 @@ def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, residual_pit
     tilted window. `residual_pitch` is the labels' median distance from the fitted thin lens [microlens pitch].
     """
     stated = setup.orientation
-    turn = 0.0
+    turn = math.nan
     if stated is not None:
         turn = Rotation.from_matrix(fitted.rotation @ stated.rotation.T).magnitude() * 180 / math.pi
     depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the middle of the board

@@ -48,7 +48,7 @@ class CalibrationQuality(LensArrayQuality):
     """Figures of a camera's mapping and of the board's dots as well."""
 
     turn_from_nominal_deg: float
-    """Rotation of the camera from its nominal pose [degree]."""
+    """Rotation of the camera from its nominal orientation [degree]. nan without one."""
     magnification: float
     """Magnification at the middle of the board."""
     sigma_nor_test: float

@@ -15,7 +15,7 @@ import typer
 
 from lfpiv.cli import terminal
 from lfpiv.cli.terminal import Interrupted, Output
-from lfpiv.errors import ClusterError, InputError, StorageError
+from lfpiv.errors import ClusterError, InputError, StorageError, printable
 from lfpiv.reproduce import CASES
 from lfpiv.version import __version__
 
@@ -146,7 +146,7 @@ def _reconstruct(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", devic
         from lfpiv.runs import pipeline
 
         summary = pipeline.reconstruct(experiment, out, pairs=selected, device=device, progress=progress)
-    _output.show(summary, lambda: print(f"volumes: {out / 'volumes'}"))
+    _output.show(summary, lambda: terminal.say(f"volumes: {out / 'volumes'}"))
     _end(summary)
 
 
@@ -169,7 +169,7 @@ def _report(experiment: ExperimentFile, out: Out) -> None:
         from lfpiv.runs import pipeline
 
         summary = pipeline.report(experiment, out)
-    _output.show(summary, lambda: print(f"report: {out / 'report.html'}"))
+    _output.show(summary, lambda: terminal.say(f"report: {out / 'report.html'}"))
 
 
 @_command("export", "lfpiv export results --to vti", "lfpiv export results --to pivpy --depth 1.5 --out planes")
@@ -200,7 +200,7 @@ def _export(
             folder, to, out=out, pairs=selected, depth_mm=depth, interval_s=interval, progress=progress
         )
     text = f"export: {written[0]}" if len(written) == 1 else f"export: {len(written)} files in {written[0].parent}"
-    _output.show({"files": [str(path) for path in written]}, lambda: print(text))
+    _output.show({"files": [str(path) for path in written]}, lambda: terminal.say(text))
 
 
 @_command("simulate", "lfpiv simulate scene.toml --out data")
@@ -213,7 +213,7 @@ def _simulate(
         from lfpiv.simulation.simulator import simulate
 
         path = simulate(scene, out, progress=progress)
-    _output.show({"experiment": str(path)}, lambda: print(f"experiment: {path}"))
+    _output.show({"experiment": str(path)}, lambda: terminal.say(f"experiment: {path}"))
 
 
 @_command("demo", "lfpiv demo", "lfpiv demo --out somewhere --device cpu")
@@ -243,7 +243,7 @@ def _reproduce(
 
         print_case = terminal.print_case if _output.is_text else None
         done = reproduce(cases or ["all"], out, scale, seed=seed, progress=progress, finished=print_case)
-    _output.show(done, lambda: print(f"page: {out / 'index.html'}"))
+    _output.show(done, lambda: terminal.say(f"page: {out / 'index.html'}"))
 
 
 @_command("doctor", "lfpiv doctor", "lfpiv doctor --device cuda")
@@ -256,7 +256,7 @@ def _doctor(device: Literal["auto", "cpu", "cuda"] = "auto") -> None:
         for one in examine(device):
             found.append(one._asdict())
             if not _output.json and not (_output.quiet and one.good):
-                print(f"{'  ' if one.good else '! '}{one.item:24s} {one.finding}", flush=True)
+                terminal.say(f"{'  ' if one.good else '! '}{one.item:24s} {one.finding}", flush=True)
     _output.show(found, lambda: None)
     if not all(item["good"] for item in found):
         raise typer.Exit(1)
@@ -299,7 +299,7 @@ def call(arguments: Sequence[str] | None = None) -> int:
 def _fail(status: int, message: str, error: BaseException | None) -> int:
     if _output.debug and error is not None:
         traceback.print_exception(error)
-    print(f"lfpiv: {' '.join(message.split())}", file=sys.stderr)
+    print(f"lfpiv: {printable(' '.join(message.split()))}", file=sys.stderr)
     return status
 
 

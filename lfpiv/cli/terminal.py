@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from lfpiv.errors import printable
 from lfpiv.progress import Progress
 
 if TYPE_CHECKING:
@@ -85,17 +86,24 @@ class Output:
                 logger.removeHandler(handler)
 
 
+class _Printable(logging.Formatter):
+    """Format log records; control characters of names and files do not reach the terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record), keep="\n\t")
+
+
 def _rich_handler(console: Console) -> logging.Handler:
     from rich.logging import RichHandler
 
     handler = RichHandler(console=console, show_path=False, markup=False, highlighter=None)
-    handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.setFormatter(_Printable("%(message)s"))
     return handler
 
 
 def _plain_handler() -> logging.Handler:
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
+    handler.setFormatter(_Printable("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
     return handler
 
 
@@ -140,23 +148,28 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def say(text: str, file: TextIO | None = None, flush: bool = False) -> None:
+    """Print a line; control characters of names and files do not reach the terminal."""
+    print(printable(text), file=file, flush=flush)
+
+
 def print_run(summary: dict[str, Any], out: Path) -> None:
     """Print calibration, vectors, warnings, time and memory of a run, and the path of its report."""
     print_calibration(summary)
     print_vectors(summary, out)
     warnings = summary["warnings"]
     for text in warnings[:LISTED_WARNINGS]:
-        print(f"warning: {text}")
+        say(f"warning: {text}")
     if len(warnings) > LISTED_WARNINGS:
-        print(f"{len(warnings) - LISTED_WARNINGS:,} more warnings are in {out / 'summary.json'}")
-    print(f"{summary['timings_s']['total']:.0f} s, peak memory {summary['peak_memory_mib']:.0f} MiB")
-    print(f"report: {out / 'report.html'}")
+        say(f"{len(warnings) - LISTED_WARNINGS:,} more warnings are in {out / 'summary.json'}")
+    say(f"{summary['timings_s']['total']:.0f} s, peak memory {summary['peak_memory_mib']:.0f} MiB")
+    say(f"report: {out / 'report.html'}")
 
 
 def print_demo(summary: dict[str, Any], out: Path) -> None:
     """Print the error of the demonstration against the simulated flow, and the result of its run."""
     truth = summary["demo"]
-    print(
+    say(
         f"against the simulated flow: mean error {truth['mean_error_voxel']:.2f} voxel, "
         f"where displacements reach {truth['largest_displacement_voxel']:.2f} voxel"
     )
@@ -165,7 +178,7 @@ def print_demo(summary: dict[str, Any], out: Path) -> None:
 
 def print_case(key: str, result: dict[str, Any]) -> None:
     """Print the result of a case of `lfpiv reproduce`, the paper's value and the goal."""
-    print(f"{key}: {result['title']}")
+    say(f"{key}: {result['title']}")
     for row in result["comparison"]:
         ours, paper = (
             "-" if row[name] is None else f"{row[name]:.4g}" if isinstance(row[name], float) else row[name]
@@ -173,13 +186,13 @@ def print_case(key: str, result: dict[str, Any]) -> None:
         )
         unit = f" {row['unit']}" if row["unit"] else ""
         goal = "" if row["goal"] is None else f", goal {row['goal']}: {'reached' if row['reached'] else 'NOT reached'}"
-        print(f"  {row['what']}: {ours}{unit}, paper {paper}{goal}", flush=True)
+        say(f"  {row['what']}: {ours}{unit}, paper {paper}{goal}", flush=True)
 
 
 def print_calibration(summary: dict[str, Any]) -> None:
     """Print one line per camera."""
     for name, figures in summary["calibration"].items():
-        print(
+        say(
             f"{name}: {figures['dots_found']} of {figures['dots_expected']} dots, "
             f"sigma_nor {figures['sigma_nor_test']:.4f} pitch on held-out dots, "
             f"lens array fitted to {figures['lens_array_rms_px']:.3f} px"
@@ -190,26 +203,24 @@ def print_vectors(summary: dict[str, Any], out: Path) -> None:
     """Print one line per pair, up to `LISTED_PAIRS`."""
     pairs = summary["pairs"]
     for pair in pairs[:LISTED_PAIRS]:
-        print(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.0f} % valid vectors")
+        say(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.0f} % valid vectors")
     if len(pairs) > LISTED_PAIRS:
         count, share = summary.get("pairs_finished", len(pairs)), 100 * summary["valid_fraction"]
-        print(f"{count} {_noun(summary)}s in all, {share:.0f} % valid vectors on average")
+        say(f"{count} {_noun(summary)}s in all, {share:.0f} % valid vectors on average")
 
 
 def print_failed(summary: dict[str, Any], where: TextIO) -> None:
     """List the pairs that failed, and print the number of pairs that failed in earlier runs and were not repeated."""
     failed = failed_now(summary)
     for item in failed[:LISTED_PAIRS]:
-        print(f"failed: {_noun(summary)} {item['pair']}: {item['reason']}", file=where)
+        say(f"failed: {_noun(summary)} {item['pair']}: {item['reason']}", file=where)
     total, earlier = summary["experiment"]["pairs"], len(summary["failed"]) - len(failed)
     unnamed = summary.get("pairs_failed", len(summary["failed"])) - len(summary["failed"])
     if failed:
         count = len(failed) + unnamed
-        print(f"{count} of {total} {_noun(summary)}s failed; the same command tries them again", file=where)
+        say(f"{count} of {total} {_noun(summary)}s failed; the same command tries them again", file=where)
     if earlier:
-        print(
-            f"{earlier} of {total} {_noun(summary)}s failed in earlier runs and were not tried in this one", file=where
-        )
+        say(f"{earlier} of {total} {_noun(summary)}s failed in earlier runs and were not tried in this one", file=where)
 
 
 def _noun(summary: dict[str, Any]) -> str:

@@ -75,7 +75,7 @@ class Series:
     saturated: np.ndarray = field(init=False)
     """Number of images in which a pixel is saturated, uint16."""
 
-    def add(self, light: np.ndarray, noise: float, saturated: np.ndarray) -> None:
+    def add(self, light: np.ndarray, noise: float, saturated: np.ndarray, shift: int | None = None) -> None:
         """Add an image.
 
         Parameters
@@ -86,8 +86,11 @@ class Series:
             Its noise [counts].
         saturated : ndarray, shape (rows, columns), bool
             Its saturated pixels.
+        shift : int, optional
+            Number of its shift. Images of the same particles have the same; default: one for each image.
         """
-        shifted = np.roll(light, lens_shift(self.decoder, 2 * self.count + self.frame), (0, 1))
+        number = 2 * self.count + self.frame if shift is None else shift
+        shifted = np.roll(light, lens_shift(self.decoder, number), (0, 1))
         if self.count == 0:
             self.smallest, self.largest = light.copy(), light.copy()
             self.shifted, self.saturated = shifted, saturated.astype(np.uint16)

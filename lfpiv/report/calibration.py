@@ -141,14 +141,13 @@ def _board_figure(
 ) -> str:
     """Draw the first, middle and last plane by depth; tabulate all planes."""
     board = experiment.board
-    per_plane = board.dots[0] * board.dots[1]
+    stated = DotBoard.from_settings(board)
     order = np.argsort(board.planes_mm)
     known = np.zeros(0, int) if camera.dots is None else camera.dots.measured_dot
     shown = []
     for plane in dict.fromkeys((order[0], order[len(order) // 2], order[-1])):
         depth = board.planes_mm[plane]
-        numbers = plane * per_plane + np.arange(per_plane)
-        stated = DotBoard.from_settings(board)
+        numbers = plane * stated.size + np.flatnonzero(stated.occupied)
         points = stated.of_dots_mm(numbers) if errors is None else errors.points_mm(stated, numbers)
         outlines = dot_outlines_px(camera.map, setup.optics, points)
         measured = np.isin(numbers, known)

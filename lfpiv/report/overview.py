@@ -106,7 +106,8 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         (
             "Board",
             f"{board.dots[0]} × {board.dots[1]} dots, {board.spacing_mm:g} mm apart, in {len(board.planes_mm)} planes "
-            f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm",
+            f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm"
+            + (f", with a mark of {len(board.mark)} places without a dot" if board.mark else ""),
         ),
         ("Axes", _axes(experiment)),
         ("Image pairs", f"{summary.finished_count:,} of {experiment.pairs:,} finished"),

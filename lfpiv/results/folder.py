@@ -131,9 +131,10 @@ class Folder:
             for path in place.glob(".*.tmp"):
                 with contextlib.suppress(OSError):  # a folder is nobody's half-written file
                     path.unlink(missing_ok=True)
-        shutil.rmtree(self.shared, ignore_errors=True)
-        with contextlib.suppress(OSError):  # a file or a link in its place
-            self.shared.unlink()
+        if self.shared.is_dir() and not self.shared.is_symlink():
+            shutil.rmtree(self.shared, ignore_errors=True)
+        else:
+            self.shared.unlink(missing_ok=True)  # `rmtree` would wait for a pipe
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:

@@ -23,7 +23,7 @@ import numpy as np
 from lfpiv import files, hdf5, warn
 from lfpiv.errors import DamagedFile
 from lfpiv.experiment import images
-from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
 from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.records import RecordError, read_json, read_object, validate
@@ -267,7 +267,12 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
         Pairs from which the light is estimated.
     """
     recorded = {camera.name: camera.background for camera in experiment.cameras}
-    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    paths = [
+        path
+        for pair in pairs
+        for frame in background_frames(experiment, pair)
+        for path in experiment.frame_paths(frame)
+    ]
     images = [
         path
         for name in recorded
@@ -288,6 +293,11 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
 def lit_frames(experiment: Experiment) -> tuple[str, ...]:
     """Return the names of the frames that lasers of their own light; one laser lights all instants of a series."""
     return experiment.frames if experiment.series is None else experiment.frames[:1]
+
+
+def background_frames(experiment: Experiment, pair: int) -> tuple[Frame, ...]:
+    """Return the frames of a pair from which standing light is estimated: both, or the first instant of a series."""
+    return experiment.pair_frames(pair)[: len(lit_frames(experiment))]
 
 
 def _existing(paths: Iterable[Path]) -> list[Path]:

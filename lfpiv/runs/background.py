@@ -19,9 +19,9 @@ import numpy as np
 
 from lfpiv import files, hdf5
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
-from lfpiv.lightfield import background, image_checks
+from lfpiv.lightfield import background, decorrelation, image_checks
 from lfpiv.lightfield.background import Series
 from lfpiv.lightfield.standing_light import StandingLight, nothing
 from lfpiv.progress import StepProgress
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 LARGE_SHARE = 0.02
 """Share of an image's light that stands still and is not subtracted, above which a warning is due."""
 LONGEST_SERIES = 32
-"""Largest number of pairs, evenly spread, from which the standing light is estimated."""
+"""Largest number of pairs, evenly spread, from which the standing light is estimated; of instants twice as many."""
 MEDIAN_PAIRS = 7
 """The same for a median, which holds both frames of all pairs in memory."""
 WARNING_PAIRS = 4
@@ -100,9 +100,12 @@ def _images_lost(stamp: Stamp, marks: Marks) -> bool:
 
 
 def series(experiment: Experiment) -> list[int]:
-    """Return the pairs from which the standing light is estimated, evenly spread over all."""
+    """Return the pairs from which the standing light is estimated, evenly spread over all.
+
+    A pair of a time series gives one image: in two successive ones the same particles overlap, which chance does not.
+    """
     longest = {"median": MEDIAN_PAIRS, "none": WARNING_PAIRS}.get(experiment.background, LONGEST_SERIES)
-    return experiment.spread_pairs(longest)
+    return experiment.spread_pairs(longest if experiment.series is None else 2 * longest)
 
 
 def estimate(
@@ -160,7 +163,13 @@ def _of_series(
     """Estimate the standing light of one camera from pairs; those that cannot be used are left out."""
     median = experiment.background == "median"
     everywhere = experiment.background == "minimum"
-    first, second, kept = _read_series(experiment, camera, dark, pairs, keep=median)
+    chance = experiment.series is not None and not (median or everywhere)
+    apart = _independent_after(experiment, camera, dark, pairs) if chance else 1
+    if apart is None:
+        text = "particles move too little within the series to tell their light from light that stands"
+        log.info("background of %s: %s, nothing is subtracted", camera.name, text)
+        return nothing(camera.decoder)
+    first, second, kept = _read_series(experiment, camera, dark, pairs, apart, keep=median)
     if not first.count:
         return nothing(camera.decoder)
     if median:
@@ -168,10 +177,38 @@ def _of_series(
     else:
         found = background.standing_light(first, second, everywhere=everywhere)
         if found.region.any():  # again, with the images at equal power of the laser
-            first, second, _ = _read_series(experiment, camera, dark, pairs, estimate=found)
+            first, second, _ = _read_series(experiment, camera, dark, pairs, apart, estimate=found)
             found = background.standing_light(first, second, everywhere=everywhere)
     _log_series(experiment, camera.name, found, first.count)
     return found
+
+
+def _independent_after(
+    experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, pairs: list[int]
+) -> int | None:
+    """Return the number of instants after which particles are elsewhere; None where the series does not show it."""
+    instants = sorted({frame for pair in pairs for frame in experiment.pair_frames(pair)})
+    overlaps: dict[int, list[float]] = {}
+    for end in (instants[0], instants[-1]):
+        reference = _light(experiment, camera, dark, end)
+        for instant in instants:
+            light = None if instant == end else _light(experiment, camera, dark, instant)
+            if light is not None and reference is not None:
+                overlaps.setdefault(abs(instant.number - end.number), []).append(
+                    decorrelation.overlap(reference, light)
+                )
+    lags = sorted(overlaps)
+    return decorrelation.independent_after(lags, [float(np.mean(overlaps[lag])) for lag in lags])
+
+
+def _light(
+    experiment: Experiment, camera: CalibratedCamera, dark: np.ndarray | None, frame: Frame
+) -> np.ndarray | None:
+    """Return the light of an image; None if it cannot be used."""
+    try:
+        return _without_dark(experiment.particle_image(camera.name, *frame), dark, camera)[0]
+    except InputError:
+        return None
 
 
 def _read_series(
@@ -179,19 +216,20 @@ def _read_series(
     camera: CalibratedCamera,
     dark: np.ndarray | None,
     pairs: list[int],
+    apart: int,
     *,
     keep: bool = False,
     estimate: StandingLight | None = None,
 ) -> tuple[Series, Series | None, tuple[list[np.ndarray], list[np.ndarray]]]:
     """Read the images of one camera; return the series of both frames, and with `keep` all light.
 
-    All images of a time series are of one frame: one laser lights them. An `estimate` gives the power of the laser in
-    each image, by which it is divided.
+    All images of a time series are of one frame: one laser lights them. They are independent when they are `apart`
+    instants apart. An `estimate` gives the power of the laser in each image, by which it is divided.
     """
     series = Series(camera.decoder, 0), Series(camera.decoder, 1)
     kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for pair in pairs:
-        frames = experiment.pair_frames(pair)
+        frames = provenance.background_frames(experiment, pair)
         try:
             images = [experiment.particle_image(camera.name, *frame) for frame in frames]
         except InputError as error:  # the pair fails when it is reconstructed
@@ -199,9 +237,10 @@ def _read_series(
             continue
         for frame, image in zip(frames, images, strict=True):
             number = experiment.frames.index(frame.name)
+            shift = None if experiment.series is None else 2 * (frame.number // apart)
             light, noise, saturated = _without_dark(image, dark, camera)
             power = 1.0 if estimate is None else estimate.power(light, number)
-            series[number].add(light / np.float32(power), noise / power, saturated)
+            series[number].add(light / np.float32(power), noise / power, saturated, shift)
             if keep:
                 kept[number].append(light)
     return series[0], series[1] if experiment.series is None else None, kept

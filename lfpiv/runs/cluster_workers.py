@@ -15,7 +15,7 @@ from typing import Any
 
 from lfpiv.errors import ClusterError, InputError
 from lfpiv.runs import worker
-from lfpiv.runs.local_workers import CLOSE_S, Capacity, import_distributed
+from lfpiv.runs.local_workers import CLOSE_S, Capacity, clock_watch, import_distributed
 
 log = logging.getLogger(__name__)
 
@@ -72,11 +72,14 @@ class SchedulerWatch:
         self.answered_s = self.reminded_s = self.asked_s = time.monotonic()
         self.broken = False
         """Whether the connection is broken."""
+        self.require_clock = clock_watch()
+        """Raises ClusterError if the clock was set back."""
         self.answer: Future[int] | None = None
         """Answer to the last request; None if it arrived."""
 
     def capacity(self) -> float:
         """Return how many pairs may be submitted; raise ClusterError if the scheduler is lost."""
+        self.require_clock()
         now = time.monotonic()
         if self.client.status != "running":
             if self.client.status == "closed" or now - self.answered_s > SILENT_S:

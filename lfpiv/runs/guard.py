@@ -174,7 +174,7 @@ def _instants(
         try:
             light = pair_light(experiment, calibration.cameras, darks, pair)
         except InputError as error:  # a pair that cannot be used fails when it is reconstructed
-            log.debug("light beyond the volume in pair %d: %s", pair, error)
+            log.debug("light beyond the volume in %s: %s", experiment.name_of(pair), error)
             continue
         if min(min(frame.structure.values()) for frame in light) < NOISE:
             continue

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -157,7 +158,7 @@ class Instants:
         path = _light_path(file, self.work.scratch)
         try:
             light = _read_light(file.frame, list(self.work.cameras), path)
-        except (OSError, ValueError, KeyError):  # it is read from the images
+        except (OSError, ValueError, KeyError, BadZipFile):  # it is read from the images
             return None
         self._take(file, path)
         return light

@@ -1,11 +1,17 @@
-"""Worker processes of this machine. Dask starts and watches them. All of them end with the run."""
+"""Worker processes of this machine. Dask starts and watches them. All of them end with the run.
+
+Their messages are code to whoever receives them. So they are encrypted, and only processes with the certificate of this
+run can send any: TLS on the machine's own interface, with a certificate that is made for the run and stored nowhere.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,8 +23,15 @@ from lfpiv.runs.worker_plan import Plan
 
 START_S = 300.0
 """Longest time that worker processes may take to start [s]."""
+LOOPBACK_S = 2.0
+"""Longest time that a connection within the machine may take [s]."""
+SET_BACK_S = 10.0
+"""Time by which the clock may be set back during a run [s]; Dask's processes wait for as long before they go on."""
 CLOSE_S = 10.0
 """Time that Dask is given to close [s]."""
+
+LOCALHOST = "127.0.0.1"
+"""Address on which scheduler and workers listen: other machines do not reach it."""
 
 Capacity = Callable[[], float]
 """Return how many pairs may be submitted at once; raise ClusterError if the scheduler is lost."""
@@ -27,6 +40,8 @@ SETTINGS = {
     "distributed.worker.profile.enabled": False,  # would look at the workers' stacks 100 times a second
     "distributed.admin.tick.interval": "1s",  # default: 20 ms, in every process
     "distributed.admin.system-monitor.interval": "10s",
+    "distributed.scheduler.http.routes": [],  # nobody asks for pages
+    "distributed.worker.http.routes": [],
 }
 """Settings of Dask that reduce its own load on the processes."""
 
@@ -59,9 +74,10 @@ def start_preloading(kind: str) -> None:
     Raises
     ------
     InputError
-        If `distributed` is not installed.
+        If `distributed` is not installed, or processes cannot reach each other here.
     """
     dask = import_distributed("--workers")
+    _require_connections()
     if not _forks(kind):
         return
     from multiprocessing import forkserver, resource_tracker
@@ -79,6 +95,32 @@ def start_preloading(kind: str) -> None:
             del os.environ["PYTHONPATH"]
         else:
             os.environ["PYTHONPATH"] = path
+
+
+def _require_connections() -> None:
+    """Refuse a machine or container on which processes cannot reach each other; Dask would wait for minutes.
+
+    Raises
+    ------
+    InputError
+        If there is no loopback interface, or no shared memory for semaphores.
+    """
+    try:
+        with socket.create_server((LOCALHOST, 0)) as server:
+            socket.create_connection(server.getsockname(), timeout=LOOPBACK_S).close()
+    except OSError as error:
+        raise InputError(
+            f"--workers: expected processes that reach each other at {LOCALHOST}, found no connection "
+            f"({(error.strerror or str(error)).lower()}). Enable the loopback interface (`ip link set lo up`), or use "
+            "--workers 1."
+        ) from None
+    try:
+        multiprocessing.get_context("spawn").Semaphore()
+    except (OSError, ImportError) as error:
+        raise InputError(
+            "--workers: expected semaphores, which processes share in /dev/shm, found that they cannot be made "
+            f"({error}). Mount a tmpfs on /dev/shm that can be written (docker: --shm-size), or use --workers 1."
+        ) from None
 
 
 def _forks(kind: str) -> bool:
@@ -99,11 +141,12 @@ def workers(planned: Plan, shared: Path) -> Iterator[tuple[Any, Capacity]]:
     """Start worker processes on this machine; yield Dask's client and their capacity. End them in any case."""
     start_preloading(planned.kind)
     with _settings(planned.kind):
-        cluster = _start_scheduler()
+        security = _security()
+        cluster = _start_scheduler(security)
         finished = False
         try:
-            with import_distributed("--workers").Client(cluster, set_as_default=False) as client:
-                cluster.worker_spec.update(_specifications(planned, shared))
+            with import_distributed("--workers").Client(cluster, security=security, set_as_default=False) as client:
+                cluster.worker_spec.update(_specifications(planned, shared, security))
                 cluster.scale(planned.workers)  # starts them
                 yield client, _capacity(client, cluster)
                 finished = True
@@ -114,28 +157,54 @@ def workers(planned: Plan, shared: Path) -> Iterator[tuple[Any, Capacity]]:
                 cluster.close(timeout=CLOSE_S)
 
 
-def _start_scheduler() -> Any:
+def _security() -> Any:
+    """Return a certificate for the processes of one run, which both sides of a connection must show.
+
+    Raises
+    ------
+    InputError
+        If the package `cryptography` is not installed.
+    """
+    try:
+        return import_distributed("--workers").Security.temporary()
+    except ImportError:
+        raise InputError(
+            "--workers: expected the package `cryptography`, which keeps others from sending work to the processes, "
+            "found none. Install it: pip install 'lfpiv[distributed]'."
+        ) from None
+
+
+def _start_scheduler(security: Any) -> Any:
     dask = import_distributed("--workers")
     with interrupts_blocked():
         return dask.SpecCluster(
             scheduler={
                 "cls": dask.Scheduler,
                 # Dask must not repeat a pair whose worker died: `dispatch` decides that
-                "options": {"host": "127.0.0.1", "dashboard": False, "allowed_failures": 0, "worker_ttl": None},
+                "options": {
+                    **_listening(security),
+                    "allowed_failures": 0,
+                    "worker_ttl": None,
+                    "dashboard_address": f"{LOCALHOST}:0",
+                },
             },
+            security=security,
             silence_logs=logging.CRITICAL,
         )
 
 
-def _specifications(planned: Plan, shared: Path) -> dict[int, dict[str, Any]]:
+def _listening(security: Any) -> dict[str, Any]:
+    return {"host": LOCALHOST, "protocol": "tls://", "security": security, "dashboard": False}
+
+
+def _specifications(planned: Plan, shared: Path, security: Any) -> dict[int, dict[str, Any]]:
     """Return Dask's specification of every worker by its number."""
     options = {
+        **_listening(security),
         "nthreads": 1,
         "memory_limit": 0,
-        "host": "127.0.0.1",
         "local_directory": str(shared / "dask"),
         "silence_logs": logging.CRITICAL,
-        "dashboard": False,
     }
     nanny = import_distributed("--workers").Nanny
     envs = [{} if device is None else {"CUDA_VISIBLE_DEVICES": device} for device in planned.devices]
@@ -144,10 +213,11 @@ def _specifications(planned: Plan, shared: Path) -> dict[int, dict[str, Any]]:
 
 def _capacity(client: Any, cluster: Any) -> Capacity:
     """Return a function that counts the workers; it raises if the scheduler ended or no worker starts."""
-    last_seen_s = time.monotonic()
+    last_seen_s, require_clock = time.monotonic(), clock_watch()
 
     def capacity() -> float:
         nonlocal last_seen_s
+        require_clock()
         if client.status != "running":
             raise ClusterError("the scheduler of the workers ended. The same command goes on where it stopped.")
         count = len(cluster.scheduler.workers)
@@ -161,6 +231,26 @@ def _capacity(client: Any, cluster: Any) -> Capacity:
         return count
 
     return capacity
+
+
+def clock_watch() -> Callable[[], None]:
+    """Return a function that raises ClusterError if the clock was set back by more than `SET_BACK_S` since now.
+
+    Dask and Tornado send messages at times of the clock of the day. They would wait until it shows these times again.
+    """
+    latest = time.time() - time.monotonic()
+
+    def require_clock() -> None:
+        nonlocal latest
+        now = time.time() - time.monotonic()
+        latest = max(latest, now)
+        if now < latest - SET_BACK_S:
+            raise ClusterError(
+                f"the clock of this machine was set back by {latest - now:.0f} s, and the processes wait for it. "
+                "Finished results are complete; the same command goes on from there."
+            )
+
+    return require_clock
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from lfpiv.simulation.particles import LitParticles
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
 from lfpiv.simulation.sensor import Noise, Sensor, SensorPattern
+from lfpiv.simulation.series import SeriesInstant
 from lfpiv.simulation.surfaces import Surface
 from lfpiv_kernels.rendering import collect, render, surfaces
 
@@ -102,6 +103,10 @@ class StaticLight:
             for frame in range(2)
         )
         return first, second
+
+    def at_power(self, power: float, pulse: int) -> np.ndarray:
+        """Return the image of one instant of a series, whose pulse has a power."""
+        return self.at_powers(np.full(2, power))[pulse]
 
 
 def static_light(scene: Scene, number: int, white: np.ndarray) -> StaticLight | None:
@@ -222,11 +227,8 @@ def _particle_images(
     scene: Scene, number: int, pairs: list[LitParticles], static: StaticLight | None
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Yield path and image [count] of both frames of each pair."""
-    particles, name = scene.particles, scene.camera[number].name
-    renderer = render_camera(scene.camera[number].at_particles, seed=[scene.seed, 3, number])
-    shape, seed = "ball" if particles.sigma_mm is None else "gaussian", _ray_seed(scene, number) + 1
-    rays = render.ray_table(scene.quality.particle_rays, shape, seed)
-    size = particles.sigma_mm or particles.radius_mm or 0.0
+    name = scene.camera[number].name
+    renderer, rays, size = _particle_renderer(scene, number)
     for pair, lit in enumerate(pairs):
         other = None if static is None else static.at_powers(lit.power)
         for pulse, frame in enumerate(FRAMES):
@@ -234,6 +236,41 @@ def _particle_images(
             rng = np.random.default_rng([scene.seed, 6, number, pair, frame == "b"])
             image = render.render_sources(renderer, lit.placed.at_frame(frame), counts, size, rays, rng=rng)
             yield f"particles/{name}/pair_{pair:04d}_{frame}.tif", image if other is None else image + other[pulse]
+
+
+def series_images(
+    scene: Scene, number: int, instants: list[SeriesInstant], static: StaticLight | None
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield path and image [count] of each instant of a series.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    number : int
+        Number of the camera.
+    instants : list of SeriesInstant
+        Particles of each instant.
+    static : StaticLight or None
+        From `static_light`.
+    """
+    pattern, first, name = scene.particles.images, scene.particles.first, scene.camera[number].name
+    renderer, rays, size = _particle_renderer(scene, number)
+    for instant, placed in enumerate(instants):
+        counts = scene.exposure.particle_counts * renderer.microimage_px * placed.brightness[number]
+        rng = np.random.default_rng([scene.seed, 34, number, instant])
+        image = render.render_sources(renderer, placed.position_mm, counts, size, rays, rng=rng)
+        other = 0.0 if static is None else static.at_power(placed.power, instant % 2)
+        yield pattern.format(camera=name, instant=first + instant), image + other
+
+
+def _particle_renderer(scene: Scene, number: int) -> tuple[render.RenderCamera, np.ndarray, float]:
+    """Return the camera as it records particles, the table of their rays, and their size [mm]."""
+    particles = scene.particles
+    renderer = render_camera(scene.camera[number].at_particles, seed=[scene.seed, 3, number])
+    shape, seed = "ball" if particles.sigma_mm is None else "gaussian", _ray_seed(scene, number) + 1
+    rays = render.ray_table(scene.quality.particle_rays, shape, seed)
+    return renderer, rays, particles.sigma_mm or particles.radius_mm or 0.0
 
 
 def expose(

@@ -8,16 +8,17 @@ therefore consistent with the flow to second order. Points and displacements are
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, model_serializer, model_validator
+from pydantic_core.core_schema import SerializerFunctionWrapHandler
 from scipy.spatial import cKDTree
 
 from lfpiv.experiment.bounds import Coordinate, Flag, Length, Name, Number, PathText, Point
 from lfpiv.experiment.settings import Table
 from lfpiv.simulation.swirl import injector_profiles
-from lfpiv.simulation.tracers import TracerScaling, TracerSet, load_tracers
+from lfpiv.simulation.tracers import TracerScaling, TracerSet, load_series, load_tracers, tracers_between
 from lfpiv.simulation.turbulence import CHUNK, TurbulentFlow, checked_points
 
 Corner = tuple[Number, Number, Number]
@@ -189,7 +190,7 @@ class SwirlingJet(Table):
 
 
 class Tracers(Table):
-    """Flow given by tracer positions at two instants, mapped into a box of the volume.
+    """Flow given by tracer positions at two instants, or at those of a series, mapped into a box of the volume.
 
     Between tracers the displacement is a weighted linear fit to the nearest ones. Outside their bounding box it is that
     of the nearest point of the box. Displacements are stretched with the axes, each of which has its own factor.
@@ -202,6 +203,9 @@ class Tracers(Table):
     """Array (tracer, >= 3) in the file whose first columns are x, y, z at the first instant, in any unit."""
     second: Name = "t1"
     """Array of the same tracers, in the same order, at the second instant."""
+    series: Name | None = None
+    """Array (instant, tracer, >= 3) of the same tracers at the instants of a time series, in place of `first` and
+    `second`; its first instant is the first one of the series."""
     size_mm: tuple[Length, Length, Length]
     """Size (x, y, z) of the box of tracers [mm]."""
     centre_mm: Point = (0.0, 0.0, 0.0)
@@ -209,7 +213,7 @@ class Tracers(Table):
     box: tuple[Corner, Corner] | None = None
     """Two opposite corners of the box in the unit of the file; absent: the extent of the tracers."""
     peak_mm: Length | None = None
-    """Largest magnitude of the scaled displacement [mm]; absent: as in the file."""
+    """Largest magnitude of the scaled displacement [mm]; absent: as in the file. Not for a series."""
     as_given: Flag = False
     """Render the tracers as particles. False places particles at random and interpolates."""
 
@@ -218,6 +222,20 @@ class Tracers(Table):
         if self.box is not None and not all(low < high for low, high in zip(*self.box, strict=True)):
             raise ValueError("a box whose second corner lies above the first along every axis")
         return self
+
+    @model_validator(mode="after")
+    def _two_instants_or_series(self) -> Tracers:
+        if self.series is not None:
+            unused = sorted({"first", "second", "peak_mm"} & self.model_fields_set)
+            if unused:
+                raise ValueError(f"no {unused[0]} with series, whose displacements follow from the positions")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _keys_of_its_kind(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        table: dict[str, Any] = serialise(self)
+        unused = ("series",) if self.series is None else ("first", "second", "peak_mm")
+        return {key: value for key, value in table.items() if key not in unused}
 
     def tracers(self) -> tuple[np.ndarray, np.ndarray]:
         """Return tracer positions midway in time and displacements, each of shape (n, 3) [mm].
@@ -230,13 +248,37 @@ class Tracers(Table):
         loaded = self._loaded()
         return loaded.position_mm, loaded.displacement_mm
 
+    def positions(self) -> np.ndarray:
+        """Return the tracer positions at the instants of a series, shape (instant, tracer, 3) [mm].
+
+        Raises
+        ------
+        InputError
+            If the file is missing or does not contain the array.
+        """
+        if self.series is None:
+            raise ValueError("positions: expected tracers with `series`, got two instants. Call tracers().")
+        return load_series(self.file, self.series, self._scaling())
+
+    def between(self, start: int, end: int) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the displacement from one instant of a series to another as a function of points (n, 3) [mm]."""
+        instants = len(self.positions())
+        if not 0 <= start < end < instants:
+            raise ValueError(f"start, end: expected 0 <= start < end < {instants}, got {start} and {end}.")
+        assert self.series is not None
+        return tracers_between(self.file, self.series, self._scaling(), start, end).interpolate
+
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement (n, 3) at points (n, 3) [mm]."""
         return self._loaded().interpolate(checked_points(points_mm))
 
     def _loaded(self) -> TracerSet:
-        scaling = TracerScaling(size_mm=self.size_mm, centre_mm=self.centre_mm, box=self.box, peak_mm=self.peak_mm)
-        return load_tracers(self.file, self.first, self.second, scaling)
+        if self.series is not None:
+            raise ValueError("tracers: expected two instants, got a series. Call between(start, end).")
+        return load_tracers(self.file, self.first, self.second, self._scaling())
+
+    def _scaling(self) -> TracerScaling:
+        return TracerScaling(size_mm=self.size_mm, centre_mm=self.centre_mm, box=self.box, peak_mm=self.peak_mm)
 
 
 Flow = Uniform | Shear | Ring | Swirl | SwirlingJet | Tracers

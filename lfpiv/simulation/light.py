@@ -56,8 +56,9 @@ class Brightness(Table):
 class Sheet(Table):
     """Table ``[sheet]``: the light sheet of the two pulses.
 
-    A list of two values states first and second pulse; one value holds for both. The sheet lights particles only.
-    Bright surfaces and stray light through the lens follow the pulses' power.
+    A list of two values states first and second pulse; one value holds for both. In a time series the two pulses take
+    turns, the first one at the first instant. The sheet lights particles only. Bright surfaces and stray light through
+    the lens follow the pulses' power.
     """
 
     profile: Literal["even", "top_hat", "gaussian"] = "even"
@@ -71,7 +72,7 @@ class Sheet(Table):
     power: Pulses = (1.0, 1.0)
     """Power of the first and the second pulse."""
     power_sd: Annotated[float, Field(strict=True, ge=0, le=0.3)] = 0.0
-    """Standard deviation of each pulse's power from pair to pair, relative to its mean."""
+    """Standard deviation of each pulse's power from pair to pair or instant to instant, relative to its mean."""
 
     @model_validator(mode="after")
     def _thickness_fits_profile(self) -> Sheet:
@@ -192,3 +193,16 @@ def frame_light(
     power = sheet.powers(rng)
     lit = np.stack([power[pulse] * sheet.light(at, pulse) for pulse, at in enumerate(at_frames)])
     return FrameLight(power, brightness[:, None] * lit)
+
+
+def pulse_light(
+    sheet: Sheet | None, brightness: np.ndarray, at_mm: np.ndarray, pulse: int, rng: np.random.Generator
+) -> tuple[float, np.ndarray]:
+    """Return the power of a pulse, and the brightness of particles in each camera, shape (cameras, particle).
+
+    Parameters as of `frame_light`; `at_mm` (particle, 3) are the positions in the light of the pulse, 0 or 1 [mm].
+    """
+    if sheet is None:
+        return 1.0, brightness
+    power = float(sheet.powers(rng)[pulse])
+    return power, brightness * power * sheet.light(at_mm, pulse)

@@ -67,8 +67,10 @@ def place_particles(scene: Scene, pair: int) -> PlacedParticles:
     InputError
         If the scene has less than one particle, or its walls leave none.
     """
+    if scene.particles.instants is not None:
+        raise ValueError("scene: expected a scene with pairs, got one with particles.instants. Call place_series.")
     rng = np.random.default_rng([scene.seed, 1, pair])
-    size, count = seeded_size_mm(scene), _count(scene)
+    size, count = seeded_size_mm(scene), seeded_count(scene)
     if isinstance(scene.flow, Tracers) and scene.flow.as_given:
         position, displacement = scene.flow.tracers()
         inside = np.flatnonzero((np.abs(position - scene.volume.centre_mm) <= size / 2).all(1))
@@ -103,8 +105,8 @@ def seeded_size_mm(scene: Scene) -> np.ndarray:
     return size if margin is None else size + 2 * np.asarray(margin)
 
 
-def _count(scene: Scene) -> int:
-    """Return the number of particles to place, before those in walls are removed."""
+def seeded_count(scene: Scene) -> int:
+    """Return the number of particles in the seeded region, before those in walls are removed."""
     particles = scene.particles
     if particles.count is not None:
         return particles.count

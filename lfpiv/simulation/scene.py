@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_serializer, model_validator
+from pydantic_core.core_schema import SerializerFunctionWrapHandler
 
 from lfpiv.experiment import bounds
 from lfpiv.experiment.bounds import (
@@ -26,6 +27,7 @@ from lfpiv.experiment.settings import Compute, Correlation, Network, NominalBoar
 from lfpiv.experiment.toml import read_toml
 from lfpiv.simulation.board_errors import BoardErrors
 from lfpiv.simulation.flows import KINDS, Flow, Tracers
+from lfpiv.simulation.image_files import check_pattern
 from lfpiv.simulation.light import Brightness, Sheet, StrayLight
 from lfpiv.simulation.scene_camera import (
     SHARED_TABLES,
@@ -91,9 +93,19 @@ class SceneParticles(Table):
     per_microlens: Annotated[float, Field(strict=True, gt=0, le=LARGEST_SEEDING)] | None = None
     """Particles per microlens of the seeded region's x-y face (the paper's ppm). Alternative to `count`."""
     count: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_PARTICLES)] | None = None
-    """Particles of each pair, before those in walls are removed."""
+    """Particles of each pair or instant, before those in walls are removed."""
     pairs: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SIMULATED_PAIRS)] = 1
     """Number of image pairs, each with other particles."""
+    instants: Annotated[int, Field(strict=True, ge=2, le=bounds.MOST_SIMULATED_PAIRS)] | None = None
+    """Number of instants of a time series, in place of `pairs`: the same particles are carried by the flow, enter and
+    leave through the faces of the seeded region, and keep their brightness."""
+    first: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] = 0
+    """Number of a series' first instant."""
+    step: bounds.Count = 1
+    """Number of instants between the two that are correlated, `dt_s` apart."""
+    images: bounds.PathText = "particles/{camera}/instant_{instant:06d}.tif"
+    """Path of a series' images with ``{camera}`` and ``{instant}``. Behind `#` it names a page of a TIFF file or an
+    image of an HDF5 dataset: ``{camera}.tif#{instant}`` or ``{camera}.h5#images[{instant}]``."""
     fill: Annotated[float, Field(strict=True, gt=0, le=LARGEST_FILL)] = 1.0
     """Edges of the seeded region relative to the volume's. Above 1, particles are outside the volume too."""
     margin_mm: tuple[Thickness, Thickness, Thickness] | None = None
@@ -113,6 +125,26 @@ class SceneParticles(Table):
         if self.sigma_mm is not None and self.radius_mm is not None:
             raise ValueError("at most one of sigma_mm and radius_mm")
         return self
+
+    @model_validator(mode="after")
+    def _pairs_or_series(self) -> SceneParticles:
+        if self.instants is None:
+            unused = sorted({"first", "step", "images"} & self.model_fields_set)
+            if unused:
+                raise ValueError(f"{unused[0]} only with instants, the number of instants of a time series")
+            return self
+        if "pairs" in self.model_fields_set:
+            raise ValueError("either pairs or instants")
+        if self.step >= self.instants:
+            raise ValueError(f"step below the {self.instants} instants, so that one has a partner")
+        check_pattern(self.images, range(self.first, self.first + self.instants))
+        return self
+
+    @model_serializer(mode="wrap")
+    def _keys_of_its_kind(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        table: dict[str, Any] = serialise(self)
+        unused = ("instants", "first", "step", "images") if self.instants is None else ("pairs",)
+        return {key: value for key, value in table.items() if key not in unused}
 
 
 class Exposure(Table):
@@ -152,7 +184,7 @@ class Scene(Table):
     seed: Seed = 0
     """Seed of all random numbers."""
     dt_s: Interval
-    """Time between the two frames of a pair [s]."""
+    """Time between the two frames of a pair, or between instants k and k + step of a series [s]."""
     camera: Annotated[tuple[SceneCamera, ...], Field(min_length=1, max_length=bounds.MOST_CAMERAS)]
     window: Windows = ()
     """Windows of all cameras that state none."""
@@ -166,9 +198,10 @@ class Scene(Table):
     volume: SceneVolume
     particles: SceneParticles
     flow: Annotated[Flow, Field(discriminator="kind")]
-    """Displacement between the two frames, equal for all pairs. With turbulence it is the mean."""
+    """Displacement within `dt_s`, equal for all pairs, steady in a series but for tracers at several instants. With
+    turbulence it is the mean."""
     turbulence: Turbulence | None = None
-    """Fluctuation added to the flow, different for each pair."""
+    """Fluctuation added to the flow, different for each pair, steady in a series."""
     sheet: Sheet | None = None
     """Light sheet; absent: both pulses light all particles alike."""
     brightness: Brightness | None = None
@@ -214,6 +247,20 @@ class Scene(Table):
         return turbulence
 
     @model_validator(mode="after")
+    def _series_of_one_kind(self) -> Scene:
+        particles, flow = self.particles, self.flow
+        of_series = isinstance(flow, Tracers) and flow.series is not None
+        if particles.instants is None:
+            if of_series:
+                raise ValueError("particles.instants with flow.series, tracers at several instants")
+            return self
+        if isinstance(flow, Tracers) and flow.as_given and not of_series:
+            raise ValueError("flow.series for tracers that move as_given in a time series: first and second are two")
+        if self.smart.motion_passes:
+            raise ValueError("smart.motion_passes = 0 with a time series")
+        return self
+
+    @model_validator(mode="after")
     def _hand_optics_to_cameras(self) -> Scene:
         shared = {name: getattr(self, name) for name in SHARED_TABLES}
         cameras = tuple(camera.with_shared(shared) for camera in self.camera)
@@ -237,11 +284,19 @@ class Scene(Table):
         """Return which points (n, 3) [mm] are in a wall, shape (n,)."""
         return solid(self.wall, points_mm)
 
-    def flow_of(self, pair: int) -> Flow | TurbulentFlow:
-        """Return the flow of one pair, mean and turbulence, as a function of points (n, 3) [mm]."""
+    def flow_of(self, pair: int) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the flow of one pair, mean and turbulence, as a function of points (n, 3) [mm].
+
+        A pair of a series has the number of its first instant.
+        """
+        flow, series = self.flow, self.particles.instants is not None
+        mean: Callable[[np.ndarray], np.ndarray] = flow
+        if isinstance(flow, Tracers) and flow.series is not None:
+            instant = pair - self.particles.first
+            mean = flow.between(instant, instant + self.particles.step)
         if self.turbulence is None:
-            return self.flow
-        return TurbulentFlow(self.flow, self.turbulence.realisation(seed=(self.seed, 7, pair)))
+            return mean
+        return TurbulentFlow(mean, self.turbulence.realisation(seed=(self.seed, 7, 0 if series else pair)))
 
 
 def open_scene(path: str | Path) -> Scene:

@@ -11,12 +11,11 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 
 from lfpiv.errors import InputError
 from lfpiv.progress import Progress, ignore_progress
@@ -30,9 +29,11 @@ from lfpiv.simulation.camera_images import (
     expose,
     image_area,
     render_camera,
+    series_images,
     static_light,
     white_image,
 )
+from lfpiv.simulation.image_files import ImageWriter
 from lfpiv.simulation.particles import (
     LEAST_INTENSITY,
     LitParticles,
@@ -44,6 +45,7 @@ from lfpiv.simulation.particles import (
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
 from lfpiv.simulation.sensor import FULL_SCALE, SensorPattern, draw_pattern
+from lfpiv.simulation.series import SeriesInstant, place_series
 from lfpiv_kernels.rendering import real_optics
 
 __all__ = [
@@ -86,10 +88,13 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     """
     if not isinstance(scene, Scene):
         scene = open_scene(scene)
-    pairs = [lit_particles(scene, pair) for pair in range(scene.particles.pairs)]
+    series = scene.particles.instants is not None
+    pairs = [] if series else [lit_particles(scene, pair) for pair in range(scene.particles.pairs)]
+    instants = place_series(scene) if series else []
     _check_sheet(scene)
+    places = [lit.placed.at_frame(frame) for lit in pairs for frame in FRAMES] + [one.position_mm for one in instants]
     for camera in scene.camera:
-        _check_positions(scene, camera, pairs)
+        _check_positions(scene, camera, np.concatenate(places))
     out = Path(out)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: expected an empty or absent folder to write to, found files. Name another folder.")
@@ -99,7 +104,8 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     except OSError as error:
         raise InputError(f"{out}: the folder cannot be written ({error.strerror}). Name another folder.") from None
     try:
-        _write(scene, pairs, scratch, progress or ignore_progress)
+        with ImageWriter(scratch) as files:
+            _write(scene, pairs, instants, files, scratch, progress or ignore_progress)
         scratch.chmod(0o755)
         os.replace(scratch, out)
     except BaseException:
@@ -108,7 +114,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     return out / "experiment.toml"
 
 
-def _check_positions(scene: Scene, nominal: SceneCamera, pairs: list[LitParticles]) -> None:
+def _check_positions(scene: Scene, nominal: SceneCamera, particles: np.ndarray) -> None:
     """Refuse dots and particles too near the lens, and log the share of them in the field of view."""
     optics = nominal.optics
     half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
@@ -116,7 +122,6 @@ def _check_positions(scene: Scene, nominal: SceneCamera, pairs: list[LitParticle
     dots = np.concatenate(
         [scene.board.dots_mm(depth) for depth in scene.board.planes_mm] if board is None else board.dots_mm
     )
-    particles = np.concatenate([lit.placed.at_frame(frame) for lit in pairs for frame in FRAMES])
     seen = (
         ("board.planes_mm", "the dots", dots, nominal),
         ("volume.size_mm", "the particles", particles, nominal.at_particles),
@@ -179,31 +184,64 @@ def _check_sheet(scene: Scene) -> None:
         )
 
 
-def _write(scene: Scene, pairs: list[LitParticles], folder: Path, progress: Progress) -> None:
+def _write(
+    scene: Scene,
+    pairs: list[LitParticles],
+    instants: list[SeriesInstant],
+    files: ImageWriter,
+    folder: Path,
+    progress: Progress,
+) -> None:
     """Write images, truth and experiment file."""
-    total = len(scene.camera) * (1 + len(scene.board.planes_mm) + 2 * len(pairs))
+    total = len(scene.camera) * (1 + len(scene.board.planes_mm) + 2 * len(pairs) + len(instants))
     total += sum(camera.dark_image for camera in scene.camera)
-    total += 0 if scene.background is None else 2 * len(scene.camera)
-    done, backgrounds = 0, 0
+    total += 0 if scene.background is None else len(scene.camera) * len(_background_names(scene))
+    written, numbered = 0, 0
     (folder / "truth").mkdir(parents=True)
     for number, camera in enumerate(scene.camera):
         white = white_image(scene, number)
         static = static_light(scene, number, white)
         pattern = _pattern(scene, number)
-        for path, image in camera_images(scene, number, pairs, white=white, static=static):
-            rng = np.random.default_rng([scene.seed, 2, number, done])
-            _write_image(folder / path, expose(image, camera, scene.noise, rng, sensor=camera.sensor, pattern=pattern))
-            done += 1
-            progress("simulated images", (done + backgrounds) / total)
+        for path, image, seed in _camera_images(scene, number, pairs, instants, white, static):
+            rng = np.random.default_rng([scene.seed, 2, number, numbered] if seed is None else seed)
+            numbered += seed is None
+            files.write(path, expose(image, camera, scene.noise, rng, sensor=camera.sensor, pattern=pattern))
+            written += 1
+            progress("simulated images", written / total)
         if scene.background is not None:
-            for frame in (0, 1):
-                path = f"background/{camera.name}_{FRAMES[frame]}.tif"
-                _write_image(folder / path, _background_image(scene, number, frame, static, pattern))
-                backgrounds += 1
-                progress("simulated images", (done + backgrounds) / total)
+            for frame, name in enumerate(_background_names(scene)):
+                path = name.format(camera=camera.name)
+                files.write(path, _background_image(scene, number, frame, static, pattern))
+                written += 1
+                progress("simulated images", written / total)
         truth.write_camera(scene, number, folder / "truth", static=static, pattern=pattern)
-    truth.write_scene(scene, pairs, folder / "truth")
+    truth.write_scene(scene, instants or pairs, folder / "truth")
     (folder / "experiment.toml").write_text(_experiment_text(scene), "utf-8")
+
+
+def _camera_images(
+    scene: Scene,
+    number: int,
+    pairs: list[LitParticles],
+    instants: list[SeriesInstant],
+    white: np.ndarray,
+    static: StaticLight | None,
+) -> Iterator[tuple[str, np.ndarray, list[int] | None]]:
+    """Yield path and noise-free image [count] of one camera, and the noise's seed; None: by the image's number.
+
+    An instant of a series has a seed of its own, so it does not depend on the length of the series.
+    """
+    for path, image in camera_images(scene, number, pairs, white=white, static=static):
+        yield path, image, None
+    for instant, (path, image) in enumerate(series_images(scene, number, instants, static)):
+        yield path, image, [scene.seed, 30, number, instant]
+
+
+def _background_names(scene: Scene) -> list[str]:
+    """Return the paths of the images without particles: one for each frame of pairs, a single one for a series."""
+    if scene.particles.instants is not None:
+        return ["background/{camera}.tif"]
+    return [f"background/{{camera}}_{frame}.tif" for frame in FRAMES]
 
 
 def _pattern(scene: Scene, number: int) -> SensorPattern | None:
@@ -216,21 +254,20 @@ def _pattern(scene: Scene, number: int) -> SensorPattern | None:
 def _background_image(
     scene: Scene, number: int, frame: int, static: StaticLight | None, pattern: SensorPattern | None
 ) -> np.ndarray:
-    """Return the stored image of one camera and frame without particles, a mean of some recordings."""
+    """Return the stored image of one camera and frame without particles, a mean of some recordings.
+
+    In a series the recordings are of both pulses in turn.
+    """
     camera, count = scene.camera[number], scene.background.averaged if scene.background else 1
     rng = np.random.default_rng([scene.seed, 28, number, frame])
     pulses = np.random.default_rng([scene.seed, 29, frame])  # equal for all cameras
     mean = np.zeros(camera.optics.sensor_shape)
-    for _ in range(count):
+    for recording in range(count):
         power = np.ones(2) if scene.sheet is None else scene.sheet.powers(pulses)
-        light = mean * 0 if static is None else static.at_powers(power)[frame]
+        pulse = frame if scene.particles.instants is None else recording % 2
+        light = mean * 0 if static is None else static.at_powers(power)[pulse]
         mean += expose(light, camera, scene.noise, rng, sensor=camera.sensor, pattern=pattern) / count
     return np.rint(mean).astype(np.uint16)
-
-
-def _write_image(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tifffile.imwrite(path, image, compression="zlib", metadata=None)
 
 
 def _experiment_text(scene: Scene) -> str:
@@ -245,7 +282,8 @@ def _experiment_text(scene: Scene) -> str:
         if camera.dark_image:
             known["dark_image"] = f"dark/{camera.name}.tif"
         if scene.background is not None:
-            known["background_image"] = f"background/{camera.name}_{{frame}}.tif"
+            frame = "_{frame}" if scene.particles.instants is None else ""
+            known["background_image"] = f"background/{camera.name}{frame}.tif"
         if camera.image_flip != "none":
             known["image_flip"] = camera.image_flip
         optics = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")
@@ -259,19 +297,23 @@ def _experiment_text(scene: Scene) -> str:
     if scene.board.mark:
         board["mark"] = scene.board.mark
     board["images"] = "board/{camera}/plane_{plane:02d}.tif"
-    particles = {
-        "images": "particles/{camera}/pair_{pair:04d}_{frame}.tif",
-        "pairs": scene.particles.pairs,
-        "frames": FRAMES,
-    }
     volume = {"centre_mm": scene.volume.centre_mm} | scene.volume.model_dump(exclude_unset=True)
-    tables = {"board": board, "volume": volume, "particles": particles}
+    tables = {"board": board, "volume": volume, "particles": _particles_table(scene)}
     for name in ("smart", "correlation", "network", "compute"):
         tables[name] = getattr(scene, name).model_dump(exclude_unset=True, exclude_none=True)
     for name, table in tables.items():
         if table:
             lines += ["", f"[{name}]", *_rows(table)]
     return "\n".join(lines) + "\n"
+
+
+def _particles_table(scene: Scene) -> dict[str, Any]:
+    """Return the table ``[particles]`` of the experiment file."""
+    particles = scene.particles
+    if particles.instants is not None:
+        return {name: getattr(particles, name) for name in ("images", "instants", "first", "step")}
+    images = "particles/{camera}/pair_{pair:04d}_{frame}.tif"
+    return {"images": images, "pairs": particles.pairs, "frames": FRAMES}
 
 
 def _rows(table: Mapping[str, Any]) -> list[str]:

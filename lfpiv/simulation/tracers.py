@@ -1,4 +1,4 @@
-"""Tracer positions at two instants: read from a file, scaled into a box, and interpolated."""
+"""Tracer positions at two or more instants: read from a file, scaled into a box, and interpolated."""
 
 from __future__ import annotations
 
@@ -81,14 +81,10 @@ def load_tracers(file: str, first: str, second: str, scaling: TracerScaling) -> 
     InputError
         If the file is missing or does not contain the two arrays.
     """
-    start, end = _read(file, first, second)
+    start, end = _read_pair(file, first, second)
     middle, displacement = (start + end) / 2, end - start
-    corners = scaling.box if scaling.box is not None else (middle.min(0), middle.max(0))
-    low, high = (np.asarray(corner, float) for corner in corners)
-    if not (high > low).all():
-        raise InputError(f"{file}: expected tracers that fill a volume, found them in a plane. Set flow.box.")
-    scale = np.asarray(scaling.size_mm) / (high - low)
-    position = (middle - (low + high) / 2) * scale + scaling.centre_mm
+    scale, shift = _box_map(file, middle, scaling)
+    position = (middle - shift) * scale + scaling.centre_mm
     displacement = displacement * scale
     largest = np.linalg.norm(displacement, axis=1).max()
     if scaling.peak_mm is not None and largest > 0:
@@ -96,28 +92,90 @@ def load_tracers(file: str, first: str, second: str, scaling: TracerScaling) -> 
     return TracerSet(position_mm=position, displacement_mm=displacement, tree=cKDTree(position))
 
 
-def _read(file: str, first: str, second: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of the tracers at both instants, each (tracer, 3), in the unit of the file."""
+@functools.lru_cache(maxsize=4)
+def load_series(file: str, series: str, scaling: TracerScaling) -> np.ndarray:
+    """Read the tracers of a .npz file at the instants of a time series and scale them into a box.
+
+    Parameters
+    ----------
+    file : str
+        A .npz file.
+    series : str
+        Array (instant, tracer, >= 3) of the same tracers.
+    scaling : TracerScaling
+        Box; `peak_mm` has no meaning here.
+
+    Returns
+    -------
+    ndarray, shape (instant, tracer, 3)
+        Positions (x, y, z) [mm], not writable.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or does not contain the array.
+    """
+    (array,) = _read(file, (series,), "flow.series")
+    if array.ndim != 3 or array.shape[0] < 2 or array.shape[1] <= NEIGHBOURS or array.shape[2] < 3:
+        raise InputError(
+            f"{file}: expected an array of shape (instant, tracer, 3 or more) with two or more instants and more than "
+            f"{NEIGHBOURS} tracers, found {series} {array.shape}. Set flow.series."
+        )
+    array = array[..., :3]
+    _require_finite(file, array)
+    scale, shift = _box_map(file, array.reshape(-1, 3), scaling)
+    position: np.ndarray = (array - shift) * scale + scaling.centre_mm
+    position.flags.writeable = False
+    return position
+
+
+@functools.lru_cache(maxsize=2)
+def tracers_between(file: str, series: str, scaling: TracerScaling, start: int, end: int) -> TracerSet:
+    """Return the tracers of a series midway between two of its instants, and what they move from one to the other."""
+    positions = load_series(file, series, scaling)
+    first, second = positions[start], positions[end]
+    middle = (first + second) / 2
+    return TracerSet(position_mm=middle, displacement_mm=second - first, tree=cKDTree(middle))
+
+
+def _box_map(file: str, points: np.ndarray, scaling: TracerScaling) -> tuple[np.ndarray, np.ndarray]:
+    """Return the scale [mm] and the centre that map the unit of the file into the box."""
+    corners = scaling.box if scaling.box is not None else (points.min(0), points.max(0))
+    low, high = (np.asarray(corner, float) for corner in corners)
+    if not (high > low).all():
+        raise InputError(f"{file}: expected tracers that fill a volume, found them in a plane. Set flow.box.")
+    return np.asarray(scaling.size_mm) / (high - low), (low + high) / 2
+
+
+def _read(file: str, names: tuple[str, ...], key: str) -> list[np.ndarray]:
+    """Return arrays of a .npz file as float64. `key` is that of the scene which names them."""
     try:
         with np.load(Path(file), allow_pickle=False) as data:
-            missing = [name for name in (first, second) if name not in data]
+            missing = [name for name in names if name not in data]
             if missing:
-                raise InputError(
-                    f"{file}: expected the array {missing[0]!r}, found {', '.join(data)}. Set flow.first/second."
-                )
-            start, end = (np.asarray(data[name], float) for name in (first, second))
+                raise InputError(f"{file}: expected the array {missing[0]!r}, found {', '.join(data)}. Set {key}.")
+            return [np.asarray(data[name], float) for name in names]
     except FileNotFoundError:
         raise InputError(f"flow.file: expected a .npz file of tracers, found no file {file}. Check the path.") from None
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"flow.file: {file} cannot be read as a .npz file of numbers ({error}).") from None
+
+
+def _read_pair(file: str, first: str, second: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions of the tracers at both instants, each (tracer, 3), in the unit of the file."""
+    start, end = _read(file, (first, second), "flow.first/second")
     if start.ndim != 2 or start.shape[1] < 3 or start.shape != end.shape or len(start) <= NEIGHBOURS:
         raise InputError(
             f"{file}: expected two arrays of shape (tracer, 3 or more) with more than {NEIGHBOURS} tracers, "
             f"found {first} {start.shape} and {second} {end.shape}."
         )
     start, end = start[:, :3], end[:, :3]
-    if not (np.isfinite(start).all() and np.isfinite(end).all()):
-        raise InputError(f"{file}: expected finite tracer positions, found NaN or infinity. Remove those tracers.")
+    _require_finite(file, start, end)
     return start, end
+
+
+def _require_finite(file: str, *positions: np.ndarray) -> None:
+    if not all(np.isfinite(array).all() for array in positions):
+        raise InputError(f"{file}: expected finite tracer positions, found NaN or infinity. Remove those tracers.")

@@ -4,8 +4,8 @@
 file                          content
 ============================  =========================================================================================
 ``truth/spec.json``           the scene, with all defaults
-``truth/particles.npz``       particles of each pair; light of each in each camera and frame, and power of the pulses,
-                              where the scene has a table ``[sheet]`` or ``[brightness]``
+``truth/particles.npz``       particles of each pair or instant; light of each in each camera and frame, and power of
+                              the pulses, where the scene has a table ``[sheet]`` or ``[brightness]``
 ``truth/light_CAMERA.npz``    light that is not from particles, where the scene has ``[[surface]]`` or ``[stray_light]``
 ``truth/sensor_CAMERA.npz``   fixed pattern, where the camera has a table ``sensor``
 ``truth/array_CAMERA.npz``    dead lenses, where the camera has a table ``array``
@@ -13,12 +13,16 @@ file                          content
 ``truth/walls.npz``           solid voxels, where the scene has a ``[[wall]]``
 ============================  =========================================================================================
 
-Images in these files are oriented as the stored images.
+Images in these files are oriented as the stored images. Positions of a pair, ``pair_0000_positions_mm``, are midway in
+time. Those of a series, ``instant_000000_positions_mm``, are at the instant, ``instant_000000_index`` has the constant
+numbers of the particles, and ``instant_000000_displacement_mm`` is the displacement to `step` instants later, which the
+last instants do not have.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,21 +34,22 @@ from lfpiv.simulation.camera_images import StaticLight, board_truth, render_came
 from lfpiv.simulation.particles import LitParticles
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.sensor import SensorPattern
+from lfpiv.simulation.series import SeriesInstant
 
 
-def write_scene(scene: Scene, pairs: list[LitParticles], folder: Path) -> None:
+def write_scene(scene: Scene, placed: Sequence[LitParticles | SeriesInstant], folder: Path) -> None:
     """Write the scene, its particles, its board and its walls.
 
     Parameters
     ----------
     scene : Scene
         The scene.
-    pairs : list of LitParticles
-        Particles of each pair.
+    placed : sequence of LitParticles or SeriesInstant
+        Particles of each pair, or of each instant of a series.
     folder : Path
         Existing folder.
     """
-    np.savez_compressed(folder / "particles.npz", **_particles(scene, pairs))
+    np.savez_compressed(folder / "particles.npz", **_particles(scene, placed))
     spec = scene.model_dump(mode="json", exclude={"smart", "correlation", "network", "compute"}, exclude_none=True)
     (folder / "spec.json").write_text(json.dumps(spec, indent=1) + "\n", "utf-8")
     board = board_truth(scene)
@@ -54,19 +59,47 @@ def write_scene(scene: Scene, pairs: list[LitParticles], folder: Path) -> None:
         np.savez_compressed(folder / "walls.npz", **_walls(scene))
 
 
-def _particles(scene: Scene, pairs: list[LitParticles]) -> dict[str, Any]:
+def _particles(scene: Scene, placed: Sequence[LitParticles | SeriesInstant]) -> dict[str, Any]:
     """Return the arrays of the particles."""
     arrays: dict[str, Any] = {}
-    for pair, (placed, power, brightness) in enumerate(pairs):
-        arrays[f"pair_{pair:04d}_positions_mm"] = placed.position_mm
-        arrays[f"pair_{pair:04d}_displacement_mm"] = placed.displacement_mm
-        arrays[f"pair_{pair:04d}_velocity_m_s"] = placed.displacement_mm / scene.dt_s / 1000
-        arrays[f"pair_{pair:04d}_intensity"] = placed.intensity
-        if scene.brightness is not None:
-            arrays[f"pair_{pair:04d}_diameter"] = placed.diameter
-        if scene.brightness is not None or scene.sheet is not None:
-            arrays[f"pair_{pair:04d}_brightness"] = brightness
-            arrays[f"pair_{pair:04d}_power"] = power
+    for number, one in enumerate(placed):
+        if isinstance(one, SeriesInstant):
+            arrays |= _instant_arrays(scene, scene.particles.first + number, one)
+        else:
+            arrays |= _pair_arrays(scene, number, one)
+    return arrays
+
+
+def _instant_arrays(scene: Scene, number: int, instant: SeriesInstant) -> dict[str, Any]:
+    """Return the arrays of one instant of a series."""
+    arrays: dict[str, Any] = {
+        "index": instant.index,
+        "positions_mm": instant.position_mm,
+        "intensity": instant.intensity,
+    }
+    if instant.displacement_mm is not None:
+        arrays["displacement_mm"] = instant.displacement_mm
+        arrays["velocity_m_s"] = instant.displacement_mm / scene.dt_s / 1000
+    if scene.brightness is not None:
+        arrays["diameter"] = instant.diameter
+    if scene.brightness is not None or scene.sheet is not None:
+        arrays |= {"brightness": instant.brightness, "power": instant.power}
+    return {f"instant_{number:06d}_{name}": value for name, value in arrays.items()}
+
+
+def _pair_arrays(scene: Scene, pair: int, lit: LitParticles) -> dict[str, Any]:
+    """Return the arrays of one pair."""
+    placed, power, brightness = lit
+    arrays: dict[str, Any] = {}
+    arrays[f"pair_{pair:04d}_positions_mm"] = placed.position_mm
+    arrays[f"pair_{pair:04d}_displacement_mm"] = placed.displacement_mm
+    arrays[f"pair_{pair:04d}_velocity_m_s"] = placed.displacement_mm / scene.dt_s / 1000
+    arrays[f"pair_{pair:04d}_intensity"] = placed.intensity
+    if scene.brightness is not None:
+        arrays[f"pair_{pair:04d}_diameter"] = placed.diameter
+    if scene.brightness is not None or scene.sheet is not None:
+        arrays[f"pair_{pair:04d}_brightness"] = brightness
+        arrays[f"pair_{pair:04d}_power"] = power
     return arrays
 
 

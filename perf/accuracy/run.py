@@ -2,8 +2,8 @@
 
     python perf/accuracy/run.py [CASE ...] --out DIR [--scale small|paper] [--seed N]
 
-Cases: real optics, one to three cameras, seeding and noise, choices of method, imperfect experiments. All are computed
-where none is named.
+Cases: real optics, one to three cameras, seeding and noise, choices of method, imperfect experiments, a time series.
+All are computed where none is named.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from lfpiv.reproduce.study import SCALES, Study, compute
 ACCURACY = Study(
     title="Beyond the paper",
     about="Cases beyond the paper, on rigs with the same main lens and microlenses, smaller volumes and noisy images",
-    modules={key: key for key in ("optics", "cameras", "sweeps", "choices", "imperfections")},
+    modules={key: key for key in ("optics", "cameras", "sweeps", "choices", "imperfections", "dns_series")},
 )
 
 

@@ -2,9 +2,10 @@
 
 import os
 import socket
+import struct
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
@@ -12,7 +13,7 @@ import imagecodecs
 import numpy as np
 import pytest
 import tifffile
-from support.recordings import write_b16, write_cine, write_mraw
+from support.recordings import pack_12, write_b16, write_cine, write_mraw
 
 from lfpiv import InputError
 from lfpiv.experiment import images
@@ -73,6 +74,28 @@ def test_pages_of_a_tiff_are_numbered(tmp_path, frames, options):
     require_numbered(tmp_path / "stack.TIF", frames)
 
 
+def test_pages_of_packed_12_bits_are_read(tmp_path, frames):
+    packed = np.frombuffer(pack_12(frames[0]), np.uint8).reshape(ROWS, -1)
+    tifffile.imwrite(tmp_path / "one.tif", packed, metadata=None, photometric="minisblack")
+    with tifffile.TiffFile(tmp_path / "one.tif", mode="r+b") as tiff:
+        tags = tiff.pages.first.tags
+        tags["ImageWidth"].overwrite(COLUMNS)
+        tags["BitsPerSample"].overwrite(12)
+    np.testing.assert_array_equal(read(tmp_path / "one.tif"), frames[0])
+
+
+def test_images_behind_the_only_directory_of_a_stack_of_imagej_are_numbered(tmp_path, frames):
+    """ImageJ writes so where the stack is larger than 4 GiB."""
+    tifffile.imwrite(tmp_path / "stack.tif", frames, imagej=True, truncate=True)
+    with tifffile.TiffFile(tmp_path / "stack.tif") as tiff:
+        assert len(tiff.pages) == 1
+    require_numbered(tmp_path / "stack.tif", frames)
+    whole = (tmp_path / "stack.tif").read_bytes()
+    (tmp_path / "stack.tif").write_bytes(whole[:-1])
+    np.testing.assert_array_equal(read(tmp_path / "stack.tif", f"#{COUNT - 2}"), frames[-2])
+    refuse(tmp_path / "stack.tif", f"#{COUNT - 1}", "truncated or damaged")
+
+
 @pytest.mark.parametrize(
     ("options", "dtype"),
     [
@@ -93,6 +116,20 @@ def test_images_of_a_cine_are_numbered_from_the_first_one_stored(tmp_path, frame
         np.testing.assert_array_equal(read(tmp_path / "run.cine", f"#{number}"), frame)
     if columns == COLUMNS:
         require_numbered(tmp_path / "run.cine", cut)
+
+
+def test_a_cine_needs_no_setup_and_no_times(tmp_path, frames):
+    count, rows, columns = frames.shape
+    images_at = 44 + 40 + 8 * count
+    size = 8 + 2 * rows * columns
+    data = struct.pack("<2sHHHiIiI", b"CI", 44, 2, 1, 0, count, 0, count)
+    data += struct.pack("<IIIQ", 44, 84, 84, 0)
+    data += struct.pack("<IiiHHIIiiII", 40, columns, rows, 1, 16, 0, size - 8, 0, 0, 0, 0)
+    data += struct.pack(f"<{count}q", *(images_at + number * size for number in range(count)))
+    for frame in frames:
+        data += struct.pack("<II", 8, size - 8) + frame[::-1].tobytes()
+    (tmp_path / "run.cine").write_bytes(data)
+    require_numbered(tmp_path / "run.cine", frames)
 
 
 def test_packed_10_bit_codes_become_linear_counts(tmp_path):
@@ -168,17 +205,19 @@ def test_hdf5_files_with_several_datasets_of_images_need_a_name(tmp_path, frames
     refuse(tmp_path / "run.h5", "#1", r"2 datasets of images \(left, right\); name one behind the file")
     with h5py.File(tmp_path / "none.h5", "w") as file:
         file["times"] = [1.0]
-    refuse(tmp_path / "none.h5", "#1", "no dataset of images")
+    refuse(tmp_path / "none.h5", "#1", "no datasets of images")
 
 
 def test_hdf5_pixels_of_other_files_are_refused(tmp_path, frames):
     """Neither links nor storage leave the file, and sizes beyond what is stored are not believed."""
     frames.tofile(tmp_path / "elsewhere.bin")
+    os.mkfifo(tmp_path / "pipe.h5")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["images"] = frames
     with h5py.File(tmp_path / "run.h5", "w") as file:
         file["link"] = h5py.ExternalLink("other.h5", "images")
         file["detour"] = h5py.SoftLink("/link")
+        file["pipe"] = h5py.ExternalLink("pipe.h5", "images")
         file["turn"], file["round"] = h5py.SoftLink("/round"), h5py.SoftLink("/turn")
         file["dangling"] = h5py.SoftLink("/nowhere")
         outside = [(tmp_path / "elsewhere.bin", 0, frames.nbytes)]
@@ -194,6 +233,7 @@ def test_hdf5_pixels_of_other_files_are_refused(tmp_path, frames):
     for name, words in {
         "link": "a link into another file",
         "detour": "a link into another file",
+        "pipe": "a link into another file",
         "turn": "links on the way",
         "dangling": "no dataset",
         "outside": "pixels are in another file",
@@ -314,19 +354,13 @@ def test_threads_read_from_one_file(tmp_path, frames, suffix):
         with h5py.File(path, "w") as file:
             file["images"] = many
     settled(path)
-    wrong = []
 
     def work(seed):
-        for number in np.random.default_rng(seed).permutation(len(many)):
-            if not np.array_equal(read(path, f"#{number}"), many[number]):
-                wrong.append(number)
+        numbers = np.random.default_rng(seed).permutation(len(many))
+        return sum(np.array_equal(read(path, f"#{number}"), many[number]) for number in numbers)
 
-    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(timeout=60)
-    assert not wrong and not any(thread.is_alive() for thread in threads)
+    with ThreadPoolExecutor(6) as threads:
+        assert list(threads.map(work, range(6))) == [len(many)] * 6
 
 
 def test_a_mark_counts_only_behind_the_suffix_of_an_image(tmp_path):
@@ -355,6 +389,9 @@ def test_an_experiment_of_recordings_opens(tiny_experiment):
     for name in shapes:
         write_cine(folder / f"{name}.cine", particles[name])
         write_stack(folder / f"board_{name}.tif", boards[name])
+    dark = rng.integers(0, 20, (2, *shapes["right"]), np.uint16)
+    with h5py.File(folder / "run.h5", "w") as file:
+        file["dark/images"] = dark
     (folder / "white.raw").write_bytes(boards["left"][2].tobytes())
     text = tiny_experiment.read_text("utf-8")
     for old, new in {
@@ -362,6 +399,7 @@ def test_an_experiment_of_recordings_opens(tiny_experiment):
         "particles/{camera}/{pair:04d}{frame}.tif": "{camera}.cine#{image}",
         "white/right.tif": "board_right.tif#2",
         "white/left.tif": "white.raw",
+        "dark/right.tif": "run.h5#dark/images[1]",
         "nominal_angle_deg = 30.0": 'nominal_angle_deg = 30.0\n[camera.raw]\nshape = [48, 64]\ndtype = "uint16"\n',
     }.items():
         assert text.count(old) == 1
@@ -372,6 +410,7 @@ def test_an_experiment_of_recordings_opens(tiny_experiment):
     experiment = open_experiment(tiny_experiment)
     np.testing.assert_array_equal(experiment.white("left"), boards["left"][2])
     np.testing.assert_array_equal(experiment.white("right"), boards["right"][2])
+    np.testing.assert_array_equal(experiment.dark("right"), dark[1])
     np.testing.assert_array_equal(experiment.board_image("right", 1), boards["right"][1])
     np.testing.assert_array_equal(experiment.particle_image("left", 1, "b"), particles["left"][3])
     before = provenance.of_calibration(experiment)

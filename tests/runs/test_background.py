@@ -7,10 +7,11 @@ import pytest
 import tifffile
 from support.small_run import DISPLACEMENT_VOXEL, same_vectors
 
+from lfpiv.calibration.camera import load_calibration
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import read_experiment
 from lfpiv.results import netcdf, provenance
-from lfpiv.runs import pipeline
+from lfpiv.runs import background, pipeline
 
 TOLERANCE_VOXEL = 0.2
 """Mean of the valid vectors against the flow, as without standing light."""
@@ -120,3 +121,27 @@ def test_with_a_background_image_the_vectors_are_true(small_run, tmp_path):
     summary = pipeline.run(experiment, out, pairs=(0, 1))
     np.testing.assert_allclose(mean_displacement(out, 0), DISPLACEMENT_VOXEL, atol=TOLERANCE_VOXEL)
     assert json.loads((out / "summary.json").read_text())["background"] == summary["background"] != {}
+
+
+@pytest.mark.slow
+def test_a_streak_is_found_in_a_time_series(small_run, tmp_path):
+    """The images of the pairs as instants: a streak stands still, and particles of other pairs are elsewhere."""
+    experiment, _ = lit(small_run, tmp_path / "data")
+    opened = read_experiment(experiment)
+    count = 2 * opened.pairs
+    for camera in opened.cameras:
+        for instant in range(count):
+            path = opened.particle_path(camera.name, instant // 2, "ab"[instant % 2])
+            path.rename(path.with_name(f"instant_{instant}.tif"))
+    text = experiment.read_text("utf-8")
+    before, after = text.split("[particles]\n")
+    rest = after.partition("\n\n")[2]
+    table = f'[particles]\nimages = "particles/{{camera}}/instant_{{instant}}.tif"\ninstants = {count}\n\n'
+    experiment.write_text(before + table + rest, "utf-8")
+    series = read_experiment(experiment)
+    calibration = load_calibration(small_run.out / "calibration.h5")
+    found = background.estimate(series, calibration.cameras, background.series(series), lambda fraction: None)
+    assert set(found.figures) == {"left", "right"}
+    for light in found.cameras.values():
+        columns = np.flatnonzero(light.region.any(axis=0))
+        assert 130 < np.median(columns) < 170 and light.region.mean() < 0.5

@@ -3,13 +3,15 @@
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
-from distributed import KilledWorker
+from distributed import Client, KilledWorker, Security
 from support.ideal_rig import two_cameras
 from support.small_run import PAIRS
 from support.stored import rewrite
@@ -20,7 +22,7 @@ from lfpiv.errors import ClusterError, InputError, StorageError
 from lfpiv.experiment.experiment import read_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf, provenance
-from lfpiv.runs import cluster_workers, dispatch, memory, pipeline, worker_plan
+from lfpiv.runs import cluster_workers, dispatch, local_workers, memory, pipeline, worker_plan
 from lfpiv.runs.pair import Outcome
 from lfpiv.runs.stretches import cut
 from lfpiv.runs.worker import Result
@@ -312,3 +314,77 @@ def test_finishing_thousands_of_pairs_opens_each_file_at_most_twice(small_run, t
     summary = pipeline.run(experiment, out)
     assert len(summary["pairs"]) == pairs and summary["failed"] == []
     assert sum("pair_" in path.name for path in opened) <= 2 * pairs
+
+
+def test_a_clock_that_is_set_back_ends_the_run_and_does_not_hang_it(monkeypatch):
+    """Dask would wait until the clock shows the old time again. Small steps, and steps forward, end nothing."""
+    now = {"time": 1e9, "monotonic": 5.0}
+    clock = SimpleNamespace(time=lambda: now["time"], monotonic=lambda: now["monotonic"])
+    monkeypatch.setattr(local_workers, "time", clock)
+    monkeypatch.setattr(cluster_workers, "time", clock)
+    watch = cluster_workers.SchedulerWatch(SimpleNamespace(status="running"), "tcp://there:1")
+    watch.answer = Future()
+    require_clock = local_workers.clock_watch()
+    for step in (0.0, -3.0, 3.0, 7200.0, -local_workers.SET_BACK_S):
+        now["time"] += step + 1
+        now["monotonic"] += 1
+        require_clock()
+        watch.capacity()
+    now["time"] -= 1
+    for check in (require_clock, watch.capacity):
+        with pytest.raises(ClusterError, match=r"set back by 11 s.*goes on from there"):
+            check()
+
+
+@pytest.mark.slow
+def test_only_processes_of_the_run_on_this_machine_can_send_work(tmp_path):
+    """Scheduler and workers listen on localhost, and answer nobody without the run's certificate."""
+    plan = worker_plan.Plan(1, 1, (None,))
+    with local_workers.workers(plan, tmp_path) as (client, capacity):
+        end = time.monotonic() + 120
+        while not capacity() and time.monotonic() < end:
+            time.sleep(0.05)
+        assert client.submit(sum, (1, 2)).result(60) == 3
+        me = psutil.Process()
+        listening = {
+            connection.laddr
+            for process in (me, *me.children(recursive=True))
+            for connection in process.net_connections()
+            if connection.status == psutil.CONN_LISTEN
+        }
+        assert {place.ip for place in listening} == {"127.0.0.1"} and len(listening) >= 3
+        address = client.scheduler.address
+        assert address.startswith("tls://127.0.0.1:")
+        with pytest.raises((OSError, RuntimeError)):
+            Client(address.replace("tls://", "tcp://"), timeout=2, set_as_default=False)
+        with pytest.raises((OSError, RuntimeError)):
+            Client(address, security=Security.temporary(), timeout=2, set_as_default=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "words"),
+    [
+        ("socket.create_connection", OSError(101, "Network is unreachable"), "network is unreachable.*--workers 1"),
+        (
+            "multiprocessing.context.BaseContext.Semaphore",
+            FileNotFoundError(2, "No such file"),
+            "/dev/shm.*--workers 1",
+        ),
+    ],
+)
+def test_where_processes_cannot_reach_each_other_the_run_is_refused_at_once(monkeypatch, name, error, words):
+    def refuse(*arguments, **options):
+        raise error
+
+    monkeypatch.setattr(name, refuse)
+    with pytest.raises(InputError, match=words):
+        local_workers.start_preloading("cpu")
+
+
+def test_without_cryptography_its_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with (
+        pytest.raises(InputError, match=r"`cryptography`.*pip install 'lfpiv\[distributed\]'"),
+        local_workers.workers(worker_plan.Plan(1, 1, (None,)), tmp_path),
+    ):
+        pass

@@ -64,10 +64,9 @@ def make_work(small_run, file: Path, out: Path) -> PairWork:
     )
 
 
-def changed(work: PairWork, out: Path, *, step: int = 1, instants: int | None = None, **settings) -> PairWork:
-    """Return the work with another step, number of instants or output folder."""
-    series = work.experiment.series
-    series = Series(instants=instants or series.instants, first=series.first, step=step)
+def changed(work: PairWork, out: Path, *, step: int = 1, instants: int = 6, **settings) -> PairWork:
+    """Return the work on the first instants, with another step or output folder."""
+    series = Series(instants=instants, first=work.experiment.series.first, step=step)
     experiment = dataclasses.replace(work.experiment, series=series, pairs=series.instants - step)
     return dataclasses.replace(work, experiment=experiment, folder=Folder(out, series), **settings)
 

@@ -103,7 +103,7 @@ def first_lattice(signals: Signals, rectify: Rectifier, board: DotBoard, plan: C
         if len(found) >= _FIRST_PLANES and any(lattice.regular for lattice in found):
             break
         rectified = rectify(signals.of_plane(plane), plan, board.planes_mm[plane])
-        found.append(_lattice_of_plane(rectified, board, plan, plane))
+        found.append(lattice_of_plane(rectified, board, plan, plane))
     candidates = [lattice for lattice in found if lattice.regular] or found
     best = max(lattice.score for lattice in candidates)
     return next(lattice for lattice in candidates if lattice.score >= best / 2)  # planes near z = 0 are more certain
@@ -129,7 +129,7 @@ def planes_from_middle(board: DotBoard) -> np.ndarray:
     return np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
 
 
-def _lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> FirstLattice:
+def lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> FirstLattice:
     """Match the lattice to the blobs of a plane, bright or dark ones."""
     best = FirstLattice(np.empty((0, 3)), np.empty((0, 2)), 1, 0.0, 0.0)
     for sign in (1, -1):

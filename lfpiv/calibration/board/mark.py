@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.signal
 
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.errors import InputError
@@ -78,21 +79,16 @@ def name_by_mark(found: np.ndarray, in_view: np.ndarray, board: DotBoard) -> Nam
     row, column = np.nonzero(known & ((share >= OCCUPIED) | (share <= EMPTY)))
     occupied = share[row, column] >= OCCUPIED
     place = np.stack([column, row], axis=1) - (found.shape[1] - 1) // 2
-    columns, rows = board.dots
-    half = (np.array(board.dots) - 1) / 2
-    matches = []
-    for turn in TURNS:
-        turned = place @ turn.T
-        low, high = turned.min(0), turned.max(0)
-        for across in range(-int(high[0]), columns - int(low[0])):
-            for up in range(-int(high[1]), rows - int(low[1])):
-                i, j = (turned + (across, up)).T
-                inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
-                stated = inside & board.occupied[np.where(inside, j, 0), np.where(inside, i, 0)]
-                matches.append((int((stated != occupied).sum()), turn, np.array([across, up]) - half))
-    matches.sort(key=lambda match: match[0])
-    wrong = matches[0][0]
-    if wrong > WRONG_SITES * len(place) or matches[1][0] - wrong < CLEAR_SITES:
+    ranked = sorted(
+        (
+            (wrong, number, shift)
+            for number in range(len(TURNS))
+            for wrong, shift in _shifts(place, occupied, board, number)
+        ),
+        key=lambda match: match[0],
+    )
+    (wrong, number, shift), (second, *_) = ranked[:2]
+    if wrong > WRONG_SITES * len(place) or second - wrong < CLEAR_SITES:
         fault = f"{wrong} of {len(place)} sites in view contradict the best match"
         if wrong <= WRONG_SITES * len(place):
             fault = "several places and turns of the board fit what is in view"
@@ -100,4 +96,19 @@ def name_by_mark(found: np.ndarray, in_view: np.ndarray, board: DotBoard) -> Nam
             f"board.mark: expected the {len(board.mark)} places without a dot in view, and dots around them; {fault}. "
             "Check board.mark and board.dots, and that the mark is in the view of every camera."
         )
-    return Naming(turn=matches[0][1], shift=matches[0][2])
+    return Naming(turn=TURNS[number], shift=shift)
+
+
+def _shifts(place: np.ndarray, occupied: np.ndarray, board: DotBoard, turn: int) -> list[tuple[int, np.ndarray]]:
+    """Return the two best shifts of sites in one turn, each with the number of sites that contradict it."""
+    turned = place @ TURNS[turn].T
+    low = turned.min(0)
+    judged, dots = np.zeros((2, *(np.ptp(turned, axis=0) + 1)))
+    judged[tuple((turned - low).T)] = 1
+    dots[tuple((turned[occupied] - low).T)] = 1
+    stated = board.occupied.T.astype(float)
+    on_judged, on_dots = (scipy.signal.correlate(stated, sites) for sites in (judged, dots))
+    wrong = np.rint(occupied.sum() + on_judged - 2 * on_dots).astype(int)
+    best = np.argsort(wrong, axis=None, kind="stable")[:2]
+    first = 1 - np.array(judged.shape) - low - (np.array(board.dots) - 1) / 2
+    return [(int(wrong.flat[at]), first + np.unravel_index(at, wrong.shape)) for at in best]

@@ -7,17 +7,17 @@ shifted, and the dots are found again from the pose that follows.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lfpiv.calibration.board.detect import (
     FULLY_SEEN,
-    FirstLattice,
     PlaneDots,
     find_in_planes,
     first_lattice,
     in_field,
+    lattice_of_plane,
     lit_share,
     planes_from_middle,
     rectifier,
@@ -27,12 +27,29 @@ from lfpiv.calibration.board.edges import MARGIN, sites_found
 from lfpiv.calibration.board.mark import Naming, name_by_mark, search_board
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
-from lfpiv.calibration.board.unposed import plans_without_pose, rotations_of
+from lfpiv.calibration.board.unposed import plans_without_pose
 from lfpiv.errors import InputError
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 
 _FIRST_PLANES = 3  # planes that are searched for a lattice without a nominal orientation
+_LEAST_FILLED = 0.9  # least filling of a lattice, relative to the best candidate's; a harmonic has half of it
+_CLEAR = 1.1  # least ratio of contrasts that shows on which side of the board the camera is
+_OTHER_SIDE = np.diag([-1.0, 1.0, -1.0])  # the same picture of the plane z = 0, with depth and one axis reversed
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Found:
+    """Dots of all planes on the lattice with arbitrary names."""
+
+    planes: list[PlaneDots]
+    pose: CameraPose
+    sign: int
+
+    @property
+    def contrast(self) -> float:
+        """Sum of the dots' contrasts, large if they are in focus at the depths of the planes."""
+        return sum(plane.contrast for plane in self.planes)
 
 
 def find_marked_dots(
@@ -40,80 +57,99 @@ def find_marked_dots(
 ) -> Detection:
     """Find and name the dots of a marked board.
 
+    A nominal orientation helps to find them. Where it does not lead to the mark, the search does without.
+
     Raises
     ------
     InputError
         If no plane shows a lattice of dots, the mark is not clearly seen, or it is seen mirrored.
     """
-    search = search_board(board)
-    plan, start = _start(signals, decoder, search, orientation)
-    pose = plan.fitted(start.points_mm, start.chief_mm, decoder.optics)
-    planes, pose = find_in_planes(signals, rectifier(decoder, search), search, pose, start.sign, decoder.optics)
-    found = sites_found([plane.site for plane in planes], search.dots)
-    in_view = np.stack(
-        [lit_share(pose, search.points_mm(plane, MARGIN), decoder) >= FULLY_SEEN for plane in range(len(planes))]
-    )
-    naming = name_by_mark(found, in_view.reshape(found.shape), board)
-    if naming.mirrored and orientation is not None:
-        raise _mirrored()
-    named, pose = max(
-        (
-            find_in_planes(signals, rectifier(decoder, board), board, named_pose, start.sign, decoder.optics)
-            for named_pose in _named_poses(pose, naming, board.spacing_mm)
-        ),
-        key=lambda result: _contrast(result[0]),
-    )
-    if naming.mirrored and _contrast(named) < _contrast(planes):  # dots are in focus at the depths of the other side
-        raise _mirrored()
-    return _detection(named, pose, start.sign, board, decoder)
-
-
-def _start(
-    signals: Signals, decoder: LightFieldDecoder, search: DotBoard, orientation: Orientation | None
-) -> tuple[CameraPose, FirstLattice]:
-    """Return the plan that explains the lattice of a plane best, and the dots on it."""
-    rectify, found = rectifier(decoder, search), list[tuple[CameraPose, FirstLattice]]()
     if orientation is not None:
-        plan = CameraPose.from_plan(decoder.optics, orientation)
-        found.append((plan, first_lattice(signals, rectify, search, plan)))
-    else:
-        for plane in planes_from_middle(search)[:_FIRST_PLANES]:
-            plans = plans_without_pose(signals, decoder, search, int(plane))
-            found += [(plan, first_lattice(signals, rectify, search, plan)) for plan in plans]
-            if any(start.regular for _, start in found):
-                break
-    regular = [(plan, start) for plan, start in found if start.regular and len(start.points_mm) >= FEWEST_DOTS]
-    if not regular:
-        stated = "" if orientation is None else f" and the nominal orientation ({orientation})"
+        try:
+            found = _on_lattice(signals, decoder, board, CameraPose.from_plan(decoder.optics, orientation), None)
+            naming = _name(found, decoder, board)
+            if not naming.mirrored:
+                return _named(signals, decoder, board, found, naming)
+        except InputError:
+            pass
+    found, naming = _without_plan(signals, decoder, board)
+    return _named(signals, decoder, board, found, naming)
+
+
+def _without_plan(signals: Signals, decoder: LightFieldDecoder, board: DotBoard) -> tuple[_Found, Naming]:
+    """Find and name the dots from what the images show; refuse mirrored ones."""
+    plan, plane = _plan(signals, decoder, search_board(board))
+    sides = [plan, replace(plan, nominal_rotation=plan.nominal_rotation @ _OTHER_SIDE)]
+    found = sorted((_on_lattice(signals, decoder, board, side, plane) for side in sides), key=lambda one: -one.contrast)
+    naming = _name(found[0], decoder, board)
+    if naming.mirrored and found[0].contrast < _CLEAR * found[1].contrast:  # the planes do not show the side
+        found, naming = found[1:], _name(found[1], decoder, board)
+    if naming.mirrored:
         raise InputError(
-            f"board: expected a lattice of dots {search.spacing_mm:g} mm apart, found none. Check that these are board "
-            f"images, the board's numbers{stated}."
+            "board.mark: expected the mark as it is stated, found its mirror image. Change image_flip of this camera: "
+            '"none" and "horizontal" for each other, or "vertical" and "both".'
         )
-    return max(regular, key=lambda one: one[1].score)
+    return found[0], naming
 
 
-def _named_poses(pose: CameraPose, naming: Naming, spacing_mm: float) -> list[CameraPose]:
-    """Return the poses in the board's axes of a camera with a pose in the axes of the lattice."""
+def _plan(signals: Signals, decoder: LightFieldDecoder, search: DotBoard) -> tuple[CameraPose, int]:
+    """Return the pose, on the side of +z, that explains the lattice of a plane best, and the plane."""
+    rectify = rectifier(decoder, search)
+    for plane in map(int, planes_from_middle(search)[:_FIRST_PLANES]):
+        signal = signals.of_plane(plane)
+        tried = []
+        for plan in plans_without_pose(signals, decoder, search, plane):
+            start = lattice_of_plane(rectify(signal, plan, search.planes_mm[plane]), search, plan, plane)
+            if start.regular and len(start.points_mm) >= FEWEST_DOTS:
+                sites = in_field(plan, search.points_mm(plane), decoder.optics).sum()
+                tried.append((start.share * len(start.points_mm) / max(sites, 1), start.score, plan))
+        if tried:
+            least = _LEAST_FILLED * max(filled for filled, _, _ in tried)
+            return max((one for one in tried if one[0] >= least), key=lambda one: one[1])[2], plane
+    raise InputError(
+        f"board: expected a lattice of dots {search.spacing_mm:g} mm apart, found none. Check that these are board "
+        "images and the board's numbers, or state nominal_direction."
+    )
+
+
+def _on_lattice(
+    signals: Signals, decoder: LightFieldDecoder, board: DotBoard, plan: CameraPose, plane: int | None
+) -> _Found:
+    """Find the dots on a larger lattice with arbitrary names, starting from one plane, or from the clearest if None."""
+    search, optics = search_board(board), decoder.optics
+    rectify = rectifier(decoder, search)
+    if plane is None:
+        start = first_lattice(signals, rectify, search, plan)
+    else:
+        start = lattice_of_plane(rectify(signals.of_plane(plane), plan, search.planes_mm[plane]), search, plan, plane)
+    if not start.regular:
+        raise InputError("board: found no lattice of dots.")
+    pose = plan.fitted(start.points_mm, start.chief_mm, optics)
+    planes, pose = find_in_planes(signals, rectify, search, pose, start.sign, optics)
+    return _Found(planes=planes, pose=pose, sign=start.sign)
+
+
+def _name(found: _Found, decoder: LightFieldDecoder, board: DotBoard) -> Naming:
+    search = search_board(board)
+    sites = sites_found([plane.site for plane in found.planes], search.dots)
+    points = [search.points_mm(plane, MARGIN) for plane in range(len(found.planes))]
+    in_view = np.stack([lit_share(found.pose, at, decoder) >= FULLY_SEEN for at in points])
+    return name_by_mark(sites, in_view.reshape(sites.shape), board)
+
+
+def _named(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, found: _Found, naming: Naming) -> Detection:
+    """Find the dots again from the pose in the board's axes."""
     turn = np.eye(3)
     turn[:2, :2] = naming.turn
-    offset = turn @ pose.parameters[3:6]
-    offset[:2] += spacing_mm * naming.shift
-    rotations = [pose.rotation @ turn.T]
-    if naming.mirrored:  # seen from the other side
-        rotations = list(rotations_of(pose.rotation[:2, :2] @ naming.turn.T))
-    lens = pose.parameters[6:]
-    return [replace(pose, parameters=(0.0, 0.0, 0.0, *offset, *lens), nominal_rotation=one) for one in rotations]
-
-
-def _contrast(planes: list[PlaneDots]) -> float:
-    return sum(plane.contrast for plane in planes)
-
-
-def _mirrored() -> InputError:
-    return InputError(
-        "board.mark: expected the mark as it is stated, found its mirror image. Change image_flip of this camera: "
-        '"none" and "horizontal" for each other, or "vertical" and "both".'
+    offset = turn @ found.pose.parameters[3:6]
+    offset[:2] += board.spacing_mm * naming.shift
+    pose = replace(
+        found.pose,
+        parameters=(0.0, 0.0, 0.0, *offset.tolist(), *found.pose.parameters[6:]),
+        nominal_rotation=found.pose.rotation @ turn.T,
     )
+    planes, pose = find_in_planes(signals, rectifier(decoder, board), board, pose, found.sign, decoder.optics)
+    return _detection(planes, pose, found.sign, board, decoder)
 
 
 def _detection(

@@ -91,6 +91,7 @@ def _corners(blobs: Blobs, spacing_mm: float, cell_mm: float) -> list[tuple[floa
     power = np.abs((first * weight) @ second.T)  # of the waves (across, along)
     norm = np.hypot(across[:, None], along[None])
     top = (power == ndimage.maximum_filter(power, 3)) & (norm > 1 / LONGEST / spacing_mm) & (norm < largest)
+    top[: len(along), 0] = False  # opposite to another wave
     at = np.argwhere(top)
     at = at[np.argsort(-power[tuple(at.T)], kind="stable")][:WAVES]
     waves = [_refined(np.array([across[i], along[j]]), position, weight, step) for i, j in at]
@@ -101,7 +102,7 @@ def _corners(blobs: Blobs, spacing_mm: float, cell_mm: float) -> list[tuple[floa
             continue
         corner = np.linalg.inv(inverse) / spacing_mm
         if np.linalg.det(corner) < 0:
-            corner = corner[:, ::-1]
+            corner = corner * (1, -1)
         large, small = np.linalg.svd(corner, compute_uv=False)
         if small > SHORTEST and 1 / LONGEST < large < LONGEST:
             found.append((min(p, q) - abs(np.log(large)), corner))

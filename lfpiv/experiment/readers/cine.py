@@ -21,6 +21,8 @@ PACKED_10, PACKED_12 = 256, 1024
 """Values of ``biCompression`` for packed pixels."""
 JPEG, UNINTERPOLATED = 1, 2
 """Values of the file header's ``Compression``; 0 is grey, and the last one is grey too without a colour filter."""
+SETUP_MARK_AT = 140
+"""Place of ``Mark`` and ``Length`` in the SETUP structure, whose length depends on the software [byte]."""
 COLOUR_FILTER_AT = 808
 """Place of ``CFA`` in the SETUP structure [byte]."""
 
@@ -101,9 +103,11 @@ def _require_grey(image: ImagePath, compression: int, bits: int, packing: int, s
     if bits not in (8, 16):
         raise NotOneImage(f"pixels of {bits} bits, such as a colour image; save raw grey values")
     if compression == UNINTERPOLATED:
-        (colour_filter,) = struct.unpack("<I", read_bytes(image.file, setup_at + COLOUR_FILTER_AT, 4))
-        if colour_filter & 0xFFFFFF:  # the last byte names the sensor head
-            raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
+        mark, setup_bytes = struct.unpack("<2sH", read_bytes(image.file, setup_at + SETUP_MARK_AT, 4))
+        if mark == b"ST" and setup_bytes >= COLOUR_FILTER_AT + 4:
+            (colour_filter,) = struct.unpack("<I", read_bytes(image.file, setup_at + COLOUR_FILTER_AT, 4))
+            if colour_filter & 0xFFFFFF:  # the last byte names the sensor head
+                raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
 
 
 def _linear_counts() -> Callable[[bytes], np.ndarray]:

@@ -79,9 +79,9 @@ class Hdf5Images:
         group, names, links = self._file, [part for part in name.split("/") if part], 0
         while names:
             first = names.pop(0)
-            link = group.get(first, getlink=True) if first in group.keys() else None  # `in group` follows links
-            if link is None:
+            if not group.id.links.exists(first.encode()):  # follows no link
                 return None
+            link = group.get(first, getlink=True)
             if isinstance(link, h5py.SoftLink):
                 links += 1
                 if links > MOST_LINKS:
@@ -111,10 +111,12 @@ class Hdf5Images:
 
             self._file.visititems(look)
             names = found[3] or found[2]
-            if len(names) != 1 or looked >= MOST_OBJECTS:
-                some = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-                held = f"{len(names)} datasets of images ({some})" if names else "no dataset of images"
-                raise NotOneImage(f"{held}; name one behind the file, such as #images[0]")
+            if looked >= MOST_OBJECTS:
+                raise NotOneImage(f"more than {MOST_OBJECTS} objects; name one behind the file, such as #images[0]")
+            if len(names) != 1:
+                some = f" ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})" if names else ""
+                found_here = f"{len(names) or 'no'} datasets of images{some}"
+                raise NotOneImage(f"{found_here}; name one behind the file, such as #images[0]")
             self._only = self._file[names[0]]
         return self._only
 

@@ -23,7 +23,7 @@ UNSETTLED_NS = 2 * 10**9
 
 
 class OpenFiles(Generic[Opened]):
-    """The files used last, opened, by path, size and time of the last change.
+    """The files used last, opened, by process, path, size and time of the last change.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class OpenFiles(Generic[Opened]):
         status = os.stat(image.file)
         if abs(time.time_ns() - status.st_mtime_ns) < UNSETTLED_NS:
             return open_file(image)
-        key = (str(image.file), status.st_ino, status.st_size, status.st_mtime_ns, image.raw)
+        key = (os.getpid(), str(image.file), status.st_ino, status.st_size, status.st_mtime_ns, image.raw)
         with self._lock:
             if key in self._opened:
                 self._opened.move_to_end(key)
@@ -134,13 +134,11 @@ class Frames(Stack):
 
 def read_bytes(file: Path, start: int, length: int) -> bytes:
     """Return some bytes of a file; raise ValueError if it ends before."""
-    with file.open("rb", buffering=0) as stream:
-        data = os.pread(stream.fileno(), length, start)
-        while len(data) < length:  # a call returns 2 GiB at most
-            more = os.pread(stream.fileno(), length - len(data), start + len(data))
-            if not more:
-                raise ValueError(f"the file ends before byte {start + length}")
-            data += more
+    with file.open("rb") as stream:
+        stream.seek(start)
+        data = stream.read(length)
+    if len(data) < length:
+        raise ValueError(f"the file ends before byte {start + length}")
     return data
 
 

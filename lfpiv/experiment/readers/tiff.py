@@ -1,7 +1,11 @@
-"""Read pages of TIFF and BigTIFF files with tifffile."""
+"""Read pages of TIFF and BigTIFF files with tifffile.
+
+ImageJ writes a stack of more than 4 GiB with one directory, that of the first image, and the others right behind it.
+"""
 
 from __future__ import annotations
 
+import re
 import struct
 import threading
 import weakref
@@ -10,7 +14,7 @@ import numpy as np
 import tifffile
 
 from lfpiv.experiment.readers.source import Header, ImagePath, NotOneImage, require_plausible
-from lfpiv.experiment.readers.stack import Stack
+from lfpiv.experiment.readers.stack import Stack, read_bytes
 
 MOST_TAGS = 4096
 """Largest number of entries of a page's directory; tifffile takes more for damage as well."""
@@ -24,6 +28,7 @@ class TiffStack(Stack):
     noun = "page"
 
     def __init__(self, image: ImagePath):
+        self._file = image.file
         self._size = image.file.stat().st_size
         if self._size == 0:
             raise ValueError("the file is empty")
@@ -33,6 +38,7 @@ class TiffStack(Stack):
         self._offsets = [self._tiff.pages.first.offset]
         self._seen = set(self._offsets)
         self._complete = False
+        self._behind = 0  # images behind the first one, without a directory
 
     @property
     def count(self) -> int:
@@ -40,31 +46,43 @@ class TiffStack(Stack):
         with self._lock:
             while not self._complete:
                 self._find_next()
-            return len(self._offsets)
+            return len(self._offsets) + self._behind
 
     def holds(self, number: int) -> bool:
         """Return whether there is a page of that number; visit directories up to it only."""
         with self._lock:
             while not self._complete and number >= len(self._offsets):
                 self._find_next()
-            return number < len(self._offsets)
+            return number < len(self._offsets) + self._behind
 
     def header(self, number: int) -> Header:
         """Return the header of a page."""
         with self._lock:
             page = self._page(number)
-        return self._checked(page)
+        return self._checked(page, number)
 
     def read(self, number: int) -> np.ndarray:
         """Return the pixels of a page."""
         with self._lock:
             page = self._page(number)
-            self._checked(page)
-            return page.asarray()
+            header = self._checked(page, number)
+            if number < len(self._offsets):
+                return page.asarray()
+        start, length = self._place_behind(page, number)
+        dtype = np.dtype(header.dtype).newbyteorder(self._tiff.byteorder)
+        return np.frombuffer(read_bytes(self._file, start, length), dtype).reshape(header.shape)
 
     def _page(self, number: int) -> tifffile.TiffPage:
+        """Return the directory of a page, or that of the first one for images without a directory."""
+        number = number if number < len(self._offsets) else 0
         self._tiff.filehandle.seek(self._offsets[number])
         return tifffile.TiffPage(self._tiff, number)
+
+    @staticmethod
+    def _place_behind(page: tifffile.TiffPage, number: int) -> tuple[int, int]:
+        """Return first byte and number of bytes of an image behind the first page."""
+        length = sum(page.databytecounts)
+        return page.dataoffsets[0] + number * length, length
 
     def _find_next(self) -> None:
         """Find the directory of the page behind the last one known."""
@@ -80,13 +98,22 @@ class TiffStack(Stack):
             raise ValueError(f"the file ends in the directory of page {len(self._offsets) - 1}") from None
         if offset == 0:
             self._complete = True
+            self._behind = self._count_behind() if len(self._offsets) == 1 else 0
         elif offset >= self._size or offset in self._seen:
             raise ValueError(f"no page where page {len(self._offsets) - 1} says that the next one begins")
         else:
             self._offsets.append(offset)
             self._seen.add(offset)
 
-    def _checked(self, page: tifffile.TiffPage) -> Header:
+    def _count_behind(self) -> int:
+        """Return the number of images behind the only page, as ImageJ's description of it says."""
+        page = self._page(0)
+        images = re.search(r"^images=(\d{1,12})$", page.description, re.MULTILINE)
+        if not page.description.startswith("ImageJ=") or images is None or not page.is_contiguous:
+            return 0
+        return max(int(images[1]) - 1, 0)
+
+    def _checked(self, page: tifffile.TiffPage, number: int) -> Header:
         """Return the header of a page; refuse one that is not one single-channel image with all its pixels."""
         end = max(
             (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0
@@ -98,12 +125,14 @@ class TiffStack(Stack):
             raise NotOneImage(f"{meaning.name} pixels; save raw grey values, 0 = black")
         if page.dtype is None:
             raise ValueError("unknown pixel type")
+        if number >= len(self._offsets):
+            end = sum(self._place_behind(page, number))
         if end == 0 or end > self._size:
             raise ValueError(f"pixel data end at byte {end}, the file at byte {self._size}")
         rows, columns = page.shape
-        stored, pixels = sum(page.databytecounts), rows * columns * page.dtype.itemsize
+        stored, strips = sum(page.databytecounts), len(page.databytecounts)
         require_plausible((rows, columns), page.dtype.itemsize, stored)
-        strips = len(page.databytecounts)
+        pixels = rows * ((columns * page.bitspersample + 7) // 8)  # rows begin at whole bytes
         if page.compression == 1 and not page.is_tiled and not pixels <= stored <= pixels + STRIP_FILL * strips:
             raise ValueError(f"{stored} bytes of pixels where its directory declares {rows} x {columns} {page.dtype}")
         return Header((int(rows), int(columns)), str(page.dtype))
