@@ -25,11 +25,20 @@ def pytest_addoption(parser):
     )
 
 
+def share_of_cores(worker, workers):
+    """Return the cores of one of several test processes; each has its own as long as there are enough."""
+    cores = sorted(os.sched_getaffinity(0))
+    return set(cores[worker::workers]) or {cores[worker % len(cores)]}
+
+
 @pytest.fixture(scope="session", autouse=True)
 def device(request):
     """Start the kernel device once, before any test can choose another."""
     from lfpiv_kernels import runtime
 
+    if (name := os.environ.get("PYTEST_XDIST_WORKER")) and hasattr(os, "sched_setaffinity"):
+        workers = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+        os.sched_setaffinity(0, share_of_cores(int(name.removeprefix("gw")), workers))
     return runtime.start(request.config.getoption("--device"))
 
 
