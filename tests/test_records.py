@@ -360,7 +360,7 @@ def change_dataset(name, change):
     ("change", "words"),
     [
         (change_dataset("camera/left/network/weight_0", lambda values: values * np.nan), "network.weight_0"),
-        (change_dataset("camera/left/network/output_scale", lambda values: 0 * values), "a scale is 0"),
+        (change_dataset("camera/left/network/input_scale", lambda values: 0 * values), "inputs is 0"),
         (change_dataset("camera/left/baseline/thin_lens_rotation", lambda values: 2 * values), "no rotation"),
         (change_dataset("camera/left/decoder/gain", lambda values: values + np.inf), "decoder.gain"),
         (change_dataset("camera/left/region_mm", lambda values: values[::-1]), "two corners"),

@@ -222,7 +222,7 @@ def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, mon
 
 def test_large_fields_are_thinned_out():
     large = report_run.field(0, (40, 120, 110))
-    html_text, step = embed(Survey(shown={0: large}, mean=None, fluctuation=None, read=1), {0: "pair 0"})
+    html_text, step = embed(Survey(shown={0: large}, mean=None, fluctuation=None, read=1))
     (entry,) = json.loads(re.search(r'id="field-list">([^<]*)</script>', html_text)[1])["fields"]
     kept = len(entry["x"]) * len(entry["y"]) * len(entry["z"])
     assert len(entry["z"]) == 40 and step == math.ceil(math.sqrt(large["u"].size / MOST_IN_FIELD))
