@@ -19,7 +19,8 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv import files
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import CHECKED_PAIRS, Experiment, check_pairs, read_experiment
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress

@@ -19,7 +19,7 @@ from support.stored import rewrite
 import lfpiv
 from lfpiv.cli import commands
 from lfpiv.errors import ClusterError, InputError, StorageError
-from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import cluster_workers, dispatch, local_workers, memory, pipeline, worker_plan
