@@ -171,7 +171,8 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
             clear = clear and all(_shows_particles(images, weights.cameras) for images in light)
             continue
         separation = fit_movements(found, list(weights.cameras), experiment.grid).separation
-        if separation.differs_from(LARGE_VOXEL * experiment.grid.voxel_mm):
+        limit_mm = LARGE_VOXEL * experiment.grid.voxel_mm
+        if separation.differs_from(limit_mm) and (separation.mm < limit_mm or len(used) > 1):
             break
     if separation is None or lost:
         if clear and len(used) >= LEAST_FOR_NOTHING:
