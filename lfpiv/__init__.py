@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.calibration.cameras import thin_lens as thin_lens
     from lfpiv.errors import InputError as InputError
     from lfpiv.experiment.experiment import Experiment as Experiment
-    from lfpiv.experiment.experiment import open_experiment as open_experiment
+    from lfpiv.experiment.opening import open_experiment as open_experiment
     from lfpiv.geometry.grid import Grid as Grid
     from lfpiv.geometry.optics import LensLattice as LensLattice
     from lfpiv.geometry.optics import Optics as Optics
@@ -50,7 +50,7 @@ _MODULES = {
     "export_results": "lfpiv.results.export",
     "find_lens_array": "lfpiv.lightfield.lens_array",
     "load_calibration": "lfpiv.calibration.camera",
-    "open_experiment": "lfpiv.experiment.experiment",
+    "open_experiment": "lfpiv.experiment.opening",
     "open_results": "lfpiv.results.reader",
     "reconstruct": "lfpiv.reconstruction.volume",
     "reconstruct_pair": "lfpiv.reconstruction.motion",

@@ -44,7 +44,12 @@ def _show_version(value: bool) -> None:
 
 ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="The experiment file.")]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for everything the run writes.")]
-Pairs = Annotated[str, typer.Option("--pairs", metavar="A:B", help="Pairs A to B - 1 only; either may be left out.")]
+Pairs = Annotated[
+    str,
+    typer.Option(
+        "--pairs", metavar="A:B", help="Pairs, or instants of a series, A to B - 1 only; either may be left out."
+    ),
+]
 Device = Annotated[
     Literal["auto", "cpu", "cuda"] | None,
     typer.Option("--device", help="Where kernels run; default: compute.device of the experiment file."),
@@ -102,16 +107,16 @@ def _run(
     keep_volumes: Annotated[bool, typer.Option("--keep-volumes", help="Write the volumes too.")] = False,
     workers: Annotated[
         int | None,
-        typer.Option("--workers", metavar="N", help="Processes that do pairs side by side; default: 1, one per GPU."),
+        typer.Option("--workers", metavar="N", help="Processes that work side by side; default: 1, one per GPU."),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the pairs instead."),
+        typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the work instead."),
     ] = None,
 ) -> None:
     """Do all steps: calibrate, reconstruct, correlate, report. Finished parts in DIR are not repeated.
 
-    A pair that fails is left out and named; then the exit status is 3.
+    A pair or instant that fails is left out and named; then the exit status is 3.
     """
     selected = _parse_pairs(pairs)
     with _output.progress() as progress:
@@ -182,7 +187,7 @@ def _export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run: its --out.")],
     to: Annotated[
         Literal["vti", "netcdf", "zarr", "csv", "pivpy"],
-        typer.Option("--to", help="ParaView images; one NetCDF or Zarr over all pairs; tables; planes for pivpy."),
+        typer.Option("--to", help="ParaView images; one NetCDF or Zarr file of all vectors; tables; planes for pivpy."),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR2", help="Folder to write to; default: DIR/export.")
@@ -193,7 +198,11 @@ def _export(
     ] = None,
     interval: Annotated[
         float | None,
-        typer.Option("--interval", metavar="S", help="Time between pairs [s]; default: times are pair numbers."),
+        typer.Option(
+            "--interval",
+            metavar="S",
+            help="Time between image pairs [s]; default: times are pair numbers. Not for a series.",
+        ),
     ] = None,
 ) -> None:
     """Write the vectors of a run for other programs: ParaView, xarray, spreadsheets, pivpy."""

@@ -1,12 +1,9 @@
-"""Open an experiment file: a TOML file in, a frozen `Experiment` out, with all its keys and images checked."""
+"""The experiment as a frozen value: its settings, the numbers of its pairs or instants, its images and their paths."""
 
 from __future__ import annotations
 
-import math
-import os
-import sys
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -14,38 +11,21 @@ import numpy as np
 from pydantic import ConfigDict
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import bounds, images, nominal_checks
-from lfpiv.experiment.mask import solid_voxels
-from lfpiv.experiment.patterns import check_length, check_pattern
+from lfpiv.experiment import images
 from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.experiment.settings import (
-    SMALLEST_WINDOW,
     Board,
-    CameraTable,
     Compute,
     Correlation,
-    ExperimentTable,
-    ExperimentVolume,
     Network,
-    Particles,
     RawImages,
     SelfCalibration,
     Series,
     Smart,
 )
-from lfpiv.experiment.toml import read_toml
-from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
-
-DECODED_PIXELS = 100_000_000
-"""Largest number of pixels of particle images that are decoded before the work starts [pixel]."""
-
-CHECKED_PAIRS = 100
-"""Largest number of pairs whose images `open_experiment` checks, evenly spread over all."""
-
-LEAST_BYTES_PER_VOXEL = 64
-"""Memory that a run needs at least for each voxel, and again for each voxel and camera [byte]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,30 +146,30 @@ class Experiment:
     def white(self, name: str) -> np.ndarray:
         """Return the white image of a camera [counts], dark image not subtracted, float32 (rows, columns)."""
         camera = self.camera(name)
-        return _read(camera.white_path, f"white_image of camera {name!r}", camera)
+        return read_image_of(camera.white_path, f"white_image of camera {name!r}", camera)
 
     def dark(self, name: str) -> np.ndarray | None:
         """Return the dark image of a camera [counts], float32 (rows, columns), or None where the file names none."""
         camera = self.camera(name)
         if camera.dark_path is None:
             return None
-        return _read(camera.dark_path, f"dark_image of camera {name!r}", camera)
+        return read_image_of(camera.dark_path, f"dark_image of camera {name!r}", camera)
 
     def board_image(self, name: str, plane: int) -> np.ndarray:
         """Return the board image of a camera at a plane [counts], float32 (rows, columns)."""
-        return _read(self.board_path(name, plane), _board_label(name, plane), self.camera(name))
+        return read_image_of(self.board_path(name, plane), board_label(name, plane), self.camera(name))
 
     def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
         """Return a particle image [counts], float32 (rows, columns); raise InputError if it has no contrast."""
         label, path = self.particle_label(name, pair, frame), self.particle_path(name, pair, frame)
-        image = _read(path, label, self.camera(name))
+        image = read_image_of(path, label, self.camera(name))
         images.require_contrast(image, path, label)
         return image
 
     def background_image(self, name: str, frame: str) -> np.ndarray | None:
         """Return the background image of a camera [counts], float32 (rows, columns); None where the file names none."""
         path = self.background_path(name, frame)
-        return None if path is None else _read(path, f"background_image of camera {name!r}", self.camera(name))
+        return None if path is None else read_image_of(path, f"background_image of camera {name!r}", self.camera(name))
 
     def background_path(self, name: str, frame: str) -> Path | None:
         """Return the path of a camera's background image for a frame; None where the file names none."""
@@ -246,268 +226,14 @@ class Experiment:
         return [self.particle_path(camera.name, *frame) for camera in self.cameras]
 
 
-def open_experiment(path: str | Path) -> Experiment:
-    """Read an experiment file and check all its keys and images.
-
-    White, dark and board images are decoded, and the particle images of up to `CHECKED_PAIRS` pairs, evenly spread, are
-    checked as by `check_pairs`. `lfpiv.run` checks the particle images of all pairs that it does and continues without
-    damaged ones.
-
-    Parameters
-    ----------
-    path : str or Path
-        TOML file in the form described in the README.
-
-    Returns
-    -------
-    Experiment
-
-    Raises
-    ------
-    InputError
-        If a key is unknown, missing or out of range, if an image is missing, damaged, or does not fit the others, or
-        if a nominal camera certainly sees nothing of the volume.
-    """
-    experiment = read_experiment(path)
-    for _, reason in check_pairs(experiment, experiment.spread_pairs(CHECKED_PAIRS)):
-        raise InputError(reason)
-    return experiment
-
-
-def read_experiment(path: str | Path) -> Experiment:
-    """Read and check an experiment as `open_experiment` does, without its particle images."""
-    path = Path(path)
-    table = read_toml(path, ExperimentTable)
-    names = [camera.name for camera in table.camera]
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{path}: camera.name: expected a different name for each camera, found {twice!r} twice.")
-    for one in table.camera:
-        if not table.board.mark:
-            _require_orientation(path, one)
-    board, particles = table.board, table.particles
-    check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
-    _check_particle_pattern(path, particles, names)
-    for one in table.camera:
-        if one.background_image is not None:
-            _check_background(path, one, particles)
-    series = particles.series
-    if series is not None and table.smart.motion_passes:
-        raise InputError(
-            f"{path}: smart.motion_passes: expected 0 for a time series, where each instant is reconstructed once and "
-            f"used in two pairs, found {table.smart.motion_passes}. Set it to 0."
-        )
-    grid = _grid(path, table.volume, len(names))
-    _check_windows(path, table.correlation, grid)
-    experiment = Experiment(
-        path=path,
-        name=table.name,
-        dt_s=table.dt_s,
-        cameras=tuple(_camera(path, camera) for camera in table.camera),
-        board=board,
-        grid=grid,
-        guard_mm=table.volume.guard_mm,
-        pairs=particles.count,
-        frames=particles.frames,
-        series=series,
-        smart=table.smart,
-        self_calibration=table.self_calibration,
-        correlation=table.correlation,
-        network=table.network,
-        compute=table.compute,
-        particle_images=particles.images,
-        background=particles.background,
-    )
-    for camera in experiment.cameras:
-        if camera.orientation is not None:
-            nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
-            nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
-    _check_calibration_images(experiment)
-    return replace(experiment, solid=solid_voxels(path, table.volume, grid))
-
-
-def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:
-    """Check the particle images of some pairs; yield each damaged pair with the reason.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        From `read_experiment`.
-    pairs : sequence of int
-        Pairs to check. The first is decoded, and the following up to `DECODED_PIXELS`; of the others the header and the
-        length are checked (a DaVis image must exist).
-
-    Yields
-    ------
-    pair : int
-    reason : str
-        Message with the file, what was expected and what was found.
-    """
-    decoded = 0
-    for number, pair in enumerate(pairs):
-        try:
-            for camera in experiment.cameras:
-                for frame in experiment.frames:
-                    label = experiment.particle_label(camera.name, pair, frame)
-                    _check_shape(experiment.particle_path(camera.name, pair, frame), label, camera)
-            decoded += 2 * sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
-            if number == 0 or decoded <= DECODED_PIXELS:
-                for camera in experiment.cameras:
-                    for frame in experiment.frames:
-                        experiment.particle_image(camera.name, pair, frame)
-        except InputError as error:
-            yield pair, str(error)
-
-
-def _check_particle_pattern(path: Path, particles: Particles, cameras: Sequence[str]) -> None:
-    fields: dict[str, Sequence[Any]] = {"camera": cameras}
-    if (series := particles.series) is not None:
-        fields["instant"] = series.numbers
-    elif "{image" in particles.images:
-        fields["image"] = range(2 * particles.count)
-    else:
-        fields |= {"pair": range(particles.count), "frame": particles.frames}
-    check_pattern(path, "particles.images", particles.images, fields)
-
-
-def _require_orientation(path: Path, camera: CameraTable) -> None:
-    if camera.orientation is None:
-        raise InputError(
-            f"{path}: camera {camera.name!r}: expected nominal_angle_deg, its angle about y, or nominal_direction, a "
-            "vector from the origin towards it, found neither. Add one, or use a board with a mark (board.mark)."
-        )
-
-
-def _check_background(path: Path, camera: CameraTable, particles: Particles) -> None:
-    """Refuse a pattern with unknown fields, and an image that `particles.background` would not use."""
-    key = f"camera {camera.name!r}, background_image"
-    assert camera.background_image is not None
-    if particles.series is not None and "{frame" in camera.background_image:
-        raise InputError(
-            f"{path}: {key}: expected no {{frame}}, because one laser lights all instants of a time series, found "
-            f"{camera.background_image!r}."
-        )
-    check_pattern(path, key, camera.background_image, {"frame": particles.frames[:1]})
-    if particles.background in ("minimum", "median"):
-        raise InputError(
-            f'{path}: {key}: expected particles.background = "auto", which takes this image, found '
-            f'"{particles.background}". Remove one of the two keys.'
-        )
-
-
-def _grid(path: Path, volume: ExperimentVolume, cameras: int) -> Grid:
-    for axis, size in zip("xyz", volume.size_mm, strict=True):
-        if not SMALLEST_WINDOW <= size / volume.voxel_mm + 0.5 < 2**31:
-            raise InputError(
-                f"{path}: volume.size_mm: expected {SMALLEST_WINDOW} voxels or more along {axis}, at most 2^31, "
-                f"found {size:g} mm with voxel_mm = {volume.voxel_mm:g}."
-            )
-    grid = Grid.from_extent(centre_mm=volume.centre_mm, size_mm=volume.size_mm, voxel_mm=volume.voxel_mm)
-    guarded = grid if volume.guard_mm == "auto" else grid.padded(grid.layers(volume.guard_mm))
-    if guarded.size > bounds.MOST_VOXELS:
-        raise InputError(
-            f"{path}: volume: expected at most {bounds.MOST_VOXELS:.0e} voxels, guard layers included, found "
-            f"{guarded.size:.1e}. Raise volume.voxel_mm, or shrink volume.size_mm or volume.guard_mm."
-        )
-    needed, machine = LEAST_BYTES_PER_VOXEL * (1 + cameras) * guarded.size, _memory_of_machine()
-    if (volume.mask is not None or volume.solid) and needed > machine:
-        raise InputError(
-            f"{path}: volume: expected voxels that fit into memory, found {guarded.size:.1e}, guard layers included, "
-            f"which need at least {needed / 2**30:,.0f} GiB of {machine / 2**30:,.0f} GiB. Raise volume.voxel_mm, or "
-            "shrink volume.size_mm or volume.guard_mm."
-        )
-    return grid
-
-
-def _memory_of_machine() -> int:
-    """Return the memory of this machine [byte]."""
-    if not hasattr(os, "sysconf"):
-        return sys.maxsize
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
-    farthest = correlation.max_displacement_voxel
-    if farthest is not None and farthest >= max(grid.shape):
-        raise InputError(
-            f"{path}: correlation.max_displacement_voxel: expected less than the volume's {max(grid.shape)} voxels, "
-            f"found {farthest:g}."
-        )
-    for window in correlation.windows or ():
-        if not isinstance(window, tuple):
-            continue  # a single edge is cut to the volume
-        for axis, edge, n in zip(AXES, window, grid.shape, strict=True):
-            if edge > n:
-                raise InputError(
-                    f"{path}: correlation.windows: expected windows inside the volume, found {edge} voxels "
-                    f"along {axis} where the volume has {n}. Use a smaller window, or a single edge, which is cut to "
-                    "the volume."
-                )
-
-
-def _camera(path: Path, table: CameraTable) -> CameraSetup:
-    key = f"camera {table.name!r}"
-    for name in ("white_image", "dark_image"):
-        if (image := getattr(table, name)) is not None:
-            check_length(path, f"{key}, {name}", image)
-    white_path = path.parent / table.white_image
-    shape = _white_shape(white_path, f"white_image of camera {table.name!r}", table.raw)
-    optics = table.optics_of(shape)
-    nominal_checks.require_microimages(path, table.name, optics)
-    return CameraSetup(
-        name=table.name,
-        optics=optics,
-        orientation=table.orientation,
-        image_flip=table.image_flip,
-        white_path=white_path,
-        dark_path=None if table.dark_image is None else path.parent / table.dark_image,
-        background=table.background_image,
-        raw=table.raw,
-    )
-
-
-def _white_shape(path: Path, label: str, raw: RawImages | None) -> tuple[int, int]:
-    header = images.read_header(path, label, raw)
-    if header is not None:
-        return header.shape
-    rows, columns = images.read_image(path, label, raw=raw).shape
-    return rows, columns
-
-
-def _check_calibration_images(experiment: Experiment) -> None:
-    """Check that every image of the calibration exists, has its camera's shape and can be decoded."""
-    for camera in experiment.cameras:
-        if camera.dark_path is not None:
-            _check_shape(camera.dark_path, f"dark_image of camera {camera.name!r}", camera)
-        for frame in experiment.frames:
-            if (path := experiment.background_path(camera.name, frame)) is not None:
-                _check_shape(path, f"background_image of camera {camera.name!r}", camera)
-                experiment.background_image(camera.name, frame)
-        for plane in range(len(experiment.board.planes_mm)):
-            _check_shape(experiment.board_path(camera.name, plane), _board_label(camera.name, plane), camera)
-    for camera in experiment.cameras:
-        white, dark = experiment.white(camera.name), experiment.dark(camera.name)
-        label = f"white_image of camera {camera.name!r}"
-        images.require_contrast(white, camera.white_path, label)
-        if dark is not None and float((white - dark).max()) <= 0:
-            raise InputError(
-                f"{camera.white_path} ({label}): expected a white image brighter than the dark image, found none of "
-                f"its pixels above {camera.dark_path}. Are the two files exchanged?"
-            )
-        for plane in range(len(experiment.board.planes_mm)):
-            board = experiment.board_image(camera.name, plane)
-            path, label = experiment.board_path(camera.name, plane), _board_label(camera.name, plane)
-            images.require_contrast(board, path, label)
-
-
-def _read(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
+def read_image_of(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
     """Read an image of a camera and reverse its mirroring; refuse another shape than the white image's."""
     image = images.read_image(path, label, flip=camera.image_flip, raw=camera.raw)
     _require_shape(image.shape, path, label, camera)
     return image
 
 
-def _check_shape(path: Path, label: str, camera: CameraSetup) -> None:
+def check_shape(path: Path, label: str, camera: CameraSetup) -> None:
     """Refuse an image that is missing, damaged, or of another shape than its camera's white image.
 
     A DaVis image must exist; its content is checked when it is decoded.
@@ -525,5 +251,6 @@ def _require_shape(shape: tuple[int, ...], path: Path, label: str, camera: Camer
         )
 
 
-def _board_label(camera: str, plane: int) -> str:
+def board_label(camera: str, plane: int) -> str:
+    """Return key, camera and plane of a board image, for messages."""
     return f"board.images, camera {camera!r}, plane {plane}"

@@ -19,6 +19,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.report import background, markup, overview, pairs, volumes
 from lfpiv.report import calibration as calibration_section
 from lfpiv.report import vectors as vector_section
+from lfpiv.report.naming import Naming
 from lfpiv.report.summary import Summary
 
 if TYPE_CHECKING:
@@ -59,20 +60,21 @@ def write_report(
         If a figure of the summary is missing or has the wrong type.
     """
     figures = Summary.model_validate(summary)
+    naming = Naming.of(experiment)
     sections = {
         "run": overview.run_facts(experiment, figures),
         "calibration": calibration_section.section(experiment, calibration, figures.calibration),
         "background": background.section(experiment, calibration),
-        "volumes": volumes.section(figures.pairs, vectors, experiment.noun) if vectors else "",
-        "vectors": vector_section.section(vectors, experiment.noun),
-        "pairs": pairs.section(figures.pairs, figures.failed, figures.finished_count) if figures.pairs else "",
-        "time": overview.timings(figures),
+        "volumes": volumes.section(figures.pairs, vectors, naming) if vectors else "",
+        "vectors": vector_section.section(vectors, naming),
+        "pairs": pairs.section(figures.pairs, figures.failed, figures.finished_count, naming) if figures.pairs else "",
+        "time": overview.timings(figures, naming.noun),
         "settings": overview.settings_and_versions(figures),
     }
     body = [
         overview.head(experiment, figures),
-        overview.warnings(figures, experiment.noun),
-        overview.contents(sections),
+        overview.warnings(figures, naming.noun),
+        overview.contents(sections, naming.noun),
         *sections.values(),
     ]
     scripts = "\n".join(_asset(name) for name in _SCRIPTS)

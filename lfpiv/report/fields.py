@@ -23,6 +23,7 @@ import xarray as xr
 
 from lfpiv import hdf5
 from lfpiv.geometry.grid import AXES
+from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.results import netcdf
 from lfpiv.velocity import derived
 
@@ -60,13 +61,15 @@ class Survey:
     """Number of pairs in mean and fluctuation."""
 
 
-def survey(vectors: Mapping[int, Path]) -> Survey:
+def survey(vectors: Mapping[int, Path], naming: Naming = PAIRS) -> Survey:
     """Read an evenly spaced sample of the pairs; average one file after the other.
 
     Parameters
     ----------
     vectors : dict
         Pair -> file of its vectors; at least one.
+    naming : Naming
+        Names of results.
 
     Raises
     ------
@@ -82,7 +85,8 @@ def survey(vectors: Mapping[int, Path]) -> Survey:
     for pair in chosen:
         velocity, valid, axes = _read_velocity(vectors[pair])
         if any(not np.array_equal(axis, first[name]) for name, axis in axes.items()):
-            log.warning("pair %d: its vectors lie elsewhere than pair %d's; it is not in the mean", pair, chosen[0])
+            names = naming.result(pair), naming.result(chosen[0])
+            log.warning("%s: its vectors lie elsewhere than those of %s; it is not in the mean", *names)
             continue
         good = valid & np.isfinite(velocity).all(0)
         velocity = np.where(good, velocity, 0.0)
@@ -119,7 +123,7 @@ def _like(first: xr.Dataset, velocity: np.ndarray, valid: np.ndarray) -> xr.Data
     return xr.Dataset({**variables, "valid": (AXES, valid), **masked}, coordinates)
 
 
-def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
+def embed(found: Survey, naming: Naming = PAIRS) -> tuple[str, int]:
     """Encode the fields of a survey for the scripts.
 
     All fields share one block of little-endian 16-bit integers, which is gzipped and written in base64. A JSON text
@@ -129,8 +133,8 @@ def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
     ----------
     found : Survey
         From `survey`.
-    names : dict
-        Pair -> its name on the page.
+    naming : Naming
+        Names of results.
 
     Returns
     -------
@@ -139,10 +143,11 @@ def embed(found: Survey, names: Mapping[int, str]) -> tuple[str, int]:
     thinning : int
         Largest step along x and y at which vectors are in the page.
     """
-    fields = [(names[pair], vectors, "velocity") for pair, vectors in found.shown.items()]
+    fields = [(naming.result(pair), vectors, "velocity") for pair, vectors in found.shown.items()]
     if found.mean is not None and found.fluctuation is not None:
-        fields += [(f"mean of {found.read:,} pairs", found.mean, "velocity")]
-        fields += [(f"fluctuation (standard deviation), {found.read:,} pairs", found.fluctuation, "fluctuation")]
+        count = f"{found.read:,} {naming.noun}s"
+        fields += [(f"mean of {count}", found.mean, "velocity")]
+        fields += [(f"fluctuation (standard deviation), {count}", found.fluctuation, "fluctuation")]
     block, described, thinning = bytearray(), [], 1
     for label, vectors, kind in fields:
         derivatives = _derivatives(vectors) if kind == "velocity" else {}

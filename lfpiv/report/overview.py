@@ -72,7 +72,7 @@ def _list(texts: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{markup.escape(text)}</li>" for text in texts) + "</ul>"
 
 
-def contents(sections: Mapping[str, str]) -> str:
+def contents(sections: Mapping[str, str], noun: str = "pair") -> str:
     """Return links to the sections that are not empty."""
     names = {
         "run": "What was run",
@@ -80,7 +80,7 @@ def contents(sections: Mapping[str, str]) -> str:
         "background": "Light that stands still",
         "volumes": "Volumes",
         "vectors": "Vectors",
-        "pairs": "All pairs",
+        "pairs": f"All {noun}s",
         "time": "Time and memory",
         "settings": "Settings",
     }
@@ -98,7 +98,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
     rows = [
         ("Experiment file", str(experiment.path)),
         ("Volume", f"{size[0]:g} × {size[1]:g} × {size[2]:g} mm (x, y, z), {nx} × {ny} × {nz} voxels of {voxel:g} mm"),
-        ("Time between frames", f"{experiment.dt_s:g} s: 1 voxel is {voxel / 1000 / experiment.dt_s:g} m/s"),
+        _interval(experiment),
         (
             "Cameras",
             ", ".join(f"{camera.name}{_orientation(camera)}" for camera in experiment.cameras)
@@ -114,13 +114,34 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
             + (f", with a mark of {len(board.mark)} places without a dot" if board.mark else ""),
         ),
         ("Axes", _axes(experiment)),
-        ("Image pairs", f"{summary.finished_count:,} of {experiment.pairs:,} finished"),
+        _recorded(experiment, summary.finished_count),
         ("Motion passes", _motion(summary)),
         ("Weights", _weights(summary.weights)),
-        ("Cameras against each other", _agreement(summary.weights)),
+        ("Cameras against each other", _agreement(summary.weights, experiment.noun)),
         ("Computed on", f"{summary.device.kind}, {summary.device.threads} threads"),
     ]
     return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
+
+
+def _interval(experiment: Experiment) -> tuple[str, str]:
+    """State the time between the two frames of a vector field and the velocity of one voxel."""
+    series, speed = experiment.series, f"1 voxel is {experiment.grid.voxel_mm / 1000 / experiment.dt_s:g} m/s"
+    if series is None:
+        return "Time between frames", f"{experiment.dt_s:g} s: {speed}"
+    later = "" if series.step == 1 else f", from each to the one {series.step} later"
+    return "Time between instants", f"{experiment.dt_s:g} s{later}: {speed}"
+
+
+def _recorded(experiment: Experiment, finished: int) -> tuple[str, str]:
+    """State what was recorded, and how much of it has vectors."""
+    series = experiment.series
+    if series is None:
+        return "Image pairs", f"{finished:,} of {experiment.pairs:,} finished"
+    last = series.first + series.instants - 1
+    return "Time series", (
+        f"instants {series.first} to {last}; vectors of {finished:,} of the {experiment.pairs:,} that have a partner "
+        f"{markup.count(series.step, 'instant')} later"
+    )
 
 
 def _orientation(camera: CameraSetup) -> str:
@@ -166,14 +187,14 @@ def _weights(weights: WeightFigures) -> str:
     return text
 
 
-def _agreement(weights: WeightFigures) -> str:
+def _agreement(weights: WeightFigures, noun: str) -> str:
     """State the disparity between the cameras, and how self-calibration changed it."""
     text = ""
     if weights.disparity_voxel is not None:
-        text = f"particles of pair {weights.disparity_pair} within {weights.disparity_voxel:.2f} voxel"
+        text = f"particles of {noun} {weights.disparity_pair} within {weights.disparity_voxel:.2f} voxel"
     corrected = weights.self_calibration
     if corrected is not None and corrected.verdict != "corrected":
-        pairs = markup.count(len(corrected.pairs), "pair")
+        pairs = markup.count(len(corrected.pairs), noun)
         text += f"{'; ' if text else ''}self-calibration by {pairs} changed nothing: {corrected.verdict}"
     elif corrected is not None:
         moved = ", ".join(
@@ -182,21 +203,21 @@ def _agreement(weights: WeightFigures) -> str:
             for name, move in corrected.movements.items()
         )
         text += (
-            f"{'; ' if text else ''}self-calibrated by {markup.count(len(corrected.pairs), 'pair')}: "
+            f"{'; ' if text else ''}self-calibrated by {markup.count(len(corrected.pairs), noun)}: "
             f"{number(corrected.disparity_before_voxel, 2)} voxel before, "
             f"{number(corrected.disparity_voxel, 2)} after; {moved}"
         )
     return text
 
 
-def timings(summary: Summary) -> str:
+def timings(summary: Summary, noun: str = "pair") -> str:
     """Tabulate the time of each stage; list what was reused, and the peak memory."""
     names = {
         "calibration": "calibration, including network training",
         "network_training": "network training alone",
         "weights": "weights",
         "reconstruction": "reconstruction, all volumes",
-        "correlation": "correlation, all pairs",
+        "correlation": f"correlation, all {noun}s",
         "total": "this run, until the report",
     }
     rows = [[text, number(summary.timings_s.get(key), 1)] for key, text in names.items()]

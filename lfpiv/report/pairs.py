@@ -12,6 +12,7 @@ import numpy as np
 from lfpiv.report import markup
 from lfpiv.report.fields import evenly
 from lfpiv.report.markup import number, percent
+from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.report.summary import Failure, PairFigures
 from lfpiv.report.svg import SERIES, new_panel, spread_ticks, style, to_svg
 
@@ -74,7 +75,12 @@ def _known(reduce: Callable[[np.ndarray], SupportsFloat], values: np.ndarray) ->
     return float(reduce(values)) if values.size else float("nan")
 
 
-def section(pairs: Sequence[PairFigures], failures: Sequence[Failure], finished: int | None = None) -> str:
+def section(
+    pairs: Sequence[PairFigures],
+    failures: Sequence[Failure],
+    finished: int | None = None,
+    naming: Naming = PAIRS,
+) -> str:
     """Return the section on all pairs, as HTML.
 
     Parameters
@@ -85,42 +91,47 @@ def section(pairs: Sequence[PairFigures], failures: Sequence[Failure], finished:
         Pairs without result, marked in the charts.
     finished : int, optional
         Number of all finished pairs, where `pairs` is an evenly chosen part of them. Default: all are given.
+    naming : Naming
+        Names of results.
     """
     pairs = sorted(pairs, key=lambda pair: pair.number)
     groups = group(pairs)
     failed = [failure.pair for failure in failures]
-    single = bool((groups.pairs == 1).all())
-    parts = ['<h2 id="pairs">All pairs</h2>', markup.paragraph(_overview(pairs, failed, finished or len(pairs)))]
-    table = _table(groups, single)
+    single, noun = bool((groups.pairs == 1).all()), naming.noun
+    parts = [
+        f'<h2 id="pairs">All {noun}s</h2>',
+        markup.paragraph(_overview(pairs, failed, finished or len(pairs), noun)),
+    ]
+    table = _table(groups, single, noun)
     if len(pairs) == 1:
         return "\n".join([*parts, table])
-    shown = [_line(groups, ("valid",), "valid vectors [%]", failed, factor=100.0, bottom=0)]
-    shown.append(_line(groups, ("uncertainty",), "median uncertainty [voxel]", failed, bottom=0))
-    shown.append(_line(groups, ("u", "v", "w"), "mean velocity [m/s]", failed))
-    caption = "Each pair's figures over its valid vectors."
+    shown = [_line(groups, ("valid",), "valid vectors [%]", failed, noun, factor=100.0, bottom=0)]
+    shown.append(_line(groups, ("uncertainty",), "median uncertainty [voxel]", failed, noun, bottom=0))
+    shown.append(_line(groups, ("u", "v", "w"), "mean velocity [m/s]", failed, noun))
+    caption = f"Each {noun}'s figures over its valid vectors."
     if not single:
         caption = (
-            f"Each pair's figures over its valid vectors; {groups.pairs.max()} neighbouring pairs are merged: "
+            f"Each {noun}'s figures over its valid vectors; {groups.pairs.max()} neighbouring {noun}s are merged: "
             "lines are their mean, bands reach from the lowest to the highest."
         )
     if failed:
-        caption += " Marks on the lower edge: failed pairs."
-    parts.append(markup.figure(shown, caption, table + (_worst(pairs) if not single else "")))
+        caption += f" Marks on the lower edge: failed {noun}s."
+    parts.append(markup.figure(shown, caption, table + (_worst(pairs, noun) if not single else "")))
     return "\n".join(parts)
 
 
-def _overview(pairs: Sequence[PairFigures], failed: Sequence[int], finished: int) -> str:
+def _overview(pairs: Sequence[PairFigures], failed: Sequence[int], finished: int, noun: str) -> str:
     """Count the pairs and state their mean and lowest valid share."""
     shares = np.array([pair.valid_fraction for pair in pairs])
-    text = f"{markup.count(finished, 'pair')} finished"
+    text = f"{markup.count(finished, noun)} finished"
     text += f", of which {len(pairs):,}, evenly chosen, are shown here" if len(pairs) < finished else ""
-    text += f", {markup.count(len(failed), 'pair')} failed" if failed else ""
+    text += f", {markup.count(len(failed), noun)} failed" if failed else ""
     if len(pairs) == 1:
-        return f"{text}: statistics over pairs need two or more."
+        return f"{text}: statistics over {noun}s need two or more."
     worst = int(shares.argmin())
     return (
-        f"{text}. Valid vectors: {percent(float(shares.mean()), 1)} in the mean over pairs, "
-        f"{percent(float(shares.min()), 1)} in the worst, pair {pairs[worst].number}."
+        f"{text}. Valid vectors: {percent(float(shares.mean()), 1)} in the mean over {noun}s, "
+        f"{percent(float(shares.min()), 1)} in the worst, {noun} {pairs[worst].number}."
     )
 
 
@@ -129,6 +140,7 @@ def _line(
     keys: Sequence[str],
     label: str,
     failed: Sequence[int],
+    noun: str,
     *,
     factor: float = 1.0,
     bottom: float | None = None,
@@ -149,19 +161,19 @@ def _line(
         from_below = axes.get_xaxis_transform()
         marked = evenly(failed, MOST_ROWS)
         axes.plot(marked, [0.02] * len(marked), "x", color=SERIES[1], ms=6, transform=from_below)
-    style(axes, title=label, xlabel="pair", legend=len(keys) > 1)
+    style(axes, title=label, xlabel=noun, legend=len(keys) > 1)
     spread_ticks(axes)
     axes.xaxis.get_major_locator().set_params(integer=True)
     means = ", ".join(f"{key} {np.nanmean(factor * groups.mean[key]):.4g}" for key in keys if not _empty(groups, key))
-    return to_svg(figure, f"{label} over the pairs; mean: {means or 'none known'}.")
+    return to_svg(figure, f"{label} over the {noun}s; mean: {means or 'none known'}.")
 
 
 def _empty(groups: Groups, key: str) -> bool:
     return bool(np.isnan(groups.mean[key]).all())
 
 
-def _table(groups: Groups, single: bool) -> str:
-    titles = ["pair", "valid", "u [m/s]", "v [m/s]", "w [m/s]", "uncertainty [voxel]", "peak ratio"]
+def _table(groups: Groups, single: bool, noun: str) -> str:
+    titles = [noun, "valid", "u [m/s]", "v [m/s]", "w [m/s]", "uncertainty [voxel]", "peak ratio"]
     rows = []
     for k in range(len(groups.pairs)):
         first, last = groups.first[k], groups.last[k]
@@ -176,11 +188,9 @@ def _table(groups: Groups, single: bool) -> str:
     return markup.table(titles, rows, caption=caption) + markup.paragraph(f"{caption}.", "quiet")
 
 
-def _worst(pairs: Sequence[PairFigures]) -> str:
+def _worst(pairs: Sequence[PairFigures], noun: str) -> str:
     """Tabulate the pairs with the lowest valid share."""
     lowest = sorted(pairs, key=lambda pair: pair.valid_fraction)[:WORST]
     rows = [[str(pair.number), percent(pair.valid_fraction, 1), pair.verdict] for pair in lowest]
-    caption = f"The {len(rows)} pairs with the lowest valid share"
-    return markup.paragraph(f"{caption}:") + markup.table(
-        ["pair", "valid", "verdict"], rows, caption=caption, words=True
-    )
+    caption = f"The {len(rows)} {noun}s with the lowest valid share"
+    return markup.paragraph(f"{caption}:") + markup.table([noun, "valid", "verdict"], rows, caption=caption, words=True)

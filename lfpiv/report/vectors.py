@@ -23,6 +23,7 @@ from matplotlib.transforms import Affine2D
 from lfpiv.report import markup
 from lfpiv.report.fields import Survey, embed, survey
 from lfpiv.report.markup import number, percent, significant
+from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.report.svg import (
     INK,
     SERIES,
@@ -63,23 +64,26 @@ _DEPTH_TITLES = (
 )
 
 
-def section(vectors: Mapping[int, pathlib.Path], noun: str = "pair") -> str:
+def section(vectors: Mapping[int, pathlib.Path], naming: Naming = PAIRS) -> str:
     """Return the section on the vectors, as HTML, with the data of its views.
 
     Parameters
     ----------
     vectors : dict
         Pair -> file of its vectors.
-    noun : str
-        What results are numbered by: "pair", or "instant" in a time series.
+    naming : Naming
+        Names of results.
     """
     if not vectors:
-        return '<h2 id="vectors">Vectors</h2>' + markup.paragraph(f"No {noun} is finished yet.")
-    found = survey(vectors)
+        return '<h2 id="vectors">Vectors</h2>' + markup.paragraph(f"No {naming.noun} is finished yet.")
+    found = survey(vectors, naming)
     pair, first = next(iter(found.shown.items()))
-    data, thinning = embed(found, {pair: f"{noun} {pair}" for pair in found.shown})
-    parts = ['<h2 id="vectors">Vectors</h2>', markup.paragraph(_overview(found, len(vectors), thinning, first, noun))]
-    name = f"{noun} {pair}"
+    data, thinning = embed(found, naming)
+    parts = [
+        '<h2 id="vectors">Vectors</h2>',
+        markup.paragraph(_overview(found, len(vectors), thinning, first, naming.noun)),
+    ]
+    name = naming.result(pair)
     parts += [_slice_view(name, first), _space_view(name, first), _displacements(name, first), data]
     return "\n".join(parts)
 

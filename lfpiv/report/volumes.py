@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from matplotlib.colors import Normalize
 from lfpiv.report import markup
 from lfpiv.report.light_sheet import ENOUGH, LightSheet, find_sheet
 from lfpiv.report.markup import number, percent
+from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.report.summary import PairFigures
 from lfpiv.report.svg import INK, SERIES, cell_edges, colour_bar, new_panel, spread_ticks, style, to_svg
 from lfpiv.results import netcdf
@@ -22,7 +24,7 @@ BAND = (5, 95)
 """Percentiles that bound the range drawn over many volumes."""
 
 
-def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], noun: str = "pair") -> str:
+def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], naming: Naming = PAIRS) -> str:
     """Return the section on the volumes, as HTML; empty where the first file holds nothing about its volumes.
 
     Parameters
@@ -31,11 +33,11 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], noun: str
         Finished pairs.
     vectors : dict
         Pair -> file of its vectors. The volumes of the first pair are shown.
-    noun : str
-        What results are numbered by: "pair", or "instant" in a time series.
+    naming : Naming
+        Names of results.
     """
     histories = {
-        f"{noun} {item.number}, {frame}": np.asarray(residual, float)
+        naming.volume(item.number, frame): np.asarray(residual, float)
         for item in pairs
         for frame, residual in item.residual.items()
         if residual
@@ -44,10 +46,10 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], noun: str
     first = netcdf.read_reconstruction(vectors[pair])
     if first is None:
         return ""
-    parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(f"{noun} {pair}", first)]
-    parts.append(quality_figure(pair, first, histories, noun))
-    parts.append(_images(pairs))
-    stops = _stops(pairs)
+    parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(pair, first, naming)]
+    parts.append(quality_figure(pair, first, histories, naming))
+    parts.append(_images(pairs, naming))
+    stops = _stops(pairs, naming)
     if stops:
         parts.append(
             markup.table(["volumes", "why the iteration ended"], stops, caption="Why the iterations ended", words=True)
@@ -55,9 +57,9 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], noun: str
     return "\n".join(parts)
 
 
-def _projection_figure(name: str, first: xr.Dataset) -> str:
+def _projection_figure(pair: int, first: xr.Dataset, naming: Naming) -> str:
     """Draw the largest intensity along each axis, with a table of percentiles."""
-    frame = str(first["frame"].values[0])
+    name = naming.volume(pair, str(first["frame"].values[0]))
     names = (("z", "x", "y"), ("y", "x", "z"), ("x", "y", "z"))
     top = float(np.percentile(first["projection_z"].values[0], 99.7)) or 1.0
     shown = [_projection(first, *axes, top) for axes in names]
@@ -77,9 +79,8 @@ def _projection_figure(name: str, first: xr.Dataset) -> str:
     )
     return markup.figure(
         shown,
-        f"Brightest voxel along each axis, {name}, frame {frame}. Particles should be round across the "
-        "cameras' mean line of sight, usually z; along it they are longer, the more so the smaller the angle between "
-        "the cameras.",
+        f"Brightest voxel along each axis, {name}. Particles should be round across the cameras' mean line of "
+        "sight, usually z; along it they are longer, the more so the smaller the angle between the cameras.",
         table,
     )
 
@@ -103,7 +104,7 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
     return to_svg(figure, f"Largest intensity of the volume along {along}, over {across} and {up}.")
 
 
-def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], noun: str = "pair") -> str:
+def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], naming: Naming = PAIRS) -> str:
     """Draw the residuals and the brightness over the depth.
 
     Parameters
@@ -114,8 +115,8 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
         Condensed volumes of that pair, from `netcdf.read_reconstruction`.
     histories : dict
         Volume -> residual per iteration.
-    noun : str
-        As of `section`.
+    naming : Naming
+        Names of results.
 
     Returns
     -------
@@ -131,10 +132,10 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
     if "profile_z" in first:
         profile = first["profile_z"].isel(frame=0).values
         sheet = find_sheet(first["z"].values, profile)
-        panel, table = _brightness(first, sheet)
+        panel, table = _brightness(first, sheet, [naming.frame(pair, str(frame)) for frame in first["frame"].values])
         shown.append(panel)
         tables.append(table)
-        captions.append(f"Mean brightness of the planes along z, {noun} {pair}. {_judgement(profile, sheet)}")
+        captions.append(f"Mean brightness of the planes along z, {naming.result(pair)}. {_judgement(profile, sheet)}")
     else:
         captions.append("The brightness over the depth is not in the file, which an earlier version wrote.")
     return markup.figure(shown, " ".join(captions), "".join(tables)) if shown else markup.paragraph(captions[0])
@@ -197,10 +198,10 @@ def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
     return svg, markup.table(["iteration", *columns], rows, caption="Residual per iteration of SMART")
 
 
-def _brightness(first: xr.Dataset, sheet: LightSheet | None) -> tuple[str, str]:
-    """Draw and tabulate the mean brightness over the depth in both frames, with the light sheet if one was found."""
+def _brightness(first: xr.Dataset, sheet: LightSheet | None, frames: Sequence[str]) -> tuple[str, str]:
+    """Draw and tabulate the mean brightness over the depth in both frames, with the light sheet if there is one."""
     z = first["z"].values
-    profiles = dict(zip(map(str, first["frame"].values), first["profile_z"].values, strict=True))
+    profiles = dict(zip(frames, first["profile_z"].values, strict=True))
     digits = 0 if max(profile.max() for profile in profiles.values()) >= 100 else 2
     figure, (axes,) = new_panel()
     if sheet is not None:
@@ -208,9 +209,7 @@ def _brightness(first: xr.Dataset, sheet: LightSheet | None) -> tuple[str, str]:
         levels = [sheet.inside, sheet.outside]
         axes.hlines(levels, z[0], z[-1], color=INK, linewidth=0.8, linestyle=":")
     for k, (frame, profile) in enumerate(profiles.items()):
-        axes.plot(
-            z, profile, "-" if k % 2 == 0 else "--", color=SERIES[k % len(SERIES)], lw=1.4, label=f"frame {frame}"
-        )
+        axes.plot(z, profile, "-" if k % 2 == 0 else "--", color=SERIES[k % len(SERIES)], lw=1.4, label=frame)
     axes.axhline(0, color=INK, linewidth=0.6)
     axes.set(ylim=(0, 1.3 * axes.get_ylim()[1]))  # room for the legend
     style(axes, title="brightness over the depth", xlabel="z [mm]", ylabel="mean intensity [counts]", legend=True)
@@ -221,7 +220,7 @@ def _brightness(first: xr.Dataset, sheet: LightSheet | None) -> tuple[str, str]:
         [number(depth, 3), *(number(float(profile[k]), digits) for profile in profiles.values())]
         for k, depth in enumerate(z)
     ]
-    titles = ["z [mm]", *(f"frame {frame} [counts]" for frame in profiles)]
+    titles = ["z [mm]", *(f"{frame} [counts]" for frame in profiles)]
     table = markup.table(titles, rows, caption="Brightness over the depth")
     if sheet is not None:
         table = _sheet_table(z, profiles) + table
@@ -237,25 +236,25 @@ def _sheet_table(z: np.ndarray, profiles: Mapping[str, np.ndarray]) -> str:
         if sheet is not None:
             values = [number(sheet.low_mm, 2), number(sheet.high_mm, 2), number(sheet.inside, 2)]
             values += [number(sheet.outside, 2), number(sheet.ratio, 2)]
-        rows.append([f"frame {frame}", *values])
+        rows.append([frame, *values])
     titles = ["light sheet", "from z [mm]", "to z [mm]", "inside [counts]", "outside [counts]", "inside / outside"]
     return markup.table(titles, rows, caption="Brightness inside and outside the light sheet")
 
 
-def _images(pairs: Sequence[PairFigures]) -> str:
+def _images(pairs: Sequence[PairFigures], naming: Naming) -> str:
     """Tabulate medians over the images of each camera: structure, brightness and light beside the volume."""
-    found: dict[str, dict[str, list[float]]] = {}
+    found: dict[str, dict[str, dict[str, float]]] = {}  # of camera, figure and volume
     for pair in pairs:
         for name in netcdf.OF_IMAGES:
-            for cameras in getattr(pair, name).values():
+            for frame, cameras in getattr(pair, name).items():
                 for camera, value in cameras.items():
-                    found.setdefault(camera, {}).setdefault(name, []).append(value)
+                    found.setdefault(camera, {}).setdefault(name, {})[naming.volume(pair.number, frame)] = value
     if not found:
         return ""
     rows = []
     for camera, values in found.items():
         structure, gain, outside = (
-            float(np.median(values[name])) if name in values else None for name in netcdf.OF_IMAGES
+            float(np.median(list(values[name].values()))) if name in values else None for name in netcdf.OF_IMAGES
         )
         rows.append([camera, number(structure, 2), number(gain, 2), percent(outside)])
     text = (
@@ -267,10 +266,7 @@ def _images(pairs: Sequence[PairFigures]) -> str:
     return markup.paragraph(text) + markup.table(titles, rows, caption="Quality of the images of each camera")
 
 
-def _stops(pairs: Sequence[PairFigures]) -> list[list[str]]:
+def _stops(pairs: Sequence[PairFigures], naming: Naming) -> list[list[str]]:
     """Count the volumes by the reason why their iteration ended."""
-    reasons: dict[str, int] = {}
-    for pair in pairs:
-        for stop in pair.stop.values():
-            reasons[stop] = reasons.get(stop, 0) + 1
-    return [[f"{count:,}", reason] for reason, count in sorted(reasons.items(), key=lambda entry: -entry[1])]
+    of_volume = {naming.volume(pair.number, frame): stop for pair in pairs for frame, stop in pair.stop.items()}
+    return [[f"{count:,}", reason] for reason, count in Counter(of_volume.values()).most_common()]

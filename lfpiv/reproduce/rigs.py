@@ -22,7 +22,8 @@ from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.camera import Calibration, load_calibration
 from lfpiv.calibration.cameras import calibrate, thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
-from lfpiv.experiment.experiment import Experiment, open_experiment
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.opening import open_experiment
 from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import random_on_pupil

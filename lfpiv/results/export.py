@@ -46,11 +46,13 @@ _MM_PER_M = 1000.0
 class Format(enum.Enum):
     """Formats of exported vectors. The text describes the files."""
 
-    VTI = "one .vti image per pair and one per stored volume, with .pvd collections over the pairs: ParaView, pyvista"
-    NETCDF = "vectors.nc, one NetCDF4 file over all pairs: xarray, MATLAB"
-    ZARR = "vectors.zarr, one Zarr store over all pairs, to which a later export adds what is new: xarray, dask"
-    CSV = "one table per pair, a row per vector, units in the header"
-    PIVPY = "one NetCDF file per depth, planes of u and v over all pairs: pivpy"
+    VTI = "one .vti image per pair or instant and one per stored volume, with .pvd collections: ParaView, pyvista"
+    NETCDF = "vectors.nc, one NetCDF4 file of all pairs or instants: xarray, MATLAB"
+    ZARR = (
+        "vectors.zarr, one Zarr store of all pairs or instants, to which a later export adds what is new: xarray, dask"
+    )
+    CSV = "one table per pair or instant, a row per vector, units in the header"
+    PIVPY = "one NetCDF file per depth, planes of u and v of all pairs or instants: pivpy"
 
 
 def export_results(

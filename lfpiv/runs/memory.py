@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import LEAST_BYTES_PER_VOXEL, Experiment
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.opening import LEAST_BYTES_PER_VOXEL
 from lfpiv.files import MIB, size_text
 
 if TYPE_CHECKING:

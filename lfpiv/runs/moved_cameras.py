@@ -25,7 +25,7 @@ from lfpiv.warn import Code, Warning, name_pairs, warn
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.experiment.experiment import Experiment
-    from lfpiv.selfcalibration.movements import Movement
+    from lfpiv.selfcalibration.movements import Movement, MovementFit
     from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
@@ -36,8 +36,17 @@ LARGE_VOXEL = 0.25
 TRIED = 3
 """Largest number of pairs that `check` uses. One is enough if it shows clearly whether the disparity is large."""
 
+FRAMES = 2
+"""Instants of a pair."""
+
 LEAST_FOR_NOTHING = 2
 """Least number of pairs without common particles that a warning of it needs."""
+
+LIKE = 0.5
+"""Least share of the movements shown by all pairs together in those that a pair shows alone, of pairs that agree."""
+
+AGREEING = 2
+"""Least number of pairs that agree on cameras that moved, where more than one was used: chance peaks differ by pair."""
 
 CLEAR = 2 * NOISE
 """Structure of images above which cameras that show no common particles are warned of."""
@@ -156,7 +165,8 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
     if len(weights.cameras) < 2 or weights.method != "footprint":
         return None
     darks, volumes, used = read_darks(experiment), CameraVolumes(weights), list[int]()
-    separation, lost, clear = None, list[str](), True
+    fit, lost, lost_in, clear = None, list[str](), list[int](), True
+    limit_mm = LARGE_VOXEL * experiment.grid.voxel_mm
     for pair in islice(experiment.disjoint(chain(pairs, experiment.numbers)), TRIED):
         try:
             light = _moving_light(experiment, weights.cameras, darks, pair)
@@ -168,22 +178,33 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
         used.append(pair)
         found = volumes.disparities()
         if lost := unlinked(found, weights.cameras):
+            lost_in.append(pair)
             clear = clear and all(_shows_particles(images, weights.cameras) for images in light)
             continue
-        separation = fit_movements(found, list(weights.cameras), experiment.grid).separation
-        if separation.differs_from(LARGE_VOXEL * experiment.grid.voxel_mm):
+        fit = fit_movements(found, list(weights.cameras), experiment.grid)
+        if fit.separation.differs_from(limit_mm) and (fit.separation.mm < limit_mm or _agree(volumes, used, fit)):
             break
-    if separation is None or lost:
-        if clear and len(used) >= LEAST_FOR_NOTHING:
-            warning = _nothing_in_common(dict.fromkeys(used, lost), len(weights.cameras))
+    if fit is None or lost:
+        if clear and len(lost_in) >= LEAST_FOR_NOTHING:
+            warning = _nothing_in_common(dict.fromkeys(lost_in, lost), len(weights.cameras))
             warn(log, warning if experiment.series is None else warning.by_instant())
         return None
+    separation = fit.separation
     disparity, std = (length / experiment.grid.voxel_mm for length in (separation.mm, separation.std_mm))
     text = "cameras show the particles of %s %.2f voxel apart (standard error %.2f)"
     log.info(text, name_pairs(used, experiment.noun), disparity, std)
-    if disparity > LARGE_VOXEL and separation.significant:
+    if disparity > LARGE_VOXEL and separation.significant and (len(used) == 1 or _agree(volumes, used, fit)):
         warn(log, _apart(disparity, experiment, weights.cameras))
     return CameraDisparity(voxel=round(disparity, 3), std_voxel=round(std, 3), pair=used[0])
+
+
+def _agree(volumes: CameraVolumes, used: Sequence[int], fit: MovementFit) -> bool:
+    """Return whether several pairs, each alone, show about the movements that all of them show together."""
+    if len(used) < AGREEING:
+        return False
+    alone = [part.disparities() for part in volumes.each(FRAMES)]
+    fits = [fit_movements(found, list(fit.cameras), volumes.weights.grid) for found in alone if found]
+    return sum(fit.share_in(one) > LIKE for one in fits) >= AGREEING
 
 
 def _moving_light(

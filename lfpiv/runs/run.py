@@ -19,7 +19,8 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv import files
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import CHECKED_PAIRS, Experiment, check_pairs, read_experiment
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
@@ -97,12 +98,13 @@ def open_run(
 
 def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> range:
     known = experiment.numbers
-    first, after = (None, None) if pairs is None else pairs
-    first, after = first or known.start, known.stop if after is None else after
+    start, stop = (None, None) if pairs is None else pairs
+    first, after = start or known.start, known.stop if stop is None else stop
     if not known.start <= first < after <= known.stop:
+        numbers = "pairs of the experiment" if experiment.series is None else "instants that have a partner"
         raise InputError(
-            f"pairs: expected A:B with {known.start} <= A < B <= {known.stop}, the pairs of the experiment, "
-            f"found {first}:{after}."
+            f"pairs: expected A:B with {known.start} <= A < B <= {known.stop}, the {numbers}, "
+            f"found {start or 0}:{'' if stop is None else stop}."
         )
     return range(first, after)
 
@@ -223,7 +225,7 @@ class Run:
             for pair, reason in bad.items():
                 self.record(Outcome(pair=pair, reason=reason), tried)
             return tried
-        for reason in list(bad.values())[:NAMED_PAIRS]:
+        for reason in list(dict.fromkeys(bad.values()))[:NAMED_PAIRS]:
             log.error("%s The other %ss will be done.", reason, self.experiment.noun)
         if len(bad) > NAMED_PAIRS:
             names = name_pairs(list(bad), self.experiment.noun)

@@ -9,7 +9,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterator
 
-from lfpiv.experiment.experiment import CHECKED_PAIRS
+from lfpiv.experiment.opening import CHECKED_PAIRS
 from lfpiv.progress import StepProgress
 from lfpiv.warn import NAMED_PAIRS, name_pairs
 

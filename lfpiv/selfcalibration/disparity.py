@@ -9,6 +9,7 @@ particle images of some instants. Output: a `Disparity` per pair of cameras and 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -134,6 +135,16 @@ class CameraVolumes:
             if progress is not None:
                 progress(number / len(self._solvers))
             self._volumes[name].append(_flattened(solver.solve({name: images[name]}).volume))
+
+    def each(self, instants: int) -> list[CameraVolumes]:
+        """Return the volumes of each run of so many instants alone."""
+        count = len(next(iter(self._volumes.values())))
+        parts = []
+        for first in range(0, count, instants):
+            part = copy.copy(self)
+            part._volumes = {name: known[first : first + instants] for name, known in self._volumes.items()}
+            parts.append(part)
+        return parts
 
     def disparities(self) -> tuple[Disparity, ...]:
         """Measure the disparities of all pairs of cameras in the parts of the volume that have a clear peak.

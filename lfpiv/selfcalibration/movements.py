@@ -168,6 +168,11 @@ class MovementFit:
         """Return the part of the movements within a projection."""
         return replace(self, values=projection @ self.values)
 
+    def share_in(self, other: MovementFit) -> float:
+        """Return how much of these movements is in those of another fit: 1 if they are equal, -1 if opposite."""
+        along = self.observed @ self.values
+        return float(along @ other.values / (along @ self.values))
+
     @property
     def explained_mm(self) -> float:
         """Observable distance of the cameras, with the part that errors make [mm]."""

@@ -18,7 +18,7 @@ import xarray as xr
 from imperfections import BAD_VOXEL
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import open_experiment
+from lfpiv.experiment.opening import open_experiment
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.reproduce import page, plots, store

@@ -15,7 +15,7 @@ import xarray as xr
 from imperfect_scenes import PAIRS, VOXEL_MM, Row
 
 from lfpiv import files
-from lfpiv.experiment.experiment import open_experiment
+from lfpiv.experiment.opening import open_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots, rigs, store

@@ -15,7 +15,7 @@ from support.recordings import write_b16, write_cine, write_mraw
 
 from lfpiv import InputError
 from lfpiv.experiment import images
-from lfpiv.experiment.experiment import check_pairs, read_experiment
+from lfpiv.experiment.opening import check_pairs, read_experiment
 from lfpiv.experiment.settings import RawImages
 
 SHAPE = (12, 16)

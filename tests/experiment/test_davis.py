@@ -112,7 +112,7 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
 @pytest.fixture
 def recorded(lvpyio, tiny_experiment, monkeypatch):
     """Experiment of many pairs, each with both exposures of both cameras in one buffer."""
-    monkeypatch.setattr("lfpiv.experiment.experiment.DECODED_PIXELS", 4 * 2 * (48 * 64 + 56 * 40))  # four pairs
+    monkeypatch.setattr("lfpiv.experiment.opening.DECODED_PIXELS", 4 * 2 * (48 * 64 + 56 * 40))  # four pairs
     rng = np.random.default_rng(1)
     shapes = {"left": (48, 64), "right": (56, 40)}
     for pair in range(PAIRS_RECORDED):

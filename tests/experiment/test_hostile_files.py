@@ -15,7 +15,7 @@ from support.mutations import mutated
 
 import lfpiv
 from lfpiv.errors import LONGEST_MESSAGE, InputError, printable
-from lfpiv.experiment.experiment import open_experiment, read_experiment
+from lfpiv.experiment.opening import open_experiment, read_experiment
 from lfpiv.experiment.settings import Box, ExperimentTable, HalfSpace
 from lfpiv.experiment.toml import LARGEST_BYTES
 from lfpiv.simulation.scene import Scene, open_scene

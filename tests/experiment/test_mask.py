@@ -5,8 +5,8 @@ import pytest
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import open_experiment
 from lfpiv.experiment.mask import read_mask
+from lfpiv.experiment.opening import open_experiment
 from lfpiv.geometry.grid import Grid
 
 GRID = Grid.from_extent(centre_mm=(0.0, 0.0, 0.1), size_mm=(0.8, 0.6, 0.4), voxel_mm=0.05)  # of `tiny_experiment`

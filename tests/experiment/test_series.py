@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import open_experiment, read_experiment
+from lfpiv.experiment.opening import open_experiment, read_experiment
 from lfpiv.experiment.settings import Series
 from lfpiv.results.folder import Folder
 

@@ -16,6 +16,7 @@ from scipy import ndimage
 from support import report_run
 
 import lfpiv
+from lfpiv.experiment.settings import Series
 from lfpiv.report import calibration, markup, overview, vectors, volumes
 from lfpiv.report import pairs as pairs_section
 from lfpiv.report.dot_map import dot_map
@@ -143,6 +144,23 @@ def test_failed_pairs_come_first_among_the_warnings_and_long_lists_end(reported,
     assert overview.warnings(figures(reported.summary | {"failed": [], "warnings": []})) == ""
 
 
+def test_a_series_is_reported_by_instant(reported, tmp_path):
+    series = Series(instants=report_run.PAIRS + 2, first=0, step=2)
+    experiment = dataclasses.replace(reported.experiment, series=series, pairs=report_run.PAIRS)
+    text = reported.write(tmp_path / "report.html", experiment=experiment)
+    page = Page(text)
+    shown = re.sub(r"<script.*?</script>|<style.*?</style>|<[^>]*>", " ", text, flags=re.DOTALL)
+    assert not re.findall(r".{30}\b[Pp]airs?\b.{20}|.{30}\bframe [ab]\b", shown)
+    assert "All instants" in page.text["h2"] and "Instant 7 failed" in text
+    assert "instants 0 to 4; vectors of 3 of the 3 that have a partner 2 instants later" in text
+    assert "0.001 s, from each to the one 2 later" in text
+    listed = json.loads(re.search(r'id="field-list">([^<]*)</script>', text)[1])
+    labels = [entry["label"] for entry in listed["fields"]]
+    assert labels[0] == "instant 0" and labels[3] == "mean of 3 instants"
+    # instants 0 to 4: the volume of instant 2 is in two vector fields and counts once
+    assert sum(int(count) for count in re.findall(r">(\d+)</t[hd]><td[^>]*>(?:iteration|misfit)", text)) == 5
+
+
 def test_fields_are_stored_to_a_65000th_of_their_range(text):
     listed = json.loads(re.search(r'id="field-list">([^<]*)</script>', text)[1])
     block = unpacked(text, "field-values")
@@ -222,7 +240,7 @@ def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, mon
 
 def test_large_fields_are_thinned_out():
     large = report_run.field(0, (40, 120, 110))
-    html_text, step = embed(Survey(shown={0: large}, mean=None, fluctuation=None, read=1), {0: "pair 0"})
+    html_text, step = embed(Survey(shown={0: large}, mean=None, fluctuation=None, read=1))
     (entry,) = json.loads(re.search(r'id="field-list">([^<]*)</script>', html_text)[1])["fields"]
     kept = len(entry["x"]) * len(entry["y"]) * len(entry["z"])
     assert len(entry["z"]) == 40 and step == math.ceil(math.sqrt(large["u"].size / MOST_IN_FIELD))

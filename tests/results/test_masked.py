@@ -8,7 +8,7 @@ import xarray as xr
 from support.vector_sets import random_vectors
 
 import lfpiv
-from lfpiv.experiment.experiment import open_experiment
+from lfpiv.experiment.opening import open_experiment
 from lfpiv.report import vectors as report
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import pair_figures

@@ -9,7 +9,7 @@ from support.small_run import DISPLACEMENT_VOXEL, same_vectors
 
 from lfpiv.calibration.camera import load_calibration
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import background, pipeline
 

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import NO_LAYERS
 from lfpiv.reconstruction.beyond import FaceLight
 from lfpiv.results import netcdf, provenance

@@ -13,7 +13,7 @@ from support.small_run import DISPLACEMENT_VOXEL, PAIRS
 
 import lfpiv
 from lfpiv import files
-from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import Folder
 from lfpiv.results.provenance import Marks

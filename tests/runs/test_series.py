@@ -20,7 +20,8 @@ from xarray.testing import assert_equal
 import lfpiv
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment, Frame, read_experiment
+from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import Folder

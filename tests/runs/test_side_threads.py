@@ -8,7 +8,8 @@ import pytest
 from support.small_run import PAIRS, damage, same_vectors
 
 from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import Experiment, Frame, open_experiment
+from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.opening import open_experiment
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.runs import pipeline
 from lfpiv.runs.side_threads import ReadAhead, Writer

@@ -11,7 +11,7 @@ import pytest
 
 import lfpiv
 from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.results.folder import Folder
 from lfpiv.runs import task
 from lfpiv.runs.pair import PairWork

@@ -11,15 +11,16 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
-from distributed import Client, KilledWorker, Security
+from distributed import Client, Security
 from support.ideal_rig import two_cameras
+from support.series_run import Done
 from support.small_run import PAIRS
 from support.stored import rewrite
 
 import lfpiv
 from lfpiv.cli import commands
 from lfpiv.errors import ClusterError, InputError, StorageError
-from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import cluster_workers, dispatch, local_workers, memory, pipeline, worker_plan
@@ -177,27 +178,13 @@ class DeadlyClient:
         self.submitted.append(pair)
         self.deaths[pair] = self.deaths.get(pair, 0) - 1
         status = self.how if self.deaths[pair] >= 0 else "finished"
-        return DeadlyFuture(key, status, self.result or Result(outcomes=(Outcome(pair=pair),)))
+        return Done(key, status, self.result or Result(outcomes=(Outcome(pair=pair),)))
 
     def subscribe_topic(self, topic, handler):
         handler((0.0, ("", 0.5)))
 
     def unsubscribe_topic(self, topic):
         pass
-
-
-class DeadlyFuture:
-    def __init__(self, key, status, result):
-        self.key, self.status, self.found = key, status, result
-
-    def result(self, timeout):
-        return self.found
-
-    def exception(self):
-        return KilledWorker(self.key, None, 0)
-
-    def add_done_callback(self, call):
-        call(self)
 
 
 def outcomes(client, todo, width=2):

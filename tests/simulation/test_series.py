@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from support.simulated_cameras import MONTE_CARLO, ROUNDING, SMALL_SCENE, small_scene
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import open_experiment
+from lfpiv.experiment.opening import open_experiment
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.series import place_series, runge_kutta
 from lfpiv.simulation.simulator import place_particles, simulate

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from support.simulated_cameras import MONTE_CARLO, ROUNDING, SMALL_SCENE
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import open_experiment
+from lfpiv.experiment.opening import open_experiment
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.simulator import render_camera, simulate
 from lfpiv_kernels.rendering import render

@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 from distributed import KilledWorker
 
-from lfpiv.experiment.experiment import read_experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.experiment.settings import Series
 from lfpiv.results.folder import Folder
 from lfpiv.runs import dispatch, guard

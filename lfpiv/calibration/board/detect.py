@@ -281,13 +281,21 @@ def _shift_to_edges(
     extents = find_extents(found, in_view, board.dots)
     if extents is None:
         return 0, 0
-    require_stated(extents, found)
+    require_stated(extents, found, lenses_apart(pose, board, decoder.optics))
     for extent, axis in zip(extents, ("x", "y"), strict=True):
         if extent.open and extent.count != extent.stated:
             figures = {"axis": axis, "count": extent.count, "stated": extent.stated}
             figures |= {"half_spacing_mm": board.spacing_mm / 2}
             warn(log, Warning(code=Code.BOARD_EDGE_UNSEEN, figures=figures))
     return extents[0].shift, extents[1].shift
+
+
+def lenses_apart(pose: CameraPose, board: DotBoard, optics: Optics) -> float:
+    """Return the distance of neighbouring dots along the direction the camera sees most foreshortened [microlens]."""
+    middle = np.array([0.0, 0.0, float(np.median(board.planes_mm))])
+    chief, _ = pose.rays(middle + board.spacing_mm * np.eye(3)[[0, 1]])
+    steps = chief - pose.rays(middle[None])[0]
+    return float(np.linalg.svd(steps, compute_uv=False)[-1]) / optics.microlens_pitch_mm
 
 
 def _name(dots: PlaneDots, plane: int, shift: tuple[int, int], board: DotBoard) -> tuple[np.ndarray, np.ndarray]:

@@ -22,6 +22,8 @@ FEWEST_SITES = 3
 OCCUPIED, EMPTY = 0.5, 0.2
 """Share of sites with a dot, relative to the typical column: a column above the first is on the board, one below the
 second is not."""
+LENSES_APART = 2.0
+"""Least distance of dots, as the camera sees them, at which each is told from its neighbours [microlens]."""
 
 
 @dataclass(frozen=True)
@@ -98,13 +100,22 @@ def find_extents(found: np.ndarray, in_view: np.ndarray, dots: tuple[int, int]) 
     return None if columns is None or rows is None else (columns, rows)
 
 
-def require_stated(extents: tuple[Extent, Extent], found: np.ndarray) -> None:
+def require_stated(extents: tuple[Extent, Extent], found: np.ndarray, apart: float = np.inf) -> None:
     """Refuse a board that is certainly larger or smaller than stated.
+
+    Parameters
+    ----------
+    extents : (Extent, Extent)
+        From `find_extents`.
+    found : ndarray of bool, shape (plane, rows + 2 MARGIN, columns + 2 MARGIN)
+        As of `find_extents`.
+    apart : float
+        Least distance of neighbouring dots as the camera sees them [microlens].
 
     Raises
     ------
     InputError
-        Names the columns and rows that each plane shows, and what to set.
+        Names the columns and rows that each plane shows, and what to set; of dots too near each other, their distance.
     """
     if all(extent.fits for extent in extents):
         return
@@ -115,6 +126,12 @@ def require_stated(extents: tuple[Extent, Extent], found: np.ndarray) -> None:
         for extent, name in zip(extents, ("columns", "rows"), strict=True)
         if not extent.fits
     )
+    if apart < LENSES_APART:
+        raise InputError(
+            f"board.spacing_mm: expected dots at least {LENSES_APART:g} microlenses apart as the camera sees them, "
+            f"found {apart:.1f}: it sees the board at so flat an angle, or with so coarse lenses, that a dot is not "
+            f"told from the next, and {seen} seem to be there ({_per_plane(found)}). Use a board with a larger spacing."
+        )
     raise InputError(
         f"board.dots: expected the {stated} dots stated (columns x rows), found {seen}, and no dots beyond them where "
         f"the camera would see some ({_per_plane(found)}). Set dots = [{columns}, {rows}], or uncover the board's "

@@ -269,7 +269,7 @@ class SliceView {
       return `${label} ${significant(field.values(name)[index])} ${unit.slice(0, -1)}`;
     });
     if (field.isMasked(index)) return `(x, y, z) = (${where}) mm: masked, too little fluid.`;
-    const replaced = field.isVector ? "replaced after validation" : "valid in too few pairs";
+    const replaced = field.isVector ? "replaced after validation" : "valid in too few fields";
     return `(x, y, z) = (${where}) mm: ${values.join(", ")}; ${field.valid[index] ? "valid" : replaced}.`;
   }
 

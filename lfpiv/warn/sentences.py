@@ -1,0 +1,216 @@
+"""Codes of the warnings, and their sentences for people."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+
+
+class Code(enum.Enum):
+    """Kind of a warning; the value is stored in files and never changes."""
+
+    # images of a pair
+    MISPLACED = "misplaced"
+    SATURATED = "saturated"
+    UNEVEN = "uneven"
+    STANDING = "standing"
+    DIM = "dim"
+    EMPTY = "empty"
+    # white image and microlens array
+    APERTURE = "aperture"
+    WHITE_SATURATED = "white_saturated"
+    LENSES_UNLIT = "lenses_unlit"
+    LENSES_DISTORTED = "lenses_distorted"
+    LENSES_IRREGULAR = "lenses_irregular"
+    # board and mapping
+    BOARD_SATURATED = "board_saturated"
+    BOARD_MISPLACED = "board_misplaced"
+    BOARD_RENAMED = "board_renamed"
+    BOARD_EDGE_UNSEEN = "board_edge_unseen"
+    DOT_WIDTH = "dot_width"
+    DOTS_MISSING = "dots_missing"
+    PLANE_EMPTY = "plane_empty"
+    PLANE_LEFT_OUT = "plane_left_out"
+    PLANE_OFF = "plane_off"
+    TURNED = "turned"
+    MAGNIFIED = "magnified"
+    FEW_LABELS = "few_labels"
+    MAPPING_ERROR = "mapping_error"
+    # cameras and volume
+    OUTSIDE_CALIBRATION = "outside_calibration"
+    OUTSIDE_SIGHT = "outside_sight"
+    SEEN_BY_ONE = "seen_by_one"
+    ONE_CAMERA = "one_camera"
+    LIGHT_GUARDED = "light_guarded"
+    LIGHT_UNGUARDED = "light_unguarded"
+    APART = "apart"
+    NOTHING_IN_COMMON = "nothing_in_common"
+    NOT_SELF_CALIBRATED = "not_self_calibrated"
+    # weights
+    WEIGHTS_UNCHECKED = "weights_unchecked"
+    WEIGHTS_DIFFER = "weights_differ"
+    COUNT_SLOW = "count_slow"
+    # volumes and vectors
+    DIVERGED = "diverged"
+    UNEXPLAINED = "unexplained"
+    MOTION_LOST = "motion_lost"
+    FEW_VALID = "few_valid"
+    UNSEEDED = "unseeded"
+    # the run
+    FEWER_WORKERS = "fewer_workers"
+    ONE_GPU = "one_gpu"
+    NO_LOCKS = "no_locks"
+    OTHER = "other"
+    """A code that this version does not know, or a sentence stored by version 0.1.0."""
+
+
+_MISPLACED = (
+    "light falls between the microimages of the white image. Is it of the same camera, focus, zoom and aperture, and "
+    "are f_number and microlens_focal_length_mm right?"
+)
+
+SENTENCES: Mapping[Code, str] = {
+    Code.MISPLACED: _MISPLACED,
+    Code.SATURATED: (
+        "{share:percent} % of the bright pixels are saturated; clipped particles make ghosts, lower the laser's "
+        "power or the camera's gain"
+    ),
+    Code.UNEVEN: (
+        "{parts:.0f} of 9 parts of the sensor are {ratio:g} times or more as bright in one frame as in the other; "
+        "check the laser's pulses and the shutter"
+    ),
+    Code.STANDING: "light stands still at {place}; it is {share:percent} % of an image's light: {remedy}",
+    Code.DIM: (
+        "particles hardly rise above the noise (light of near pixels correlates by {structure:.2f}; clear images "
+        "give 0.2 or more): displacements are biased towards zero. More light, more particles or larger windows help"
+    ),
+    Code.EMPTY: (
+        "no particles, only noise in the image (light of near pixels correlates by {structure:.3f}; clear images "
+        "give 0.2 or more): check laser, trigger and file. If fewer than two cameras saw particles, no vector of the "
+        "pair is valid; otherwise do not rely on its vectors"
+    ),
+    Code.APERTURE: (
+        "the microimages are {seen_px:.1f} px wide, not {stated_px:.1f} px as f_number = {f_number:g} and "
+        "microlens_focal_length_mm = {microlens_focal_length_mm:g} imply; f_number = {fitting:.3g} would fit. Check "
+        "both, and the aperture of all images."
+    ),
+    Code.WHITE_SATURATED: (
+        "{share:percent} % of the white image's bright pixels are saturated, so their response is not known; expose "
+        "it to two thirds of the range."
+    ),
+    Code.LENSES_UNLIT: "lens array: only {lit} of {count} microimages are lit; the others are extrapolated.",
+    Code.LENSES_DISTORTED: (
+        "lens array: the microimages leave their lattice by a smooth distortion of {rms_px:.3f} px rms, "
+        "{largest_px:.3f} px at most; centres follow the lattice."
+    ),
+    Code.LENSES_IRREGULAR: "microimages lie {rms_px:.2f} px (rms) off a regular lattice; check the white image.",
+    Code.BOARD_SATURATED: (
+        "{share:percent} % of the bright pixels of {path} are saturated and left out, so the dots are measured less "
+        "accurately; expose the board to two thirds of the range."
+    ),
+    Code.BOARD_MISPLACED: "{path}: " + _MISPLACED,
+    Code.BOARD_RENAMED: "the board's dots were renamed by {columns} columns and {rows} rows to match its outline",
+    Code.BOARD_EDGE_UNSEEN: (
+        "no edge of the board is in view along {axis} ({count} dots, {stated} stated): their numbers are right only "
+        "if the camera's axis meets the board within half a spacing ({half_spacing_mm:g} mm) of its middle"
+    ),
+    Code.DOT_WIDTH: "the board's dots look {seen_mm:.3g} mm wide, not {stated_mm:.3g} mm",
+    Code.DOTS_MISSING: (
+        "only {found} of {expected} board dots in the field were found; check focus, exposure and the planes listed "
+        "in the report.{hint}"
+    ),
+    Code.PLANE_EMPTY: (
+        "no dot was found in plane {plane} of the board (z = {z_mm:g} mm), {path}: look at the image; the "
+        "calibration does not use it."
+    ),
+    Code.PLANE_LEFT_OUT: (
+        "{left_out} of {seen} dots of plane {plane} of the board (z = {z_mm:g} mm) do not fit the others and are "
+        "left out: check that place in board.planes_mm, and {path}."
+    ),
+    Code.PLANE_OFF: (
+        "plane {plane} of the board stands at z = {fitted_mm:.3f} mm, not at {z_mm:g} mm, shifted by {x_mm:.3f} and "
+        "{y_mm:.3f} mm along x and y and tilted by {tilt_deg:.2f} degrees, as its dots show; the calibration corrects "
+        "it. Check that place in board.planes_mm, and the stage."
+    ),
+    Code.TURNED: (
+        "the board's dots show the camera turned by {turn_deg:.0f} degrees from where it is stated to be, {nominal}. "
+        "Are its pictures turned by 90 degrees? Then x and y are exchanged; otherwise check its nominal orientation."
+    ),
+    Code.MAGNIFIED: (
+        "the board's dots are magnified {magnification:.3f} times, not {stated:g} times as stated. Check "
+        "magnification, and board.spacing_mm and board.planes_mm: all lengths and velocities depend on those two."
+    ),
+    Code.FEW_LABELS: (
+        "{dots} dots give the network {values} values for its {parameters} parameters, so it can be wrong between "
+        "the dots; use more dots or planes, or fewer nodes (network.hidden)."
+    ),
+    Code.MAPPING_ERROR: (
+        "the mapping is {sigma_nor:.3f} pitch off on held-out dots (sigma_nor), {usual:g} and less is usual; use "
+        "more dots or planes, and check the board's images."
+    ),
+    Code.OUTSIDE_CALIBRATION: (
+        "{share:percent} % of the volume lies outside the calibrated region ({region} mm), by up to "
+        "{distance_mm:.2f} mm: {advice}."
+    ),
+    Code.OUTSIDE_SIGHT: "sees only about {share:percent} % of the volume",
+    Code.SEEN_BY_ONE: (
+        "about {share:percent} % of the volume is seen by fewer than two cameras; vectors there are not valid: {where}"
+    ),
+    Code.ONE_CAMERA: (
+        "one camera hardly resolves depth: do not rely on velocities along its line of sight (w, displacement_z for a "
+        "camera on the z axis), nor on their validation"
+    ),
+    Code.LIGHT_GUARDED: (
+        "particles are lit beyond the face {face} of the volume, up to {reach_mm:.2g} mm ({share:percent} % of the "
+        "volume's light): guard layers of {guard_mm:.2g} mm are reconstructed there and cut away"
+    ),
+    Code.LIGHT_UNGUARDED: (
+        "particles are lit beyond the face {face} of the volume, {reach_mm:.2g} mm or more ({share:percent} % of the "
+        "volume's light), farther than the guard layers of {guard_mm:.2g} mm: their light falls into the volume and "
+        "biases vectors near its faces; {reason}"
+    ),
+    Code.APART: (
+        "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: a camera moved since the board was "
+        "recorded; {advice}."
+    ),
+    Code.NOTHING_IN_COMMON: (
+        "{names} show no particles in common within {search} voxels: a camera moved by more, their images are of "
+        "different instants, or show very few particles."
+    ),
+    Code.NOT_SELF_CALIBRATED: (
+        "self-calibration keeps the calibration of the board: {verdict}. Check the particle images, use more pairs "
+        "(self_calibration.pairs), or record the board again if a camera moved."
+    ),
+    Code.WEIGHTS_UNCHECKED: (
+        "sees none of the voxels drawn at random to check its weights against counted rays: they are unchecked. "
+        "Check the volume's place and size against what the camera sees"
+    ),
+    Code.WEIGHTS_DIFFER: (
+        "weights as {form} differ from counted rays by {mean:percent1} % (worst voxel {worst:percent1} %), the aim "
+        "is {aim_mean:percent} % ({aim_worst:percent1} %). Cause: {cause} (rays depart from second order by "
+        "{bent_pitch:.2f}, a voxel's edge is {wide_pitch:.1f} microlens pitch)"
+    ),
+    Code.COUNT_SLOW: "counting rays for {voxels} voxels; 'footprint' is about a thousand times faster",
+    Code.DIVERGED: "SMART: {verdict}",
+    Code.UNEXPLAINED: (
+        "the volumes explain little of the images' light (residual {residual:.2f}; 0.3 to 0.6 is usual): do not rely "
+        "on their vectors before the report shows why"
+    ),
+    Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
+    Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
+    Code.UNSEEDED: (
+        "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
+        "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"
+    ),
+    Code.FEWER_WORKERS: (
+        "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "
+        "{weights_gib:.1f} GiB of weights"
+    ),
+    Code.ONE_GPU: (
+        "one of {gpus} GPUs is used: several processes need the package `distributed`. Install it: pip install "
+        "'lfpiv[distributed]'"
+    ),
+    Code.NO_LOCKS: "this file system has no file locks: do not start a second run on this folder",
+    Code.OTHER: "{text}",
+}
+"""Sentence of each code, with its figures in braces. Shares have the format `percent` or `percent1`."""
