@@ -17,7 +17,6 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CHECKED_PAIRS, Experiment, check_pairs, read_experiment
 from lfpiv.files import writing
@@ -289,9 +288,7 @@ class Run:
             with writing(self.folder.report):
                 write_report(self.experiment, calibrated.calibration, result, vectors, self.folder.report)
             result |= self._usage(done, result["timings_s"] | {"report": time.perf_counter() - start})
-        with writing(self.folder.summary):
-            files.write_json(result, self.folder.summary)
-        return result
+        return summary.write(result, self.folder.summary)
 
     def _contents(self) -> Contents:
         """Read the figures of all finished pairs of the experiment, from the attributes of their files."""
