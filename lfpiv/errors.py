@@ -47,11 +47,12 @@ class InputError(ValueError):
     """Bad input; the message names the file or key, what was expected, what was found and what to do.
 
     The command line prints it without a traceback and exits with status 2. The message is one line of at most
-    `LONGEST_MESSAGE` characters: control characters are escaped, and the middle of a longer text is left out.
+    `LONGEST_MESSAGE` characters: line breaks become blanks, control characters are escaped, and the middle of a longer
+    text is left out.
     """
 
     def __init__(self, message: str = "") -> None:
-        text = printable(message)
+        text = printable(" ".join(message.splitlines()))
         if len(text) > LONGEST_MESSAGE:
             text = f"{text[:_HEAD]} ... {text[_HEAD + 5 - LONGEST_MESSAGE :]}"
         super().__init__(text)

@@ -151,6 +151,8 @@ def _converted(path: str | Path) -> Iterator[None]:
     except (FileNotFoundError, InputError):
         raise
     except Exception as error:
+        if "file signature not found" in str(error):
+            raise DamagedFile(path, "it is no HDF5 file") from None
         raise DamagedFile(path, f"{type(error).__name__}: {error}") from None
 
 

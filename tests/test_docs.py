@@ -45,7 +45,7 @@ MODULES = {
 }
 """Source of each module by its dotted name."""
 
-ENDINGS = ("py", "md", "h", "toml", "h5", "json", "html", "nc", "pvd")
+ENDINGS = ("py", "md", "h", "toml", "h5", "json", "html", "nc", "pvd", "jsonl", "zarr", "cih")
 """Endings of file names, which look like attributes of modules."""
 
 LONG = ("demo", "reproduce", "simulate")
@@ -133,8 +133,8 @@ def test_named_commands_and_options_exist(name):
         assert {word for word in rest if word.startswith("--")} <= options, spoken
 
 
-ALTERNATIVES = {"nominal_direction"}
-"""Keys that stand in place of another one, so that no file has both."""
+ALTERNATIVES = {"nominal_direction", "instants", "first", "step"}
+"""Keys that stand in place of another one, so that no file has both; the page shows them elsewhere."""
 
 
 def uncommented(text):
@@ -167,6 +167,8 @@ def test_the_annotated_experiment_shows_every_key_and_its_default():
             if isinstance(part, tuple):  # one table of each kind, or the first of those that hold the table sought
                 part = next(one for one in part if depth < len(path) or isinstance(one, model))
         assert part.model_fields_set | ALTERNATIVES >= set(type(part).model_fields), path
+        elsewhere = set(type(part).model_fields) & ALTERNATIVES
+        assert all(re.search(rf"\b{key} = ", PAGES["docs/experiment.md"].read_text("utf-8")) for key in elsewhere), path
         for key, field in model.model_fields.items():
             if not field.is_required() and field.default not in (None, ()) and not isinstance(field.default, BaseModel):
                 assert getattr(part, key) == field.default, (path, key)

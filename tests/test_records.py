@@ -1,5 +1,6 @@
 """Stored records of any other form are refused by name, or made again: never an unexpected error."""
 
+import dataclasses
 import fcntl
 import json
 import os
@@ -371,7 +372,7 @@ def change_dataset(name, change):
     ("change", "words"),
     [
         (change_dataset("camera/left/network/weight_0", lambda values: values * np.nan), "network.weight_0"),
-        (change_dataset("camera/left/network/output_scale", lambda values: 0 * values), "a scale is 0"),
+        (change_dataset("camera/left/network/input_scale", lambda values: 0 * values), "scale of an input is 0"),
         (change_dataset("camera/left/baseline/thin_lens_rotation", lambda values: 2 * values), "no rotation"),
         (change_dataset("camera/left/decoder/gain", lambda values: values + np.inf), "decoder.gain"),
         (change_dataset("camera/left/region_mm", lambda values: values[::-1]), "two corners"),
@@ -385,6 +386,18 @@ def test_numbers_that_no_calibration_has_are_refused_by_name(tmp_path, calibrati
     rewrite(path, change, sealed=True)
     with pytest.raises(InputError, match=rf"calibration\.h5.*{words}"):
         lfpiv.load_calibration(path)
+
+
+def test_a_network_that_corrects_nothing_is_whole(tmp_path):
+    """Training shrinks a correction that explains nothing of the test dots to 0."""
+    calibration = small_calibration()
+    cameras = {
+        name: dataclasses.replace(camera, network=camera.network.with_scaled_output(0.0))
+        for name, camera in calibration.cameras.items()
+    }
+    dataclasses.replace(calibration, cameras=cameras).save(tmp_path / "calibration.h5")
+    points = np.zeros((3, 3)), np.zeros((3, 2))
+    assert not np.any(lfpiv.load_calibration(tmp_path / "calibration.h5").cameras["left"].network(np.hstack(points)))
 
 
 def test_a_background_of_other_cameras_or_other_light_is_refused(tmp_path):

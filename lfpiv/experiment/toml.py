@@ -92,16 +92,18 @@ def _read_bytes(path: Path) -> bytes:
     except (OSError, ValueError) as error:  # ValueError: a path with NUL or characters that cannot be encoded
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: the file cannot be read ({reason}). Check path and permissions.") from None
-    with os.fdopen(file, "rb") as opened:
+    try:
         about = os.fstat(file)
         if stat.S_ISDIR(about.st_mode):
             raise InputError(f"{path}: expected a TOML file, found a folder. Name the .toml file in it.")
         if not stat.S_ISREG(about.st_mode):
             raise InputError(f"{path}: expected a TOML file, found a pipe, a socket or a device. Name a regular file.")
-        try:
+        with open(file, "rb", closefd=False) as opened:
             content = opened.read(LARGEST_BYTES + 1)
-        except OSError as error:
-            raise InputError(f"{path}: the file cannot be read ({error.strerror}). Check its permissions.") from None
+    except OSError as error:
+        raise InputError(f"{path}: the file cannot be read ({error.strerror}). Check its permissions.") from None
+    finally:
+        os.close(file)
     if len(content) > LARGEST_BYTES:
         size = max(about.st_size, len(content)) / 1024
         raise InputError(

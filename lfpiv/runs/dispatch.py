@@ -41,7 +41,7 @@ TICK_S = 0.5
 def sequential(work: PairWork, todo: Iterable[int], progress: StepProgress) -> Generator[Outcome, None, None]:
     """Do pairs one after the other in this process; yield the outcome of each.
 
-    Pairs are taken from `todo` when their turn comes; those of a series come along its chains. `operator.length_hint`
+    Pairs are taken from `todo` when their turn comes; those of a series come along its chains. `length_hint`
     says how many may come.
     """
     source = iter(todo)

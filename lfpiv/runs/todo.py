@@ -22,7 +22,7 @@ MOST_NAMED = 10_000
 class Todo:
     """Iterator over the selected pairs whose results are missing or do not fit.
 
-    `operator.length_hint` of it is the number of pairs that may yet come.
+    `length_hint` of it is the number of pairs that may yet come.
 
     Parameters
     ----------

@@ -68,8 +68,11 @@ SPOILERS = {
         "microlens_pitch_mm",
     ),
     "zero size": (lambda e: edit(e, "size_mm = [0.8,", "size_mm = [0.0,"), "volume.size_mm[0]"),
-    "too little memory": (lambda e: edit(e, "voxel_mm = 0.05", "voxel_mm = 1e-5"), "GiB"),
-    "more than any memory": (lambda e: edit(e, "size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e6, 1e6, 1e6]"), "GiB"),
+    "too little memory": (lambda e: edit(e, "voxel_mm = 0.05", "voxel_mm = 1e-3"), "GiB"),
+    "more than any memory": (
+        lambda e: edit(e, "size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e6, 1e6, 1e6]"),
+        "at most 1e+11 voxels",
+    ),
     "no such pair": (lambda e: None, "pairs"),
     "a million dots": (lambda e: edit(e, "dots = [5, 5]", "dots = [1000000, 1000000]"), "board.dots"),
     "volume out of view": (lambda e: edit(e, "centre_mm = [0.0,", "centre_mm = [50.0,"), "volume.centre_mm"),
