@@ -25,8 +25,8 @@ WHOLE_BYTES = 4 << 30
 OUTLINE, CONTENT = "outline_digest", "content_digest"
 """Attributes of a Zarr store: digest of names, sizes, metadata and axes, and digest of all bytes."""
 
-_METADATA = ".zmetadata"
-_OWN = (_METADATA, ".zattrs")  # hold the digests
+_METADATA, _ATTRIBUTES = ".zmetadata", ".zattrs"
+_OWN = (_METADATA, _ATTRIBUTES)  # hold the digests
 _FIELD_CHUNK_DOTS = 3  # a chunk of a variable over pair, z, y, x is named as 0.0.0.0
 
 
@@ -63,6 +63,20 @@ def zarr_metadata(path: Path) -> dict[str, Any]:
         reason = "it has no consolidated metadata" if isinstance(error, FileNotFoundError) else str(error)
         raise DamagedFile(path, reason) from None
     return found
+
+
+def zarr_attributes(path: Path) -> dict[str, Any]:
+    """Read the attributes of a Zarr store as it states them beside the consolidated metadata.
+
+    Raises
+    ------
+    DamagedFile
+        If they are missing or have another form.
+    """
+    try:
+        return read_object(read_text(path / _ATTRIBUTES))
+    except (FileNotFoundError, RecordError) as error:
+        raise DamagedFile(path, f"{_ATTRIBUTES}: {error}") from None
 
 
 def zarr_digests(path: Path, *, whole: bool = True) -> dict[str, str]:
@@ -105,6 +119,8 @@ def verify_zarr(path: Path) -> None:
         If its files are not those that were written, as far as they are read.
     """
     stated = zarr_metadata(path)["metadata"][".zattrs"]
+    if zarr_attributes(path) != stated:  # readers take the attributes from either
+        raise DamagedFile(path, "its attributes are not those of its consolidated metadata")
     whole = sum(size for _, size in _files(path)) <= WHOLE_BYTES
     if any(stated.get(name) != found for name, found in zarr_digests(path, whole=whole).items()):
         raise DamagedFile(path, "its files are not those that were written: the digest differs")

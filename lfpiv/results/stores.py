@@ -6,7 +6,6 @@ read few chunks. They are written in blocks of one chunk along the pairs, each v
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import importlib.util
 import json
@@ -25,7 +24,6 @@ from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import replacing
 from lfpiv.progress import StepProgress
-from lfpiv.records import RecordError, read_object, read_text
 from lfpiv.results import netcdf, store_seal
 from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
 
@@ -107,7 +105,8 @@ def _verified(path: Path) -> xr.Dataset:
         store_seal.verify_netcdf(path)
         results = xr.open_dataset(path, engine="h5netcdf", chunks=chunks)
     results = results.drop_vars(CHANGED, errors="ignore")
-    return results.assign_coords({name: values.compute() for name, values in results.coords.items()})
+    held: xr.Dataset = results.assign_coords({name: values.compute() for name, values in results.coords.items()})
+    return held
 
 
 def _require_form(attributes: Mapping[str, Any], path: Path) -> None:
@@ -298,9 +297,10 @@ def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray) -
 
 
 def _plain_attributes(path: Path) -> dict[str, Any]:
-    with contextlib.suppress(OSError, RecordError):
-        return read_object(read_text(path / ".zattrs"))
-    return {}
+    try:
+        return store_seal.zarr_attributes(path)
+    except DamagedFile:
+        return {}
 
 
 def _create(

@@ -216,10 +216,10 @@ def change_values(path):
     stored[...] = 2 * stored[...]
 
 
-def change_interval(path):
+def change_interval(path, names=(".zmetadata", ".zattrs")):
     """Change a setting everywhere that it is stored."""
     if path.is_dir():
-        for name in (".zmetadata", ".zattrs"):
+        for name in names:
             text = (path / name).read_text()
             stated = f'"dt_s": {DT_S}'
             assert stated in text
@@ -229,6 +229,11 @@ def change_interval(path):
 
         with h5py.File(path, "r+") as file:
             file.attrs["dt_s"] = 7.0
+
+
+def change_copy(path):
+    """Zarr states attributes twice."""
+    change_interval(path, (".zattrs",))
 
 
 def remove_chunk(path):
@@ -246,7 +251,7 @@ def put_pipe(path):
 
 
 @pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("forge", [change_values, change_interval, remove_chunk, put_pipe])
+@pytest.mark.parametrize("forge", [change_values, change_interval, change_copy, remove_chunk, put_pipe])
 def test_a_forged_store_is_refused_and_written_anew(tmp_path, form, forge, whole, monkeypatch):
     """Also where a store is too large to read all of it: sizes, metadata and axes tell."""
     write_run(tmp_path, NUMBERS)
