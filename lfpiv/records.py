@@ -56,6 +56,8 @@ def open_regular(path: str | Path) -> FileIO:
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
+        if os.path.islink(path):
+            raise RecordError("it is a link to a file that does not exist") from None
         raise
     except OSError as error:
         raise RecordError((error.strerror or str(error)).lower()) from None

@@ -244,7 +244,7 @@ def test_what_no_result_holds_is_refused_before_it_is_read(tmp_path, change, wor
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
-@pytest.mark.parametrize("place", ["pipe", "folder", "device", "empty", "text"])
+@pytest.mark.parametrize("place", ["pipe", "folder", "device", "dead link", "empty", "text"])
 def test_what_is_no_file_is_refused_at_once(tmp_path, kind, place):
     path, read = tmp_path / "pair_0000.nc", KINDS[kind][1]
     if place == "pipe":
@@ -253,6 +253,8 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, kind, place):
         path.mkdir()
     elif place == "device":
         path.symlink_to("/dev/zero")
+    elif place == "dead link":
+        path.symlink_to("nothing")
     else:
         path.write_bytes(b"" if place == "empty" else b"no HDF5" * 100)
     start = time.monotonic()

@@ -191,6 +191,17 @@ def test_an_earlier_summary_of_any_form_is_used_or_left_out(tmp_path, changed):
     assert all(isinstance(reason, str) for reason in found.failed.values())
 
 
+def test_a_changed_summary_is_left_out_by_name(tmp_path, caplog):
+    """A digit of a figure, which no form shows; a summary of an earlier version states no digest."""
+    path = tmp_path / "summary.json"
+    summary.write(SUMMARY, path)
+    whole = path.read_text()
+    assert summary.read(path).weights_s == 2.0 and not caplog.messages
+    path.write_text(whole.replace("100.0", "900.0"))
+    assert summary.read(path) == summary.EarlierSummary()
+    assert "summary.json" in caplog.text and "digest differs" in caplog.text
+
+
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=list(HOSTILE))
 def test_hostile_summaries_and_guards_are_left_out_by_name(tmp_path, text, caplog):
     folder = Folder(tmp_path)

@@ -43,7 +43,8 @@ def volume_marks(path: Path, grid: Grid | None = None, frame: str | None = None)
         refuse(path, DamagedFile(path, f"it is the volume of frame {marks.frame!r}, not of {frame!r}"))
         return None
     try:
-        netcdf.read_volume(path, grid=grid)
+        if not netcdf.read_volume(path, grid=grid).values.any():
+            raise DamagedFile(path, "all its intensities are 0")
     except InputError as error:
         refuse(path, error)
         return None

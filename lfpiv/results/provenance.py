@@ -196,7 +196,7 @@ def _note_unsealed(folder: Path) -> None:
     """Log once for a folder that its files have no digest."""
     if folder not in _noted:
         _noted.add(folder)
-        log.info("%s: files of an earlier version have no digest; damage to them can be seen only in part", folder)
+        log.warning("%s: files of an earlier version have no digest; damage to them can be seen only in part", folder)
 
 
 def background_content(path: Path) -> str | None:

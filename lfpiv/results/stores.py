@@ -6,7 +6,6 @@ read few chunks. They are written in blocks of one chunk along the pairs, each v
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import importlib.util
 import json
@@ -21,10 +20,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfpiv.errors import InputError
+from lfpiv import hdf5
+from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import replacing
 from lfpiv.progress import StepProgress
-from lfpiv.results import netcdf
+from lfpiv.results import netcdf, store_seal
 from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
 
 log = logging.getLogger(__name__)
@@ -68,32 +68,50 @@ def open_store(path: Path, pairs: tuple[int, int | None] | None = None) -> xr.Da
     InputError
         If it is no such store, it is damaged or not complete, or it has none of the pairs.
     """
-    chunks: dict[str, int] | None = None if importlib.util.find_spec("dask") is None else {}
     try:
-        if path.is_dir():
-            _require_zarr()
-            results = xr.open_zarr(path, consolidated=True, chunks=chunks)
-        else:
-            results = xr.open_dataset(path, engine="h5netcdf", chunks=chunks)
-    except (OSError, ValueError, KeyError) as error:
-        text = " ".join(str(error).split())
+        results = _verified(path)
+    except Exception as error:  # readers of damaged stores raise whatever they meet
+        if isinstance(error, InputError) and not isinstance(error, DamagedFile):
+            raise
+        text = " ".join((error.reason if isinstance(error, DamagedFile) else str(error)).split())[:300]
         raise InputError(f"{path}: expected a store of `lfpiv export`, found {text}. Export again.") from None
-    form, dimension = results.attrs.pop(FORM, None), INSTANT if INSTANT in results.dims else PAIR
-    if form != LAYOUT or dimension not in results.dims:
-        raise InputError(f"{path}: expected a store of `lfpiv export --to zarr` or netcdf, found another file.")
-    if not results.attrs.pop(COMPLETE, 1):
-        raise InputError(
-            f"{path}: expected a complete store, found that of an export that was interrupted or goes on. The same "
-            "`lfpiv export` goes on from there."
-        )
-    results.attrs.pop(SIGNATURE, None)
-    results = results.drop_vars(CHANGED, errors="ignore")
-    results = results.assign_coords({name: values.compute() for name, values in results.coords.items()})
+    dimension = INSTANT if INSTANT in results.dims else PAIR
+    for name in (FORM, COMPLETE, SIGNATURE, hdf5.SEALED, store_seal.OUTLINE, store_seal.CONTENT):
+        results.attrs.pop(name, None)
     if isinstance(edges := results.attrs.get("voxel_mm"), list):
         results.attrs["voxel_mm"] = np.asarray(edges)
     names = [*netcdf.VECTOR_UNITS, *(str(name) for name in results.data_vars if name not in netcdf.VECTOR_UNITS)]
     results = results[names]
     return results if pairs is None else _chosen(results, dimension, pairs, path)
+
+
+def _verified(path: Path) -> xr.Dataset:
+    """Verify a store and open it, with its coordinates in memory."""
+    chunks: dict[str, int] | None = None if importlib.util.find_spec("dask") is None else {}
+    if path.is_dir():
+        _require_zarr()
+        stated = store_seal.zarr_metadata(path)["metadata"][".zattrs"]
+        _require_form(stated, path)
+        if not stated.get(COMPLETE, 1):
+            raise InputError(
+                f"{path}: expected a complete store, found that of an export that was interrupted or goes on. The same "
+                "`lfpiv export` goes on from there."
+            )
+        store_seal.verify_zarr(path)
+        results = xr.open_zarr(path, consolidated=True, chunks=chunks)
+    else:
+        with hdf5.glanced(path) as file:
+            _require_form(file.attrs, path)
+        store_seal.verify_netcdf(path)
+        results = xr.open_dataset(path, engine="h5netcdf", chunks=chunks)
+    results = results.drop_vars(CHANGED, errors="ignore")
+    held: xr.Dataset = results.assign_coords({name: values.compute() for name, values in results.coords.items()})
+    return held
+
+
+def _require_form(attributes: Mapping[str, Any], path: Path) -> None:
+    if np.ravel(attributes.get(FORM, 0)).tolist() != [LAYOUT]:
+        raise InputError(f"{path}: expected a store of `lfpiv export --to zarr` or netcdf, found another file.")
 
 
 def _chosen(results: xr.Dataset, dimension: str, pairs: tuple[int, int | None], path: Path) -> xr.Dataset:
@@ -141,6 +159,7 @@ def write_netcdf(
                     if files.dimension in variable.dims:
                         target = file.variables[str(name)]
                         target[first:after] = variable.values.astype(target.dtype)
+        hdf5.seal(scratch)
     progress(1.0)
 
 
@@ -188,7 +207,15 @@ def write_zarr(
             _create(block, path, own, files.dimension, (pairs, *tile))
         _resize(zarr, path, files.dimension, after, complete=0, block=block, first=first)
     _resize(zarr, path, files.dimension, len(files), complete=1)
+    _seal(zarr, path)
     progress(1.0)
+
+
+def _seal(zarr: Any, path: Path) -> None:
+    """State the digests of a complete Zarr store in its metadata."""
+    choice = {"use_consolidated": False} if _is_plural(zarr) else {}
+    zarr.open_group(str(path), mode="r+", **choice).attrs.update(store_seal.zarr_digests(path))
+    zarr.consolidate_metadata(str(path))
 
 
 def _layout(files: StackedFiles) -> tuple[int, tuple[int, ...]]:
@@ -239,10 +266,9 @@ def _require_zarr() -> None:
 def _attributes_of(path: Path) -> dict[str, Any]:
     """Return the attributes of a Zarr store as its consolidated metadata state them; empty without."""
     try:
-        found = json.loads((path / ".zmetadata").read_text("utf-8"))["metadata"][".zattrs"]
-    except (OSError, ValueError, KeyError, TypeError):
+        return dict(store_seal.zarr_metadata(path)["metadata"][".zattrs"])
+    except DamagedFile:
         return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray) -> int | None:
@@ -255,6 +281,12 @@ def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray) -
     if own.get(FORM) != LAYOUT or own.get(SIGNATURE) != identity:
         return None
     try:
+        if own.get(COMPLETE):
+            store_seal.verify_zarr(path)
+    except DamagedFile as error:
+        log.warning("%s: damaged, written anew: %s", path, error.reason)
+        return None
+    try:
         with xr.open_zarr(path, consolidated=True, chunks=None) as stored:
             numbers, times = stored[files.dimension].values, stored[CHANGED].values
     except (OSError, ValueError, KeyError):
@@ -265,9 +297,10 @@ def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray) -
 
 
 def _plain_attributes(path: Path) -> dict[str, Any]:
-    with contextlib.suppress(OSError, ValueError):
-        return dict(json.loads((path / ".zattrs").read_text("utf-8")))
-    return {}
+    try:
+        return store_seal.zarr_attributes(path)
+    except DamagedFile:
+        return {}
 
 
 def _create(

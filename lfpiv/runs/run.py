@@ -17,7 +17,6 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
@@ -291,9 +290,7 @@ class Run:
             with writing(self.folder.report):
                 write_report(self.experiment, calibrated.calibration, result, vectors, self.folder.report)
             result |= self._usage(done, result["timings_s"] | {"report": time.perf_counter() - start})
-        with writing(self.folder.summary):
-            files.write_json(result, self.folder.summary)
-        return result
+        return summary.write(result, self.folder.summary)
 
     def _contents(self) -> Contents:
         """Read the figures of all finished pairs of the experiment, from the attributes of their files."""

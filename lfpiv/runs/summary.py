@@ -19,9 +19,10 @@ import numpy as np
 from lfpiv import files, version
 from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.files import writing
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
-from lfpiv.records import RecordError, read_object, read_text, validate
+from lfpiv.records import RecordError, digest, read_object, read_text, validate
 from lfpiv.results.folder import Folder
 from lfpiv.runs import guard
 from lfpiv.runs.guard import Guard
@@ -115,6 +116,8 @@ def read(path: Path) -> EarlierSummary:
     """Read an earlier summary; an empty one if the file is missing, damaged or of another schema."""
     try:
         found = read_object(read_text(path))
+        if "digest" in found and found["digest"] != digest(found):  # files of earlier versions state none
+            raise RecordError("its entries are not those that were written: the digest differs")
         if found.get("schema_version") != SCHEMA_VERSION:
             raise RecordError(
                 f"expected schema version {SCHEMA_VERSION}, found {str(found.get('schema_version'))[:40]}"
@@ -135,6 +138,14 @@ def read(path: Path) -> EarlierSummary:
     )
 
 
+def write(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Write ``summary.json`` with a digest of its entries; return its content."""
+    written = {**content, "digest": digest(files.plain(content))}
+    with writing(path):
+        files.write_json(written, path)
+    return written
+
+
 def build(
     experiment: Experiment,
     device: Device,
@@ -144,7 +155,7 @@ def build(
     earlier: EarlierSummary,
     folder: Folder,
 ) -> dict[str, Any]:
-    """Build the content of ``summary.json`` without ``timings_s.total`` and ``peak_memory_mib``, which the run adds.
+    """Build the content of ``summary.json`` without ``timings_s.total``, ``peak_memory_mib`` and the digest.
 
     ``timings_s`` is the time that the results took, also those of earlier invocations. ``warnings`` are
     sentences for people. ``warning_records`` are the same warnings, in the same order, with code and figures. Of more

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import tracemalloc
 
 import numpy as np
@@ -11,7 +12,7 @@ from support.vector_sets import DT_S, random_vectors, write_run
 
 import lfpiv
 from lfpiv import statistics
-from lfpiv.results import netcdf, stacked_files, stores
+from lfpiv.results import netcdf, stacked_files, store_seal, stores
 from lfpiv.velocity import statistics as streaming
 
 NUMBERS = (0, 1, 3, 4, 7, 8, 9)
@@ -181,7 +182,7 @@ def test_nothing_else_is_taken_for_a_store_or_removed(tmp_path):
         lfpiv.open_results(tmp_path / "empty.zarr")
 
 
-def test_a_damaged_chunk_is_not_read_in_silence(tmp_path, form):
+def test_a_damaged_chunk_is_not_read_in_silence(tmp_path, form, monkeypatch):
     write_run(tmp_path, NUMBERS)
     (path,) = lfpiv.export_results(tmp_path, form)
     chunk = path if form == "netcdf" else max((path / "u").glob("[0-9]*"))
@@ -195,8 +196,74 @@ def test_a_damaged_chunk_is_not_read_in_silence(tmp_path, form):
     else:
         content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
+    with pytest.raises(lfpiv.InputError, match=f"{path.name}.*digest differs"):
+        lfpiv.open_results(path)
+    monkeypatch.setattr(store_seal, "WHOLE_BYTES", 0)  # of a store too large to be read, chunks tell it when read
     with pytest.raises((OSError, RuntimeError, ValueError)):
         lfpiv.open_results(path).u.load()
+
+
+def change_values(path):
+    if path.is_dir():
+        import zarr
+
+        stored = zarr.open_group(str(path), mode="r+")["u"]
+    else:
+        import h5py
+
+        file = h5py.File(path, "r+")
+        stored = file["u"]
+    stored[...] = 2 * stored[...]
+
+
+def change_interval(path, names=(".zmetadata", ".zattrs")):
+    """Change a setting everywhere that it is stored."""
+    if path.is_dir():
+        for name in names:
+            text = (path / name).read_text()
+            stated = f'"dt_s": {DT_S}'
+            assert stated in text
+            (path / name).write_text(text.replace(stated, '"dt_s": 7.0'))
+    else:
+        import h5py
+
+        with h5py.File(path, "r+") as file:
+            file.attrs["dt_s"] = 7.0
+
+
+def change_copy(path):
+    """Zarr states attributes twice."""
+    change_interval(path, (".zattrs",))
+
+
+def remove_chunk(path):
+    """Zarr reads a missing chunk as fill values; a NetCDF file is cut off."""
+    if path.is_dir():
+        next((path / "u").glob("[0-9]*")).unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-1000])
+
+
+def put_pipe(path):
+    chunk = next((path / "u").glob("[0-9]*")) if path.is_dir() else path
+    chunk.unlink()
+    os.mkfifo(chunk)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("forge", [change_values, change_interval, change_copy, remove_chunk, put_pipe])
+def test_a_forged_store_is_refused_and_written_anew(tmp_path, form, forge, whole, monkeypatch):
+    """Also where a store is too large to read all of it: sizes, metadata and axes tell."""
+    write_run(tmp_path, NUMBERS)
+    (path,) = lfpiv.export_results(tmp_path, form)
+    wanted = lfpiv.open_results(path).load()
+    if not whole:
+        monkeypatch.setattr(store_seal, "WHOLE_BYTES", 0)
+    forge(path)
+    with pytest.raises(lfpiv.InputError, match=path.name):
+        lfpiv.open_results(path)
+    lfpiv.export_results(tmp_path, form)
+    xr.testing.assert_identical(lfpiv.open_results(path).load(), wanted)
 
 
 def test_pairs_and_a_series_in_one_folder_are_refused(tmp_path):

@@ -115,11 +115,13 @@ def test_volumes_of_other_pairs_and_frames_are_not_correlated(small_run, out, ca
     change("intensity", lambda values: 0 * values)(volumes / "pair_0002_b.nc")
     for name in ("a", "b"):  # an earlier version states pair and frame alone
         unseal(volumes / f"pair_0003_{name}.nc", version=3)
+    unseal(volumes / "pair_0001_b.nc", version=3)
+    change("intensity", lambda values: 0 * values)(volumes / "pair_0001_b.nc")
     shutil.copy2(volumes / "pair_0003_b.nc", volumes / "pair_0003_a.nc")
     with pytest.raises(lfpiv.InputError, match="expected the two volumes"):
         pipeline.correlate(small_run.experiment, out)
     assert rejected(caplog) == [
-        f"pair_000{pair}_{frame}.nc" for pair, frame in ((0, "a"), (1, "a"), (2, "b"), (3, "a"))
+        f"pair_000{pair}_{frame}.nc" for pair, frame in ((0, "a"), (1, "a"), (1, "b"), (2, "b"), (3, "a"))
     ]
 
 
