@@ -165,7 +165,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
     if len(weights.cameras) < 2 or weights.method != "footprint":
         return None
     darks, volumes, used = read_darks(experiment), CameraVolumes(weights), list[int]()
-    fit, lost, lost_in, clear = None, list[str](), list[int](), True
+    fit, lost, losses, clear = None, list[str](), 0, True
     limit_mm = LARGE_VOXEL * experiment.grid.voxel_mm
     for pair in islice(experiment.disjoint(chain(pairs, experiment.numbers)), TRIED):
         try:
@@ -178,15 +178,15 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
         used.append(pair)
         found = volumes.disparities()
         if lost := unlinked(found, weights.cameras):
-            lost_in.append(pair)
+            losses += 1
             clear = clear and all(_shows_particles(images, weights.cameras) for images in light)
             continue
         fit = fit_movements(found, list(weights.cameras), experiment.grid)
         if fit.separation.differs_from(limit_mm) and (fit.separation.mm < limit_mm or _agree(volumes, used, fit)):
             break
     if fit is None or lost:
-        if clear and len(lost_in) >= LEAST_FOR_NOTHING:
-            warning = _nothing_in_common(dict.fromkeys(lost_in, lost), len(weights.cameras))
+        if clear and losses >= LEAST_FOR_NOTHING:
+            warning = _nothing_in_common(dict.fromkeys(used, lost), len(weights.cameras))
             warn(log, warning if experiment.series is None else warning.by_instant())
         return None
     separation = fit.separation
