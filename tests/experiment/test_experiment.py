@@ -6,9 +6,8 @@ import tifffile
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import images
-from lfpiv.experiment.experiment import ExperimentTable
 from lfpiv.experiment.opening import open_experiment
-from lfpiv.experiment.settings import Compute, Correlation, Network, Smart
+from lfpiv.experiment.settings import Compute, Correlation, ExperimentTable, Network, Smart
 from lfpiv.geometry.orientation import Orientation
 
 
