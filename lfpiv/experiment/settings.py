@@ -154,6 +154,26 @@ class SelfCalibration(Table):
     cameras that moved."""
 
 
+SHARE_SIMULATED = 10
+"""Number of pairs of a run for each one that is simulated."""
+MOST_SIMULATED = 12
+"""Largest number of pairs that "auto" simulates."""
+
+
+class Bootstrap(Table):
+    """Table ``[bootstrap]``: damping of the flow's fluctuations by ghosts, measured in simulated pairs."""
+
+    pairs: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] | Literal["auto"] = "auto"
+    """Number of pairs that are simulated, each at the cost of a recorded one, after a pilot; "auto" takes one for ten
+    recorded pairs, at most 12 and none below five, 0 measures nothing."""
+
+    def count(self, pairs: int) -> int:
+        """Return the number of simulated pairs for a number of recorded ones."""
+        if isinstance(self.pairs, int):
+            return self.pairs
+        return min((pairs + SHARE_SIMULATED // 2) // SHARE_SIMULATED, MOST_SIMULATED)
+
+
 class NominalCamera(Table):
     """Nominal keys of ``[[camera]]``, in experiments and in scenes of the simulator."""
 
@@ -454,4 +474,5 @@ class ExperimentTable(Table):
     correlation: Correlation = Correlation()
     network: Network = Network()
     self_calibration: SelfCalibration = SelfCalibration()
+    bootstrap: Bootstrap = Bootstrap()
     compute: Compute = Compute()

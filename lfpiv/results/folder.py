@@ -67,6 +67,11 @@ class Folder:
         return self.path / "guard.json"
 
     @property
+    def bootstrap(self) -> Path:
+        """Damping by ghosts, measured in simulated pairs."""
+        return self.path / "bootstrap.json"
+
+    @property
     def summary(self) -> Path:
         """Figures of the run as JSON."""
         return self.path / "summary.json"

@@ -360,6 +360,27 @@ def of_pair(
     return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
 
 
+def of_bootstrap(
+    experiment: Experiment,
+    calibration: str,
+    pairs: Sequence[int],
+    *,
+    background: str | None = None,
+    guard: Layers = NO_LAYERS,
+) -> Stamp:
+    """Return the stamp of the damping that was measured with the flow of some pairs; arguments as of `of_pair`.
+
+    It has all parts of the stamp of vectors, so that readers can compare the two.
+    """
+    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    parts = _of_light(experiment, calibration, background, guard)
+    parts |= {"images": _identity(paths, experiment.path.parent)}
+    parts |= {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    if experiment.series is not None:
+        parts["step"] = experiment.series.step
+    return Stamp(parts | {"bootstrap": experiment.simulated_pairs})
+
+
 def _of_light(experiment: Experiment, calibration: str, background: str | None, guard: Layers) -> dict[str, Any]:
     """Return the parts of the stamp of volumes; the identity of the images is None and to be filled in."""
     compute = experiment.compute

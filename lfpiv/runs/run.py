@@ -27,7 +27,7 @@ from lfpiv.results import finished, provenance
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
-from lfpiv.runs import guard, memory, pair_figures, summary
+from lfpiv.runs import bootstrap, guard, memory, pair_figures, summary
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
@@ -311,6 +311,7 @@ class Run:
             background=light,
             background_warnings=warnings,
             guard=self.guard,
+            damping=bootstrap.stored(self),
         )
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:

@@ -1,0 +1,119 @@
+"""Damping by ghosts of a run: measured once in simulated pairs, after recorded ones are finished.
+
+The outcome is one file for all pairs (`lfpiv.results.stored_damping`). It depends on finished vectors, their images and
+fixed seeds only, so that it is the same for any number of workers.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from threadpoolctl import threadpool_limits
+
+from lfpiv.errors import InputError
+from lfpiv.files import writing
+from lfpiv.geometry.grid import AXES
+from lfpiv.progress import StepProgress
+from lfpiv.reconstruction.bootstrap import measure_damping
+from lfpiv.results import netcdf, provenance, stored_damping
+from lfpiv.results.provenance import Stamp
+from lfpiv.results.stored_damping import StoredDamping
+from lfpiv.runs.frame_light import FrameLight
+from lfpiv.runs.pair import PairWork
+from lfpiv.velocity.damping import Damping
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from lfpiv.runs.run import Run
+
+log = logging.getLogger(__name__)
+
+IMITATED = 4
+"""Largest number of recorded pairs whose images show how many particles there are."""
+
+
+def stored(run: Run) -> StoredDamping | None:
+    """Return the stored damping if it fits the run; None if it is off, missing, or of other settings or images."""
+    if not run.experiment.simulated_pairs or (found := stored_damping.read(run.folder.bootstrap)) is None:
+        return None
+    known, marks = found
+    return known if _stamp(run, known.pairs).fits(marks) else None
+
+
+def decide(run: Run, make_work: Callable[[], PairWork], progress: StepProgress) -> StoredDamping | None:
+    """Return the stored damping, or measure and store it; None if it is off or cannot be measured.
+
+    `make_work` returns the work on pairs with its weights; it is called only if pairs must be simulated.
+    """
+    if not run.experiment.simulated_pairs:
+        with writing(run.folder.bootstrap):
+            run.folder.bootstrap.unlink(missing_ok=True)
+        return None
+    if (known := stored(run)) is not None:
+        log.info("damping by ghosts: measured before, kept")
+        return known
+    pairs = _usable(run)
+    if not pairs:
+        return None
+    start = time.perf_counter()
+    try:
+        with threadpool_limits(1):  # sums of BLAS depend on its number of threads
+            damping = _measure(run, make_work(), pairs, progress)
+    except (InputError, ValueError) as error:
+        log.warning("damping by ghosts: not measured: %s", error)
+        return None
+    found = StoredDamping(damping=damping, pairs=tuple(pairs), seconds=time.perf_counter() - start)
+    stored_damping.write(found, _stamp(run, pairs), run.folder.bootstrap)
+    for axis in AXES[::-1]:
+        log.info("%s", sentence(damping, axis))
+    return found
+
+
+def sentence(damping: Damping, axis: str) -> str:
+    """Return the damping along an axis as a sentence."""
+    found = damping.axes[axis]
+    used = "taken off" if found.applied else "not significant" if found.fluctuation else "no fluctuations"
+    return (
+        f"damping by ghosts along {axis}: slope of measured on true fluctuations {found.slope:.3f} +- "
+        f"{found.slope_error:.3f}, offset {found.offset:+.3f} +- {found.offset_error:.3f} voxel; {used}"
+    )
+
+
+def _stamp(run: Run, pairs: tuple[int, ...] | list[int]) -> Stamp:
+    return provenance.of_bootstrap(
+        run.experiment, run.calibration_stamp.hash, pairs, background=run.background, guard=run.guard_layers
+    )
+
+
+def _usable(run: Run) -> list[int]:
+    """Return finished pairs, evenly spread over the experiment: as many as are simulated, or all if these are fewer."""
+    finished = [pair for pair in run.numbers if run.files(pair).fitting_vectors() is not None]
+    if not finished:
+        return []
+    count = min(run.experiment.simulated_pairs, len(finished))
+    return [finished[(2 * number + 1) * len(finished) // (2 * count)] for number in range(count)]
+
+
+def _measure(run: Run, work: PairWork, pairs: list[int], progress: StepProgress) -> Damping:
+    """Measure the damping with the vectors and the images of some finished pairs."""
+    assert work.weights is not None
+    vectors: list[xr.Dataset] = [netcdf.read_vectors(run.folder.vectors(pair)) for pair in pairs]
+    frames: list[FrameLight] = []
+    for pair in pairs[:IMITATED]:
+        frames += [work.light_again(frame) for frame in run.experiment.pair_frames(pair)]
+    noise = {name: sum(frame.noise[name] for frame in frames) / len(frames) for name in frames[0].noise}
+    first = work.solver.smart.solve(frames[0].images, floor=frames[0].noise)
+    return measure_damping(
+        work.weights,
+        vectors,
+        [frame.images for frame in frames],
+        work.measure,
+        pairs=run.experiment.simulated_pairs,
+        noise=noise,
+        volume=first.volume,
+        progress=progress,
+    )
