@@ -4,9 +4,9 @@ A parametric bootstrap: random particles as many, as large and as bright as the 
 field, imaged through the calibrated mappings with noise, and measured with the same settings. What the measurement
 leaves of the imposed displacement is the damping (`lfpiv.velocity.damping`).
 
-A measured field is no true flow: it has errors, mostly of short wavelength, and its fluctuations are damped already. A
-pilot pair moved by the measured field shows the power spectrum of the errors. All other pairs are moved by the field
-that a Wiener filter with this spectrum leaves, its fluctuations divided by the slope that is known so far.
+A measured field is no true flow: it has errors, mostly of short wavelength, and its fluctuations are damped already. So
+the simulated flow is the measured one with other amplitudes: those with which simulated vectors have the power of the
+recorded ones at each wave number (`shell_gains`). A pilot pair, moved by the measured field, makes the start.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy import fft, ndimage
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
-from lfpiv.velocity.damping import SLOPES, Damping, Simulated, estimate_damping
+from lfpiv.velocity.damping import Damping, Simulated, estimate_damping
 from lfpiv.velocity.imposed_field import ImposedField
 from lfpiv.velocity.validation import fill
 from lfpiv.weights.operator import Weights
@@ -34,9 +34,10 @@ Measure = Callable[[Sequence[Images], Sequence[Mapping[str, float]]], xr.Dataset
 
 SEED = 20_260
 """Seed of all draws. Those of each pair also depend on its number alone."""
-POWER = float(__import__("os").environ.get("LF_POWER", "1"))
-SPECTRUM_MODES = 1.0
-"""Standard deviation of the Gaussian that smooths power spectra [mode]."""
+SHELL_WIDTH = 0.1
+"""Width of the shells of wave numbers in which powers are compared [1 / distance of windows]."""
+SHELL_SLOPES = (0.5, 1.2)
+"""Limits of the slope of a shell. Few modes do not know it well."""
 LIGHT_VOXEL = 6.0
 """Standard deviation of the Gaussian that smooths a volume to the light of its particles [voxel]: several particles are
 within its reach."""
@@ -149,16 +150,13 @@ class _Bootstrap:
     def run(self, pairs: int, progress: StepProgress) -> Damping:
         """Simulate the pilot and the pairs; return the damping of the pairs."""
         progress(0.0)
-        pilot = self._simulate(0, self._fields[0])
-        known, noise = estimate_damping([pilot]), _error_power(pilot)
-        simulated: list[Simulated] = []
+        simulated = [self._simulate(0, self._fields[0])]
         for number in range(1, pairs + 1):
             progress(number / (pairs + 1))
-            flow = likely_flow(self._fields[(number - 1) % len(self._fields)], noise, known)
-            simulated.append(self._simulate(number, flow))
-            known = estimate_damping(simulated)
+            measured = self._fields[(number - 1) % len(self._fields)]
+            simulated.append(self._simulate(number, likely_flow(measured, shell_gains(self._fields, simulated))))
         progress(1.0)
-        return known
+        return estimate_damping(simulated[1:])
 
     def _simulate(self, number: int, displacement: np.ndarray) -> Simulated:
         """Simulate and measure one pair whose window means are to be a displacement (z, y, x, 3) [voxel]."""
@@ -169,49 +167,72 @@ class _Bootstrap:
         return Simulated(vectors=found, imposed=flow.window_means)
 
 
-def likely_flow(measured: np.ndarray, noise: np.ndarray, damping: Damping) -> np.ndarray:
-    """Return the flow that a measured one probably is: without most of its errors, and not damped.
+def shell_gains(measured: Sequence[np.ndarray], simulated: Sequence[Simulated]) -> np.ndarray:
+    """Return the factors of a measured field's modes with which simulated vectors have the power of measured ones.
+
+    Simulated pairs show the slope S of a shell of modes and the power N of its errors. A flow of power P is measured
+    with the power S^2 P + N. So measured vectors of power Q come from a flow of power (Q - N) / S^2.
+
+    Parameters
+    ----------
+    measured : sequence of ndarrays, shape (z, y, x, 3)
+        Measured displacements along (z, y, x) [voxel].
+    simulated : sequence of Simulated
+
+    Returns
+    -------
+    ndarray, shape (shell, 3)
+        ``sqrt(max(Q - N, 0) / Q) / S`` of each shell and component.
+    """
+    shells = _shells(measured[0].shape[:3])
+    recorded = np.mean([_shell_sums(_modes(field), _modes(field), shells) for field in measured], axis=0)
+    pairs = [(_modes(one.imposed), _modes(_displacement(one.vectors))) for one in simulated]
+    imposed = np.mean([_shell_sums(exact, exact, shells) for exact, _ in pairs], axis=0)
+    products = np.mean([_shell_sums(exact, found, shells) for exact, found in pairs], axis=0)
+    found = np.mean([_shell_sums(found, found, shells) for _, found in pairs], axis=0)
+    tiny = np.finfo(float).tiny
+    slope = np.clip(products / np.maximum(imposed, tiny), *SHELL_SLOPES)
+    errors = np.maximum(found - 2 * slope * products + slope**2 * imposed, 0)
+    gains: np.ndarray = np.sqrt(np.maximum(recorded - errors, 0) / np.maximum(recorded, tiny)) / slope
+    return gains
+
+
+def likely_flow(measured: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Return a flow whose measured vectors have the power of measured ones.
 
     Parameters
     ----------
     measured : ndarray, shape (z, y, x, 3)
         Displacement along (z, y, x) [voxel].
-    noise : ndarray, shape (z, y, x, 3)
-        Power of its errors in each mode of the discrete cosine transform [voxel^2].
-    damping : Damping
-        What is known of the damping.
+    gains : ndarray, shape (shell, 3)
+        From `shell_gains`.
 
     Returns
     -------
     ndarray, shape (z, y, x, 3)
-        With P the power of a mode, that of its neighbours included, the mode's share max(1 - noise / P, 0) over the
-        slope.
     """
-    flow = np.empty_like(measured)
-    for number, axis in enumerate(AXES):
-        mean = measured[..., number].mean()
-        modes = fft.dctn(measured[..., number] - mean, norm="ortho")
-        power = _smooth(np.square(modes))
-        share = np.clip(1 - noise[..., number] / np.maximum(power, np.finfo(float).tiny), 0, 1)
-        slope = np.clip(damping.axes[axis].slope, *SLOPES)
-        flow[..., number] = mean + fft.idctn(share**POWER * modes, norm="ortho") / slope
+    modes = gains[_shells(measured.shape[:3])] * _modes(measured)
+    flow: np.ndarray = measured.mean((0, 1, 2)) + fft.idctn(modes, axes=(0, 1, 2), norm="ortho")
     return flow
 
 
-def _error_power(pair: Simulated) -> np.ndarray:
-    """Return the smoothed power of what a simulated pair's regression leaves, in each mode [voxel^2]."""
-    found, power = _displacement(pair.vectors), np.empty(pair.imposed.shape)
-    damping = estimate_damping([pair])
-    for number, axis in enumerate(AXES):
-        away = pair.imposed[..., number] - pair.imposed[..., number].mean()
-        rest = found[..., number] - found[..., number].mean() - damping.axes[axis].slope * away
-        power[..., number] = _smooth(np.square(fft.dctn(rest, norm="ortho")))
-    return power
+def _modes(field: np.ndarray) -> np.ndarray:
+    """Return the discrete cosine transform of the fluctuations of a field (z, y, x, 3)."""
+    modes: np.ndarray = fft.dctn(field - field.mean((0, 1, 2)), axes=(0, 1, 2), norm="ortho")
+    return modes
 
 
-def _smooth(power: np.ndarray) -> np.ndarray:
-    smooth: np.ndarray = ndimage.gaussian_filter(power, SPECTRUM_MODES, mode="nearest")
-    return smooth
+def _shells(shape: tuple[int, ...]) -> np.ndarray:
+    """Return the number of the shell of each mode, by its wave number."""
+    waves = np.meshgrid(*(np.arange(count) / (2 * count) for count in shape), indexing="ij")
+    shells: np.ndarray = (np.sqrt(sum(wave**2 for wave in waves)) / SHELL_WIDTH).astype(int)
+    return shells
+
+
+def _shell_sums(first: np.ndarray, second: np.ndarray, shells: np.ndarray) -> np.ndarray:
+    """Return the sums of products of modes over each shell, shape (shell, 3)."""
+    products = first * second
+    return np.stack([np.bincount(shells.ravel(), products[..., k].ravel()) for k in range(3)], axis=1)
 
 
 def _displacement(vectors: xr.Dataset) -> np.ndarray:

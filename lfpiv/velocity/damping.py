@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.records import RecordError, validate
+from lfpiv.velocity.coverage import LEAST_SEEDED
 from lfpiv.velocity.systematic import DAMPING
 
 SIGNIFICANT = 2.0
@@ -37,6 +38,8 @@ LEAST_WINDOWS = 8
 """Least number of valid windows of all simulated pairs."""
 WHOLE_FLUID = 0.99
 """Least share of fluid of a window that enters the regression."""
+UNKNOWN = 1e6
+"""Standard error of what cannot be known."""
 COVERED = 0.95
 """Share of the errors that two standard deviations should cover."""
 
@@ -205,9 +208,14 @@ class Simulated:
 
     @property
     def used(self) -> np.ndarray:
-        """True where a vector is valid and all of its window is fluid, shape (z, y, x)."""
-        valid: np.ndarray = self.vectors["valid"].values
-        return valid & (self.vectors["fluid_share"].values >= WHOLE_FLUID)
+        """True where all of a window is fluid that can be measured, shape (z, y, x).
+
+        Vectors that validation replaced count: the correction of all vectors is one.
+        """
+        whole: np.ndarray = self.vectors["fluid_share"].values >= WHOLE_FLUID
+        seeded: np.ndarray = self.vectors["seeded_share"].values >= LEAST_SEEDED
+        used: np.ndarray = whole & seeded & np.isfinite(self.vectors["displacement_x"].values)
+        return used
 
 
 def without_ghosts(stated: np.ndarray, distance: np.ndarray) -> np.ndarray:
@@ -227,52 +235,59 @@ def estimate_damping(pairs: Sequence[Simulated]) -> Damping:
     ValueError
         If fewer than `LEAST_WINDOWS` windows of all pairs are valid.
     """
-    if sum(int(pair.used.sum()) for pair in pairs) < LEAST_WINDOWS:
+    if sum(int((pair.used & pair.vectors["valid"].values).sum()) for pair in pairs) < LEAST_WINDOWS:
         raise ValueError("simulated pairs: hardly any vector is valid, so that the damping cannot be measured.")
     return Damping(axes={axis: _of_axis(pairs, axis) for axis in AXES[::-1]}, simulated=len(pairs))
 
 
 def _of_axis(pairs: Sequence[Simulated], axis: str) -> AxisDamping:
     """Regress measured on imposed displacements of one axis."""
-    number = AXES.index(axis)
-    parts, errors = [], []
-    for pair in (pair for pair in pairs if pair.used.any()):
-        used = pair.used
-        found, exact = pair.vectors[f"displacement_{axis}"].values.astype(float), pair.imposed[..., number]
-        away = exact - exact[used].mean()
-        moved = found - found[used].mean()
-        parts += [
-            (len(away[some]), (away[some] ** 2).sum(), (away[some] * moved[some]).sum(), (found - exact)[some].sum())
-            for octant in _octants(used.shape)
-            if (some := used & octant).any()
-        ]
-    sums = np.array(parts)
-    slope, offset = _line(sums.sum(0))
-    without_one = np.array([_line(sums.sum(0) - one) for one in sums]) if len(sums) > 1 else np.full((1, 2), np.nan)
-    spread = np.sqrt((len(sums) - 1) * without_one.var(axis=0)) if len(sums) > 1 else np.full(2, np.inf)
-    for pair in (pair for pair in pairs if pair.used.any()):
-        errors.append(_scaled_errors(pair, axis, slope, offset))
-    factor = float(np.quantile(np.concatenate(errors), COVERED)) / 2
-    fluctuation = float(np.sqrt(sums[:, 1].sum() / sums[:, 0].sum()))
+    pairs = [pair for pair in pairs if pair.used.any()]
+    parts = [part for pair in pairs for part in _parts(pair, axis)]
+    sums = np.array([((away**2).sum(), (away * moved).sum()) for away, moved, _ in parts])
+    slope, slope_error = _jackknife(sums, empty=1.0)
+    rests = [(len(away), (error - (slope - 1) * away).sum()) for away, _, error in parts]
+    offset, offset_error = _jackknife(np.array(rests, float), empty=0.0)
+    errors = np.concatenate([_scaled_errors(pair, axis, slope, offset) for pair in pairs])
+    fluctuation = np.sqrt(sums[:, 0].sum() / sum(len(away) for away, _, _ in parts))
     return AxisDamping(
         slope=slope,
-        slope_error=_finite(spread[0]),
+        slope_error=slope_error,
         offset=offset,
-        offset_error=_finite(spread[1]),
-        fluctuation=fluctuation,
-        uncertainty_factor=max(factor, 1.0) if np.isfinite(factor) else 1.0,
+        offset_error=offset_error,
+        fluctuation=float(fluctuation),
+        uncertainty_factor=max(float(np.quantile(errors, COVERED)) / 2, 1.0),
     )
 
 
-def _line(sums: np.ndarray) -> tuple[float, float]:
-    """Return slope and offset from the sums of 1, X^2, X F and F - X; a slope of 1 without fluctuations."""
-    count, squares, products, differences = sums
-    return float(products / squares) if squares > 0 else 1.0, float(differences / count) if count else 0.0
+def _parts(pair: Simulated, axis: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield imposed and measured displacements from their means, and errors, of each octant of a pair [voxel]."""
+    used, exact = pair.used, pair.imposed[..., AXES.index(axis)]
+    found = pair.vectors[f"displacement_{axis}"].values.astype(float)
+    away, moved = exact - exact[used].mean(), found - found[used].mean()
+    for octant in _octants(used.shape):
+        if (some := used & octant).any():
+            yield away[some], moved[some], (found - exact)[some]
 
 
-def _finite(value: float) -> float:
-    """Return a number that JSON can hold in place of infinity."""
-    return float(min(value, 1e6)) if value == value else 1e6
+def _jackknife(sums: np.ndarray, *, empty: float) -> tuple[float, float]:
+    """Return the ratio of summed numerators to denominators, and its standard error over the parts.
+
+    Parameters
+    ----------
+    sums : ndarray, shape (part, 2)
+        Denominator and numerator of each part.
+    empty : float
+        Ratio where the denominators are 0.
+    """
+    below, above = sums.sum(0)
+    if not below > 0:
+        return empty, UNKNOWN
+    rest = sums.sum(0) - sums
+    if len(sums) < 2 or not (rest[:, 0] > 0).all():
+        return float(above / below), UNKNOWN
+    without_one = rest[:, 1] / rest[:, 0]
+    return float(above / below), float(np.sqrt((len(sums) - 1) * without_one.var()))
 
 
 def _scaled_errors(pair: Simulated, axis: str, slope: float, offset: float) -> np.ndarray:
@@ -280,8 +295,9 @@ def _scaled_errors(pair: Simulated, axis: str, slope: float, offset: float) -> n
     used, exact = pair.used, pair.imposed[..., AXES.index(axis)]
     found = pair.vectors[f"displacement_{axis}"].values.astype(float)
     mean = exact[used].mean()
+    used = used & pair.vectors["valid"].values  # others state no deviation
     rest = found - offset - mean - slope * (exact - mean)
-    distance = found - found[used].mean()
+    distance = found - (found[used].mean() if used.any() else 0.0)
     variance = without_ghosts(pair.vectors[f"uncertainty_{axis}"].values, distance)
     known = used & (variance > 0)  # none after a single pass
     return np.abs(rest[known]) / np.sqrt(variance[known]) if known.any() else np.full(1, 2.0)

@@ -14,7 +14,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.velocity.predictor import spline_matrix
 from lfpiv.velocity.settings import CorrelationSettings
 
-KEPT = 0.1
+KEPT = 0.02
 """Weight of the difference between the spline's nodes and the vectors, against that between means and vectors. Without
 it fluctuations shorter than a window, whose means are nearly zero, would grow without limit."""
 
