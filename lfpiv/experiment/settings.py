@@ -155,7 +155,7 @@ class SelfCalibration(Table):
 
 
 SHARE_SIMULATED = 10
-"""Number of pairs of a run for each one that is simulated."""
+"""Number of pairs of a run for each one that is simulated, the pilot included."""
 MOST_SIMULATED = 12
 """Largest number of pairs that "auto" simulates."""
 
@@ -164,14 +164,14 @@ class Bootstrap(Table):
     """Table ``[bootstrap]``: damping of the flow's fluctuations by ghosts, measured in simulated pairs."""
 
     pairs: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] | Literal["auto"] = "auto"
-    """Number of pairs that are simulated, each at the cost of a recorded one, after a pilot; "auto" takes one for ten
-    recorded pairs, at most 12 and none below five, 0 measures nothing."""
+    """Number of pairs that are simulated after a pilot, each at the cost of a recorded one; "auto" takes one for ten
+    recorded pairs, the pilot included, at most 12 and none in runs of fewer than 20 pairs, 0 measures nothing."""
 
     def count(self, pairs: int) -> int:
         """Return the number of simulated pairs for a number of recorded ones."""
         if isinstance(self.pairs, int):
             return self.pairs
-        return min((pairs + SHARE_SIMULATED // 2) // SHARE_SIMULATED, MOST_SIMULATED)
+        return min(max(pairs // SHARE_SIMULATED - 1, 0), MOST_SIMULATED)
 
 
 class NominalCamera(Table):

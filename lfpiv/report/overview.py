@@ -213,8 +213,8 @@ def _agreement(weights: WeightFigures, noun: str) -> str:
 
 def _damping(damping: DampingFigures | None) -> str:
     """State the slope of measured on true fluctuations along each axis, and whether it is taken off."""
-    if damping is None:
-        return "not measured"
+    if damping is None or not damping.axes:
+        return "not measured" + (f": {damping.reason}" if damping is not None else "")
     slopes = ", ".join(
         f"{axis} {found.slope:.3f} ± {found.slope_error:.3f}{'' if found.applied else ' (not significant)'}"
         for axis, found in sorted(damping.axes.items())

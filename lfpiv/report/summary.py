@@ -116,7 +116,10 @@ class DampingFigures(_Figures):
     """Damping by ghosts, of the axes x, y, z."""
 
     axes: dict[str, AxisDamping]
+    """Empty if it could not be measured."""
     simulated: int
+    reason: str = ""
+    """Why it could not be measured."""
 
 
 class DeviceFigures(_Figures):

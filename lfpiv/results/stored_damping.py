@@ -26,24 +26,29 @@ FILE = "bootstrap.json"
 class StoredDamping:
     """Damping of a run."""
 
-    damping: Damping
+    damping: Damping | None
+    """None if simulated pairs did not show it."""
     pairs: tuple[int, ...]
     """Recorded pairs whose flow and particles were imitated."""
     seconds: float
     """Time that the measurement took [s]."""
+    reason: str = ""
+    """Why it could not be measured."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that the file and the summary store."""
-        return {**self.damping.to_json(), "pairs": list(self.pairs), "seconds": self.seconds}
+        known = {"axes": {}, "simulated": 0} if self.damping is None else self.damping.to_json()
+        return {**known, "pairs": list(self.pairs), "seconds": self.seconds, "reason": self.reason}
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Content:
     settings_hash: str
     depends_on: str
-    damping: dict[str, Any]
+    damping: dict[str, Any] | None
     pairs: tuple[int, ...]
     seconds: float
+    reason: str
     digest: str
 
 
@@ -58,7 +63,8 @@ def read(path: Path) -> tuple[StoredDamping, Marks] | None:
         if found.digest != digest(stored):
             raise RecordError("its entries are not those that were written: the digest differs")
         read_object(found.depends_on)
-        known = StoredDamping(damping=Damping.from_json(found.damping), pairs=found.pairs, seconds=found.seconds)
+        damping = None if found.damping is None else Damping.from_json(found.damping)
+        known = StoredDamping(damping=damping, pairs=found.pairs, seconds=found.seconds, reason=found.reason)
         return known, Marks(settings_hash=found.settings_hash, depends_on=found.depends_on)
     except FileNotFoundError:
         return None
@@ -69,7 +75,8 @@ def read(path: Path) -> tuple[StoredDamping, Marks] | None:
 
 def write(found: StoredDamping, stamp: Stamp, path: Path) -> None:
     """Write the damping of a run, atomically."""
-    about = {"damping": found.damping.to_json(), "pairs": list(found.pairs), "seconds": found.seconds}
+    damping = None if found.damping is None else found.damping.to_json()
+    about = {"damping": damping, "pairs": list(found.pairs), "seconds": found.seconds, "reason": found.reason}
     content = files.plain({**stamp.attributes, **about})
     with writing(path):
         files.write_json({**content, "digest": digest(content)}, path)

@@ -50,6 +50,8 @@ def decide(run: Run, make_work: Callable[[], PairWork], progress: StepProgress) 
     `make_work` returns the work on pairs with its weights; it is called only if pairs must be simulated.
     """
     if not run.experiment.simulated_pairs:
+        if run.experiment.bootstrap.pairs:
+            log.info("damping by ghosts: not measured in so short a run; set bootstrap.pairs")
         with writing(run.folder.bootstrap):
             run.folder.bootstrap.unlink(missing_ok=True)
         return None
@@ -57,19 +59,25 @@ def decide(run: Run, make_work: Callable[[], PairWork], progress: StepProgress) 
         log.info("damping by ghosts: measured before, kept")
         return known
     pairs = _usable(run)
-    if not pairs:
+    if not pairs or _stamp(run, pairs).parts["images"] is None:
+        log.info("damping by ghosts: not measured, no finished %s has its images", run.experiment.noun)
         return None
-    start = time.perf_counter()
+    start, damping, reason = time.perf_counter(), None, ""
     try:
         with threadpool_limits(1):  # sums of BLAS depend on its number of threads
             damping = _measure(run, make_work(), pairs, progress)
-    except (InputError, ValueError) as error:
+    except InputError as error:
         log.warning("damping by ghosts: not measured: %s", error)
         return None
-    found = StoredDamping(damping=damping, pairs=tuple(pairs), seconds=time.perf_counter() - start)
+    except ValueError as error:
+        reason = str(error)
+        log.warning("damping by ghosts: not measured: %s", reason)
+    seconds = time.perf_counter() - start
+    found = StoredDamping(damping=damping, pairs=tuple(pairs), seconds=seconds, reason=reason)
     stored_damping.write(found, _stamp(run, pairs), run.folder.bootstrap)
-    for axis in AXES[::-1]:
-        log.info("%s", sentence(damping, axis))
+    if damping is not None:
+        for axis in AXES[::-1]:
+            log.info("%s", sentence(damping, axis))
     return found
 
 

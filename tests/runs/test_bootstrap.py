@@ -26,7 +26,7 @@ def simulated(small_run, tmp_path_factory):
     return experiment, out, pipeline.run(experiment, out)
 
 
-@pytest.mark.parametrize(("pairs", "count"), [(1, 0), (4, 0), (5, 1), (30, 3), (5000, 12)])
+@pytest.mark.parametrize(("pairs", "count"), [(1, 0), (19, 0), (20, 1), (50, 4), (5000, 12)])
 def test_auto_takes_a_tenth_of_the_pairs_and_at_most_a_dozen(pairs, count):
     assert Bootstrap().count(pairs) == count and Bootstrap(pairs=7).count(pairs) == 7
 
@@ -61,7 +61,7 @@ def test_it_is_measured_once_and_again_if_lost_or_damaged(simulated, caplog):
     pipeline.run(experiment, out)
     assert path.read_bytes() == before and "measured before, kept" in caplog.text
     stored = json.loads(before)
-    stored["damping"]["axes"]["x"]["slope"] += 0.1
+    stored["damping"]["axes"]["x"]["slope"] += 0.1  # the digest differs
     path.write_text(json.dumps(stored))
     assert "displacement_unbiased_x" not in lfpiv.open_results(out)  # a damaged file is not used
     pipeline.run(experiment, out)
