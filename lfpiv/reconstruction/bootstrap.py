@@ -164,7 +164,7 @@ class _Bootstrap:
         """Simulate and measure one pair whose window means are to be a displacement (z, y, x, 3) [voxel]."""
         like = self._vectors[max(number - 1, 0) % len(self._vectors)]
         flow = _imposed(like, displacement)
-        frames = self._pair.images(flow, flow.reach_mm, np.random.default_rng([SEED, number]))
+        frames = self._pair.images(flow, np.random.default_rng([SEED, number]))
         found = self._measure(frames, (self._noise, self._noise))
         return Simulated(vectors=found, imposed=flow.window_means)
 

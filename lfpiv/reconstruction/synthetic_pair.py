@@ -109,7 +109,7 @@ class RecordedImages:
         for size, sigma in enumerate(SIGMAS_VOXEL):
             imager = ParticleImager(self.weights, sigma)
             for number in range(REFERENCES):
-                places = random_places(grid, count, 0.0, np.random.default_rng([DRAWS, number]))
+                places = random_places(grid, count, np.random.default_rng([DRAWS, number]))
                 for name, image in imager(places, self.light(places)).items():
                     found[name][size] += count * self._ratios(name, image) / REFERENCES
         return found
@@ -129,11 +129,10 @@ class RecordedImages:
         return pixels
 
 
-def random_places(grid: Grid, count: float, margin_voxel: float | np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return random places (x, y, z) [mm] in a grid and a margin around it; `count` of them lie in the grid."""
-    edges = np.array(grid.shape[::-1]) + 2 * np.broadcast_to(margin_voxel, 3)
-    number = round(count * edges.prod() / grid.size)
-    places: np.ndarray = grid.centre_mm + rng.uniform(-0.5, 0.5, (number, 3)) * edges * grid.voxel_mm
+def random_places(grid: Grid, count: float, rng: np.random.Generator) -> np.ndarray:
+    """Return random places (x, y, z) [mm] in a grid, shape (round(count), 3)."""
+    edges_mm = np.array(grid.shape[::-1]) * grid.voxel_mm
+    places: np.ndarray = grid.centre_mm + rng.uniform(-0.5, 0.5, (round(count), 3)) * edges_mm
     return places
 
 
@@ -150,30 +149,24 @@ class SyntheticPair:
         self.recorded, self.particles = recorded, particles
         self.imager = ParticleImager(recorded.weights, particles.sigma_voxel)
 
-    def images(
-        self, displacement: Displacement, reach_mm: np.ndarray, rng: np.random.Generator
-    ) -> tuple[Images, Images]:
+    def images(self, displacement: Displacement, rng: np.random.Generator) -> tuple[Images, Images]:
         """Return the images of both frames, with noise.
+
+        Particles are in the grid midway in time and have the same light in both frames, also where they leave it.
 
         Parameters
         ----------
         displacement : callable
             Displacement (x, y, z) of particles at points midway in time [mm].
-        reach_mm : ndarray, shape (3,)
-            Largest displacement along x, y, z [mm]. Particles from as far beyond the volume enter it.
         rng : Generator
             Determines places and noise.
         """
         grid = self.recorded.weights.grid
-        count = self.particles.density * grid.size
-        middle = random_places(grid, count, reach_mm / 2 / grid.voxel_mm, rng)
-        moved = displacement(middle)
-        first, second = (self._frame(middle + sign * moved / 2) for sign in (-1, 1))
-        scale = {name: 2 * light / self._sum(name, first, second) for name, light in self.particles.light.items()}
+        middle = random_places(grid, self.particles.density * grid.size, rng)
+        moved, light = displacement(middle), self.recorded.light(middle)
+        first, second = (self.imager(middle + sign * moved / 2, light) for sign in (-1, 1))
+        scale = {name: 2 * total / self._sum(name, first, second) for name, total in self.particles.light.items()}
         return self._noisy(first, scale, rng), self._noisy(second, scale, rng)
-
-    def _frame(self, places_mm: np.ndarray) -> Images:
-        return self.imager(places_mm, self.recorded.light(places_mm))
 
     def _sum(self, name: str, *frames: Images) -> float:
         return float(sum(image[name][self.recorded.seen(name)].sum(dtype=np.float64) for image in frames))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
@@ -18,7 +18,7 @@ from lfpiv.files import writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.bootstrap import measure_damping
-from lfpiv.results import netcdf, provenance, stored_damping
+from lfpiv.results import netcdf, stored_damping
 from lfpiv.results.provenance import Stamp
 from lfpiv.results.stored_damping import StoredDamping
 from lfpiv.runs.frame_light import FrameLight
@@ -28,7 +28,8 @@ from lfpiv.velocity.damping import Damping
 if TYPE_CHECKING:
     import xarray as xr
 
-    from lfpiv.runs.run import Run
+    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.results.folder import Folder
 
 log = logging.getLogger(__name__)
 
@@ -36,36 +37,48 @@ IMITATED = 4
 """Largest number of recorded pairs whose images show how many particles there are."""
 
 
-def stored(run: Run) -> StoredDamping | None:
+StampOf = Callable[[Sequence[int]], Stamp]
+"""Returns the stamp of the damping measured with some pairs."""
+
+
+def stored(experiment: Experiment, folder: Folder, stamp_of: StampOf) -> StoredDamping | None:
     """Return the stored damping if it fits the run; None if it is off, missing, or of other settings or images."""
-    if not run.experiment.simulated_pairs or (found := stored_damping.read(run.folder.bootstrap)) is None:
+    if not experiment.simulated_pairs or (found := stored_damping.read(folder.bootstrap)) is None:
         return None
     known, marks = found
-    return known if _stamp(run, known.pairs).fits(marks) else None
+    return known if stamp_of(known.pairs).fits(marks) else None
 
 
-def decide(run: Run, make_work: Callable[[], PairWork], progress: StepProgress) -> StoredDamping | None:
-    """Return the stored damping, or measure and store it; None if it is off or cannot be measured.
+def decide(
+    experiment: Experiment,
+    folder: Folder,
+    stamp_of: StampOf,
+    finished: Callable[[], Sequence[int]],
+    make_work: Callable[[], PairWork],
+    progress: StepProgress,
+) -> StoredDamping | None:
+    """Return the stored damping, or measure and store it; None if it is off or no pair can be imitated.
 
-    `make_work` returns the work on pairs with its weights; it is called only if pairs must be simulated.
+    `finished` returns the pairs whose vectors are in the folder, `make_work` the work on pairs with its weights. Both
+    are called only if pairs must be simulated.
     """
-    if not run.experiment.simulated_pairs:
-        if run.experiment.bootstrap.pairs:
+    if not experiment.simulated_pairs:
+        if experiment.bootstrap.pairs:
             log.info("damping by ghosts: not measured in so short a run; set bootstrap.pairs")
-        with writing(run.folder.bootstrap):
-            run.folder.bootstrap.unlink(missing_ok=True)
+        with writing(folder.bootstrap):
+            folder.bootstrap.unlink(missing_ok=True)
         return None
-    if (known := stored(run)) is not None:
+    if (known := stored(experiment, folder, stamp_of)) is not None:
         log.info("damping by ghosts: measured before, kept")
         return known
-    pairs = _usable(run)
-    if not pairs or _stamp(run, pairs).parts["images"] is None:
-        log.info("damping by ghosts: not measured, no finished %s has its images", run.experiment.noun)
+    pairs = _spread(finished(), experiment.simulated_pairs)
+    if not pairs or stamp_of(pairs).parts["images"] is None:
+        log.info("damping by ghosts: not measured, no finished %s has its images", experiment.noun)
         return None
     start, damping, reason = time.perf_counter(), None, ""
     try:
         with threadpool_limits(1):  # sums of BLAS depend on its number of threads
-            damping = _measure(run, make_work(), pairs, progress)
+            damping = _measure(make_work(), pairs, progress)
     except InputError as error:
         log.warning("damping by ghosts: not measured: %s", error)
         return None
@@ -74,7 +87,7 @@ def decide(run: Run, make_work: Callable[[], PairWork], progress: StepProgress) 
         log.warning("damping by ghosts: not measured: %s", reason)
     seconds = time.perf_counter() - start
     found = StoredDamping(damping=damping, pairs=tuple(pairs), seconds=seconds, reason=reason)
-    stored_damping.write(found, _stamp(run, pairs), run.folder.bootstrap)
+    stored_damping.write(found, stamp_of(pairs), folder.bootstrap)
     if damping is not None:
         for axis in AXES[::-1]:
             log.info("%s", sentence(damping, axis))
@@ -91,28 +104,19 @@ def sentence(damping: Damping, axis: str) -> str:
     )
 
 
-def _stamp(run: Run, pairs: tuple[int, ...] | list[int]) -> Stamp:
-    return provenance.of_bootstrap(
-        run.experiment, run.calibration_stamp.hash, pairs, background=run.background, guard=run.guard_layers
-    )
-
-
-def _usable(run: Run) -> list[int]:
-    """Return finished pairs, evenly spread over the experiment: as many as are simulated, or all if these are fewer."""
-    finished = [pair for pair in run.numbers if run.files(pair).fitting_vectors() is not None]
-    if not finished:
-        return []
-    count = min(run.experiment.simulated_pairs, len(finished))
+def _spread(finished: Sequence[int], count: int) -> list[int]:
+    """Return evenly spread pairs: as many as are simulated, or all finished ones if these are fewer."""
+    count = min(count, len(finished))
     return [finished[(2 * number + 1) * len(finished) // (2 * count)] for number in range(count)]
 
 
-def _measure(run: Run, work: PairWork, pairs: list[int], progress: StepProgress) -> Damping:
+def _measure(work: PairWork, pairs: list[int], progress: StepProgress) -> Damping:
     """Measure the damping with the vectors and the images of some finished pairs."""
     assert work.weights is not None
-    vectors: list[xr.Dataset] = [netcdf.read_vectors(run.folder.vectors(pair)) for pair in pairs]
+    vectors: list[xr.Dataset] = [netcdf.read_vectors(work.folder.vectors(pair)) for pair in pairs]
     frames: list[FrameLight] = []
     for pair in pairs[:IMITATED]:
-        frames += [work.light_again(frame) for frame in run.experiment.pair_frames(pair)]
+        frames += [work.light_again(frame) for frame in work.experiment.pair_frames(pair)]
     noise = {name: sum(frame.noise[name] for frame in frames) / len(frames) for name in frames[0].noise}
     first = work.solver.smart.solve(frames[0].images, floor=frames[0].noise)
     return measure_damping(
@@ -120,7 +124,7 @@ def _measure(run: Run, work: PairWork, pairs: list[int], progress: StepProgress)
         vectors,
         [frame.images for frame in frames],
         work.measure,
-        pairs=run.experiment.simulated_pairs,
+        pairs=work.experiment.simulated_pairs,
         noise=noise,
         volume=first.volume,
         progress=progress,

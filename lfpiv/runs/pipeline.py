@@ -260,7 +260,14 @@ def _bootstrap(current: Run, prepared: Prepared, done: Invocation, weights: _Wei
             built.append(figures)
         return _work(current, known, keep_volumes=False, calibration=prepared.calibration)
 
-    bootstrap.decide(current, work, current.step(SIMULATED))
+    bootstrap.decide(
+        current.experiment,
+        current.folder,
+        current.damping_stamp,
+        current.pairs_with_vectors,
+        work,
+        current.step(SIMULATED),
+    )
     return replace(done, weights=built[0]) if built else done
 
 

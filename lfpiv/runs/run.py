@@ -161,6 +161,18 @@ class Run:
             guard=self.guard_layers,
         )
 
+    def damping_stamp(self, pairs: Sequence[int]) -> Stamp:
+        """Return the stamp of the damping by ghosts that was measured with some pairs."""
+        return provenance.of_bootstrap(
+            self.experiment, self.calibration_stamp.hash, pairs, background=self.background, guard=self.guard_layers
+        )
+
+    def pairs_with_vectors(self) -> list[int]:
+        """Return the selected pairs whose vectors are finished and fit."""
+        there = self.folder.stored(self.numbers, vectors=True, volumes=False)
+        stored = (pair for pair, one in zip(self.numbers, there, strict=True) if one)
+        return [pair for pair in stored if self.files(pair).fitting_vectors() is not None]
+
     def has_volumes(self, pair: int) -> bool:
         """Return whether both volumes of a pair are in the folder and fit."""
         return self.files(pair).fitting_volumes() is not None
@@ -311,7 +323,7 @@ class Run:
             background=light,
             background_warnings=warnings,
             guard=self.guard,
-            damping=bootstrap.stored(self),
+            damping=bootstrap.stored(self.experiment, self.folder, self.damping_stamp),
         )
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ it fluctuations shorter than a window, whose means are nearly zero, would grow w
 
 
 class ImposedField:
-    """Displacement at any place: a cubic spline, linear beyond the outermost vectors.
+    """Displacement at any place: a cubic spline between the outermost vectors, constant beyond them.
 
     Parameters
     ----------
@@ -39,7 +39,8 @@ class ImposedField:
             centres = (vectors[axis].values - vectors[axis].values[0]) / voxel_mm + (edge - 1) / 2  # from first voxel
             self._first_mm.append(float(vectors[axis].values[0]) - (edge - 1) / 2 * voxel_mm)
             starts = np.round(centres - (edge - 1) / 2).astype(int)
-            spline = spline_matrix(centres, np.arange(starts[-1] + edge))
+            places = np.clip(np.arange(starts[-1] + edge), centres[0], centres[-1])
+            spline = spline_matrix(centres, places)
             splines.append(spline)
             means.append(np.stack([spline[start : start + edge].mean(0) for start in starts]))
         for number, mean in enumerate(means):
@@ -57,12 +58,6 @@ class ImposedField:
         places = ((points_mm[:, ::-1] - self._first_mm) / self._voxel_mm).T
         moved = [ndimage.map_coordinates(self._dense[..., axis], places, order=1, mode="nearest") for axis in range(3)]
         return np.stack([part * edge for part, edge in zip(moved, self._voxel_mm, strict=True)][::-1], axis=1)
-
-    @property
-    def reach_mm(self) -> np.ndarray:
-        """Largest displacement along (x, y, z) [mm], shape (3,)."""
-        largest: np.ndarray = np.abs(self._dense).max((0, 1, 2))[::-1] * self._voxel_mm[::-1]
-        return largest
 
 
 def _apply(matrix: np.ndarray, field: np.ndarray, axis: int) -> np.ndarray:

@@ -43,7 +43,7 @@ def test_a_particle_looks_like_its_voxels(weights, place_mm):
 
 
 def test_light_adds_up_in_any_number_of_batches(weights, monkeypatch):
-    places = random_places(GRID, 20, 0.0, np.random.default_rng(0))
+    places = random_places(GRID, 20, np.random.default_rng(0))
     light = np.linspace(1, 3, 20)
     imager = ParticleImager(weights, 0.7)
     whole, half = imager(places, light), imager(places, light / 2)
@@ -59,7 +59,7 @@ def test_number_and_size_of_particles_are_found_under_noise(weights, count, sigm
     imager, instants = ParticleImager(weights, sigma), []
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        images = imager(random_places(GRID, count, 0.0, rng), np.full(count, 4e4))
+        images = imager(random_places(GRID, count, rng), np.full(count, 4e4))
         instants.append({name: image + 2 * rng.standard_normal(image.shape) for name, image in images.items()})
     found = RecordedImages(weights, even).particles(instants, NOISE)
     assert abs(found.density * GRID.size / count - 1) < 0.2
@@ -80,7 +80,7 @@ def test_simulated_images_have_light_and_noise_of_the_recorded_ones(weights):
     full = {"cam1": 200.0, "cam2": 1e9}
     particles = RecordedParticles(density=0.01, sigma_voxel=0.7, light=light, noise=NOISE, full=full)
     pair = SyntheticPair(RecordedImages(weights, even), particles)
-    frames = pair.images(lambda points: 0 * points + 0.05, np.full(3, 0.05), np.random.default_rng(1))
+    frames = pair.images(lambda points: 0 * points + 0.05, np.random.default_rng(1))
     sums = [sum(float(frame[name].sum(dtype=float)) for frame in frames) / 2 for name in ("cam1", "cam2")]
     assert abs(sums[1] / light["cam2"] - 1) < 0.1 and sums[0] < 1.05 * light["cam1"]
     assert max(frame["cam1"].max() for frame in frames) <= 200.0
@@ -135,7 +135,7 @@ def test_the_damping_of_a_rig_is_measured_and_the_same_each_time(weights):
         return np.stack([0.08 * points[:, 2] / 0.8, 0 * points[:, 0], 0.06 * points[:, 0]], 1)
 
     rng = np.random.default_rng(0)
-    frames = SyntheticPair(RecordedImages(weights, even), particles).images(shear, np.full(3, 0.1), rng)
+    frames = SyntheticPair(RecordedImages(weights, even), particles).images(shear, rng)
     vectors = measure(frames, (NOISE, NOISE))
     done = []
     found = measure_damping(weights, [vectors], frames, measure, pairs=1, progress=done.append)
