@@ -78,10 +78,12 @@ class Smart(Table):
     motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
     """Number of times the motion is measured and both frames are reconstructed again from their common light along it;
     0 reconstructs each frame separately."""
+    predict: Flag = False
+    """Whether an instant of a time series starts from the one before, moved by the flow, and takes fewer iterations."""
 
     def of_one_frame(self) -> dict[str, Any]:
         """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame."""
-        return self.model_dump(exclude={"motion_passes"})
+        return self.model_dump(exclude={"motion_passes", "predict"})
 
 
 Displacement = Annotated[float, Field(strict=True, gt=0, le=bounds.LARGEST_DISPLACEMENT_VOXEL)]

@@ -25,12 +25,16 @@ from lfpiv.errors import DamagedFile
 from lfpiv.experiment import images
 from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
 from lfpiv.experiment.readers.source import ImagePath, split
+from lfpiv.experiment.segments import followed
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.records import RecordError, read_json, read_object, validate
 from lfpiv.version import __version__
 from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
+
+IMAGES, IMAGES_BEFORE = "images", "images_before"
+"""Parts of a stamp: the images of a result, and those of the instants before it from which it follows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,10 +87,10 @@ class Stamp:
         found = []
         for name in {**before, **now}:
             old, new = before.get(name), now.get(name)
-            if old == new or (name == "images" and new is None):
+            if old == new or (name in (IMAGES, IMAGES_BEFORE) and new is None):
                 continue
             if isinstance(old, dict) and isinstance(new, dict):
-                gone = {"images"} if new.get("images", ()) is None else set()
+                gone = {IMAGES} if new.get("images", ()) is None else set()
                 found += [f"{name}.{key}" for key in {**old, **new} if old.get(key) != new.get(key) and key not in gone]
             else:
                 found.append(name)
@@ -357,7 +361,22 @@ def of_pair(
         for instant in experiment.pair_frames(pair)
     )
     of_vectors["step"] = experiment.series.step
+    if experiment.in_sequence:
+        before = [_images_before(experiment, instant.number) for instant in experiment.pair_frames(pair)]
+        first, second = (
+            Stamp({**stamp.parts, IMAGES_BEFORE: hashed}) for stamp, hashed in zip((first, second), before, strict=True)
+        )
+        of_vectors[IMAGES_BEFORE] = None if None in before else before
     return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
+
+
+def _images_before(experiment: Experiment, instant: int) -> str | None:
+    """Hash the identity of the images from which an instant of a sequence follows; None if one is missing."""
+    assert experiment.series is not None
+    name = experiment.frames[0]
+    frames = (Frame(number, name) for number in followed(experiment.series, instant)[:-1])
+    found = _identity([path for frame in frames for path in experiment.frame_paths(frame)], experiment.path.parent)
+    return None if found is None else files.settings_hash(images=found)
 
 
 def _of_light(experiment: Experiment, calibration: str, background: str | None, guard: Layers) -> dict[str, Any]:
@@ -374,7 +393,7 @@ def _of_light(experiment: Experiment, calibration: str, background: str | None, 
         "mask": _mask_hash(experiment.solid),
         "guard": guard if guard != NO_LAYERS else None,
         "smart": experiment.smart.model_dump(),
-        "motion": reach if experiment.smart.motion_passes else None,
+        "motion": reach if experiment.smart.motion_passes or experiment.in_sequence else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
         "particles": particles,
         "images": None,

@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -29,6 +29,7 @@ from lfpiv.geometry.volume import VIEWS
 from lfpiv.lightfield import image_checks
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.motion import Motion, PairSolver, unshared_quality
+from lfpiv.reconstruction.sequence import Before, SequenceSolver, Start
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairFiles, PairVolumes, VolumeFile
@@ -36,6 +37,7 @@ from lfpiv.runs import pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.guard import with_guard
 from lfpiv.runs.instants import Instants, failure
+from lfpiv.runs.sequences import SequentialInstants, restarted
 from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.warn import FirstOfEachCode, Warning
@@ -108,7 +110,9 @@ class PairWork:
         StorageError
             If a result cannot be written; then no other pair could be written either.
         """
-        instants = None if self.experiment.series is None else Instants(self, stored)
+        instants: Instants | None = None
+        if self.experiment.series is not None:
+            instants = SequentialInstants(self, stored) if self.experiment.in_sequence else Instants(self, stored)
         computed: _Computed | None = None
         try:
             for number, (pair, coming) in enumerate(_with_next(pairs)):
@@ -142,7 +146,9 @@ class PairWork:
         """Start to read the images of the coming pair whose volumes are not in the folder."""
         frames: list[Frame] = []
         if coming is not None and self.weights is not None:
-            both = enumerate(self.experiment.pair_frames(coming))
+            both = list(enumerate(self.experiment.pair_frames(coming)))
+            if self.experiment.in_sequence:  # the first instant is reconstructed already
+                del both[0]
             frames = [frame for number, frame in both if not self.folder.volume(coming, number).exists()]
         self.images.start(frames, self.experiment.pair_frames(pair))
 
@@ -180,6 +186,16 @@ class PairWork:
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
             mask=with_guard(self.experiment, self.guard).solid,
         )
+
+    @cached_property
+    def sequence(self) -> SequenceSolver:
+        """SMART along a series, made once."""
+        return SequenceSolver(self.solver.smart, self.solver.correlation, self.between)
+
+    @cached_property
+    def between(self) -> LastVectors:
+        """Correlation along a sequence, which may need the same vectors as a result and to predict an instant."""
+        return LastVectors(self.experiment.dt_s)
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
@@ -243,12 +259,16 @@ class PairWork:
         InputError
             If an image cannot be used, or there are no weights because all volumes should be in the folder.
         """
+        self.require_weights(file)
+        return self.light_again(file.frame)
+
+    def require_weights(self, file: VolumeFile) -> None:
+        """Raise InputError if there are no weights because all volumes should be in the folder."""
         if self.weights is None:
             raise InputError(
                 f"{file.path}: expected the volume of instant {file.frame.number} made with the present settings, "
                 "found none. Run `lfpiv reconstruct` first."
             )
-        return self.light_again(file.frame)
 
     def light_again(self, instant: Frame) -> FrameLight:
         """Read the images of an instant, also if its volume is known; raise InputError if that is not possible."""
@@ -276,6 +296,30 @@ class PairWork:
         log.info("instant %d: reconstructed in %.1f s", instant, seconds)
         return self._frame_volume(found.to_dataarray(), light, seconds)
 
+    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
+        """Reconstruct one instant of a series from the one before; return it and what the next one needs.
+
+        Raises
+        ------
+        InputError
+            If its images cannot be reconstructed.
+        """
+        instant = light.frame.number
+        self._log(instant, light.warnings)
+        self.writer.wait_large()
+        start = time.perf_counter()
+        try:
+            solved = self.sequence.solve(light.images, before, floor=light.noise, progress=progress)
+        except ValueError as error:
+            raise InputError(f"instant {instant}: {error}") from error
+        seconds = time.perf_counter() - start
+        log.info("instant %d: reconstructed in %.1f s; %s", instant, seconds, solved.start.value)
+        found = self._frame_volume(solved.found.to_dataarray(), light, seconds)
+        if solved.start is Start.MISSED:
+            found = restarted(found, solved.misfit_ratio, instant)
+            self._log(instant, found.record.warnings[-1:])
+        return found, solved.before(found.volume, before)
+
     def _frame_volume(self, guarded: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
         """Return a volume without its guard layers, with its record."""
         assert self.weights is not None
@@ -290,7 +334,11 @@ class PairWork:
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment, start = self.experiment, time.perf_counter()
-        vectors = correlate(*volumes.volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
+        settings = experiment.correlation.model_dump()
+        if experiment.in_sequence:
+            vectors = self.between(*volumes.volumes, settings)
+        else:
+            vectors = correlate(*volumes.volumes, dt_s=experiment.dt_s, **settings)
         vectors = _without_unmeasured(_with_motion(vectors, volumes), volumes)
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
         vectors.attrs["reconstruction_s"] = self._reconstruction_s(files.pair, volumes)
@@ -324,6 +372,23 @@ class PairWork:
         first, second = (record.seconds for record in volumes.records)
         series = self.experiment.series
         return second if series is not None and pair - series.step in self.experiment.numbers else first + second
+
+
+@dataclass(eq=False)
+class LastVectors:
+    """Correlation of two volumes, which is not repeated if it was the last one."""
+
+    dt_s: float
+    """Time between the volumes [s]."""
+    _last: tuple[xr.DataArray, xr.DataArray, dict[str, Any], xr.Dataset] | None = None
+
+    def __call__(self, first: xr.DataArray, second: xr.DataArray, settings: Mapping[str, Any]) -> xr.Dataset:
+        """Return the vectors between two volumes; `settings` are those of `correlate`."""
+        known = self._last
+        if known is None or known[0] is not first or known[1] is not second or known[2] != settings:
+            known = first, second, dict(settings), correlate(first, second, dt_s=self.dt_s, **settings)
+            self._last = known
+        return known[3].copy()
 
 
 @dataclass(frozen=True, kw_only=True)

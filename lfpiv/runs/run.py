@@ -177,7 +177,8 @@ class Run:
             return changed
 
         stored = self.folder.stored(self.numbers, vectors=vectors, volumes=volumes)
-        step = 1 if self.experiment.series is None else self.experiment.series.step
+        series = self.experiment.series
+        step = 1 if series is None or self.experiment.in_sequence else series.step
         todo = Todo(self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun)
         todo.quiet = quiet
         return todo

@@ -55,6 +55,8 @@ class Code(enum.Enum):
     UNEXPLAINED = "unexplained"
     MOTION_LOST = "motion_lost"
     FEW_VALID = "few_valid"
+    NOT_FOLLOWED = "not_followed"
+    REPEATED = "repeated"
     UNSEEDED = "unseeded"
     # the run
     FEWER_WORKERS = "fewer_workers"
@@ -197,6 +199,15 @@ SENTENCES: Mapping[Code, str] = {
         "on their vectors before the report shows why"
     ),
     Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
+    Code.NOT_FOLLOWED: (
+        "the particles are not where the instant before and the flow put them (the misfit is {ratio:.2f} times that of "
+        "particles in other places), so the volume starts from its images alone. Check the laser's pulses, and whether "
+        "images are missing or the flow changed"
+    ),
+    Code.REPEATED: (
+        "the image of {camera} is the one of instant {before}, pixel by pixel, so the volume starts from its images "
+        "alone. Check the recording for repeated images"
+    ),
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
     Code.UNSEEDED: (
         "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
