@@ -40,7 +40,7 @@ PERSISTENCE = 0.8
 """Exponent of the moved volume in the first guess."""
 FLOW_MEMORY = 0.5
 """Weight of the flow known before in the flow that moves the next instant."""
-ITERATION_SHARE = 0.4
+ITERATION_SHARE = 0.3
 """Iterations of an instant that starts from the one before, as a share of those of one that starts from its images."""
 DIMMEST = 0.05
 """Least light of the moved volume in the first guess, as a share of the guess's mean."""
