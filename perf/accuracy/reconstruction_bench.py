@@ -16,8 +16,8 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import cache
 from itertools import pairwise, product
 from pathlib import Path
@@ -30,134 +30,23 @@ from reconstruction_cases import (
     CONDITIONS,
     FLOWS,
     Case,
-    Recorded,
-    Rig,
     make_rig,
     record,
     true_field,
     true_volume,
 )
+from reconstruction_ways import WAYS, Way, table_of
 
 import lfpiv
 from lfpiv import metrics
-from lfpiv.experiment.settings import Correlation, Smart
-from lfpiv.geometry.grid import Grid
-from lfpiv.reconstruction.beyond import light_beyond
+from lfpiv.experiment.settings import Correlation
 from lfpiv.reproduce import rigs, store
 from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.weights.operator import Weights, build_weights
 
 CACHE = Path(tempfile.gettempdir()) / "lfpiv-reconstruction-bench"
 BLOBS = {"points": 0.0, "blobs": rigs.BLOB_VOXEL}
 LEAST_MOTION = 0.1
 """Least standard deviation of a true component for which its slope is stated [voxel]."""
-TODAY = {
-    "smart.iterations": 40,
-    "smart.accelerate": True,
-    "smart.sieve_voxel": "auto",
-    "smart.intensity_cap": "auto",
-    "smart.floor_share": 0.1,
-    "smart.tolerance": 5e-4,
-}
-"""Settings of SMART as of commit b2f8238."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Measured:
-    """What a way of reconstructing returns."""
-
-    volumes: Sequence[xr.DataArray]
-    """Volume of each frame on the voxels of the rig's grid."""
-    passes: float
-    """Passes over all rays, mean of the frames."""
-    misfit: float
-    """Misfit of the images at the end, mean of the frames [counts]; NaN if unknown."""
-    cpu_s: float
-    """CPU time of a frame without the preparation of the rig [s]."""
-    vectors: Sequence[xr.Dataset] | None = None
-    """Vectors between each frame and the next one. Default: the correlation of the volumes."""
-
-
-Reconstruct = Callable[[Rig, Recorded, Mapping[str, Any]], Measured]
-"""Reconstruct the frames of a recording with some settings."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Way:
-    """A way of reconstructing: a function, and its settings as keys of the experiment file, "smart.iterations"."""
-
-    label: str
-    reconstruct: Reconstruct
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-
-def by_smart(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) -> Measured:
-    """Reconstruct each frame by SMART, as `lfpiv run` does."""
-    smart = Smart(**_table(settings, "smart"))
-    guard = settings.get("volume.guard_mm", "auto")
-    grid = rig.grid.padded(_guard_layers(rig, recorded) if guard == "auto" else rig.grid.layers(guard))
-    weights = weights_of(rig, grid)
-    start = time.process_time()
-    found = [rigs.reconstruct_images(weights, images, smart) for images in recorded.images]
-    return Measured(
-        cpu_s=(time.process_time() - start) / len(found),
-        volumes=[_cut(volume, rig.grid, grid) for volume in found],
-        passes=float(np.mean([volume.attrs["iterations"] for volume in found])),
-        misfit=float(np.mean([volume.attrs["misfit"][-1] for volume in found])),
-    )
-
-
-def true_particles(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) -> Measured:
-    """Return the true particles as blobs: the error that correlation itself has."""
-    volumes = [
-        metrics.truth_volume(at, light, rig.grid, rigs.BLOB_VOXEL)
-        for at, light in zip(recorded.positions_mm, recorded.light, strict=True)
-    ]
-    return Measured(volumes=volumes, passes=0.0, misfit=float("nan"), cpu_s=0.0)
-
-
-WAYS = {
-    "ours": Way(label="ours", reconstruct=by_smart),
-    "today": Way(label="today", reconstruct=by_smart, settings=TODAY),
-    "truth": Way(label="truth", reconstruct=true_particles),
-}
-"""Ways by name. "ours" has the defaults of the code."""
-
-
-def weights_of(rig: Rig, grid: Grid) -> Weights:
-    """Return the weights of a rig on a grid. Those of the last few rigs stay in memory."""
-    key = (tuple(camera.model_dump_json() for camera in rig.cameras), grid)
-    if key not in _WEIGHTS:
-        while len(_WEIGHTS) >= 2:
-            _WEIGHTS.pop(next(iter(_WEIGHTS)))
-        _WEIGHTS[key] = build_weights(rig.calibration, grid)
-    return _WEIGHTS[key]
-
-
-_WEIGHTS: dict[Any, Weights] = {}
-
-
-def _table(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
-    return {key.split(".", 1)[1]: value for key, value in settings.items() if key.startswith(name + ".")}
-
-
-def _guard_layers(rig: Rig, recorded: Recorded):
-    """Return the guard layers that the images demand, as a run finds them."""
-    light = [
-        {name: image - rig.calibration.cameras[name].decoder.background(image)[0] for name, image in images.items()}
-        for images in recorded.images
-    ]
-    counts = [[0, 0], [0, 0], [0, 0]]
-    for face in light_beyond(rig.calibration, rig.grid, [light[:2]]):
-        counts[face.axis][face.side] = round(face.guard_mm / rig.grid.voxel_mm)
-    z, y, x = ((low, high) for low, high in counts)
-    return z, y, x
-
-
-def _cut(volume: xr.DataArray, grid: Grid, padded: Grid) -> xr.DataArray:
-    cut = volume[grid.within(padded)]
-    cut = cut.copy(data=np.ascontiguousarray(cut.values))
-    return cut.drop_vars([name for name in cut.coords if cut.coords[name].ndim == 3])
 
 
 # -- figures -----------------------------------------------------------------------------------------------------------
@@ -204,7 +93,7 @@ def measure(case: Case, way: Way, folder: Path) -> dict[str, float]:
 
 def vectors_of(case: Case, volumes: Sequence[xr.DataArray], settings: Mapping[str, Any]) -> list[xr.Dataset]:
     """Correlate each volume with the next one."""
-    keys = ({"windows": case.windows} if case.windows else {}) | _table(settings, "correlation")
+    keys = ({"windows": case.windows} if case.windows else {}) | table_of(settings, "correlation")
     options = Correlation(**keys).model_dump()
     return [correlate(first, second, dt_s=rigs.DT_S, **options) for first, second in pairwise(volumes)]
 
@@ -293,9 +182,9 @@ def compare(cases: Sequence[Case], ways: Sequence[Way], folder: Path) -> list[di
     records, everything = [], {way.label: [] for way in ways}
     for label, members in groups.items():
         print(f"{label}, {len(members)} seeds\n{'':{width}s} " + _head(COLUMNS), flush=True)
-        scores = {}
+        measured = [[score(case, way, folder) for way in ways] for case in members]
+        scores = {way.label: [row[number] for row in measured] for number, way in enumerate(ways)}
         for way in ways:
-            scores[way.label] = [score(case, way, folder) for case in members]
             figures = {name: mean_and_error([one[name] for one in scores[way.label]]) for name in scores[way.label][0]}
             cells = " ".join(f"{figures[name][0]:{form}}" for name, (_, form) in COLUMNS.items())
             print(f"{way.label:{width}s} {cells}", flush=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +187,7 @@ class Recorded:
     """Light of each particle in each frame, mean of the cameras, relative to the mean."""
 
 
+@lru_cache(maxsize=16)
 def record(case: Case, folder: Path) -> Recorded:
     """Record a case, or read its images from a folder."""
     rig, condition = make_rig(case.scale, case.angles_deg), CONDITIONS[case.condition]
