@@ -117,12 +117,19 @@ def field_figures(case: Case, vectors: xr.Dataset) -> dict[str, float]:
 
 
 def _errors(measured: np.ndarray, exact: np.ndarray) -> dict[str, float]:
+    """Return errors and slopes of the vectors that are known; where hardly any is valid, some stay unknown."""
+    inner = np.zeros(exact.shape[:3], bool)
+    inner[tuple(slice(1, -1) if count > 2 else slice(None) for count in inner.shape)] = True
+    known = np.isfinite(measured).all(-1)
+    measured, exact, inner = measured[known], exact[known], inner[known]
     error = measured - exact
     length = np.linalg.norm(error, axis=-1)
-    inner = tuple(slice(1, -1) if count > 2 else slice(None) for count in length.shape)
+    if not inner.any():
+        names = ("error", "interior", *(f"{name}_{axis}" for name in ("error", "bias", "slope") for axis in "xyz"))
+        return dict.fromkeys(names, float("nan"))
     figures = {"error": float(length.mean()), "interior": float(length[inner].mean())}
     for number, axis in enumerate("xyz"):
-        true, found = exact[..., number].ravel(), measured[..., number].ravel()
+        true, found = exact[..., number], measured[..., number]
         fluctuation = true - true.mean()
         moved = fluctuation.std() > LEAST_MOTION
         figures[f"error_{axis}"] = float(np.abs(error[..., number]).mean())

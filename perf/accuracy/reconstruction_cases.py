@@ -118,6 +118,10 @@ class Rig:
     white: Mapping[str, np.ndarray]
     """White images relative to a fully lit pixel."""
 
+    def light(self, name: str, image: np.ndarray) -> np.ndarray:
+        """Return a camera's image above its dark level [count]."""
+        return image - np.float32(self.calibration.cameras[name].decoder.background(image)[0])
+
 
 @cache
 def make_rig(scale: str, angles_deg: tuple[float, ...]) -> Rig:

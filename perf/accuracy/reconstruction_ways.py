@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from reconstruction_cases import Recorded, Rig
+from refocused import refocused_volume
 
 from lfpiv import metrics
 from lfpiv.experiment.settings import Smart
-from lfpiv.geometry.grid import Grid, Layers
+from lfpiv.geometry.grid import AXES, Grid, Layers
 from lfpiv.reconstruction.beyond import light_beyond
+from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import rigs
 from lfpiv.weights.operator import Weights, build_weights
 
@@ -34,6 +36,14 @@ TODAY = {
     "volume.guard_mm": 0.0,
 } | {f"smart.{key}": value for key, value in _KEYS_SINCE.items() if key in Smart.model_fields}
 """Settings of commit b2f8238, which had no intensity cap and no guard layers."""
+PAPER = TODAY | {
+    "smart.iterations": 10,
+    "smart.accelerate": False,
+    "smart.sieve_voxel": 0.0,
+    "smart.floor_share": 0.0,
+    "smart.tolerance": 0.0,
+}
+"""Settings of the paper."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,12 +100,42 @@ def true_particles(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) ->
     return Measured(volumes=volumes, passes=0.0, misfit=float("nan"), cpu_s=0.0)
 
 
+def by_first_guess(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) -> Measured:
+    """Return SMART's multiplicative first guess: the mean logarithm of the light that each voxel's rays meet (MLOS)."""
+    weights = weights_of(rig, rig.grid)
+    start = time.process_time()
+    light = [{name: rig.light(name, image) for name, image in images.items()} for images in recorded.images]
+    found = [reconstruct(weights, images, 0, floor_share=0.0) for images in light]
+    return Measured(
+        volumes=found,
+        passes=1.0,
+        misfit=float(np.mean([volume.attrs["misfit"][-1] for volume in found])),
+        cpu_s=(time.process_time() - start) / len(found),
+    )
+
+
+def by_refocusing(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) -> Measured:
+    """Refocus the light field of each camera, and combine the stacks."""
+    start, volumes = time.process_time(), []
+    for images in recorded.images:
+        light = {name: rig.light(name, image) for name, image in images.items()}
+        values = refocused_volume(rig.calibration, light, rig.grid, **table_of(settings, "refocused"))
+        volumes.append(xr.DataArray(values, rig.grid.coordinates(), AXES))
+    cpu_s = (time.process_time() - start) / len(volumes)
+    return Measured(volumes=volumes, passes=0.0, misfit=float("nan"), cpu_s=cpu_s)
+
+
 WAYS = {
     "ours": Way(label="ours", reconstruct=by_smart),
     "today": Way(label="today", reconstruct=by_smart, settings=TODAY),
+    "paper": Way(label="paper", reconstruct=by_smart, settings=PAPER),
+    "printed": Way(label="printed", reconstruct=by_smart, settings=PAPER | {"smart.normalisation": "paper"}),
+    "mlos": Way(label="mlos", reconstruct=by_first_guess),
+    "refocused": Way(label="refocused", reconstruct=by_refocusing),
     "truth": Way(label="truth", reconstruct=true_particles),
 }
-"""Ways by name. "ours" has the defaults of the code."""
+"""Ways by name: the defaults of the code, commit b2f8238, the paper's ten plain iterations normalised by the column sum
+and as printed, the multiplicative first guess alone, refocused stacks, and the true particles."""
 
 
 def weights_of(rig: Rig, grid: Grid) -> Weights:
@@ -119,10 +159,7 @@ def table_of(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
 @lru_cache(maxsize=64)
 def _guard_layers(rig: Rig, recorded: Recorded) -> Layers:
     """Return the guard layers that the images demand, as a run finds them."""
-    light = [
-        {name: image - rig.calibration.cameras[name].decoder.background(image)[0] for name, image in images.items()}
-        for images in recorded.images
-    ]
+    light = [{name: rig.light(name, image) for name, image in images.items()} for images in recorded.images]
     counts = [[0, 0], [0, 0], [0, 0]]
     for face in light_beyond(rig.calibration, rig.grid, [light[:2]]):
         counts[face.axis][face.side] = round(face.guard_mm / rig.grid.voxel_mm)
