@@ -1,11 +1,12 @@
-"""Plots of methods side by side, drawn from stored figures in the colours of the page, light or dark.
+"""Plots and a table of methods side by side, drawn from stored figures in the colours of the page, light or dark.
 
-`panels` needs no Sphinx; `setup` registers the directive ``{side-by-side}``. `perf/accuracy/method_comparison.py` writes
-the figures.
+`panels` and `table` need no Sphinx; `setup` registers the directive ``{side-by-side}``. The figures are those that
+`perf/accuracy/method_comparison.py` wrote.
 """
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -26,8 +27,10 @@ STYLES = {
     ("truth", 2): ("true particles", svg.INK, ":"),
 }
 """Name, colour and line of each method and number of cameras, in the order of the legend."""
-LARGEST_ERROR = 2.2
-"""Upper end of the axis of errors [voxel]."""
+TABLE_PPM = 0.5
+"""Seeding of the table [particles per microlens]."""
+ERROR_TICKS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+"""Marks of the logarithmic axis of errors [voxel]."""
 
 
 def panels(stored: Mapping[str, Any]) -> str:
@@ -52,18 +55,32 @@ def _against_seeding(rows: Sequence[Mapping[str, Any]], key: str, label: str) ->
         value, error = ([row["figures"][key][part] or 0.0 for row in known] for part in (0, 1))
         width = 2.0 if way == "ours" else 1.3
         axes.errorbar(
-            [row["ppm"] for row in known], value, error, color=colour, ls=line, lw=width, marker="o", ms=3, elinewidth=1
+            [row["ppm"] for row in known],
+            value,
+            error,
+            color=colour,
+            ls=line,
+            lw=width,
+            marker="o",
+            ms=3,
+            elinewidth=1,
+            zorder=3 if way == "ours" else 2,
         )
     svg.style(axes, title=f"{label} against seeding", xlabel="particles per microlens", ylabel=label)
     axes.set_xscale("log")
     axes.set_xticks(seedings, [f"{ppm:g}" for ppm in seedings])
     axes.set_xticks([], minor=True)
-    axes.set_ylim(0, 1 if key == "q" else LARGEST_ERROR)
-    return svg.to_svg(figure, f"{label} of each method against particles per microlens; the table has the numbers")
+    if key == "q":
+        axes.set_ylim(0, 1)
+    else:
+        axes.set_yscale("log")
+        axes.set_yticks(ERROR_TICKS, [f"{tick:g}" for tick in ERROR_TICKS])
+        axes.set_yticks([], minor=True)
+    return svg.to_svg(figure, f"{label} of each method against particles per microlens; the table below has numbers")
 
 
 def _legend() -> str:
-    figure, (axes,) = svg.new_panel(2.6)
+    figure, (axes,) = svg.new_panel(2.3)
     for name, colour, line in STYLES.values():
         axes.plot(
             [], [], color=colour, ls=line, lw=2.0 if name.startswith("this") else 1.3, marker="o", ms=3, label=name
@@ -89,8 +106,50 @@ def _time(rows: Sequence[Mapping[str, Any]]) -> str:
     svg.style(axes, title="time of a frame", xlabel="times a pass over all rays")
     axes.set_yticks(place, [STYLES[way, 2][0] for way in names])
     axes.invert_yaxis()
-    axes.margins(x=0.15)
+    axes.set_xlim(0, 1.3 * max(values))
     return svg.to_svg(figure, "Time of a frame by each method in passes over all rays; the table has the numbers")
+
+
+def table(stored: Mapping[str, Any], ppm: float = TABLE_PPM) -> str:
+    """Return the figures at one seeding as an HTML table: means, and standard errors after a plus-minus sign."""
+    rows = {(row["way"], row["cameras"]): row for row in stored["seeding"] if row["ppm"] == ppm}
+    passes = {row["way"]: row["passes"][0] for row in stored["time"]}
+    heads = ("method", "error", "more than ours", "slopes x, y, z", "valid", "2 sigma", "Q", "ghosts", "time")
+    lines = []
+    for key, (name, _, _) in STYLES.items():
+        figures = rows[key]["figures"]
+        own = key == ("ours", 2)
+        slopes = ",\u00a0".join(_number(figures[f"slope_{axis}"][0], 2) for axis in "xyz")
+        cells = (
+            name,
+            _with_error(figures["error"]),
+            "" if own else _with_error(rows[key]["beyond_ours"]["error"]),
+            slopes,
+            _percent(figures["valid"][0]),
+            _percent(figures["within"][0]),
+            _with_error(figures["q"]),
+            _number(figures["ghosts"][0], 2),
+            _number(passes.get(key[0]), 1) if key[1] == 2 else "",
+        )
+        lines.append("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>")
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
+    return (
+        '<div class="table-wrapper"><table class="docutils"><thead><tr>'
+        f"{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
+    )
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{100 * value:.0f}\u00a0%"
+
+
+def _with_error(value: Sequence[float | None]) -> str:
+    mean, error = value
+    return _number(mean, 3) + ("" if error is None or mean is None else f"\u00a0±\u00a0{error:.3f}")
 
 
 def setup(app):
@@ -103,7 +162,8 @@ def setup(app):
 
         def run(self):
             self.env.note_dependency(str(FIGURES))
-            return [nodes.raw("", panels(json.loads(FIGURES.read_text("utf-8"))), format="html")]
+            stored = json.loads(FIGURES.read_text("utf-8"))
+            return [nodes.raw("", panels(stored) + table(stored), format="html")]
 
     app.add_directive("side-by-side", SideBySide)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
