@@ -190,22 +190,16 @@ class PairFiles:
         """Marks of the vectors, read once; None if they are missing or cannot be used."""
         return finished.vectors_marks(self.vectors, self.grid)
 
-    def _wanted(self, vectors: bool, volumes: bool) -> Iterator[tuple[Path, Stamp]]:
+    def _stamped(self, vectors: bool, volumes: bool) -> Iterator[tuple[Stamp, Marks | None]]:
+        """Yield the stamp of each file and the marks of the stored one; None if it is missing or cannot be used."""
         if vectors:
-            yield self.vectors, self.stamp
+            yield self.stamp, self.vector_marks
         if volumes:
-            yield from ((frame.path, frame.stamp) for frame in self.frames)
-
-    def _marks(self, path: Path) -> Marks | None:
-        """Return the marks of one of the files; None if it is missing or cannot be used."""
-        if path == self.vectors:
-            return self.vector_marks
-        return next(frame.marks() for frame in self.frames if frame.path == path)
+            yield from ((frame.stamp, frame.marks()) for frame in self.frames)
 
     def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:
         """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""
-        for path, stamp in self._wanted(vectors, volumes):
-            marks = self._marks(path)
+        for stamp, marks in self._stamped(vectors, volumes):
             changes = [] if marks is None else stamp.changes(marks)
             if changes or marks is None:
                 return changes
@@ -213,7 +207,7 @@ class PairFiles:
 
     def fitting_vectors(self) -> Marks | None:
         """Return the marks of the vectors; None if they are missing or do not fit."""
-        marks = self._marks(self.vectors)
+        marks = self.vector_marks
         return marks if self.stamp.fits(marks) else None
 
     def fitting_volumes(self) -> tuple[Marks, ...] | None:
@@ -230,7 +224,8 @@ class PairFiles:
 
     def retire_outdated(self) -> Iterator[tuple[Path, Path]]:
         """Rename the results whose images changed; yield old and new paths."""
-        for path, stamp in self._wanted(vectors=True, volumes=True):
+        volumes = [(frame.path, frame.stamp) for frame in self.frames]
+        for path, stamp in [(self.vectors, self.stamp), *volumes]:
             marks = provenance.read_marks(path)
             if marks is not None and "images" in stamp.changes(marks):
                 with writing(path):

@@ -291,7 +291,7 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
 
 
 def lit_frames(experiment: Experiment) -> tuple[str, ...]:
-    """Return the names of the frames that lasers of their own light; one laser lights all instants of a series."""
+    """Return the names of the frames that each have a laser. One laser lights all instants of a series."""
     return experiment.frames if experiment.series is None else experiment.frames[:1]
 
 
