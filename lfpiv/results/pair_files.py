@@ -146,6 +146,9 @@ class PairFiles:
     """Attributes that say of what the vectors are: the pair, or instant, step and time."""
     grid: Grid | None = None
     """Voxels of the volumes; None if files are not compared with them."""
+    particles: Path | None = None
+    """Linked particles; None without tracking."""
+    particles_stamp: Stamp | None = None
 
     @classmethod
     def of(
@@ -183,6 +186,8 @@ class PairFiles:
             frames=(first, second),
             origin=origin,
             grid=experiment.grid,
+            particles=None if stamps.particles is None else folder.particles(pair),
+            particles_stamp=stamps.particles,
         )
 
     @cached_property
@@ -190,9 +195,11 @@ class PairFiles:
         """Marks of the vectors, read once; None if they are missing or cannot be used."""
         return finished.vectors_marks(self.vectors, self.grid)
 
-    def _wanted(self, vectors: bool, volumes: bool) -> Iterator[tuple[Path, Stamp]]:
+    def _wanted(self, vectors: bool, volumes: bool, particles: bool = True) -> Iterator[tuple[Path, Stamp]]:
         if vectors:
             yield self.vectors, self.stamp
+        if vectors and particles and self.particles is not None and self.particles_stamp is not None:
+            yield self.particles, self.particles_stamp
         if volumes:
             yield from ((frame.path, frame.stamp) for frame in self.frames)
 
@@ -200,11 +207,13 @@ class PairFiles:
         """Return the marks of one of the files; None if it is missing or cannot be used."""
         if path == self.vectors:
             return self.vector_marks
+        if path == self.particles:
+            return provenance.read_marks(path)
         return next(frame.marks() for frame in self.frames if frame.path == path)
 
-    def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:
+    def outdated(self, *, vectors: bool, volumes: bool, particles: bool = True) -> list[str] | None:
         """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""
-        for path, stamp in self._wanted(vectors, volumes):
+        for path, stamp in self._wanted(vectors, volumes, particles):
             marks = self._marks(path)
             changes = [] if marks is None else stamp.changes(marks)
             if changes or marks is None:
@@ -243,6 +252,13 @@ class PairFiles:
         with writing(self.vectors):
             netcdf.write_vectors(vectors, self.vectors, attributes=marks, reconstruction=condensed)
             self.vectors.with_suffix(RETIRED).unlink(missing_ok=True)
+
+    def write_particles(self, table: xr.Dataset) -> None:
+        """Write the linked particles, atomically."""
+        assert self.particles is not None and self.particles_stamp is not None
+        with writing(self.particles):
+            netcdf.write_particles(table, self.particles, attributes={**self.particles_stamp.attributes, **self.origin})
+            self.particles.with_suffix(RETIRED).unlink(missing_ok=True)
 
 
 def _origin(experiment: Experiment, frame: Frame) -> dict[str, Any]:

@@ -31,8 +31,8 @@ class FoundParticles:
     """Share of the images' squared light, noise subtracted, that the particles explain."""
     crowding: float
     """Mean number of particles whose images overlap the image of one by half or more."""
-    size_voxel: float
-    """Voxels of the volume that was searched."""
+    per_microlens: float
+    """Particles per microlens of the volume's x-y face."""
 
     def __len__(self) -> int:
         return len(self.positions_mm)
@@ -54,7 +54,7 @@ class FoundParticles:
                 voxel_mm=grid.voxel_mm,
                 explained=0.0,
                 crowding=0.0,
-                size_voxel=float(grid.size),
+                per_microlens=0.0,
             )
         errors = np.sqrt(np.maximum(np.einsum("pii->pi", covariances(normal))[:, :3], 0)) * grid.voxel_mm
         left = scene.counts - normal.model
@@ -70,7 +70,7 @@ class FoundParticles:
             voxel_mm=grid.voxel_mm,
             explained=float(np.clip(explained, 0, 1)),
             crowding=_crowding(normal),
-            size_voxel=float(grid.size),
+            per_microlens=count / _microlenses(weights),
         )
 
 
@@ -90,3 +90,11 @@ def _crowding(normal: Normal) -> float:
     """Return the mean number of other particles whose images overlap a particle's by half or more, in any camera."""
     _, _, overlap = overlaps(normal)
     return float(2 * (overlap > 0.5).any(1).sum() / max(len(normal.right), 1))
+
+
+def _microlenses(weights: Weights) -> float:
+    """Return the number of microlenses that the volume's x-y face covers in a camera, mean of the cameras."""
+    grid = weights.grid
+    face = grid.shape[1] * grid.shape[2] * grid.voxel_mm**2
+    every = [camera.optics for camera in weights.cameras.values()]
+    return float(np.mean([face * (one.magnification / one.microlens_pitch_mm) ** 2 for one in every]))

@@ -264,7 +264,7 @@ def _group_matrix(matrix: sparse.bsr_array, group: np.ndarray, parameters: int) 
         for column, other in enumerate(group):
             if int(other) in where:
                 block = matrix.data[span][where[int(other)]]
-                joint[
-                    row * parameters : (row + 1) * parameters, column * parameters : (column + 1) * parameters
-                ] = block
+                joint[row * parameters : (row + 1) * parameters, column * parameters : (column + 1) * parameters] = (
+                    block
+                )
     return joint

@@ -52,7 +52,7 @@ def _add_pairs(
     right_out: wp.array(dtype=wp.vec4f),
 ):
     particle = first_particle + wp.tid()
-    used = int(0)
+    used = wp.int32(0)
     right = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     for k in range(int(lists.first[particle]), int(lists.first[particle + 1])):
         pixel = lists.pixel[k]

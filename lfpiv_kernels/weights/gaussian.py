@@ -220,7 +220,7 @@ def _bound_pixels(
 ):
     particle = first_particle + wp.tid()
     view = _view(inputs, particle)
-    lenses = int(0)
+    lenses = wp.int32(0)
     for j in range(view.bounds[1], view.bounds[3] + 1):
         for i in range(view.bounds[0], view.bounds[2] + 1):
             if _reaches(inputs, view, _lens_centre(inputs, i, j)):
@@ -242,7 +242,7 @@ def _write_pixels(
     particle = first_particle + wp.tid()
     view = _view(inputs, particle)
     first = int(first_entry[particle])
-    entry = int(0)
+    entry = wp.int32(0)
     for j in range(view.bounds[1], view.bounds[3] + 1):
         for i in range(view.bounds[0], view.bounds[2] + 1):
             centre = _lens_centre(inputs, i, j)
