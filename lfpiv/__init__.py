@@ -30,9 +30,9 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.reconstruction.volume import reconstruct as reconstruct
     from lfpiv.report import write_report as write_report
     from lfpiv.results.export import export_results as export_results
+    from lfpiv.results.particles import open_particles as open_particles
     from lfpiv.results.reader import open_results as open_results
     from lfpiv.runs.pipeline import run as run
-    from lfpiv.results.particles import open_particles as open_particles
     from lfpiv.selfcalibration.movements import self_calibrate as self_calibrate
     from lfpiv.tracking.finding import find_particles as find_particles
     from lfpiv.tracking.linking import link_particles as link_particles

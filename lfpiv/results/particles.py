@@ -1,16 +1,17 @@
-"""`open_particles`: the linked particles of all finished pairs of a run as one table, and their files for other programs."""
+"""`open_particles`: the linked particles of all pairs of a run as one table, and their files for other programs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import xarray as xr
 
-from lfpiv.errors import InputError
-from lfpiv.files import replacing
+from lfpiv.errors import DamagedFile, InputError
+from lfpiv.files import plain, replacing
 from lfpiv.results import netcdf
 from lfpiv.results.stacked_files import NAME
 
@@ -73,6 +74,16 @@ def particle_files(folder: Path, pairs: tuple[int, int | None] | None = None) ->
             "file and run `lfpiv run`."
         )
     return dict(sorted(found.items()))
+
+
+def figures(path: Path) -> dict[str, Any]:
+    """Return the figures of a pair's linked particles as entry ``particles`` of the summary; none without a file."""
+    try:
+        stored = netcdf.read_attributes(path)
+    except (FileNotFoundError, DamagedFile):
+        return {}
+    kept = ("found", "linked", "valid_links", "per_microlens", "explained", "crowding", "sigma_voxel")
+    return {"particles": {name: plain(stored[name]) for name in kept if name in stored}}
 
 
 def write_csv(table: xr.Dataset, path: Path, digits: int) -> None:

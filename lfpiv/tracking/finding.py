@@ -20,9 +20,9 @@ from lfpiv.geometry.volume import is_finite
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import checked_images
 from lfpiv.tracking import candidates
+from lfpiv.tracking.found import FoundParticles
 from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Normal, Scene, diagonal_blocks, light_scatter, overlaps, refine, rendered
-from lfpiv.tracking.found import FoundParticles
 from lfpiv.weights.operator import Weights
 
 ROUNDS = 5
@@ -43,6 +43,8 @@ SEEN = 0.3
 """Least share of a particle's image on a camera's sensor for the camera to see it, relative to the largest share."""
 FIRST_STEPS, STEPS, LAST_STEPS = 4, 4, 4
 """Iterations of the first round, of the later rounds, and after the last one."""
+EARLY = 0.5
+"""Part of the limits of light that applies after the first iteration of a round."""
 SIZED_ROUNDS = 2
 """Rounds after which the particles' size is fitted."""
 OUTLIER_SIGMA = 5.0
@@ -51,8 +53,10 @@ START_SCATTER = 0.5
 """Relative scatter of light between cameras that is assumed at first."""
 USUAL_SIGMA_VOXEL = 0.7
 """Size of particles where the images do not show it [voxel]."""
-SIZE_STEP = 1.2
+SIZE_STEP = 1.25
 """Ratio of the sizes that are compared."""
+SIZE_FITS = 4
+"""Largest number of comparisons of sizes in a round."""
 
 
 def find_particles(
@@ -165,13 +169,16 @@ class ParticleSearch:
                     break
             if not len(state.cloud):
                 break
-            state.refine(FIRST_STEPS if number == 0 else STEPS)
-            state.cloud = self._pruned(state)
+            state.refine(1)
+            state.cloud = self._pruned(state, EARLY)
+            if len(state.cloud):
+                state.refine(FIRST_STEPS - 1 if number == 0 else STEPS - 1)
+                state.cloud = self._pruned(state)
             if not len(state.cloud):
                 break
             state.scatter = light_scatter(state.cloud.light)
             if self.sigma_voxel is None and number < SIZED_ROUNDS:
-                state.model = _fitted_size(state)
+                _fit_size(state)
             state.refine(1)
             if number and len(state.cloud) == before:
                 break
@@ -200,8 +207,11 @@ class ParticleSearch:
             return Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, count)))
         return candidates.volume_peaks(volume, count, self.weakest * candidates.typical(cloud.light.mean(1)))
 
-    def _pruned(self, state: _State) -> Cloud:
-        """Return the particles that all cameras confirm, those closer than one particle's size merged."""
+    def _pruned(self, state: _State, part: float = 1.0) -> Cloud:
+        """Return the particles that all cameras confirm, those closer than one particle's size merged.
+
+        `part` is the part of the limits that applies.
+        """
         cloud, normal = state.cloud, state.normal
         assert normal is not None
         good = candidates.inside(self.weights, cloud.positions_mm, MARGIN_VOXEL)
@@ -210,7 +220,7 @@ class ParticleSearch:
         inverse = np.linalg.pinv(own / size[:, :, None] / size[:, None, :], hermitian=True)
         error = np.sqrt(np.maximum(np.einsum("pii->pi", inverse), 0)) / size
         least = self.weakest * candidates.typical(cloud.light[good].mean(1)) if good.any() else 0.0
-        good &= (cloud.light > np.maximum(SIGNIFICANCE * error[:, 3:], least)).all(1)
+        good &= (cloud.light > part * np.maximum(SIGNIFICANCE * error[:, 3:], least)).all(1)
         first, second, overlap = overlaps(normal)
         same = (overlap > MERGED_OVERLAP).all(1) & good[first] & good[second]
         apart = (cloud.positions_mm[first] - cloud.positions_mm[second]) / state.model.voxel_mm
@@ -249,7 +259,16 @@ def _merged(cloud: Cloud, pairs: np.ndarray, good: np.ndarray) -> Cloud:
     return Cloud(positions_mm=positions, light=light)[kept]
 
 
-def _fitted_size(state: _State) -> ParticleImages:
+def _fit_size(state: _State) -> None:
+    """Change the size of the particles to the one that explains the images best."""
+    for _ in range(SIZE_FITS):
+        before, state.model = state.model, _better_size(state)
+        state.refine(1)
+        if abs(np.log(state.model.sigma_voxel / before.sigma_voxel)) < np.log(SIZE_STEP) / 2:
+            break
+
+
+def _better_size(state: _State) -> ParticleImages:
     """Return the model with the size of particles that explains the images best, from three sizes."""
     assert state.normal is not None
     variance = state.scene.variance(state.normal.model)
@@ -261,5 +280,5 @@ def _fitted_size(state: _State) -> ParticleImages:
         chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2).sum(dtype=np.float64)))
     below, here, above = chi2
     curvature, slope = below - 2 * here + above, (below - above) / 2
-    power = float(np.clip(slope / curvature, -1.5, 1.5)) if curvature > 0 else float(np.sign(slope))
+    power = float(np.clip(slope / curvature, -2, 2)) if curvature > 0 else 2 * float(np.sign(slope))
     return state.model.of_size(state.model.sigma_voxel * SIZE_STEP**power)

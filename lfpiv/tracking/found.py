@@ -18,7 +18,8 @@ class FoundParticles:
     positions_mm: np.ndarray
     """Positions (x, y, z) [mm], shape (particle, 3)."""
     errors_mm: np.ndarray
-    """Standard errors of the positions along (x, y, z) [mm], shape (particle, 3)."""
+    """Standard errors of the positions along (x, y, z) [mm], shape (particle, 3). They contain noise and what the
+    particles leave unexplained, but no errors of the calibration."""
     light: np.ndarray
     """Light of each particle, mean of the cameras [counts, summed over pixels], shape (particle,)."""
     residual: np.ndarray
@@ -57,15 +58,16 @@ class FoundParticles:
                 per_microlens=0.0,
             )
         errors = np.sqrt(np.maximum(np.einsum("pii->pi", covariances(normal))[:, :3], 0)) * grid.voxel_mm
+        residual = _residuals(model, scene, cloud, normal)
         left = scene.counts - normal.model
         noise = float(scene.variance(normal.model).sum(dtype=np.float64))
         whole = float(np.square(scene.counts, dtype=np.float64).sum()) - noise
         explained = 1 - (float(np.square(left, dtype=np.float64).sum()) - noise) / whole if whole > 0 else 0.0
         return cls(
             positions_mm=cloud.positions_mm,
-            errors_mm=errors,
+            errors_mm=errors * np.maximum(residual, 1)[:, None],
             light=cloud.light.mean(1),
-            residual=_residuals(model, scene, cloud, normal),
+            residual=residual,
             sigma_voxel=model.sigma_voxel,
             voxel_mm=grid.voxel_mm,
             explained=float(np.clip(explained, 0, 1)),

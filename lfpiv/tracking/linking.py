@@ -1,8 +1,8 @@
 """`link_particles`: the displacement of single particles between two frames, with a correlation field as predictor.
 
 Particles are linked where each is the other's best match in position and light, and no other match is nearly as good.
-The first pass measures how far links lie from the predictor, the second one searches as far as that. A normalised median
-test on the nearest links [1]_ finds outliers.
+The first pass measures how far links lie from the predictor, the second one searches as far as that. A normalised
+median test on the nearest links [1]_ finds outliers.
 
 .. [1] J. Duncan et al., "Universal outlier detection for particle image velocimetry (PIV) and particle tracking
    velocimetry (PTV) data", Meas. Sci. Technol. 21 (2010) 057002, doi:10.1088/0957-0233/21/5/057002.
