@@ -24,6 +24,8 @@ from lfpiv.tracking.table import link_table
 
 FIRST_SPREAD_VOXEL = 0.7
 """Standard deviation of true displacements about the predictor that the first pass assumes [voxel]."""
+SPREAD_PERCENTILE = 95.0
+"""Percentile of the distances of links from their neighbours' median that counts as two standard deviations."""
 LEAST_SPREAD_VOXEL = 0.1
 """Least spread that the second pass assumes [voxel]."""
 REACH = 4.0
@@ -171,7 +173,7 @@ def _corrected(
     _, own = tree.query(places, NEIGHBOURS + 1)
     around = off[own[:, 1:]]
     median = np.median(around, axis=1)
-    spread = NORMAL_MAD * np.median(np.abs(off - median), axis=0)
+    spread = np.percentile(np.abs(off - median), SPREAD_PERCENTILE, axis=0) / 2
     _, near = tree.query(first.positions_mm / first.voxel_mm, NEIGHBOURS)
     return predicted + np.median(off[near], axis=1), np.maximum(spread, LEAST_SPREAD_VOXEL)
 

@@ -42,8 +42,8 @@ class TrackingRig:
         """Return random positions in the volume, shape (count, 3) [mm]."""
         return np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3)) * (1.6, 1.6, 1.2)
 
-    def images(self, positions_mm, seed, *, cameras=None):
-        """Render particles, only in some `cameras` if they are named, with shot noise and read noise."""
+    def images(self, positions_mm, seed, *, cameras=None, noise=True):
+        """Render particles, only in some `cameras` if they are named, with shot noise and read noise or without."""
         rays, images = render.ray_table(16384, "gaussian", 0), {}
         for number, (name, camera) in enumerate(self.cameras.items()):
             rng = np.random.default_rng([seed, number])
@@ -53,6 +53,9 @@ class TrackingRig:
             if len(lit):
                 counts = np.full(len(lit), LIGHT * eye.microimage_px)
                 light = render.render_sources(eye, lit, counts, SIGMA_VOXEL * VOXEL_MM, rays, rng=rng)
+            if not noise:
+                images[name] = light
+                continue
             shot = rng.poisson(light * PER_COUNT) / PER_COUNT
             images[name] = (shot + READ_NOISE * rng.standard_normal(shot.shape)).astype(np.float32)
         return images

@@ -53,12 +53,11 @@ def test_images_equal_their_twin(rig, model):
 
 
 def test_images_equal_rendered_ones(rig, model):
-    images = rig.images(POINTS, 3)
+    images = rig.images(POINTS, 3, noise=False)
     for number, (name, lists) in enumerate(zip(rig.cameras, model.lists(POINTS), strict=True)):
         ours, seen = dense(lists, model, number)[:, 3].sum(0), images[name].reshape(-1)
-        assert np.corrcoef(ours, seen)[0, 1] > 0.98
         light = (ours * seen).sum() / (ours * ours).sum()
-        assert np.linalg.norm(seen - light * ours) < 0.2 * np.linalg.norm(seen)
+        assert np.linalg.norm(seen - light * ours) < 0.12 * np.linalg.norm(seen)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
