@@ -105,6 +105,16 @@ class Correlation(Table):
     """Exponent applied to the smoothed volumes' intensities before correlation; 1 leaves them unchanged."""
 
 
+class Tracking(Table):
+    """Table ``[tracking]``: vectors of single particles beside the correlation; absent: none."""
+
+    rounds: Annotated[int, Field(strict=True, ge=1, le=20)] = 5
+    """Largest number of rounds in which particles are fitted to the images, removed where a camera does not confirm
+    them, and added where light is left."""
+    weakest: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1
+    """Least light of a particle in each camera that counts, as a share of the typical particle's."""
+
+
 Nodes = Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_NODES)]
 
 
@@ -454,6 +464,7 @@ class ExperimentTable(Table):
     particles: Particles
     smart: Smart = Smart()
     correlation: Correlation = Correlation()
+    tracking: Tracking | None = None
     network: Network = Network()
     self_calibration: SelfCalibration = SelfCalibration()
     compute: Compute = Compute()

@@ -108,6 +108,8 @@ class PairStamps:
     volumes: tuple[Stamp, Stamp]
     """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
     vectors: Stamp
+    particles: Stamp | None = None
+    """Of the linked particles; None without tracking."""
 
 
 def read_marks(path: Path) -> Marks | None:
@@ -355,7 +357,11 @@ def of_pair(
     of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
     if experiment.series is None:
         volumes = Stamp(of_pair)
-        return PairStamps(volumes=(volumes, volumes), vectors=Stamp(of_pair | of_vectors))
+        return PairStamps(
+            volumes=(volumes, volumes),
+            vectors=Stamp(of_pair | of_vectors),
+            particles=_of_particles(experiment, of_pair | of_vectors),
+        )
     first, second = (
         Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
         for instant in experiment.pair_frames(pair)
@@ -367,7 +373,17 @@ def of_pair(
             Stamp({**stamp.parts, IMAGES_BEFORE: hashed}) for stamp, hashed in zip((first, second), before, strict=True)
         )
         of_vectors[IMAGES_BEFORE] = None if None in before else before
-    return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
+    return PairStamps(
+        volumes=(first, second),
+        vectors=Stamp(of_pair | of_vectors),
+        particles=_of_particles(experiment, of_pair | of_vectors),
+    )
+
+
+def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp | None:
+    """Return the stamp of the linked particles, for which the vectors are the predictor."""
+    tracking = experiment.tracking
+    return None if tracking is None else Stamp(of_vectors | {"tracking": tracking.model_dump()})
 
 
 def _images_before(experiment: Experiment, instant: int) -> str | None:

@@ -37,8 +37,10 @@ from lfpiv.runs import pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.guard import with_guard
 from lfpiv.runs.instants import Instants, failure
+from lfpiv.runs.particles import track
 from lfpiv.runs.sequences import SequentialInstants, restarted
 from lfpiv.runs.side_threads import ReadAhead, Writer
+from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.warn import FirstOfEachCode, Warning
 
@@ -210,7 +212,8 @@ class PairWork:
 
     def _do(self, pair: int, instants: Instants | None, progress: StepProgress) -> None:
         files = self.files(pair)
-        if files.outdated(vectors=self.vectors, volumes=self.keep_volumes) is None:
+        wanted = {"vectors": self.vectors, "volumes": self.keep_volumes, "particles": self.weights is not None}
+        if files.outdated(**wanted) is None:
             log.info("%s: was finished by a worker that died afterwards", self.experiment.name_of(pair))
             return
         if instants is None:
@@ -343,8 +346,11 @@ class PairWork:
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
         vectors.attrs["reconstruction_s"] = self._reconstruction_s(files.pair, volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
-        condensed = volumes.condensed()
-        figures = pair_figures.measure(vectors, condensed, volumes.warnings)
+        condensed, found = volumes.condensed(), volumes.warnings
+        if files.particles is not None and self.weights is not None:
+            found = (*found, *self._track(files, volumes, vectors))
+            vectors.attrs["warnings"] = warn.to_text(found)
+        figures = pair_figures.measure(vectors, condensed, found)
         self._log(files.pair, volumes.between)
         if figures.lost_unseeded > 0:
             self._log(files.pair, [figures.unseeded_warning(files.pair)])
@@ -362,6 +368,30 @@ class PairWork:
             log.info("%s: %.0f %% of the vectors valid", name, 100 * figures.valid_fraction)
 
         self.write(write)
+
+    def _track(self, files: PairFiles, volumes: PairVolumes, vectors: xr.Dataset) -> list[Warning]:
+        """Find and link the particles of both frames and write them; return the warnings about them."""
+        table, found = track(self.search, [self.light_again(file.frame) for file in files.frames], volumes, vectors)
+        self.write(partial(files.write_particles, table))
+        name, linked = self.experiment.name_of(files.pair), table.sizes["particle"]
+        log.info(
+            "%s: %d and %d particles found, %d linked, %d of them valid; %.3g per microlens, %.0f %% of the light "
+            "explained",
+            name,
+            *table.attrs["found"],
+            linked,
+            table.attrs["valid_links"],
+            np.mean(table.attrs["per_microlens"]),
+            100 * np.mean(table.attrs["explained"]),
+        )
+        self._log(files.pair, found)
+        return found
+
+    @cached_property
+    def search(self) -> ParticleSearch:
+        """Search for particles of this rig, made once for all pairs."""
+        assert self.weights is not None and self.experiment.tracking is not None
+        return ParticleSearch(self.weights, **self.experiment.tracking.model_dump())
 
     def _reconstruction_s(self, pair: int, volumes: PairVolumes) -> float:
         """Return the time that the volumes of a pair took [s].

@@ -58,6 +58,7 @@ class Code(enum.Enum):
     NOT_FOLLOWED = "not_followed"
     REPEATED = "repeated"
     UNSEEDED = "unseeded"
+    CROWDED = "crowded"
     # the run
     FEWER_WORKERS = "fewer_workers"
     ONE_GPU = "one_gpu"
@@ -212,6 +213,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.UNSEEDED: (
         "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
         "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"
+    ),
+    Code.CROWDED: (
+        "the image of a particle overlaps those of {crowding:.2g} others by half or more ({limit:g} is the limit; "
+        "{per_microlens:.2g} particles per microlens were found): some particles are missed and some found are none. "
+        "Rely on the correlation, or use less seeding"
     ),
     Code.FEWER_WORKERS: (
         "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "
