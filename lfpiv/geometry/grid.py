@@ -171,11 +171,11 @@ class Grid:
 
         Where this grid reaches beyond the other one, the voxels at its faces are taken.
         """
-        z, y, x = (
-            np.clip(np.rint((self.axis_mm(k) - other.first_centre_mm[k]) / other.voxel_mm), 0, other.shape[k] - 1)
-            for k in range(3)
+        places = [(self.axis_mm(k) - other.first_centre_mm[k]) / other.voxel_mm for k in range(3)]
+        z, y, x = np.ix_(
+            *(np.clip(np.rint(at), 0, n - 1).astype(int) for at, n in zip(places, other.shape, strict=True))
         )
-        return np.ix_(z.astype(int), y.astype(int), x.astype(int))
+        return z, y, x
 
     @property
     def centre_mm(self) -> np.ndarray:

@@ -17,16 +17,15 @@ amount in the numerator and in the denominator of the ratio.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from scipy import ndimage
 
-from lfpiv.calibration.camera import CalibratedCamera, Calibration
-from lfpiv.geometry.grid import Grid
+from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.lightfield.microimage_layout import microimage_centres
 from lfpiv.reconstruction.sieve import Sieve
-from lfpiv.weights.operator import Weights, build_weights
+from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +51,6 @@ VOXEL_VARIANCE = 1 / 12
 """Variance of an evenly lit voxel along each axis [voxel^2]."""
 LEAST_SIEVE_VOXEL = 0.3
 """Least standard deviation of a sieve [voxel]. Narrower Gaussians, sampled at voxels, are single voxels."""
-LARGEST_PART = 40
-"""Largest edge of the part of a volume whose weights measure the particles' size [voxel]."""
 SIEVE_STEP_VOXEL = 0.05
 """Sieves are rounded to multiples of this [voxel], so that the frames of a run have the same sieve."""
 
@@ -179,30 +176,3 @@ class ParticleSizer:
         text = "unknown size, in" if size is None else f"{size:.2f}"
         log.debug("particles of %s voxel: sieve of %.2f voxel", text, sieve)
         return sieve if sieve >= LEAST_SIEVE_VOXEL else 0.0
-
-
-def measure_size(calibration: Calibration, grid: Grid, images: Sequence[Mapping[str, np.ndarray]]) -> float | None:
-    """Measure the size of the particles before the weights of the volume are built.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        Cameras.
-    grid : Grid
-        The volume. The weights of its middle, at most `LARGEST_PART` voxels along each axis, are built.
-    images : sequence of dict
-        Some instants: camera name -> image, shape (rows, columns) [counts], background subtracted, its noise included.
-
-    Returns
-    -------
-    float or None
-        Standard deviation of the particles [voxel of the grid], as of `ParticleSizer.size`: root mean square over the
-        instants. None if it can be measured in none of them.
-    """
-    shape = tuple(min(n, LARGEST_PART) for n in grid.shape)
-    x, y, z = grid.centre_mm.tolist()
-    size = tuple(n * grid.voxel_mm for n in reversed(shape))
-    middle = Grid.from_extent(centre_mm=(x, y, z), size_mm=(size[0], size[1], size[2]), voxel_mm=grid.voxel_mm)
-    sizer = ParticleSizer(build_weights(calibration, middle), partial=True)
-    found = [size for image in images if (size := sizer.size(image)) is not None]
-    return float(np.sqrt(np.mean(np.square(found)))) if found else None

@@ -18,7 +18,7 @@ import numpy as np
 from lfpiv import files
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
-from lfpiv.reconstruction.particle_size import measure_size
+from lfpiv.reconstruction.refinement import LARGEST, STEP, measure_size, needed_refinement
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
 from lfpiv.results import provenance
 from lfpiv.results.provenance import Marks
@@ -32,13 +32,6 @@ if TYPE_CHECKING:
     from lfpiv.results.folder import Folder
 
 log = logging.getLogger(__name__)
-
-RESOLVED = 0.93
-"""Least size of particles whose images unit voxels describe well, standard deviation [reconstructed voxel]."""
-LARGEST = 1.35
-"""Largest refinement that "auto" takes: 2.5 times as many voxels."""
-STEP = 0.05
-"""Refinements are rounded to multiples of this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +139,7 @@ def decide(
     instants = light()
     images = [image for instant in instants.values() for image in instant]
     size = measure_size(calibration, experiment.grid, images) if images else None
-    demanded = demanded_by(size)
+    demanded = needed_refinement(size)
     found = Refinement(
         pairs=tuple(instants),
         size_voxel=None if size is None else round(size, 3),
@@ -159,14 +152,6 @@ def decide(
         content = {**stamp.attributes, "refinement": found.to_json()}
         files.write_json({**content, "digest": digest(content)}, folder.refinement)
     return found
-
-
-def demanded_by(size_voxel: float | None) -> float:
-    """Return the refinement that particles of a size demand; 1 for an unknown one."""
-    if size_voxel is None:
-        return 1.0
-    wanted = min(RESOLVED / max(size_voxel, RESOLVED / LARGEST), LARGEST)
-    return round(max(1.0, STEP * round(wanted / STEP)), 2)
 
 
 def warnings(experiment: Experiment, found: Refinement | None) -> list[Warning]:
