@@ -14,15 +14,20 @@ from lfpiv.geometry.volume import MASKED, SPACING_TOLERANCE, checked_volume
 
 VOXEL_ATTRIBUTES = ("sieve_voxel", "smoothing_voxel")
 """Attributes of a volume that are lengths in its voxels."""
+EDGE = 1e-6
+"""Tolerance of places at the faces of a grid [voxel]."""
+SMOOTH_VOXEL = 0.5
+"""Least standard deviation of Gaussians of which a volume is made that samples of it represent well [voxel]."""
 
 
 def volume_on(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
     """Return a volume of light on the voxels of another grid.
 
-    Each axis is sampled at the voxel centres from the cubic spline through the values [1]_. Negative values, which
-    splines have beside bright voxels, become 0, and the others are lowered in proportion, so that the light stays the
-    same. A voxel holds the light of its own size: values are scaled by the ratio of the voxels' volumes. Voxels of the
-    same size and place are cut out as they are.
+    The light between voxels is the cubic spline through the values [1]_. A volume whose attribute ``sieve_voxel`` is
+    `SMOOTH_VOXEL` or more is smooth, and is sampled at the voxel centres. Any other one, of single bright voxels, is
+    integrated over each voxel: samples would depend on where in a voxel a particle lies. Negative values, which splines
+    have beside bright voxels, become 0, and the others are lowered in proportion, so that the light stays the same. A
+    voxel holds the light of its own size. Voxels of the same size and place are cut out as they are.
 
     Parameters
     ----------
@@ -60,7 +65,8 @@ def volume_on(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
     values, given = checked_volume(volume, None, "volume")
     if _holds(given, grid):
         return _cut(volume, grid.within(given))
-    sampling = [_sampling(given, grid, axis) for axis in range(3)]
+    matrix_of = _sampling if float(volume.attrs.get("sieve_voxel", 0.0)) >= SMOOTH_VOXEL else _integral
+    sampling = [matrix_of(given, grid, axis) for axis in range(3)]
     ratio, nearest = grid.voxel_mm / given.voxel_mm, grid.nearest_in(given)
     others = {str(name): about for name, about in volume.coords.items() if about.dims == AXES}
     dark = others[MASKED].values[nearest].astype(bool) if MASKED in others else None
@@ -112,24 +118,53 @@ def _resampled(values: np.ndarray, sampling: list[np.ndarray], ratio: float, dar
 
 
 def _sampling(given: Grid, grid: Grid, axis: int) -> np.ndarray:
-    """Return the matrix from voxels of one grid to those of another along an axis, float32.
+    """Return the matrix that samples the spline of one grid at the voxels of another along an axis, float32.
 
     A row is zero for voxels with their centre outside the given grid.
     """
-    count = given.shape[axis]
-    place = (grid.axis_mm(axis) - given.first_centre_mm[axis]) / given.voxel_mm
-    inside = (place > -0.5 - 1e-6) & (place < count - 0.5 + 1e-6)
-    unit = np.eye(count)
-    if count > 1:
-        unit = ndimage.spline_filter1d(unit, order=3, axis=0, mode="mirror")
+    count, place = given.shape[axis], _place(given, grid, axis)
+    inside = (place > -0.5 - EDGE) & (place < count - 0.5 + EDGE)
     matrix = np.zeros((len(place), count))
     first = np.floor(place).astype(int) - 1
     for step in range(4):
         distance = np.abs(place - (first + step))
         weight = np.where(distance < 1, 2 / 3 - distance**2 + distance**3 / 2, np.maximum(2 - distance, 0) ** 3 / 6)
         matrix[np.arange(len(place)), _mirrored(first + step, count)] += np.where(inside, weight, 0.0)
-    sampled: np.ndarray = (matrix @ unit).astype(np.float32)
-    return sampled
+    return _of_values(matrix)
+
+
+def _integral(given: Grid, grid: Grid, axis: int) -> np.ndarray:
+    """Return the matrix that averages the spline of one grid over the voxels of another along an axis, float32."""
+    count, place, edge = given.shape[axis], _place(given, grid, axis), grid.voxel_mm / given.voxel_mm
+    low, high = (np.clip(place + side * edge / 2, -0.5, count - 0.5) for side in (-1, 1))
+    matrix = np.zeros((len(place), count))
+    first = np.floor(low).astype(int) - 1
+    for step in range(math.ceil(edge) + 4):
+        weight = (_spline_integral(high - (first + step)) - _spline_integral(low - (first + step))) / edge
+        matrix[np.arange(len(place)), _mirrored(first + step, count)] += weight
+    return _of_values(matrix)
+
+
+def _spline_integral(end: np.ndarray) -> np.ndarray:
+    """Return the integral of the cubic B-spline around 0 from minus infinity to `end`."""
+    far = np.clip(np.abs(end), 0, 2)
+    half = np.where(far < 1, 2 * far / 3 - far**3 / 3 + far**4 / 8, 0.5 - (2 - far) ** 4 / 24)
+    integral: np.ndarray = 0.5 + np.sign(end) * half
+    return integral
+
+
+def _of_values(matrix: np.ndarray) -> np.ndarray:
+    """Return a matrix that applies to coefficients of the spline as one that applies to values."""
+    count = matrix.shape[1]
+    if count > 1:
+        matrix = matrix @ ndimage.spline_filter1d(np.eye(count), order=3, axis=0, mode="mirror")
+    return matrix.astype(np.float32)
+
+
+def _place(given: Grid, grid: Grid, axis: int) -> np.ndarray:
+    """Return the voxel centres of a grid along an axis [voxel of the given one]."""
+    place: np.ndarray = (grid.axis_mm(axis) - given.first_centre_mm[axis]) / given.voxel_mm
+    return place
 
 
 def _mirrored(index: np.ndarray, count: int) -> np.ndarray:

@@ -178,6 +178,7 @@ class PairWork:
         correlate the reconstructed voxels.
         """
         assert self.weights is not None
+        self.weights.volume = self.experiment.grid
         smart, farthest = self.experiment.smart, self.experiment.correlation.max_displacement_voxel
         if farthest is None and self.refinement > 1:
             farthest = FIRST_SEARCH * DEFAULT_WINDOWS[0]
