@@ -160,13 +160,17 @@ class PairFiles:
         *,
         background: str | None = None,
         guard: Layers = NO_LAYERS,
+        refinement: float = 1.0,
     ) -> PairFiles:
         """Return the files of a pair.
 
         `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light. `guard`
-        has the guard layers of the volumes.
+        has the guard layers of the volumes, `refinement` is the edge of their voxels over that of the reconstructed
+        ones.
         """
-        stamps = provenance.of_pair(experiment, calibration, pair, background=background, guard=guard)
+        stamps = provenance.of_pair(
+            experiment, calibration, pair, background=background, guard=guard, refinement=refinement
+        )
         frames = experiment.pair_frames(pair)
         first, second = (
             VolumeFile(

@@ -43,6 +43,7 @@ class Code(enum.Enum):
     ONE_CAMERA = "one_camera"
     LIGHT_GUARDED = "light_guarded"
     LIGHT_UNGUARDED = "light_unguarded"
+    COARSE_VOXELS = "coarse_voxels"
     APART = "apart"
     NOTHING_IN_COMMON = "nothing_in_common"
     NOT_SELF_CALIBRATED = "not_self_calibrated"
@@ -171,6 +172,10 @@ SENTENCES: Mapping[Code, str] = {
         "particles are lit beyond the face {face} of the volume, {reach_mm:.2g} mm or more ({share:percent} % of the "
         "volume's light), farther than the guard layers of {guard_mm:.2g} mm: their light falls into the volume and "
         "biases vectors near its faces; {reason}"
+    ),
+    Code.COARSE_VOXELS: (
+        "particles of {size:.2f} voxel demand that voxels of {demanded_mm:.3g} mm are reconstructed, the memory allows "
+        "{used_mm:.3g} mm: expect more ghosts; raise compute.memory_gib or shrink volume.size_mm"
     ),
     Code.APART: (
         "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: a camera moved since the board was "
