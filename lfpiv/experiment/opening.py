@@ -105,6 +105,7 @@ def read_experiment(path: str | Path) -> Experiment:
         self_calibration=table.self_calibration,
         bootstrap=table.bootstrap,
         correlation=table.correlation,
+        tracking=table.tracking,
         network=table.network,
         compute=table.compute,
         particle_images=particles.images,

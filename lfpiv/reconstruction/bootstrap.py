@@ -38,8 +38,6 @@ SHELL_WIDTH = 0.1
 """Width of the shells of wave numbers in which powers are compared [1 / distance of windows]."""
 SHELL_SLOPES = (0.5, 1.2)
 """Limits of the slope of a shell. Few modes do not know it well."""
-MOST_RAISED = 1.5
-"""Largest factor by which amplitudes are raised so that means over windows have the power that is wanted."""
 LIGHT_VOXEL = 6.0
 """Standard deviation of the Gaussian that smooths a volume to the light of its particles [voxel]: several particles are
 within its reach."""
@@ -163,21 +161,10 @@ class _Bootstrap:
     def _simulate(self, number: int, displacement: np.ndarray) -> Simulated:
         """Simulate and measure one pair whose window means are to be a displacement (z, y, x, 3) [voxel]."""
         like = self._vectors[max(number - 1, 0) % len(self._vectors)]
-        flow = _imposed(like, displacement)
+        flow = ImposedField(like, displacement)
         frames = self._pair.images(flow, np.random.default_rng([SEED, number]))
         found = self._measure(frames, (self._noise, self._noise))
         return Simulated(vectors=found, imposed=flow.window_means)
-
-
-def _imposed(like: xr.Dataset, displacement: np.ndarray) -> ImposedField:
-    """Return the field whose window means have the power of a displacement in each shell of modes.
-
-    A spline cannot have all the means that short waves demand. Their amplitudes are raised once for what is missing.
-    """
-    flow, shells = ImposedField(like, displacement), _shells(displacement.shape[:3])
-    wanted, found = _modes(displacement), _modes(flow.window_means)
-    missing = _shell_sums(wanted, wanted, shells) / np.maximum(_shell_sums(found, found, shells), np.finfo(float).tiny)
-    return ImposedField(like, likely_flow(displacement, np.sqrt(np.clip(missing, 1, MOST_RAISED**2))))
 
 
 def shell_gains(measured: Sequence[np.ndarray], simulated: Sequence[Simulated]) -> np.ndarray:

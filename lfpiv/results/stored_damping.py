@@ -85,11 +85,11 @@ def write(found: StoredDamping, stamp: Stamp, path: Path) -> None:
 def of_vectors(path: Path, depends_on: Mapping[str, Any]) -> Damping | None:
     """Return the damping in a file that holds for vectors, given the parts of their stamp; None if there is none.
 
-    All parts must be equal but the images, which are other ones for each pair.
+    All parts must be equal but `provenance.OF_PAIR`.
     """
     found = read(path)
     if found is None:
         return None
     stored = read_object(found[1].depends_on)
-    same = all(stored.get(name) == part for name, part in depends_on.items() if name != "images")
+    same = all(stored.get(name) == part for name, part in depends_on.items() if name not in provenance.OF_PAIR)
     return found[0].damping if same and depends_on else None

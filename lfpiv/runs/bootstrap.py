@@ -68,6 +68,9 @@ def decide(
         with writing(folder.bootstrap):
             folder.bootstrap.unlink(missing_ok=True)
         return None
+    if experiment.in_sequence:
+        log.info("damping by ghosts: not measured in a series whose instants follow from those before (smart.predict)")
+        return None
     if (known := stored(experiment, folder, stamp_of)) is not None:
         log.info("damping by ghosts: measured before, kept")
         return known
