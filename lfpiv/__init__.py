@@ -31,9 +31,13 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.reconstruction.volume import reconstruct as reconstruct
     from lfpiv.report import write_report as write_report
     from lfpiv.results.export import export_results as export_results
+    from lfpiv.results.particles import open_particles as open_particles
     from lfpiv.results.reader import open_results as open_results
     from lfpiv.runs.pipeline import run as run
     from lfpiv.selfcalibration.movements import self_calibrate as self_calibrate
+    from lfpiv.tracking.finding import find_particles as find_particles
+    from lfpiv.tracking.linking import link_particles as link_particles
+    from lfpiv.tracking.tracks import particle_tracks as particle_tracks
     from lfpiv.velocity.cross_correlation import correlate as correlate
     from lfpiv.weights.operator import build_weights as build_weights
 
@@ -50,9 +54,13 @@ _MODULES = {
     "correlate": "lfpiv.velocity.cross_correlation",
     "export_results": "lfpiv.results.export",
     "find_lens_array": "lfpiv.lightfield.lens_array",
+    "find_particles": "lfpiv.tracking.finding",
+    "link_particles": "lfpiv.tracking.linking",
     "load_calibration": "lfpiv.calibration.camera",
     "open_experiment": "lfpiv.experiment.opening",
     "open_results": "lfpiv.results.reader",
+    "open_particles": "lfpiv.results.particles",
+    "particle_tracks": "lfpiv.tracking.tracks",
     "reconstruct": "lfpiv.reconstruction.volume",
     "reconstruct_pair": "lfpiv.reconstruction.motion",
     "run": "lfpiv.runs.pipeline",

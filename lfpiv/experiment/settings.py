@@ -81,13 +81,15 @@ class Smart(Table):
     motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
     """Number of times the motion is measured and both frames are reconstructed again from their common light along it;
     0 reconstructs each frame separately."""
+    predict: Flag = False
+    """Whether an instant of a time series starts from the one before, moved by the flow, and takes fewer iterations."""
 
     def of_one_frame(self, refinement: float = 1.0) -> dict[str, Any]:
         """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame.
 
         `refinement` is the edge of a voxel over that of the reconstructed ones, in which lengths are returned.
         """
-        settings = self.model_dump(exclude={"motion_passes", "refinement"})
+        settings = self.model_dump(exclude={"motion_passes", "predict", "refinement"})
         lengths = ("sieve_voxel", "smoothing_voxel")
         return settings | {name: settings[name] * refinement for name in lengths if settings[name] != "auto"}
 
@@ -109,6 +111,16 @@ class Correlation(Table):
     switches it off."""
     intensity_power: Annotated[float, Field(strict=True, gt=0, le=2)] = 0.5
     """Exponent applied to the smoothed volumes' intensities before correlation; 1 leaves them unchanged."""
+
+
+class Tracking(Table):
+    """Table ``[tracking]``: vectors of single particles beside the correlation; absent: none."""
+
+    rounds: Annotated[int, Field(strict=True, ge=1, le=20)] = 5
+    """Largest number of rounds in which particles are fitted to the images, removed where a camera does not confirm
+    them, and added where light is left."""
+    weakest: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1
+    """Least light of a particle in each camera that counts, as a share of the typical particle's."""
 
 
 Nodes = Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_NODES)]
@@ -461,6 +473,7 @@ class ExperimentTable(Table):
     particles: Particles
     smart: Smart = Smart()
     correlation: Correlation = Correlation()
+    tracking: Tracking | None = None
     network: Network = Network()
     self_calibration: SelfCalibration = SelfCalibration()
     compute: Compute = Compute()

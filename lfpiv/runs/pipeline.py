@@ -149,7 +149,7 @@ def correlate(
     """
     with open_run(experiment, out, device, progress, pairs) as current:
         calibrated = rig.load_calibration(current)
-        todo = current.unfinished()
+        todo = current.unfinished(particles=False)
         if (known := todo.ahead()) and not current.has_some_volumes():
             first = known[0]
             raise InputError(

@@ -176,19 +176,22 @@ class Run:
         """Return whether both volumes of a pair are in the folder and fit."""
         return self.files(pair).fitting_volumes() is not None
 
-    def unfinished(self, *, vectors: bool = True, volumes: bool = False, quiet: bool = False) -> Todo:
-        """Find the selected pairs whose vectors or volumes are missing or do not fit; log changes unless `quiet`."""
+    def unfinished(
+        self, *, vectors: bool = True, volumes: bool = False, particles: bool = True, quiet: bool = False
+    ) -> Todo:
+        """Find the selected pairs whose results are missing or do not fit; log changes unless `quiet`."""
         self.finished.clear()
 
         def changes(pair: int) -> list[str] | None:
             found = self.files(pair)
-            changed = found.outdated(vectors=vectors, volumes=volumes)
+            changed = found.outdated(vectors=vectors, volumes=volumes, particles=particles)
             if changed is None:
                 self._keep(found)
             return changed
 
         stored = self.folder.stored(self.numbers, vectors=vectors, volumes=volumes)
-        step = 1 if self.experiment.series is None else self.experiment.series.step
+        series = self.experiment.series
+        step = 1 if series is None or self.experiment.in_sequence else series.step
         todo = Todo(self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun)
         todo.quiet = quiet
         return todo
@@ -204,7 +207,9 @@ class Run:
         return any(self.has_volumes(pair) for pair, there in zip(self.numbers, stored, strict=True) if there)
 
     def need_weights(self, todo: Todo) -> bool:
-        """Return whether a pair to do has no volumes that fit."""
+        """Return whether a pair to do has no volumes that fit, or particles are to be found in its images."""
+        if self.experiment.tracking is not None and todo.ahead():
+            return True
         if not all(map(self.has_volumes, todo.ahead())):
             return True
         if todo.whole:

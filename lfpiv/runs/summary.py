@@ -23,6 +23,7 @@ from lfpiv.files import writing
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
+from lfpiv.results import particles
 from lfpiv.results.folder import Folder
 from lfpiv.runs import guard, refinement
 from lfpiv.runs.guard import Guard
@@ -221,10 +222,12 @@ class _Survey:
 def _survey(contents: Contents, folder: Folder) -> _Survey:
     """Go through the figures of all finished pairs once. If they are too many for the summary, write them to a file."""
     total, images, vectors = len(contents.vectors), Gathering(), Gathering()
+    tracked = folder.particles(0).parent.is_dir()
     totals, listed = dict.fromkeys(_SUMMED, 0.0), []
     with _lines(folder.pairs if total > MOST_LISTED else None) as write:
         for place, (pair, figures) in enumerate(contents.vectors.items()):
             entry = {"pair": pair, "file": folder.vectors(pair).name, **figures.to_json()}
+            entry |= particles.figures(folder.particles(pair)) if tracked else {}
             write(entry)
             if total <= MOST_LISTED or place in (0, total - 1) or _is_sampled(place, total):
                 listed.append(entry)
