@@ -17,7 +17,7 @@ def rig():
     return two_cameras(optics=optics(400, 480))
 
 
-def images_of(rig, sigma_voxel, seed, count=200):
+def images_of(rig, sigma_voxel, seed, count=80):
     """Images of Gaussian particles, through voxels of half the size, with noise."""
     rng = np.random.default_rng(seed)
     at = rng.uniform(-0.5, 0.5, (count, 3)) * (1.8, 1.6, 1.4)
