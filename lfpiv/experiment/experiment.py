@@ -22,6 +22,7 @@ from lfpiv.experiment.settings import (
     SelfCalibration,
     Series,
     Smart,
+    Tracking,
 )
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
@@ -94,6 +95,8 @@ class Experiment:
     """Estimate of the light that stands still: "auto", "none", "minimum" or "median"."""
     series: Series | None = None
     """The time series; None for image pairs."""
+    tracking: Tracking | None = None
+    """Settings of the tracking of particles; None without it."""
 
     @property
     def numbers(self) -> range:

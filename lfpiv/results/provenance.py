@@ -108,6 +108,8 @@ class PairStamps:
     volumes: tuple[Stamp, Stamp]
     """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
     vectors: Stamp
+    particles: Stamp | None = None
+    """Of the linked particles; None without tracking."""
 
 
 def read_marks(path: Path) -> Marks | None:
@@ -321,7 +323,7 @@ def of_self_calibration(experiment: Experiment, calibration: str, background: st
 
 
 def of_guard(experiment: Experiment, calibration: str, pairs: Sequence[int], background: str | None = None) -> Stamp:
-    """Return the stamp of the guard layers measured with some pairs.
+    """Return the stamp of what is measured in some pairs before volumes are reconstructed: guard layers, refinement.
 
     `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light.
     """
@@ -344,18 +346,27 @@ def of_pair(
     *,
     background: str | None = None,
     guard: Layers = NO_LAYERS,
+    refinement: float = 1.0,
 ) -> PairStamps:
     """Return the stamps of the volumes and of the vectors of a pair.
 
     `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
-    the guard layers of the volumes.
+    the guard layers of the volumes, `refinement` the edge of their voxels over that of the reconstructed ones.
     """
-    parts, start = _of_light(experiment, calibration, background, guard), experiment.path.parent
+    light, start = _of_light(experiment, calibration, background), experiment.path.parent
+    parts = light | {
+        "guard": guard if guard != NO_LAYERS else None,
+        "refinement": refinement if refinement != 1 else None,
+    }
     of_pair = parts | {"images": _identity(experiment.pair_paths(pair), start)}
     of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
     if experiment.series is None:
         volumes = Stamp(of_pair)
-        return PairStamps(volumes=(volumes, volumes), vectors=Stamp(of_pair | of_vectors))
+        return PairStamps(
+            volumes=(volumes, volumes),
+            vectors=Stamp(of_pair | of_vectors),
+            particles=_of_particles(experiment, of_pair | of_vectors),
+        )
     first, second = (
         Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
         for instant in experiment.pair_frames(pair)
@@ -367,7 +378,17 @@ def of_pair(
             Stamp({**stamp.parts, IMAGES_BEFORE: hashed}) for stamp, hashed in zip((first, second), before, strict=True)
         )
         of_vectors[IMAGES_BEFORE] = None if None in before else before
-    return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
+    return PairStamps(
+        volumes=(first, second),
+        vectors=Stamp(of_pair | of_vectors),
+        particles=_of_particles(experiment, of_pair | of_vectors),
+    )
+
+
+def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp | None:
+    """Return the stamp of the linked particles, for which the vectors are the predictor."""
+    tracking = experiment.tracking
+    return None if tracking is None else Stamp(of_vectors | {"tracking": tracking.model_dump()})
 
 
 def _images_before(experiment: Experiment, instant: int) -> str | None:
@@ -379,7 +400,7 @@ def _images_before(experiment: Experiment, instant: int) -> str | None:
     return None if found is None else files.settings_hash(images=found)
 
 
-def _of_light(experiment: Experiment, calibration: str, background: str | None, guard: Layers) -> dict[str, Any]:
+def _of_light(experiment: Experiment, calibration: str, background: str | None) -> dict[str, Any]:
     """Return the parts of the stamp of volumes; the identity of the images is None and to be filled in."""
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
@@ -391,7 +412,6 @@ def _of_light(experiment: Experiment, calibration: str, background: str | None, 
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
         "mask": _mask_hash(experiment.solid),
-        "guard": guard if guard != NO_LAYERS else None,
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes or experiment.in_sequence else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},

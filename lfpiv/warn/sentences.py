@@ -43,6 +43,7 @@ class Code(enum.Enum):
     ONE_CAMERA = "one_camera"
     LIGHT_GUARDED = "light_guarded"
     LIGHT_UNGUARDED = "light_unguarded"
+    COARSE_VOXELS = "coarse_voxels"
     APART = "apart"
     NOTHING_IN_COMMON = "nothing_in_common"
     NOT_SELF_CALIBRATED = "not_self_calibrated"
@@ -58,6 +59,7 @@ class Code(enum.Enum):
     NOT_FOLLOWED = "not_followed"
     REPEATED = "repeated"
     UNSEEDED = "unseeded"
+    CROWDED = "crowded"
     # the run
     FEWER_WORKERS = "fewer_workers"
     ONE_GPU = "one_gpu"
@@ -171,6 +173,10 @@ SENTENCES: Mapping[Code, str] = {
         "volume's light), farther than the guard layers of {guard_mm:.2g} mm: their light falls into the volume and "
         "biases vectors near its faces; {reason}"
     ),
+    Code.COARSE_VOXELS: (
+        "particles of {size:.2f} voxel demand that voxels of {demanded_mm:.3g} mm are reconstructed, the memory allows "
+        "{used_mm:.3g} mm: expect more ghosts; raise compute.memory_gib or shrink volume.size_mm"
+    ),
     Code.APART: (
         "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: a camera moved since the board was "
         "recorded; {advice}."
@@ -212,6 +218,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.UNSEEDED: (
         "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
         "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"
+    ),
+    Code.CROWDED: (
+        "the image of a particle overlaps those of {crowding:.2g} others by half or more ({limit:g} is the limit; "
+        "{per_microlens:.2g} particles per microlens were found): some particles are missed and some found are none. "
+        "Rely on the correlation, or use less seeding"
     ),
     Code.FEWER_WORKERS: (
         "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "

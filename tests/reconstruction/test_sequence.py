@@ -40,7 +40,7 @@ def vectors_of(flow, valid=True):
     dims = ("z", "y", "x")
     variables = {f"displacement_{axis}": (dims, moved[..., k]) for k, axis in enumerate("xyz")}
     variables["valid"] = (dims, np.full(x.shape, valid))
-    shares = {"valid_fraction": 1.0, "measurable_fraction": 1.0}
+    shares = {"valid_fraction": 1.0, "measurable_fraction": 1.0, "voxel_mm": [VOXEL_MM] * 3}
     return xr.Dataset(variables, dict(zip(dims, nodes, strict=True)), shares)
 
 
