@@ -44,7 +44,10 @@ SEEN = 0.3
 FIRST_STEPS, STEPS, LAST_STEPS = 4, 4, 4
 """Iterations of the first round, of the later rounds, and after the last one."""
 EARLY = 0.5
-"""Part of the limits of light that applies after the first iteration of a round."""
+"""Part of the limits of light that applies after the very first iteration."""
+LEFT_SHARE = 0.03
+"""Least light of a candidate in the residual images, as a share of the typical particle's: one of two particles that
+were found as one leaves little there."""
 SIZED_ROUNDS = 2
 """Rounds after which the particles' size is fitted."""
 OUTLIER_SIGMA = 5.0
@@ -170,7 +173,8 @@ class ParticleSearch:
             if not len(state.cloud):
                 break
             state.refine(1)
-            state.cloud = self._pruned(state, EARLY)
+            if number == 0:
+                state.cloud = self._pruned(state, EARLY)
             if len(state.cloud):
                 state.refine(FIRST_STEPS - 1 if number == 0 else STEPS - 1)
                 state.cloud = self._pruned(state)
@@ -205,7 +209,7 @@ class ParticleSearch:
         count = cloud.light.shape[1]
         if volume is None:
             return Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, count)))
-        return candidates.volume_peaks(volume, count, self.weakest * candidates.typical(cloud.light.mean(1)))
+        return candidates.volume_peaks(volume, count, LEFT_SHARE * candidates.typical(cloud.light.mean(1)))
 
     def _pruned(self, state: _State, part: float = 1.0) -> Cloud:
         """Return the particles that all cameras confirm, those closer than one particle's size merged.
@@ -280,5 +284,5 @@ def _better_size(state: _State) -> ParticleImages:
         chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2).sum(dtype=np.float64)))
     below, here, above = chi2
     curvature, slope = below - 2 * here + above, (below - above) / 2
-    power = float(np.clip(slope / curvature, -2, 2)) if curvature > 0 else 2 * float(np.sign(slope))
-    return state.model.of_size(state.model.sigma_voxel * SIZE_STEP**power)
+    change = float(np.clip(slope / curvature, -2, 2)) if curvature > 0 else 2 * float(np.sign(slope))
+    return state.model.of_size(state.model.sigma_voxel * SIZE_STEP**change)
