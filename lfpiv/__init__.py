@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.geometry.grid import Grid as Grid
     from lfpiv.geometry.optics import LensLattice as LensLattice
     from lfpiv.geometry.optics import Optics as Optics
+    from lfpiv.geometry.resampling import volume_on as volume_on
     from lfpiv.lightfield.lens_array import LensArray as LensArray
     from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
     from lfpiv.reconstruction.motion import reconstruct_pair as reconstruct_pair
@@ -65,6 +66,7 @@ _MODULES = {
     "run": "lfpiv.runs.pipeline",
     "self_calibrate": "lfpiv.selfcalibration.movements",
     "thin_lens": "lfpiv.calibration.cameras",
+    "volume_on": "lfpiv.geometry.resampling",
     "write_report": "lfpiv.report",
 }
 

@@ -116,6 +116,11 @@ class Experiment:
             return Frame(pair, first), Frame(pair, second)
         return Frame(pair, first), Frame(pair + self.series.step, first)
 
+    @property
+    def in_sequence(self) -> bool:
+        """Whether each instant of a series is reconstructed from the one before."""
+        return self.series is not None and self.smart.predict
+
     def instant_s(self, instant: int) -> float:
         """Return the time of an instant of a series after the first one [s]."""
         assert self.series is not None

@@ -10,9 +10,11 @@ the volume itself after an iteration.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy import ndimage
+
+from lfpiv_kernels.reconstruction.blur import GaussianBlur
 
 TRUNCATE = 3.5
 """Reach of the sieve's Gaussian [standard deviation]."""
@@ -33,9 +35,11 @@ class Sieve:
         """Blur a volume."""
         if self.sigma_voxel == 0:
             return volume
-        shaped = volume.reshape(self.shape)
-        blurred: np.ndarray = ndimage.gaussian_filter(shaped, self.sigma_voxel, mode="constant", truncate=TRUNCATE)
-        return blurred.ravel()
+        return self._blur(volume)
+
+    @cached_property
+    def _blur(self) -> GaussianBlur:
+        return GaussianBlur(self.sigma_voxel, self.shape, truncate=TRUNCATE, border="constant")
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,9 @@ class Smoothing:
         """Blur a volume."""
         if self.sigma_voxel == 0:
             return volume
-        shaped = volume.reshape(self.shape)
-        blurred = ndimage.gaussian_filter(shaped, self.sigma_voxel, mode="nearest", truncate=SMOOTHING_TRUNCATE)
-        smoothed: np.ndarray = blurred.ravel() * self.lit
+        smoothed: np.ndarray = self._blur(volume) * self.lit
         return smoothed
+
+    @cached_property
+    def _blur(self) -> GaussianBlur:
+        return GaussianBlur(self.sigma_voxel, self.shape, truncate=SMOOTHING_TRUNCATE, border="nearest")

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy import ndimage
 
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
+from lfpiv_kernels.reconstruction.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.update import update
 
 SHARPENING = 0.5
@@ -58,9 +59,10 @@ class SharpenedStep:
     def __call__(self, coefficients: np.ndarray, exponent: np.ndarray) -> np.ndarray:
         """Return the next coefficients."""
         logarithm = exponent * self.size
-        blurred = ndimage.gaussian_filter(
-            logarithm.reshape(self.shape), SHARPENED_VOXEL, mode="nearest", truncate=TRUNCATE
-        )
-        sharp: np.ndarray = logarithm + np.float32(SHARPENING) * (logarithm - blurred.ravel())
+        sharp: np.ndarray = logarithm + np.float32(SHARPENING) * (logarithm - self._blur(logarithm))
         following: np.ndarray = coefficients * np.exp(np.clip(sharp, -LARGEST_STEP, LARGEST_STEP, out=sharp))
         return following
+
+    @cached_property
+    def _blur(self) -> GaussianBlur:
+        return GaussianBlur(SHARPENED_VOXEL, self.shape, truncate=TRUNCATE, border="nearest")

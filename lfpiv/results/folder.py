@@ -67,6 +67,11 @@ class Folder:
         return self.path / "guard.json"
 
     @property
+    def refinement(self) -> Path:
+        """Size of the particles, and the voxels that it demands."""
+        return self.path / "refinement.json"
+
+    @property
     def summary(self) -> Path:
         """Figures of the run as JSON."""
         return self.path / "summary.json"
@@ -273,7 +278,7 @@ def make_writable(path: Path) -> list[Path]:
             raise InputError(
                 f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
             )
-    results = (folder.calibration, folder.self_calibration, folder.background, folder.guard)
+    results = (folder.calibration, folder.self_calibration, folder.background, folder.guard, folder.refinement)
     for place in (*results, folder.summary, folder.report):
         if place.is_dir():
             raise InputError(

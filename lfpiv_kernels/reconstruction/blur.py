@@ -1,0 +1,114 @@
+"""Warp: Gaussian blur of a volume along its three axes. Twin: ``scipy.ndimage.gaussian_filter``.
+
+Each thread blurs planes of the outermost axis, so its intermediate results stay in the caches. The loops are C++, see
+``blur.h``.
+"""
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch, to_device
+
+wp.set_module_options(native.options("blur.h", contract="fast"))
+
+BORDERS = ("constant", "nearest")
+"""Beyond the volume: zero, or its outermost voxels continued."""
+
+
+@wp.struct
+class Axis:
+    """The weights along one axis, see ``AxisBlur`` in ``blur.h``."""
+
+    first: wp.array(dtype=int)
+    weight: wp.array(dtype=float)
+    taps: int
+    begin: int
+    end: int
+
+
+@wp.func_native("""
+    const int64_t area = (int64_t)middle.first.shape[0] * inner.first.shape[0];
+    lfpiv::blur_plane(lfpiv::axis_blur(outer), lfpiv::axis_blur(middle), lfpiv::axis_blur(inner), plane, volume.data,
+                      work_out.data + plane * area, blurred_out.data + plane * area);
+""")
+def _blur_one(
+    outer: Axis,
+    middle: Axis,
+    inner: Axis,
+    plane: int,
+    volume: wp.array(dtype=float),
+    work_out: wp.array(dtype=float),
+    blurred_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _blur(
+    # in
+    outer: Axis,
+    middle: Axis,
+    inner: Axis,
+    volume: wp.array(dtype=float),
+    first_plane: int,
+    # out
+    work_out: wp.array(dtype=float),
+    blurred_out: wp.array(dtype=float),
+):
+    _blur_one(outer, middle, inner, first_plane + wp.tid(), volume, work_out, blurred_out)
+
+
+class GaussianBlur:
+    """Gaussian blur of flat volumes of one shape.
+
+    Parameters
+    ----------
+    sigma_voxel : float
+        Standard deviation, above 0 [voxel].
+    shape : tuple of int
+        Voxel counts, the axis of neighbours in memory last.
+    truncate : float
+        Reach of the Gaussian [standard deviation].
+    border : {"constant", "nearest"}
+        Light beyond the volume: none, or that of its outermost voxels. With "constant" the blur is its own adjoint.
+
+    Raises
+    ------
+    ValueError
+        If `border` is neither.
+    """
+
+    def __init__(self, sigma_voxel: float, shape: tuple[int, int, int], *, truncate: float, border: str):
+        if border not in BORDERS:
+            raise ValueError(f"border: expected one of {', '.join(BORDERS)}, got {border!r}.")
+        radius = int(truncate * sigma_voxel + 0.5)
+        offset = np.arange(-radius, radius + 1)
+        profile = np.exp(-(offset**2) / (2 * sigma_voxel**2))
+        self.shape = shape
+        self._axes = [_axis(profile / profile.sum(), size, border) for size in shape]
+
+    def __call__(self, volume: np.ndarray) -> np.ndarray:
+        """Return the blurred volume; both float32, C-contiguous, shape (voxel,)."""
+        blurred, work = np.empty_like(volume), np.empty_like(volume)
+        device = runtime.device()
+        outputs = [to_device(array, float) for array in (work, blurred)]
+        launch(Call(_blur, self.shape[0], [*self._axes, to_device(volume, float)], outputs))
+        if device.kind != "cpu":
+            blurred[:] = outputs[1].numpy()
+        return blurred
+
+
+def _axis(profile: np.ndarray, size: int, border: str) -> Axis:
+    """Return the weights along an axis of `size` voxels. Those beyond the border are added to the outermost voxel's."""
+    radius, taps = len(profile) // 2, min(len(profile), size)
+    first = np.clip(np.arange(size) - radius, 0, size - taps)
+    weight = np.zeros((size, taps))
+    for voxel in range(size):
+        source = voxel + np.arange(-radius, radius + 1)
+        inside = (source >= 0) & (source < size)
+        share = np.where(inside | (border == "nearest"), profile, 0)
+        np.add.at(weight[voxel], np.clip(source, 0, size - 1) - first[voxel], share)
+    axis = Axis()
+    axis.first, axis.weight = to_device(first.astype(np.int32)), to_device(weight.astype(np.float32).ravel())
+    axis.taps, axis.begin, axis.end = taps, min(radius, size), max(size - radius, 0)
+    return axis
