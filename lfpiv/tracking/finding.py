@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import is_finite
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import checked_images
@@ -131,9 +132,13 @@ class _State:
 
 @dataclass
 class ParticleSearch:
-    """Search for the particles of many instants with one rig; `find_particles` describes the settings."""
+    """Search for the particles of many instants with one rig; `find_particles` describes the settings.
+
+    `grid` is the volume whose voxels are the unit of lengths; default: the grid of the weights.
+    """
 
     weights: Weights
+    grid: Grid | None = None
     sigma_voxel: float | None = None
     rounds: int = ROUNDS
     weakest: float = WEAKEST
@@ -141,10 +146,14 @@ class ParticleSearch:
     def __post_init__(self) -> None:
         self.images = ParticleImages(
             cameras=self.weights.cameras,
-            voxel_mm=self.weights.grid.voxel_mm,
+            voxel_mm=self._grid.voxel_mm,
             sigma_voxel=self.sigma_voxel or USUAL_SIGMA_VOXEL,
         )
         self._sizer: ParticleSizer | None = None
+
+    @property
+    def _grid(self) -> Grid:
+        return self.weights.grid if self.grid is None else self.grid
 
     def find(
         self,
@@ -191,11 +200,12 @@ class ParticleSearch:
             state.cloud = self._pruned(state)
         if len(state.cloud):
             state.refine(2)
-        return FoundParticles.of(self.weights, state.model, state.scene, state.cloud, state.normal)
+        return FoundParticles.of(self.weights.cameras, self._grid, state.model, state.scene, state.cloud, state.normal)
 
     def _first_size(self, images: Mapping[str, np.ndarray]) -> float:
         self._sizer = self._sizer or ParticleSizer(self.weights)
-        return self._sizer.size(images) or USUAL_SIGMA_VOXEL
+        found = self._sizer.size(images)
+        return found * self.weights.grid.voxel_mm / self._grid.voxel_mm if found else USUAL_SIGMA_VOXEL
 
     def _new(self, state: _State, noise: Mapping[str, float]) -> Cloud:
         """Return candidates from the light that the particles leave."""
