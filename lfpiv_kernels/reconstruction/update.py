@@ -6,7 +6,7 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch, to_device
 from lfpiv_kernels.reconstruction.pixel_rays import PixelRays
-from lfpiv_kernels.reconstruction.projector import Projector
+from lfpiv_kernels.reconstruction.projector import ALL, Projector
 
 wp.set_module_options(native.options("update.h"))
 
@@ -107,8 +107,10 @@ class Comparison:
         device = runtime.device().warp
         self._sums = [wp.zeros(projector.map.rays.runs, dtype=wp.float64, device=device) for _ in range(2)]
 
-    def compare(self, volume: np.ndarray) -> tuple[float, float]:
+    def compare(self, volume: np.ndarray, lenses: int = ALL) -> tuple[float, float]:
         """Project `volume`, shape (voxel,), and write gain * log((image + floor) / (projection + floor)) on the rays.
+
+        With `lenses` only the pixels that see no other lenses count. The other rays become dark.
 
         Returns
         -------
@@ -117,11 +119,11 @@ class Comparison:
         float
             Sum of P log(P / I) - P + I with P the projection and I the image, both plus floor [counts].
         """
-        self.projector.scatter(volume)
-        rays = self.projector.map.rays
+        self.projector.scatter(volume, lenses)
+        rays = self.projector.map.rays if lenses == ALL else self.projector.map.of_lenses[lenses]
         inputs, outputs = [rays, self._image, self._gain, self._floor], [self.projector.rays, *self._sums]
         launch(Call(_compare, rays.runs, inputs, outputs), parts=_parts(rays.runs, FEWEST_RUNS))
-        squares, divergence = (float(sums.numpy().sum()) for sums in self._sums)
+        squares, divergence = (float(sums.numpy()[: rays.runs].sum()) for sums in self._sums)
         return squares, divergence
 
 
