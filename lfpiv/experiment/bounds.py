@@ -67,6 +67,8 @@ MOST_VOXELS = 10**11
 """Largest number of voxels of a volume, guard layers included. A run of as many needs some 10 TB of memory."""
 MOST_STEPS = 10**6
 """Largest number of iterations or epochs."""
+MOST_SUBSETS = 64
+"""Largest number of ordered subsets."""
 MOST_PASSES = 32
 """Largest number of passes of the correlation."""
 LARGEST_WINDOW = 4096

@@ -65,6 +65,22 @@ def _update(
 
 
 @wp.kernel
+def _sharpen(
+    # in
+    logarithm: wp.array(dtype=float),
+    blurred: wp.array(dtype=float),
+    share: float,
+    largest: float,
+    first_voxel: int,
+    # out
+    volume_out: wp.array(dtype=float),
+):
+    voxel = first_voxel + wp.tid()
+    step = logarithm[voxel] + share * (logarithm[voxel] - blurred[voxel])
+    volume_out[voxel] = volume_out[voxel] * wp.exp(wp.clamp(step, -largest, largest))
+
+
+@wp.kernel
 def _extrapolate(
     # in
     exponent: float,
@@ -130,6 +146,18 @@ class Comparison:
 def update(volume: np.ndarray, exponent: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Multiply `volume` by exp(step * exponent) in place; float32, shape (voxel,). Return `volume`."""
     _sweep(_update, [to_device(exponent, float), to_device(step, float)], [volume])
+    return volume
+
+
+def sharpened(
+    volume: np.ndarray, logarithm: np.ndarray, blurred: np.ndarray, share: float, largest: float
+) -> np.ndarray:
+    """Multiply `volume` by exp(logarithm + share * (logarithm - blurred)) in place; float32, shape (voxel,).
+
+    The absolute exponent is at most `largest`. Return `volume`.
+    """
+    inputs = [to_device(logarithm, float), to_device(blurred, float), float(share), float(largest)]
+    _sweep(_sharpen, inputs, [volume])
     return volume
 
 
