@@ -53,7 +53,7 @@ class Table(BaseModel):
 class Smart(Table):
     """Table ``[smart]``: settings of the reconstruction (Eq. 5)."""
 
-    iterations: Steps = 16
+    iterations: Steps = 14
     """Largest number of SMART iterations, passes over all rays; without `subsets` some 40 are needed."""
     subsets: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SUBSETS)] | Literal["auto"] = "auto"
     """Number of ordered subsets of the rays: 1 for plain SMART, the number of cameras or twice that; "auto" chooses."""

@@ -27,7 +27,9 @@ from lfpiv.reconstruction.smart import ImageEquations, Misfit, State
 from lfpiv.reconstruction.steps import Step
 from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
 
-WHOLE_PASSES = 3
+SUBSET_MOMENTUM = 0.94
+"""Largest exponent of the momentum from subset to subset: a memory of four passes over four subsets."""
+WHOLE_PASSES = 2
 """Passes over all rays after the last epoch, at most half of all passes."""
 SHORTENING = 0.05
 """Steps of epoch k are 1 / (1 + k SHORTENING) as long as those of the first one."""
@@ -77,7 +79,7 @@ def iterate_epochs(
     equations : ImageEquations
         Locked.
     state : State
-        Where to start, with momentum. Its steps are kept for whole passes.
+        Where to start. Its steps are kept for whole passes, its momentum starts anew.
     sieve : Sieve
         Sieve G, E = G c.
     subsets, steps : sequence
@@ -85,7 +87,7 @@ def iterate_epochs(
     epochs : int
         Number of epochs.
     """
-    coefficients, momentum = state.coefficients, state.momentum or Momentum(state.coefficients)
+    coefficients, momentum = state.coefficients, Momentum(state.coefficients, largest=SUBSET_MOMENTUM)
     for epoch in range(epochs):
         misfit, length = Misfit(0.0, 0.0), np.float32(1 / (1 + SHORTENING * epoch))
         for subset, step in zip(subsets, steps, strict=True):
