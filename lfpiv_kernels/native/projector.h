@@ -44,6 +44,27 @@ LFPIV_INLINE VoxelBlocks blocks_of(const Matrix& matrix, int voxel, int lenses) 
     return {first, last, matrix.ray.data, matrix.height.data, matrix.width.data, level, matrix.stride, matrix.profiles};
 }
 
+/// Ask for the memory from `begin` to `end`.
+template <class T>
+LFPIV_INLINE void prefetch_range(const T* begin, const T* end) {
+    constexpr int LINE = 64;
+    for (const char* from = (const char*)begin; from < (const char*)end; from += LINE) prefetch((const float*)from);
+}
+
+/// Ask for the next voxel's blocks. Where half of each voxel's are skipped, the processor does not foresee them.
+template <class Matrix>
+LFPIV_INLINE void prefetch_next(const Matrix& matrix, int voxel, int lenses) {
+    if (lenses == ALL_LENSES || voxel + 1 >= (int)matrix.even_blocks.shape[0]) return;
+    const VoxelBlocks next = blocks_of(matrix, voxel + 1, lenses);
+    const unsigned char* const level = matrix.level.data + matrix.first_value.data[voxel + 1];
+    const unsigned char* const end = lenses == EVEN_LENSES ? level + matrix.even_values.data[voxel + 1]
+                                                           : matrix.level.data + matrix.first_value.data[voxel + 2];
+    prefetch_range(next.level, end);
+    prefetch_range(next.ray + next.first, next.ray + next.last);
+    prefetch_range(next.height + next.first, next.height + next.last);
+    if (!next.profiles) prefetch_range(next.width + next.first, next.width + next.last);
+}
+
 /// Return the sum of a block's rays times its levels, and move `level` behind its values.
 LFPIV_INLINE Row gather_pixels(const float* ray, int rows, int columns, int stride, const unsigned char*& level) {
     Row even = splat<BLOCK_WIDTH>(0.0f), odd = even;

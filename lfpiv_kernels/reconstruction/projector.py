@@ -102,11 +102,17 @@ class Matrix:
     profiles: bool
 
 
-@wp.func_native("return lfpiv::gather(lfpiv::blocks_of(matrix, voxel, lenses), rays.data);")
+@wp.func_native("""
+    lfpiv::prefetch_next(matrix, voxel, lenses);
+    return lfpiv::gather(lfpiv::blocks_of(matrix, voxel, lenses), rays.data);
+""")
 def _gather(matrix: Matrix, voxel: int, lenses: int, rays: wp.array(dtype=float)) -> float: ...
 
 
-@wp.func_native("lfpiv::scatter(lfpiv::blocks_of(matrix, voxel, lenses), intensity, rays_out.data);")
+@wp.func_native("""
+    lfpiv::prefetch_next(matrix, voxel, lenses);
+    lfpiv::scatter(lfpiv::blocks_of(matrix, voxel, lenses), intensity, rays_out.data);
+""")
 def _scatter(matrix: Matrix, voxel: int, lenses: int, intensity: float, rays_out: wp.array(dtype=float)): ...
 
 
