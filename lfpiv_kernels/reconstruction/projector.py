@@ -241,9 +241,9 @@ class Projector:
         self._matrix.level = to_device(blocks.value)
         self.lens_sets = 1 if blocks.even_blocks is None else 2
         """Sets of lenses that can be taken alone."""
-        for name in ("even_blocks", "even_values"):
+        for name, ends in (("even_blocks", blocks.first_block), ("even_values", blocks.first_value)):
             array = getattr(blocks, name)
-            setattr(self._matrix, name, to_device(np.zeros(1, np.int32) if array is None else array))
+            setattr(self._matrix, name, to_device(np.diff(ends).astype(np.int32) if array is None else array))
         self._matrix.stride = blocks.microimages.edge
         self._matrix.profiles = blocks.form == "profiles"
         wp.load_module(_project.module, device=runtime.device().warp)  # before threads start
