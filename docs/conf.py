@@ -27,6 +27,7 @@ extensions = [
     "house",
     "tables",
     "mathml",
+    "side_by_side",
 ]
 exclude_patterns = ["_build", "_ext", "gallery", "generated/extra"]
 nitpicky = True

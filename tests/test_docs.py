@@ -7,6 +7,7 @@ import importlib
 import importlib.resources
 import importlib.util
 import itertools
+import json
 import logging
 import re
 import shlex
@@ -393,6 +394,20 @@ def test_the_picture_of_the_house_shows_every_package_below_those_that_import_it
     assert all(place[room][1] < place[other][1] for room, others in house.arrows().items() for other in others)
     for (x, y, _), (other_x, other_y, width) in itertools.permutations(place.values(), 2):
         assert y != other_y or x < other_x or x > other_x + width
+
+
+def test_plots_of_methods_side_by_side_show_every_stored_method():
+    side_by_side = extension("side_by_side")
+    stored = json.loads(side_by_side.FIGURES.read_text("utf-8"))
+    shown = {(row["way"], row["cameras"]) for row in stored["seeding"]}
+    assert shown == side_by_side.STYLES.keys()
+    drawn = side_by_side.panels(stored)
+    assert drawn.count("<svg") == 4 and not re.search(r"\bnan\b", drawn)
+    assert all(name in drawn for name, _, _ in side_by_side.STYLES.values())
+    assert not set(re.findall(r"#[0-9a-f]{6}", drawn))  # colours are the page's
+    for row in stored["seeding"]:
+        if row["ppm"] == side_by_side.TABLE_PPM:
+            assert f"<td>{row['figures']['error'][0]:.3f}" in side_by_side.table(stored)
 
 
 def test_sections_of_the_method_name_modules_that_exist():

@@ -1,11 +1,10 @@
 """Statistics over pairs: mean and its standard error, RMS, Reynolds stresses, turbulent kinetic energy.
 
 Vectors are datasets as `lfpiv.open_results` opens: ``u``, ``v``, ``w`` [m/s] over pair, or over instant for a time
-series, z, y, x [mm]. At each position
-only vectors that are finite and valid (``valid`` true, or all without such a flag) are used. A result is NaN where too
-few vectors remain. Fluctuations are deviations from the mean over the pairs. They contain the measurement noise: noise
-of standard deviation s in u adds s^2 to ``uu``. Dask arrays stay lazy, except in `standard_error`. Of other arrays that
-are read from files, at most `BLOCK_BYTES` are in memory.
+series, z, y, x [mm]. At each position only vectors that are finite and valid (``valid`` true, or all without such a
+flag) are used. A result is NaN where too few vectors remain. Fluctuations are deviations from the mean over the pairs.
+They contain the measurement noise: noise of standard deviation s in u adds s^2 to ``uu``. Dask arrays stay lazy, except
+in `standard_error`. Of other arrays that are read from files, at most `BLOCK_BYTES` are in memory.
 """
 
 from __future__ import annotations
@@ -228,7 +227,8 @@ def _dimension(vectors: xr.Dataset) -> str:
     check_velocity(vectors)
     found = [name for name in DIMENSIONS if name in vectors["u"].dims]
     if len(found) != 1 or not all(found[0] in vectors[name].dims for name in COMPONENTS):
-        short = next(name for name in COMPONENTS if not set(found[:1] or DIMENSIONS) & set(vectors[name].dims))
+        expected = set(found[:1] or DIMENSIONS)
+        short = next((name for name in COMPONENTS if not expected & set(vectors[name].dims)), "u")
         raise ValueError(
             f"vectors: expected {short} over pair, z, y, x, or over instant, found it over {vectors[short].dims}. "
             "Open all pairs of a run with `lfpiv.open_results`."

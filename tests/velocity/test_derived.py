@@ -159,6 +159,7 @@ def test_dask_arrays_stay_lazy():
             "x in mm",
         ),
         (lambda: statistics.mean(random_vectors(0)), "u over pair.*open_results"),
+        (lambda: statistics.mean(random_vectors(0).expand_dims(pair=2, instant=2)), "found it over.*pair"),
         (lambda: statistics.standard_error(ensemble(np.zeros((2, 3))).assign_coords(pair=[1, 1])), "each once"),
     ],
 )
