@@ -167,9 +167,12 @@ class SmartSolver:
     ) -> State:
         """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
         epochs = history.iterations - min(WHOLE_PASSES, -(-history.iterations // 2))
+        if epochs:
+            history.append(equations.compare(sieve(state.coefficients)))  # exact, as all steps begin here
         states = iterate_epochs(equations, state, sieve, subsets=self.subsets, steps=steps, epochs=epochs)
         for state, misfit in states:  # noqa: B007 - the last state is the result
-            history.append(misfit)
+            if history.epochs:
+                history.append(misfit)
             history.epochs += 1
             if progress is not None:
                 progress(history.epochs / (history.iterations + 1))

@@ -163,6 +163,15 @@ def test_the_last_passes_take_all_rays_and_lower_the_misfit(volume_of_blobs):
     assert len(misfit) == 10 and (np.diff(whole) < 0).all()
 
 
+@pytest.mark.parametrize("iterations", [0, 1, 2, 5])
+def test_the_first_misfit_is_that_of_the_first_guess(volume_of_blobs, iterations):
+    weights, _, images = volume_of_blobs
+    guess = lfpiv.reconstruct(weights, images, 0, sieve_voxel=0.6)
+    volume = lfpiv.reconstruct(weights, images, iterations, sieve_voxel=0.6, subsets=4)
+    assert volume.attrs["misfit"][0] == pytest.approx(guess.attrs["misfit"][0], rel=1e-9)
+    assert volume.attrs["iterations"] == iterations and len(volume.attrs["residual"]) == iterations + 1
+
+
 def test_a_stop_by_tolerance_is_one_of_whole_passes(volume_of_blobs):
     weights, _, images = volume_of_blobs
     volume = lfpiv.reconstruct(weights, images, 60, sieve_voxel=0.6, subsets=4, tolerance=3e-3)
