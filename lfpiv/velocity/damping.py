@@ -32,8 +32,10 @@ SIGNIFICANT = 2.0
 LEAST_FLUCTUATION = 0.1
 """Least root mean square of a component's fluctuations whose slope is corrected [voxel]. Smaller ones are mostly
 errors, which a correction would amplify."""
-SLOPES = (0.3, 1.2)
-"""Slopes that are corrected. Below, nearly nothing of the flow is left."""
+SLOPES = (0.5, 1.2)
+"""Slopes that are corrected. Below, errors would be amplified more than the flow is restored."""
+LARGEST_ERROR = 0.1
+"""Largest standard error of a slope that is corrected, as a share of the slope."""
 LEAST_WINDOWS = 8
 """Least number of valid windows of all simulated pairs."""
 WHOLE_FLUID = 0.99
@@ -70,7 +72,8 @@ class AxisDamping:
     @property
     def applied(self) -> bool:
         """Whether the slope differs from 1 significantly, so that vectors are corrected."""
-        significant = abs(self.slope - 1) > SIGNIFICANT * self.slope_error
+        known = self.slope_error <= LARGEST_ERROR * self.slope
+        significant = known and abs(self.slope - 1) > SIGNIFICANT * self.slope_error
         return significant and self.fluctuation >= LEAST_FLUCTUATION and SLOPES[0] <= self.slope <= SLOPES[1]
 
     @property

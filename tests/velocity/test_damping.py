@@ -95,7 +95,16 @@ def axis_of(**changed):
     return AxisDamping(**{**values, "uncertainty_factor": 1.0, **changed})
 
 
-@pytest.mark.parametrize("changed", [{"slope_error": 0.15}, {"fluctuation": 0.05}, {"slope": 0.1}, {"slope": 1.5}])
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"slope_error": 0.15},
+        {"slope": 0.7, "slope_error": 0.09},
+        {"fluctuation": 0.05},
+        {"slope": 0.45},
+        {"slope": 1.5},
+    ],
+)
 def test_what_is_not_significant_is_not_corrected(changed):
     assert axis_of().applied and axis_of().used_slope == 0.8
     left = axis_of(**changed)
