@@ -53,8 +53,10 @@ class Table(BaseModel):
 class Smart(Table):
     """Table ``[smart]``: settings of the reconstruction (Eq. 5)."""
 
-    iterations: Steps = 40
-    """Largest number of SMART iterations; `tolerance` usually stops them earlier."""
+    iterations: Steps = 14
+    """Largest number of SMART iterations, passes over all rays; without `subsets` some 40 are needed."""
+    subsets: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SUBSETS)] | Literal["auto"] = "auto"
+    """Number of ordered subsets of the rays: 1 for plain SMART, the number of cameras or twice that; "auto" chooses."""
     relaxation: Annotated[float, Field(strict=True, gt=0, le=3)] = 1.0
     """Relaxation mu of Eq. 5; values near 3 diverge."""
     normalisation: Literal["column", "paper"] = "column"

@@ -402,7 +402,7 @@ class PairWork:
     def search(self) -> ParticleSearch:
         """Search for particles of this rig, made once for all pairs."""
         assert self.weights is not None and self.experiment.tracking is not None
-        return ParticleSearch(self.weights, **self.experiment.tracking.model_dump())
+        return ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.model_dump())
 
     def _reconstruction_s(self, pair: int, volumes: PairVolumes) -> float:
         """Return the time that the volumes of a pair took [s].

@@ -148,7 +148,8 @@ def test_the_step_changes_no_volume(made, reference, tmp_path, step):
     one = changed(made[1], tmp_path / "one", step=step, instants=INSTANTS, keep_volumes=True)
     assert not any(outcome.reason for outcome in sequential(one))
     found, expected = volumes(tmp_path / "one"), volumes(reference)
-    assert list(found) == list(expected)
+    used = {frame.number for pair in one.experiment.numbers for frame in one.experiment.pair_frames(pair)}
+    assert list(found) == [name(instant - FIRST) for instant in sorted(used)]
     assert all(np.array_equal(found[name], expected[name]) for name in found)
     if step == 2:  # seams whose two instants are both within a segment of pairs to do
         many = changed(one, tmp_path / "many", step=step, instants=INSTANTS, scratch=tmp_path / "scratch")
