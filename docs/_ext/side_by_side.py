@@ -98,11 +98,9 @@ def _time(rows: Sequence[Mapping[str, Any]]) -> str:
     error = [passes[way][1] or 0.0 for way in names]
     values = [passes[way][0] for way in names]
     axes.barh(place, values, xerr=error, height=0.6, color=[STYLES[way, 2][1] for way in names], ecolor=svg.INK)
-    for at, value in zip(place, values, strict=True):
-        axes.annotate(
-            f"{value:.1f}", (value, at), (4, 0), textcoords="offset points", va="center", color=svg.INK,
-            fontsize=svg.SMALL_POINT,
-        )  # fmt: skip
+    for at, value, beyond in zip(place, values, error, strict=True):
+        spot = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+        axes.annotate(f"{value:.1f}", (value + beyond, at), color=svg.INK, fontsize=svg.SMALL_POINT, **spot)
     svg.style(axes, title="time of a frame", xlabel="times a pass over all rays")
     axes.set_yticks(place, [STYLES[way, 2][0] for way in names])
     axes.invert_yaxis()
