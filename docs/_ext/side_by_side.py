@@ -104,7 +104,7 @@ def _time(rows: Sequence[Mapping[str, Any]]) -> str:
     svg.style(axes, title="time of a frame", xlabel="times a pass over all rays")
     axes.set_yticks(place, [STYLES[way, 2][0] for way in names])
     axes.invert_yaxis()
-    axes.set_xlim(0, 1.3 * max(values))
+    axes.set_xlim(0, 1.35 * max(values))
     return svg.to_svg(figure, "Time of a frame by each method in passes over all rays; the table has the numbers")
 
 
