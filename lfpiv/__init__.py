@@ -24,15 +24,20 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.geometry.grid import Grid as Grid
     from lfpiv.geometry.optics import LensLattice as LensLattice
     from lfpiv.geometry.optics import Optics as Optics
+    from lfpiv.geometry.resampling import volume_on as volume_on
     from lfpiv.lightfield.lens_array import LensArray as LensArray
     from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
     from lfpiv.reconstruction.motion import reconstruct_pair as reconstruct_pair
     from lfpiv.reconstruction.volume import reconstruct as reconstruct
     from lfpiv.report import write_report as write_report
     from lfpiv.results.export import export_results as export_results
+    from lfpiv.results.particles import open_particles as open_particles
     from lfpiv.results.reader import open_results as open_results
     from lfpiv.runs.pipeline import run as run
     from lfpiv.selfcalibration.movements import self_calibrate as self_calibrate
+    from lfpiv.tracking.finding import find_particles as find_particles
+    from lfpiv.tracking.linking import link_particles as link_particles
+    from lfpiv.tracking.tracks import particle_tracks as particle_tracks
     from lfpiv.velocity.cross_correlation import correlate as correlate
     from lfpiv.weights.operator import build_weights as build_weights
 
@@ -49,14 +54,19 @@ _MODULES = {
     "correlate": "lfpiv.velocity.cross_correlation",
     "export_results": "lfpiv.results.export",
     "find_lens_array": "lfpiv.lightfield.lens_array",
+    "find_particles": "lfpiv.tracking.finding",
+    "link_particles": "lfpiv.tracking.linking",
     "load_calibration": "lfpiv.calibration.camera",
     "open_experiment": "lfpiv.experiment.opening",
     "open_results": "lfpiv.results.reader",
+    "open_particles": "lfpiv.results.particles",
+    "particle_tracks": "lfpiv.tracking.tracks",
     "reconstruct": "lfpiv.reconstruction.volume",
     "reconstruct_pair": "lfpiv.reconstruction.motion",
     "run": "lfpiv.runs.pipeline",
     "self_calibrate": "lfpiv.selfcalibration.movements",
     "thin_lens": "lfpiv.calibration.cameras",
+    "volume_on": "lfpiv.geometry.resampling",
     "write_report": "lfpiv.report",
 }
 

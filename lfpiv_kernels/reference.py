@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtr
+
+from lfpiv_kernels.weights.microimages import LAYERS
 
 
 def position(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
@@ -133,6 +136,48 @@ def count(rays, shift, window, first_pixel, *, optics, lattice, samples, shape):
         np.add.at(counts, (window[point], row[hit], column[hit]), 1)
         total[window[point]] += len(u)
     return counts, total
+
+
+def gaussian_image(trace, point, sigma_mm, *, optics, lattice, microimages, frame, rectangles):
+    """Return the image of a Gaussian particle pixel by pixel, shape (rows * columns,); see ``weights.gaussian``.
+
+    ``trace(points, pupil)`` is the exact mapping (x, y, z), (u, v) -> (s, t).
+    """
+    ratio, cell = optics.sensor_per_pupil, optics.pixel_mm / optics.sensor_per_pupil
+    rows, columns = optics.sensor_shape
+    image, edge, step = np.zeros(rows * columns), microimages.edge, 1e-3
+    turned_lenses = microimages.corner.shape[:2]
+    for j in range(turned_lenses[0]):
+        for i in range(turned_lenses[1]):
+            first = (j * LAYERS + 1) * turned_lenses[1] * edge**2 + i * edge**2
+            ray = np.arange(first, first + edge**2)
+            ray = ray[(microimages.share[ray] > 0) & (microimages.pixel[ray] >= 0)]
+            if not len(ray):
+                continue
+            pixel, share = microimages.pixel[ray], microimages.share[ray].astype(float)
+            centre = lattice.centres_mm(np.array([i, j]) + np.asarray(microimages.first_lens))
+            sensor = np.stack([pixel % columns + 0.5 - columns / 2, pixel // columns + 0.5 - rows / 2], axis=1)
+            pupil = (centre * (1 + ratio) - sensor * optics.pixel_mm) / ratio
+            radius = np.maximum(np.linalg.norm(pupil, axis=1), cell)
+            pupil *= (1 - (1 - share) * 0.5 * cell / radius)[:, None]
+            here = np.repeat(np.asarray(point, float)[None], len(ray), axis=0)
+            slope = [trace(here, pupil + step * unit) - trace(here, pupil - step * unit) for unit in np.eye(2)]
+            slope = np.stack(slope, axis=2) / (2 * step)
+            back = np.linalg.inv(np.eye(2) - slope)
+            to_cell = np.asarray(frame, float) @ back
+            at = np.einsum("nij,nj->ni", to_cell, trace(here, pupil) - centre)
+            variance = np.square(to_cell @ slope).sum(2) * cell**2 / 12
+            for unit in np.eye(3):
+                moved = (trace(here + step * unit, pupil) - trace(here - step * unit, pupil)) / (2 * step)
+                variance += np.square(np.einsum("nij,nj->ni", to_cell, moved) * sigma_mm)
+            sigma, inside = np.sqrt(variance), 0.0
+            for low_a, high_a, low_b, high_b in rectangles:
+                along_a = ndtr((high_a - at[:, 0]) / sigma[:, 0]) - ndtr((low_a - at[:, 0]) / sigma[:, 0])
+                along_b = ndtr((high_b - at[:, 1]) / sigma[:, 1]) - ndtr((low_b - at[:, 1]) / sigma[:, 1])
+                inside = inside + along_a * along_b
+            area = cell**2 / (np.pi * optics.pupil_radius_mm**2)
+            np.add.at(image, pixel, inside * area * np.abs(np.linalg.det(back)) * share)
+    return image
 
 
 def dense(blocks) -> np.ndarray:

@@ -42,6 +42,7 @@ MAY_IMPORT = {
     "results": {"experiment", "velocity"},
     "weights": {"calibration", "lightfield"},
     "reconstruction": {"weights", "calibration", "lightfield", "velocity", "experiment"},
+    "tracking": {"reconstruction", "weights", "calibration", "lightfield", "metrics"},
     "selfcalibration": {"reconstruction", "weights", "calibration"},
     "report": {"results", "calibration", "lightfield", "velocity", "experiment"},
 }

@@ -186,8 +186,12 @@ def _report(experiment: ExperimentFile, out: Out) -> None:
 def _export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run: its --out.")],
     to: Annotated[
-        Literal["vti", "netcdf", "zarr", "csv", "pivpy"],
-        typer.Option("--to", help="ParaView images; one NetCDF or Zarr file of all vectors; tables; planes for pivpy."),
+        Literal["vti", "netcdf", "zarr", "csv", "vtp", "pivpy"],
+        typer.Option(
+            "--to",
+            help="ParaView images; one NetCDF or Zarr file of all vectors; tables; particles for ParaView; planes for "
+            "pivpy.",
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR2", help="Folder to write to; default: DIR/export.")

@@ -65,6 +65,8 @@ MOST_SOLIDS = 1000
 """Largest number of solids, walls, surfaces or windows."""
 MOST_VOXELS = 10**11
 """Largest number of voxels of a volume, guard layers included. A run of as many needs some 10 TB of memory."""
+LARGEST_REFINEMENT = 4
+"""Largest edge of a voxel over that of the voxels that are reconstructed: 64 times as many."""
 MOST_STEPS = 10**6
 """Largest number of iterations or epochs."""
 MOST_PASSES = 32

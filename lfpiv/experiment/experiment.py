@@ -22,6 +22,7 @@ from lfpiv.experiment.settings import (
     SelfCalibration,
     Series,
     Smart,
+    Tracking,
 )
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
@@ -94,6 +95,8 @@ class Experiment:
     """Estimate of the light that stands still: "auto", "none", "minimum" or "median"."""
     series: Series | None = None
     """The time series; None for image pairs."""
+    tracking: Tracking | None = None
+    """Settings of the tracking of particles; None without it."""
 
     @property
     def numbers(self) -> range:
@@ -112,6 +115,11 @@ class Experiment:
         if self.series is None:
             return Frame(pair, first), Frame(pair, second)
         return Frame(pair, first), Frame(pair + self.series.step, first)
+
+    @property
+    def in_sequence(self) -> bool:
+        """Whether each instant of a series is reconstructed from the one before."""
+        return self.series is not None and self.smart.predict
 
     def instant_s(self, instant: int) -> float:
         """Return the time of an instant of a series after the first one [s]."""

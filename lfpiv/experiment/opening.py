@@ -104,6 +104,7 @@ def read_experiment(path: str | Path) -> Experiment:
         smart=table.smart,
         self_calibration=table.self_calibration,
         correlation=table.correlation,
+        tracking=table.tracking,
         network=table.network,
         compute=table.compute,
         particle_images=particles.images,

@@ -71,6 +71,9 @@ class Smart(Table):
     sieve_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] | Literal["auto"] = "auto"
     """Standard deviation of the Gaussians that make up the volume [voxel]; 0 lets voxels vary freely, "auto" takes the
     particles' size from the images, or 0 where particles are smaller than voxels."""
+    refinement: Annotated[float, Field(strict=True, ge=1, le=bounds.LARGEST_REFINEMENT)] | Literal["auto"] = "auto"
+    """Edge of a voxel over that of the voxels that are reconstructed, which the volume is then sampled from; "auto"
+    follows from the particles' size in the images, and is 1 where they are large enough."""
     active_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
     """Share of the first guess's maximum below which voxels are left out; 0 keeps all."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
@@ -78,10 +81,17 @@ class Smart(Table):
     motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
     """Number of times the motion is measured and both frames are reconstructed again from their common light along it;
     0 reconstructs each frame separately."""
+    predict: Flag = False
+    """Whether an instant of a time series starts from the one before, moved by the flow, and takes fewer iterations."""
 
-    def of_one_frame(self) -> dict[str, Any]:
-        """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame."""
-        return self.model_dump(exclude={"motion_passes"})
+    def of_one_frame(self, refinement: float = 1.0) -> dict[str, Any]:
+        """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame.
+
+        `refinement` is the edge of a voxel over that of the reconstructed ones, in which lengths are returned.
+        """
+        settings = self.model_dump(exclude={"motion_passes", "predict", "refinement"})
+        lengths = ("sieve_voxel", "smoothing_voxel")
+        return settings | {name: settings[name] * refinement for name in lengths if settings[name] != "auto"}
 
 
 Displacement = Annotated[float, Field(strict=True, gt=0, le=bounds.LARGEST_DISPLACEMENT_VOXEL)]
@@ -101,6 +111,16 @@ class Correlation(Table):
     switches it off."""
     intensity_power: Annotated[float, Field(strict=True, gt=0, le=2)] = 0.5
     """Exponent applied to the smoothed volumes' intensities before correlation; 1 leaves them unchanged."""
+
+
+class Tracking(Table):
+    """Table ``[tracking]``: vectors of single particles beside the correlation; absent: none."""
+
+    rounds: Annotated[int, Field(strict=True, ge=1, le=20)] = 5
+    """Largest number of rounds in which particles are fitted to the images, removed where a camera does not confirm
+    them, and added where light is left."""
+    weakest: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1
+    """Least light of a particle in each camera that counts, as a share of the typical particle's."""
 
 
 Nodes = Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_NODES)]
@@ -324,7 +344,8 @@ class Volume(Table):
     """Edge of a voxel [mm]."""
     guard_mm: Thickness | tuple[Thickness, Thickness, Thickness] | Literal["auto"] = "auto"
     """Thickness of the guard layers beyond the volume's faces, one number or (x, y, z), which are reconstructed and cut
-    away [mm]; "auto" measures in the particle images how far their light reaches, 0 reconstructs no guard layers."""
+    away [mm]; "auto" measures in the particle images how far their light reaches and takes at least one voxel, 0
+    reconstructs no guard layers."""
 
 
 class HalfSpace(Table):
@@ -452,6 +473,7 @@ class ExperimentTable(Table):
     particles: Particles
     smart: Smart = Smart()
     correlation: Correlation = Correlation()
+    tracking: Tracking | None = None
     network: Network = Network()
     self_calibration: SelfCalibration = SelfCalibration()
     compute: Compute = Compute()

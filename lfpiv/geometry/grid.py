@@ -137,6 +137,46 @@ class Grid:
         z, y, x = (slice(start, start + n) for start, n in zip(first, self.shape, strict=True))
         return z, y, x
 
+    def refined(self, factor: float) -> Grid:
+        """Return a grid of smaller voxels around the same centre that covers this one.
+
+        Parameters
+        ----------
+        factor : float
+            Edge of this grid's voxels over that of the smaller ones, >= 1.
+
+        Raises
+        ------
+        ValueError
+            If the factor is not finite or below 1.
+
+        Examples
+        --------
+        >>> from lfpiv import Grid
+        >>> grid = Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.6, 0.4, 0.2), voxel_mm=0.1)
+        >>> grid.refined(1.25).shape
+        (3, 5, 8)
+        """
+        if not (math.isfinite(factor) and factor >= 1):
+            raise ValueError(f"factor: expected a number >= 1, got {factor!r}.")
+        if factor == 1:
+            return self
+        nz, ny, nx = (math.ceil(n * factor - 1e-6) for n in self.shape)
+        edge, centre = self.voxel_mm / factor, self.centre_mm[::-1].tolist()
+        z, y, x = (middle - (n - 1) / 2 * edge for middle, n in zip(centre, (nz, ny, nx), strict=True))
+        return Grid(shape=(nz, ny, nx), voxel_mm=edge, first_centre_mm=(z, y, x))
+
+    def nearest_in(self, other: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return for each voxel of this grid the nearest one of another grid: an index of its volumes (`numpy.ix_`).
+
+        Where this grid reaches beyond the other one, the voxels at its faces are taken.
+        """
+        places = [(self.axis_mm(k) - other.first_centre_mm[k]) / other.voxel_mm for k in range(3)]
+        z, y, x = np.ix_(
+            *(np.clip(np.rint(at), 0, n - 1).astype(int) for at, n in zip(places, other.shape, strict=True))
+        )
+        return z, y, x
+
     @property
     def centre_mm(self) -> np.ndarray:
         """Centre (x, y, z) of the volume, shape (3,) [mm]."""

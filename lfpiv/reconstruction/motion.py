@@ -33,7 +33,8 @@ from lfpiv.reconstruction.shared_light import MotionField, shared_guesses
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
-from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings
+from lfpiv.velocity.peak_width import peak_reach, refine_search
+from lfpiv.velocity.settings import CorrelationSettings
 from lfpiv.velocity.systematic import image_residual, with_systematic
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.velocity.windows import Windows
@@ -265,7 +266,7 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     -------
     Dataset
         The vectors with other ``uncertainty_z``, ``_y``, ``_x`` and ``uncertainty`` [voxel], NaN where they were
-        replaced, where the frames by themselves show no peak within `REFINE_SEARCH`, and after a single pass; with
+        replaced, where the frames by themselves show no peak within `refine_search`, and after a single pass; with
         other ``peak_ratio`` and ``correlation``, unless after a single pass.
 
     References
@@ -294,8 +295,9 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     scatter = displacement_deviation(
         first, second, window=window, origin=windows.origin, step=step, count=windows.count
     )
-    search = (REFINE_SEARCH,) * 3
-    left = correlate_windows(first, second, window=window, step=step, search=search, symmetric=True)
+    reach = peak_reach(first, second, window)
+    search = refine_search(reach)
+    left = correlate_windows(first, second, window=window, step=step, search=search, symmetric=True, reach=reach)
     measured = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
     shown = motion.midway.window_means(windows) + left.displacement
     valid = vectors["valid"].values

@@ -41,6 +41,8 @@ PUPIL_SHARE = 0.6
 """Largest coordinate of a sub-aperture along an axis of the pupil, as a share of the pupil's radius."""
 MEAN_LENSES = 3.0
 """Standard deviation of the Gaussian over which the mean light is taken [lens]."""
+FAR_LENSES = 4
+"""Distance at which products show no particles any more, only light that varies slowly [lens]."""
 LIT_SHARE = 0.1
 """Least light of a lens that counts, as a share of the brightest lens's light of an evenly lit volume."""
 LEAST_RANGE = 0.1
@@ -82,16 +84,26 @@ class SubApertures:
         self._lit = self._even[0] > LIT_SHARE * self._even[0].max()
 
     def covariances(self, image: np.ndarray) -> np.ndarray:
-        """Return sums of products of neighbours in the pupil, shape (2, sub-aperture): at the same lens, one away."""
+        """Return sums of products of neighbours in the pupil, shape (2, sub-aperture): at the same lens, one away.
+
+        The product `FAR_LENSES` away is subtracted: light that varies slowly and was not removed with the mean.
+        """
         pixels = np.asarray(image, np.float32).reshape(-1)
         here, right, below = (
             self._fluctuation(pixels[self._first + step], even)
             for step, even in zip(self._steps, self._even, strict=True)
         )
         same = (here * (right + below)).sum((1, 2))
-        along_i = here[..., :-1] * below[..., 1:] + here[..., 1:] * below[..., :-1]
-        along_j = here[:, :-1] * right[:, 1:] + here[:, 1:] * right[:, :-1]
-        return np.stack([same, (along_i.sum((1, 2)) + along_j.sum((1, 2))) / 2])
+        near, far = (self._apart(here, right, below, lenses) for lenses in (1, FAR_LENSES))
+        return np.stack([same - far, near - far])
+
+    @staticmethod
+    def _apart(here: np.ndarray, right: np.ndarray, below: np.ndarray, lenses: int) -> np.ndarray:
+        """Return the sums of products some lenses apart, mean of both directions, shape (sub-aperture,)."""
+        along_i = here[..., :-lenses] * below[..., lenses:] + here[..., lenses:] * below[..., :-lenses]
+        along_j = here[:, :-lenses] * right[:, lenses:] + here[:, lenses:] * right[:, :-lenses]
+        apart: np.ndarray = (along_i.sum((1, 2)) + along_j.sum((1, 2))) / 2
+        return apart
 
     def _fluctuation(self, light: np.ndarray, even: np.ndarray) -> np.ndarray:
         """Subtract the mean light: that of an evenly lit volume times a slowly varying factor. 0 where it is dark."""
@@ -104,6 +116,19 @@ class SubApertures:
         return fluctuation
 
 
+def _evenly_lit(weights: Weights) -> np.ndarray:
+    """Return a volume (z, y, x) whose voxels are lit evenly, but not the guard layers, which users do not see."""
+    if weights.volume == weights.grid:
+        return np.ones(weights.grid.shape, np.float32)
+    z, y, x = (
+        np.abs(weights.grid.axis_mm(axis) - weights.volume.centre_mm[2 - axis])
+        <= weights.volume.shape[axis] * weights.volume.voxel_mm / 2
+        for axis in range(3)
+    )
+    lit: np.ndarray = z[:, None, None] & y[:, None] & x
+    return lit.astype(np.float32)
+
+
 class ParticleSizer:
     """Estimator of the particles' size for one rig. Making it projects a volume of each known size.
 
@@ -111,11 +136,17 @@ class ParticleSizer:
     ----------
     weights : Weights
         The operator.
+    partial : bool
+        Whether its grid is a part of the volume that the images show.
     """
 
-    def __init__(self, weights: Weights):
-        even = weights(np.ones(weights.grid.shape, np.float32))
+    def __init__(self, weights: Weights, *, partial: bool = False):
+        even = weights(_evenly_lit(weights))
         self._sub_apertures = {name: SubApertures(camera, even[name]) for name, camera in weights.cameras.items()}
+        known = self._sub_apertures
+        if partial:
+            white = {name: np.asarray(camera.gain, np.float32) for name, camera in weights.cameras.items()}
+            self._sub_apertures = {name: SubApertures(one, white[name]) for name, one in weights.cameras.items()}
         size = weights.grid.size
         lit = np.random.default_rng(0).choice(size, min(size, max(LEAST_LIT, size // SPARSITY)), replace=False)
         points = np.zeros(size, np.float32)
@@ -123,7 +154,7 @@ class ParticleSizer:
         ratios: dict[str, list[float]] = {name: [] for name in self._sub_apertures}
         for width in WIDTHS_VOXEL:
             images = weights(Sieve(width, weights.grid.shape)(points).reshape(weights.grid.shape), out=even)
-            for name, sub_apertures in self._sub_apertures.items():
+            for name, sub_apertures in known.items():
                 same, next_lens = sub_apertures.covariances(images[name]).sum(1)
                 ratios[name].append(next_lens / same if same > 0 else 0.0)
         self._ratios = {name: np.maximum.accumulate(values) for name, values in ratios.items()}

@@ -83,7 +83,7 @@ class MotionField:
     volume : DataArray, shape (z, y, x)
         One of the frames, with coordinates in mm.
     vectors : Dataset
-        From `correlate`.
+        From `correlate`, of volumes whose voxels may have another size.
     """
 
     def __init__(self, volume: xr.DataArray, vectors: xr.Dataset):
@@ -93,6 +93,8 @@ class MotionField:
         nz, ny, nx = volume.shape
         displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], axis=-1).astype(float)
         displacement = fill(displacement, np.isfinite(displacement).all(-1))  # masked vectors have none
+        edges = [(own[-1] - own[0]) / (len(own) - 1) for own, _ in axes]
+        displacement *= np.asarray(vectors.attrs["voxel_mm"]) / edges
         self.midway = Predictor.between(self.nodes, displacement, (nz, ny, nx))
         """Displacement of what is at a control point midway in time."""
         trust = vectors["valid"].values.astype(float)

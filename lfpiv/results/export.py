@@ -25,7 +25,7 @@ from lfpiv.files import replacing, writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.records import read_object
-from lfpiv.results import netcdf, provenance, stores
+from lfpiv.results import netcdf, particles, provenance, stores
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.reader import open_results
 from lfpiv.results.stacked_files import INSTANT, PAIR, TIME_ATTRIBUTES, StackedFiles
@@ -51,7 +51,8 @@ class Format(enum.Enum):
     ZARR = (
         "vectors.zarr, one Zarr store of all pairs or instants, to which a later export adds what is new: xarray, dask"
     )
-    CSV = "one table per pair or instant, a row per vector, units in the header"
+    CSV = "one table per pair or instant, a row per vector, and one of its linked particles; units in the header"
+    VTP = "one .vtp file of linked particles per pair or instant, with a .pvd collection: ParaView, pyvista"
     PIVPY = "one NetCDF file per depth, planes of u and v of all pairs or instants: pivpy"
 
 
@@ -71,7 +72,7 @@ def export_results(
     ----------
     folder : str or Path
         Folder of the run.
-    to : {"vti", "netcdf", "zarr", "csv", "pivpy"}
+    to : {"vti", "netcdf", "zarr", "csv", "vtp", "pivpy"}
         The format, see `Format` and docs/conventions.md.
     out : str or Path, optional
         Folder to write to. Default: `FOLDER` inside `folder`.
@@ -124,6 +125,7 @@ def export_results(
         raise InputError(f"depth: expected with pivpy only, whose files are planes, found it with {to}. Leave it out.")
     if interval_s is not None and not (math.isfinite(interval_s) and interval_s > 0):
         raise InputError(f"interval: expected a time above 0 s between pairs, found {interval_s!r}.")
+    tables = _particles(Path(folder), pairs, required=form is Format.VTP)
     files = StackedFiles(Path(folder), pairs)
     if interval_s is not None and files.dimension == INSTANT:
         raise InputError("interval: expected for image pairs only; the times of a time series are known. Leave it out.")
@@ -145,7 +147,12 @@ def export_results(
                 write(files, path, {"versions": versions()}, interval_s, step)
                 return [path]
             if form is Format.CSV:
-                return _write_csv(results, target, step)
+                return _write_csv(results, target, step) + _write_particle_csv(tables, target)
+            if form is Format.VTP:
+                times = dict(
+                    zip(results[files.dimension].values.tolist(), _times(results, interval_s).tolist(), strict=True)
+                )
+                return _write_vtp(tables, target, times)
             return _write_pivpy(results, planes, target, interval_s, step)
     finally:
         for path in made:
@@ -314,6 +321,35 @@ def _write_csv(results: xr.Dataset, target: Path, progress: StepProgress) -> lis
             )
         written.append(path)
     return written
+
+
+def _particles(folder: Path, pairs: tuple[int, int | None] | None, *, required: bool) -> dict[int, Path]:
+    """Return the files of linked particles; none where there are none and they are not required."""
+    try:
+        return particles.particle_files(folder, pairs)
+    except InputError:
+        if required:
+            raise
+        return {}
+
+
+def _write_particle_csv(tables: dict[int, Path], target: Path) -> list[Path]:
+    written = []
+    for path in tables.values():
+        written.append(target / f"particles_{path.stem}.csv")
+        particles.write_csv(netcdf.read_particles(path), written[-1], CSV_DIGITS)
+    return written
+
+
+def _write_vtp(tables: dict[int, Path], target: Path, times: dict[int, float]) -> list[Path]:
+    files = {}
+    for number, path in tables.items():
+        written = target / f"particles_{path.stem}.vtp"
+        particles.write_vtp(netcdf.read_particles(path), written)
+        files[written] = times.get(number, float(number))
+    collection = target / "particles.pvd"
+    _write_collection(files, collection)
+    return [collection]
 
 
 def _write_pivpy(

@@ -67,6 +67,11 @@ class Folder:
         return self.path / "guard.json"
 
     @property
+    def refinement(self) -> Path:
+        """Size of the particles, and the voxels that it demands."""
+        return self.path / "refinement.json"
+
+    @property
     def summary(self) -> Path:
         """Figures of the run as JSON."""
         return self.path / "summary.json"
@@ -95,6 +100,10 @@ class Folder:
         """Return the path of one pair's vectors; in a series it has the number of the pair's first instant."""
         name = f"pair_{pair:04d}" if self.series is None else f"instant_{pair:06d}"
         return self.path / "vectors" / f"{name}.nc"
+
+    def particles(self, pair: int) -> Path:
+        """Return the path of one pair's linked particles, named as its vectors."""
+        return self.path / "particles" / self.vectors(pair).name
 
     def volume(self, pair: int, frame: int) -> Path:
         """Return the path of a pair's volume of frame 0 or 1; two pairs of a series share an instant's volume."""
@@ -127,7 +136,7 @@ class Folder:
 
     def sweep(self) -> None:
         """Remove half-written and shared files of a run that was killed. The caller must hold the lock."""
-        for place in (self.path, self.vectors(0).parent, self.volume(0, 0).parent):
+        for place in (self.path, self.vectors(0).parent, self.volume(0, 0).parent, self.particles(0).parent):
             for path in place.glob(".*.tmp"):
                 with contextlib.suppress(OSError):  # a folder is nobody's half-written file
                     path.unlink(missing_ok=True)
@@ -264,12 +273,12 @@ def make_writable(path: Path) -> list[Path]:
             "Choose another one with --out."
         ) from None
     folder = Folder(path)
-    for place in (folder.vectors(0).parent, folder.volume(0, 0).parent):
+    for place in (folder.vectors(0).parent, folder.volume(0, 0).parent, folder.particles(0).parent):
         if place.exists() and not place.is_dir():
             raise InputError(
                 f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
             )
-    results = (folder.calibration, folder.self_calibration, folder.background, folder.guard)
+    results = (folder.calibration, folder.self_calibration, folder.background, folder.guard, folder.refinement)
     for place in (*results, folder.summary, folder.report):
         if place.is_dir():
             raise InputError(

@@ -45,6 +45,19 @@ VECTOR_UNITS = {
 }
 """Variables of a vector dataset and their units."""
 
+PARTICLE = "particle"
+"""Dimension of a table of linked particles."""
+
+PARTICLE_UNITS = {
+    **dict.fromkeys("xyz", "mm"),
+    **dict.fromkeys("uvw", "m/s"),
+    **{f"{kind}_{axis}": "voxel" for kind in ("displacement", "uncertainty") for axis in "xyz"},
+    "intensity": "counts",
+    "residual": "1",
+    "valid": "1",
+}
+"""Variables of a table of linked particles and their units."""
+
 ROUNDING = 1e-5
 """Largest difference between a velocity and its displacement, relative or [voxel]: both have single precision."""
 
@@ -312,6 +325,56 @@ def read_volume(path: Path, *, grid: Grid | None = None) -> xr.DataArray:
     except ValueError as error:
         raise DamagedFile(path, str(error)) from None
     return dataset["intensity"]
+
+
+def check_particles(table: xr.Dataset) -> None:
+    """Check the form of a table of linked particles.
+
+    Raises
+    ------
+    ValueError
+        If a variable or a unit is missing or wrong, or a value is not finite.
+    """
+    for name, unit in PARTICLE_UNITS.items():
+        if name not in table or table[name].dims != (PARTICLE,):
+            raise ValueError(
+                f"particles: expected the variable {name!r} over {PARTICLE}, found {list(table.data_vars)}."
+            )
+        if (found := table[name].attrs.get("units")) != unit:
+            raise ValueError(f"particles: expected {name!r} in {unit}, found {found}.")
+        if not np.isfinite(table[name].values).all():
+            raise ValueError(f"particles: expected finite numbers in {name!r}, found others.")
+    if table["valid"].dtype != bool:
+        raise ValueError(f"particles: expected 'valid' to be boolean, found {table['valid'].dtype}.")
+
+
+def write_particles(table: xr.Dataset, path: Path, *, attributes: Mapping[str, Any]) -> None:
+    """Write the linked particles of one pair as NetCDF4, atomically.
+
+    Raises
+    ------
+    ValueError
+        If the table does not have the form that `check_particles` requires.
+    """
+    check_particles(table)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write({"": _packed(table, {**attributes, "versions": versions(), FILE: path.name})}, path)
+
+
+def read_particles(path: Path) -> xr.Dataset:
+    """Read the linked particles of one pair into memory, verified.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, of a newer schema, damaged, or no table of particles.
+    """
+    table = _read(path, None)
+    try:
+        check_particles(table)
+    except ValueError as error:
+        raise DamagedFile(path, str(error)) from None
+    return table
 
 
 def read_attributes(path: Path) -> dict[str, Any]:

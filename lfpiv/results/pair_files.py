@@ -146,6 +146,9 @@ class PairFiles:
     """Attributes that say of what the vectors are: the pair, or instant, step and time."""
     grid: Grid | None = None
     """Voxels of the volumes; None if files are not compared with them."""
+    particles: Path | None = None
+    """Linked particles; None without tracking."""
+    particles_stamp: Stamp | None = None
 
     @classmethod
     def of(
@@ -157,13 +160,17 @@ class PairFiles:
         *,
         background: str | None = None,
         guard: Layers = NO_LAYERS,
+        refinement: float = 1.0,
     ) -> PairFiles:
         """Return the files of a pair.
 
         `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light. `guard`
-        has the guard layers of the volumes.
+        has the guard layers of the volumes, `refinement` is the edge of their voxels over that of the reconstructed
+        ones.
         """
-        stamps = provenance.of_pair(experiment, calibration, pair, background=background, guard=guard)
+        stamps = provenance.of_pair(
+            experiment, calibration, pair, background=background, guard=guard, refinement=refinement
+        )
         frames = experiment.pair_frames(pair)
         first, second = (
             VolumeFile(
@@ -183,6 +190,8 @@ class PairFiles:
             frames=(first, second),
             origin=origin,
             grid=experiment.grid,
+            particles=None if stamps.particles is None else folder.particles(pair),
+            particles_stamp=stamps.particles,
         )
 
     @cached_property
@@ -190,16 +199,18 @@ class PairFiles:
         """Marks of the vectors, read once; None if they are missing or cannot be used."""
         return finished.vectors_marks(self.vectors, self.grid)
 
-    def _stamped(self, vectors: bool, volumes: bool) -> Iterator[tuple[Stamp, Marks | None]]:
+    def _stamped(self, vectors: bool, volumes: bool, particles: bool = True) -> Iterator[tuple[Stamp, Marks | None]]:
         """Yield the stamp of each file and the marks of the stored one; None if it is missing or cannot be used."""
         if vectors:
             yield self.stamp, self.vector_marks
+        if vectors and particles and self.particles is not None and self.particles_stamp is not None:
+            yield self.particles_stamp, provenance.read_marks(self.particles)
         if volumes:
             yield from ((frame.stamp, frame.marks()) for frame in self.frames)
 
-    def outdated(self, *, vectors: bool, volumes: bool) -> list[str] | None:
+    def outdated(self, *, vectors: bool, volumes: bool, particles: bool = True) -> list[str] | None:
         """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""
-        for stamp, marks in self._stamped(vectors, volumes):
+        for stamp, marks in self._stamped(vectors, volumes, particles):
             changes = [] if marks is None else stamp.changes(marks)
             if changes or marks is None:
                 return changes
@@ -224,8 +235,10 @@ class PairFiles:
 
     def retire_outdated(self) -> Iterator[tuple[Path, Path]]:
         """Rename the results whose images changed; yield old and new paths."""
-        volumes = [(frame.path, frame.stamp) for frame in self.frames]
-        for path, stamp in [(self.vectors, self.stamp), *volumes]:
+        results = [(self.vectors, self.stamp), *((frame.path, frame.stamp) for frame in self.frames)]
+        if self.particles is not None and self.particles_stamp is not None:
+            results.append((self.particles, self.particles_stamp))
+        for path, stamp in results:
             marks = provenance.read_marks(path)
             if marks is not None and "images" in stamp.changes(marks):
                 with writing(path):
@@ -238,6 +251,13 @@ class PairFiles:
         with writing(self.vectors):
             netcdf.write_vectors(vectors, self.vectors, attributes=marks, reconstruction=condensed)
             self.vectors.with_suffix(RETIRED).unlink(missing_ok=True)
+
+    def write_particles(self, table: xr.Dataset) -> None:
+        """Write the linked particles, atomically."""
+        assert self.particles is not None and self.particles_stamp is not None
+        with writing(self.particles):
+            netcdf.write_particles(table, self.particles, attributes={**self.particles_stamp.attributes, **self.origin})
+            self.particles.with_suffix(RETIRED).unlink(missing_ok=True)
 
 
 def _origin(experiment: Experiment, frame: Frame) -> dict[str, Any]:

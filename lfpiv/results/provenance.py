@@ -25,12 +25,16 @@ from lfpiv.errors import DamagedFile
 from lfpiv.experiment import images
 from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
 from lfpiv.experiment.readers.source import ImagePath, split
+from lfpiv.experiment.segments import followed
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.records import RecordError, read_json, read_object, validate
 from lfpiv.version import __version__
 from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
+
+IMAGES, IMAGES_BEFORE = "images", "images_before"
+"""Parts of a stamp: the images of a result, and those of the instants before it from which it follows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,10 +87,10 @@ class Stamp:
         found = []
         for name in {**before, **now}:
             old, new = before.get(name), now.get(name)
-            if old == new or (name == "images" and new is None):
+            if old == new or (name in (IMAGES, IMAGES_BEFORE) and new is None):
                 continue
             if isinstance(old, dict) and isinstance(new, dict):
-                gone = {"images"} if new.get("images", ()) is None else set()
+                gone = {IMAGES} if new.get("images", ()) is None else set()
                 found += [f"{name}.{key}" for key in {**old, **new} if old.get(key) != new.get(key) and key not in gone]
             else:
                 found.append(name)
@@ -104,6 +108,8 @@ class PairStamps:
     volumes: tuple[Stamp, Stamp]
     """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
     vectors: Stamp
+    particles: Stamp | None = None
+    """Of the linked particles; None without tracking."""
 
 
 def read_marks(path: Path) -> Marks | None:
@@ -317,7 +323,7 @@ def of_self_calibration(experiment: Experiment, calibration: str, background: st
 
 
 def of_guard(experiment: Experiment, calibration: str, pairs: Sequence[int], background: str | None = None) -> Stamp:
-    """Return the stamp of the guard layers measured with some pairs.
+    """Return the stamp of what is measured in some pairs before volumes are reconstructed: guard layers, refinement.
 
     `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light.
     """
@@ -340,27 +346,61 @@ def of_pair(
     *,
     background: str | None = None,
     guard: Layers = NO_LAYERS,
+    refinement: float = 1.0,
 ) -> PairStamps:
     """Return the stamps of the volumes and of the vectors of a pair.
 
     `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
-    the guard layers of the volumes.
+    the guard layers of the volumes, `refinement` the edge of their voxels over that of the reconstructed ones.
     """
-    parts, start = _of_light(experiment, calibration, background, guard), experiment.path.parent
+    light, start = _of_light(experiment, calibration, background), experiment.path.parent
+    parts = light | {
+        "guard": guard if guard != NO_LAYERS else None,
+        "refinement": refinement if refinement != 1 else None,
+    }
     of_pair = parts | {"images": _identity(experiment.pair_paths(pair), start)}
     of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
     if experiment.series is None:
         volumes = Stamp(of_pair)
-        return PairStamps(volumes=(volumes, volumes), vectors=Stamp(of_pair | of_vectors))
+        return PairStamps(
+            volumes=(volumes, volumes),
+            vectors=Stamp(of_pair | of_vectors),
+            particles=_of_particles(experiment, of_pair | of_vectors),
+        )
     first, second = (
         Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
         for instant in experiment.pair_frames(pair)
     )
     of_vectors["step"] = experiment.series.step
-    return PairStamps(volumes=(first, second), vectors=Stamp(of_pair | of_vectors))
+    if experiment.in_sequence:
+        before = [_images_before(experiment, instant.number) for instant in experiment.pair_frames(pair)]
+        first, second = (
+            Stamp({**stamp.parts, IMAGES_BEFORE: hashed}) for stamp, hashed in zip((first, second), before, strict=True)
+        )
+        of_vectors[IMAGES_BEFORE] = None if None in before else before
+    return PairStamps(
+        volumes=(first, second),
+        vectors=Stamp(of_pair | of_vectors),
+        particles=_of_particles(experiment, of_pair | of_vectors),
+    )
 
 
-def _of_light(experiment: Experiment, calibration: str, background: str | None, guard: Layers) -> dict[str, Any]:
+def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp | None:
+    """Return the stamp of the linked particles, for which the vectors are the predictor."""
+    tracking = experiment.tracking
+    return None if tracking is None else Stamp(of_vectors | {"tracking": tracking.model_dump()})
+
+
+def _images_before(experiment: Experiment, instant: int) -> str | None:
+    """Hash the identity of the images from which an instant of a sequence follows; None if one is missing."""
+    assert experiment.series is not None
+    name = experiment.frames[0]
+    frames = (Frame(number, name) for number in followed(experiment.series, instant)[:-1])
+    found = _identity([path for frame in frames for path in experiment.frame_paths(frame)], experiment.path.parent)
+    return None if found is None else files.settings_hash(images=found)
+
+
+def _of_light(experiment: Experiment, calibration: str, background: str | None) -> dict[str, Any]:
     """Return the parts of the stamp of volumes; the identity of the images is None and to be filled in."""
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
@@ -372,9 +412,8 @@ def _of_light(experiment: Experiment, calibration: str, background: str | None, 
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
         "mask": _mask_hash(experiment.solid),
-        "guard": guard if guard != NO_LAYERS else None,
         "smart": experiment.smart.model_dump(),
-        "motion": reach if experiment.smart.motion_passes else None,
+        "motion": reach if experiment.smart.motion_passes or experiment.in_sequence else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
         "particles": particles,
         "images": None,

@@ -34,7 +34,8 @@ CHECKED_FILES = 100
 """Largest number of files that are compared with the first one when they are opened; of more, these are spread evenly.
 Every file is compared when it is read for the first time."""
 
-_NAME = re.compile(r"(pair|instant)_(\d{1,18})\.nc")
+NAME = re.compile(r"(pair|instant)_(\d{1,18})\.nc")
+"""Name of a file of results: kind and number."""
 
 _LONG_NAMES = {PAIR: "number of the image pair", INSTANT: "number of the first of the two instants"}
 
@@ -176,7 +177,7 @@ def _listed(folder: Path, pairs: tuple[int, int | None] | None) -> tuple[str, ar
     found = {PAIR: array("q"), INSTANT: array("q")}
     with os.scandir(vectors) as entries:
         for entry in entries:
-            if (match := _NAME.fullmatch(entry.name)) and match[2] == f"{int(match[2]):0{_WIDTHS[match[1]]}d}":
+            if (match := NAME.fullmatch(entry.name)) and match[2] == f"{int(match[2]):0{_WIDTHS[match[1]]}d}":
                 found[match[1]].append(int(match[2]))
     if all(found.values()):
         raise InputError(

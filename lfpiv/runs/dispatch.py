@@ -24,7 +24,7 @@ from lfpiv.progress import StepProgress
 from lfpiv.runs import cluster_workers, local_workers, worker
 from lfpiv.runs.local_workers import Capacity
 from lfpiv.runs.pair import Outcome, PairWork
-from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut
+from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut, cut_at_segments
 from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan
 from lfpiv.warn import name_pairs
@@ -56,8 +56,11 @@ def _kept(todo: Iterable[int]) -> int:
     return todo.finished[1] if isinstance(todo, Todo) else 0
 
 
-def _step(experiment: Experiment) -> int | None:
-    return None if experiment.series is None else experiment.series.step
+def _stretches(experiment: Experiment, todo: Iterable[int], workers: int) -> Iterable[Stretch]:
+    if experiment.series is None:
+        return cut(todo, None, workers)
+    step = experiment.series.step
+    return cut_at_segments(todo, step) if experiment.in_sequence else cut(todo, step, workers)
 
 
 def parallel(
@@ -92,7 +95,7 @@ def parallel(
         cluster_workers.workers(workers, shared) if isinstance(workers, str) else local_workers.workers(workers, shared)
     )
     total = max(length_hint(todo), 1)
-    stretches = cut(todo, _step(experiment), CLUSTER_WORKERS if isinstance(workers, str) else workers.workers)
+    stretches = _stretches(experiment, todo, CLUSTER_WORKERS if isinstance(workers, str) else workers.workers)
     with found as (client, capacity):
         yield from Dispatch(client, capacity, shared, stretches, total, experiment.noun).outcomes(progress)
 

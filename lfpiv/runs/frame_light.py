@@ -6,22 +6,29 @@ frame of a pair or an instant of a series. `compare` compares both frames of a p
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Frame
 from lfpiv.lightfield import image_checks
-from lfpiv.lightfield.particle_signal import seen_structure
+from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.lightfield.standing_light import remains_warnings
 from lfpiv.warn import Warning
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.experiment.experiment import Experiment
+
+log = logging.getLogger(__name__)
+
+SAMPLED, TRIED = 3, 9
+"""Largest number of pairs that stand for the whole experiment, and that are tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,3 +151,34 @@ def pair_light(
 
 def _name(experiment: Experiment, frame: Frame) -> str:
     return f"pair {frame.number}, frame {frame.name}" if experiment.series is None else f"instant {frame.number}"
+
+
+def sampled_light(
+    experiment: Experiment, cameras: Mapping[str, CalibratedCamera]
+) -> dict[int, list[dict[str, np.ndarray]]]:
+    """Read up to `SAMPLED` pairs that show particles, spread over the whole experiment.
+
+    Returns
+    -------
+    dict of int to list of dict
+        Pair -> the images of both frames: camera name -> image, shape (rows, columns), background removed [counts].
+    """
+    return dict(_lit_pairs(experiment, cameras))
+
+
+def _lit_pairs(
+    experiment: Experiment, cameras: Mapping[str, CalibratedCamera]
+) -> Iterator[tuple[int, list[dict[str, np.ndarray]]]]:
+    darks, used = read_darks(experiment), 0
+    for pair in dict.fromkeys(experiment.spread_pairs(SAMPLED) + experiment.spread_pairs(TRIED)):
+        try:
+            light = pair_light(experiment, cameras, darks, pair)
+        except InputError as error:  # a pair that cannot be used fails when it is reconstructed
+            log.debug("light of %s: %s", experiment.name_of(pair), error)
+            continue
+        if min(min(frame.structure.values()) for frame in light) < NOISE:
+            continue
+        yield pair, [dict(frame.images) for frame in light]
+        used += 1
+        if used == SAMPLED:
+            return

@@ -9,23 +9,20 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lfpiv import files
-from lfpiv.errors import InputError
 from lfpiv.files import writing
 from lfpiv.geometry.grid import AXES, NO_LAYERS, Layers
-from lfpiv.lightfield.particle_signal import NOISE
 from lfpiv.reconstruction.beyond import FaceLight, light_beyond
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
 from lfpiv.results import provenance
 from lfpiv.results.provenance import Marks
 from lfpiv.runs import memory
-from lfpiv.runs.frame_light import pair_light, read_darks
 from lfpiv.warn import Code, Warning
 
 if TYPE_CHECKING:
@@ -35,8 +32,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PAIRS, TRIED = 3, 9
-"""Largest number of pairs that the measurement uses, and that it tries."""
+LEAST_LAYERS = 1
+"""Least number of layers beyond each face with ``volume.guard_mm = "auto"``: particles at a face protrude from it."""
+
+SampledLight = Callable[[], Mapping[int, Sequence[Mapping[str, np.ndarray]]]]
+"""Reads pairs that stand for the experiment, as `lfpiv.runs.frame_light.sampled_light` does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,10 +105,12 @@ def read(folder: Folder) -> tuple[Guard, Marks] | None:
 
 
 def layers(experiment: Experiment, guard: Guard | None) -> Layers:
-    """Return the guard layers of an experiment: those of its file, or the measured ones; none before `decide`."""
+    """Return the guard layers of an experiment: those of its file, or at least `LEAST_LAYERS` and the measured ones."""
     if experiment.guard_mm != "auto":
         return experiment.grid.layers(experiment.guard_mm)
-    return NO_LAYERS if guard is None else guard.layers
+    measured = NO_LAYERS if guard is None else guard.layers
+    z, y, x = ((max(low, LEAST_LAYERS), max(high, LEAST_LAYERS)) for low, high in measured)
+    return z, y, x
 
 
 def with_guard(experiment: Experiment, guard: Layers) -> Experiment:
@@ -118,7 +120,12 @@ def with_guard(experiment: Experiment, guard: Layers) -> Experiment:
 
 
 def decide(
-    experiment: Experiment, folder: Folder, stamp_hash: str, background: str | None, calibration: Calibration
+    experiment: Experiment,
+    folder: Folder,
+    stamp_hash: str,
+    background: str | None,
+    calibration: Calibration,
+    light: SampledLight,
 ) -> Guard:
     """Return the stored outcome, or measure the light beyond the volume and store the outcome.
 
@@ -130,7 +137,7 @@ def decide(
             log.info("light beyond the volume: measured before, kept")
             return known
     start = time.perf_counter()
-    instants = dict(_instants(experiment, calibration))
+    instants = light()
     faces = light_beyond(calibration, experiment.grid, list(instants.values())) if instants else ()
     demanded = _demanded(experiment, faces)
     allowed = _fitting(experiment, demanded)
@@ -163,25 +170,6 @@ def warnings(experiment: Experiment, guard: Guard | None) -> list[Warning]:
             figures["reason"] = _reason(experiment, guard, face)
             found.append(Warning(code=Code.LIGHT_UNGUARDED, figures=figures))
     return found
-
-
-def _instants(
-    experiment: Experiment, calibration: Calibration
-) -> Iterator[tuple[int, Sequence[dict[str, np.ndarray]]]]:
-    """Yield the images of both frames of some usable pairs, spread over the whole experiment."""
-    darks, used = read_darks(experiment), 0
-    for pair in dict.fromkeys(experiment.spread_pairs(PAIRS) + experiment.spread_pairs(TRIED)):
-        try:
-            light = pair_light(experiment, calibration.cameras, darks, pair)
-        except InputError as error:  # a pair that cannot be used fails when it is reconstructed
-            log.debug("light beyond the volume in %s: %s", experiment.name_of(pair), error)
-            continue
-        if min(min(frame.structure.values()) for frame in light) < NOISE:
-            continue
-        yield pair, [dict(frame.images) for frame in light]
-        used += 1
-        if used == PAIRS:
-            return
 
 
 def _demanded(experiment: Experiment, faces: Sequence[FaceLight]) -> Layers:

@@ -27,6 +27,7 @@ from lfpiv.runs.frame_light import FrameLight, compare
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.experiment.experiment import Experiment
+    from lfpiv.reconstruction.sequence import Before
     from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
@@ -54,11 +55,17 @@ class InstantWork(Protocol):
     def read_light(self, file: VolumeFile) -> FrameLight:
         """Read and check the images of an instant whose volume is to be reconstructed."""
 
+    def require_weights(self, file: VolumeFile) -> None:
+        """Raise InputError if a volume that is not in the folder cannot be reconstructed."""
+
     def light_again(self, instant: Frame) -> FrameLight:
         """Read the images of an instant, also if its volume is known."""
 
     def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
         """Reconstruct one instant."""
+
+    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
+        """Reconstruct one instant from the one before; return it and what the next one needs."""
 
     def write(self, write: Callable[[], None], *, large: bool = False) -> None:
         """Start to write a result of the present pair."""
@@ -82,7 +89,7 @@ def failure(error: Exception) -> Failure:
 
 
 @dataclass(eq=False)
-class _Instant:
+class Instant:
     """One instant: its volume and, once it was read, the light of its images."""
 
     frame: Frame
@@ -100,7 +107,7 @@ class Instants:
     work: InstantWork
     stored: Collection[int] = ()
     """Instants whose volumes are stored for other processes."""
-    held: dict[Frame, _Instant | Failure] = field(default_factory=dict)
+    held: dict[Frame, Instant | Failure] = field(default_factory=dict)
     taken: list[Path] = field(default_factory=list)
     """Files of other processes that this one has read and no other one needs."""
 
@@ -138,7 +145,7 @@ class Instants:
     def _obtain(self, files: PairFiles, progress: StepProgress, wanted: Sequence[VolumeFile] | None = None) -> None:
         """Hold the instants of a pair, and no others."""
         wanted = files.frames if wanted is None else wanted
-        self.held = {file.frame: self.held[file.frame] for file in wanted if file.frame in self.held}
+        self.held = {frame: found for frame, found in self.held.items() if self._needed(frame, files, wanted)}
         new = [file for file in wanted if file.frame not in self.held]
         for number, file in enumerate(new):
             step = part_of(progress, number / len(new), (number + 1) / len(new))
@@ -149,30 +156,38 @@ class Instants:
             except Exception as error:  # an error in one instant must not end the series
                 self.held[file.frame] = failure(error)
 
-    def _read(self, file: VolumeFile) -> _Instant | None:
+    def _needed(self, frame: Frame, files: PairFiles, wanted: Sequence[VolumeFile]) -> bool:
+        """Return whether an instant that is held is held further while a pair is done."""
+        return any(frame == file.frame for file in wanted)
+
+    def _read(self, file: VolumeFile) -> Instant | None:
         """Return an instant whose volume is in the output folder or was stored by another process."""
         if (found := file.read()) is not None:
-            return _Instant(file.frame, found, self._stored_light(file))
+            return Instant(file.frame, found, self._stored_light(file))
         if self.work.scratch is None:
             return None
         there = file.within(self.work.scratch)
         if (found := there.read()) is None:
             return None
         self._take(file, there.path)
-        return _Instant(file.frame, found, self._stored_light(file))
+        return Instant(file.frame, found, self._stored_light(file))
 
-    def _reconstruct(self, file: VolumeFile, progress: StepProgress) -> _Instant:
+    def _reconstruct(self, file: VolumeFile, progress: StepProgress) -> Instant:
         light = self.work.read_light(file)
-        found = _Instant(file.frame, self.work.reconstruct(light, progress), light)
+        return self._handed_on(file, Instant(file.frame, self.work.reconstruct(light, progress), light))
+
+    def _handed_on(self, file: VolumeFile, found: Instant) -> Instant:
+        """Start to write a new volume where it is wanted; return the instant."""
         if self.work.keep_volumes:
             self.work.write(partial(file.write, found.volume), large=True)
         if file.frame.number in self.stored and self.work.scratch is not None:
-            _write_light(light, _light_path(file, self.work.scratch))
+            assert found.light is not None
+            _write_light(found.light, _light_path(file, self.work.scratch))
             if not self.work.keep_volumes:
                 self.work.write(partial(file.within(self.work.scratch).write, found.volume), large=True)
         return found
 
-    def _compared(self, first: _Instant, second: _Instant) -> Sequence[Warning]:
+    def _compared(self, first: Instant, second: Instant) -> Sequence[Warning]:
         """Return the warnings about both instants; none if the images of one cannot be read any more."""
         lights = []
         for one in (first, second):
@@ -201,7 +216,7 @@ class Instants:
             self.taken.append(path)
 
 
-def _usable(found: _Instant | Failure) -> _Instant:
+def _usable(found: Instant | Failure) -> Instant:
     if isinstance(found, Failure):
         raise found.with_traceback(None)
     return found

@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -25,10 +25,12 @@ from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.experiment.settings import Correlation
 from lfpiv.geometry.grid import Grid, Layers
+from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS
 from lfpiv.lightfield import image_checks
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.motion import Motion, PairSolver, unshared_quality
+from lfpiv.reconstruction.sequence import Before, SequenceSolver, Start
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairFiles, PairVolumes, VolumeFile
@@ -36,8 +38,13 @@ from lfpiv.runs import pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.guard import with_guard
 from lfpiv.runs.instants import Instants, failure
+from lfpiv.runs.particles import track
+from lfpiv.runs.refinement import refined
+from lfpiv.runs.sequences import SequentialInstants, restarted
 from lfpiv.runs.side_threads import ReadAhead, Writer
+from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.settings import DEFAULT_WINDOWS, FIRST_SEARCH
 from lfpiv.warn import FirstOfEachCode, Warning
 
 if TYPE_CHECKING:
@@ -81,6 +88,8 @@ class PairWork:
     calibration_hash: str
     guard: Layers
     """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
+    refinement: float
+    """Edge of a voxel of the experiment over that of the weights, which volumes are sampled from."""
     weights: Weights | None
     """None if all volumes are in the folder."""
     cameras: Mapping[str, CalibratedCamera]
@@ -108,7 +117,9 @@ class PairWork:
         StorageError
             If a result cannot be written; then no other pair could be written either.
         """
-        instants = None if self.experiment.series is None else Instants(self, stored)
+        instants: Instants | None = None
+        if self.experiment.series is not None:
+            instants = SequentialInstants(self, stored) if self.experiment.in_sequence else Instants(self, stored)
         computed: _Computed | None = None
         try:
             for number, (pair, coming) in enumerate(_with_next(pairs)):
@@ -142,7 +153,9 @@ class PairWork:
         """Start to read the images of the coming pair whose volumes are not in the folder."""
         frames: list[Frame] = []
         if coming is not None and self.weights is not None:
-            both = enumerate(self.experiment.pair_frames(coming))
+            both = list(enumerate(self.experiment.pair_frames(coming)))
+            if self.experiment.in_sequence:  # the first instant is reconstructed already
+                del both[0]
             frames = [frame for number, frame in both if not self.folder.volume(coming, number).exists()]
         self.images.start(frames, self.experiment.pair_frames(pair))
 
@@ -169,17 +182,35 @@ class PairWork:
     def solver(self) -> PairSolver:
         """SMART for this rig, made once for all pairs.
 
-        The motion passes use default windows, so that other windows in `[correlation]` do not change the volumes.
+        The motion passes use default windows, so that other windows in `[correlation]` do not change the volumes. They
+        correlate the reconstructed voxels.
         """
         assert self.weights is not None
+        self.weights.volume = self.experiment.grid
         smart, farthest = self.experiment.smart, self.experiment.correlation.max_displacement_voxel
+        if farthest is None and self.refinement > 1:
+            farthest = FIRST_SEARCH * DEFAULT_WINDOWS[0]
+        if farthest is not None:
+            farthest *= self.refinement
         return PairSolver(
             self.weights,
-            SmartSettings(**smart.of_one_frame()),
+            SmartSettings(**smart.of_one_frame(self.refinement)),
             motion_passes=smart.motion_passes,
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
-            mask=with_guard(self.experiment, self.guard).solid,
+            mask=refined(with_guard(self.experiment, self.guard), self.refinement).solid,
         )
+
+    @cached_property
+    def sequence(self) -> SequenceSolver:
+        """SMART along a series, made once."""
+        farthest = self.experiment.correlation.max_displacement_voxel
+        correlation = Correlation(max_displacement_voxel=farthest).model_dump()
+        return SequenceSolver(self.solver.smart, correlation, self.between)
+
+    @cached_property
+    def between(self) -> LastVectors:
+        """Correlation along a sequence, which may need the same vectors as a result and to predict an instant."""
+        return LastVectors(self.experiment.dt_s)
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
@@ -190,11 +221,13 @@ class PairWork:
             pair,
             background=self.background,
             guard=self.guard,
+            refinement=self.refinement,
         )
 
     def _do(self, pair: int, instants: Instants | None, progress: StepProgress) -> None:
         files = self.files(pair)
-        if files.outdated(vectors=self.vectors, volumes=self.keep_volumes) is None:
+        wanted = {"vectors": self.vectors, "volumes": self.keep_volumes, "particles": self.weights is not None}
+        if files.outdated(**wanted) is None:
             log.info("%s: was finished by a worker that died afterwards", self.experiment.name_of(pair))
             return
         if instants is None:
@@ -228,11 +261,9 @@ class PairWork:
         self.writer.wait_large()
         self._log(files.pair, [warning for frame in light for warning in frame.warnings])
         start = time.perf_counter()
-        guarded = _reconstruct_frames(self.solver, light, files.pair, progress)
+        found = _reconstruct_frames(self.solver, light, files.pair, progress)
         seconds = (time.perf_counter() - start) / 2
-        first, second = (
-            self._frame_volume(volume, frame, seconds) for volume, frame in zip(guarded, light, strict=True)
-        )
+        first, second = (self._frame_volume(volume, frame, seconds) for volume, frame in zip(found, light, strict=True))
         return first, second
 
     def read_light(self, file: VolumeFile) -> FrameLight:
@@ -243,12 +274,16 @@ class PairWork:
         InputError
             If an image cannot be used, or there are no weights because all volumes should be in the folder.
         """
+        self.require_weights(file)
+        return self.light_again(file.frame)
+
+    def require_weights(self, file: VolumeFile) -> None:
+        """Raise InputError if there are no weights because all volumes should be in the folder."""
         if self.weights is None:
             raise InputError(
                 f"{file.path}: expected the volume of instant {file.frame.number} made with the present settings, "
                 "found none. Run `lfpiv reconstruct` first."
             )
-        return self.light_again(file.frame)
 
     def light_again(self, instant: Frame) -> FrameLight:
         """Read the images of an instant, also if its volume is known; raise InputError if that is not possible."""
@@ -276,10 +311,33 @@ class PairWork:
         log.info("instant %d: reconstructed in %.1f s", instant, seconds)
         return self._frame_volume(found.to_dataarray(), light, seconds)
 
-    def _frame_volume(self, guarded: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
-        """Return a volume without its guard layers, with its record."""
-        assert self.weights is not None
-        volume = _without_guard(guarded, self.experiment.grid, self.weights.grid)
+    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
+        """Reconstruct one instant of a series from the one before; return it and what the next one needs.
+
+        Raises
+        ------
+        InputError
+            If its images cannot be reconstructed.
+        """
+        instant = light.frame.number
+        self._log(instant, light.warnings)
+        self.writer.wait_large()
+        start = time.perf_counter()
+        try:
+            solved = self.sequence.solve(light.images, before, floor=light.noise, progress=progress)
+        except ValueError as error:
+            raise InputError(f"instant {instant}: {error}") from error
+        seconds = time.perf_counter() - start
+        log.info("instant %d: reconstructed in %.1f s; %s", instant, seconds, solved.start.value)
+        found = self._frame_volume(solved.found.to_dataarray(), light, seconds)
+        if solved.start is Start.MISSED:
+            found = restarted(found, solved.misfit_ratio, instant)
+            self._log(instant, found.record.warnings[-1:])
+        return found, solved.before(found.volume, before)
+
+    def _frame_volume(self, found: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
+        """Return a volume on the voxels of the experiment, with its record."""
+        volume = _as_written(found, self.experiment.grid)
         record = FrameRecord(structure=light.structure, warnings=light.warnings, seconds=seconds + light.seconds)
         return FrameVolume(volume=volume, record=record)
 
@@ -290,13 +348,20 @@ class PairWork:
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment, start = self.experiment, time.perf_counter()
-        vectors = correlate(*volumes.volumes, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
+        settings = experiment.correlation.model_dump()
+        if experiment.in_sequence:
+            vectors = self.between(*volumes.volumes, settings)
+        else:
+            vectors = correlate(*volumes.volumes, dt_s=experiment.dt_s, **settings)
         vectors = _without_unmeasured(_with_motion(vectors, volumes), volumes)
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
         vectors.attrs["reconstruction_s"] = self._reconstruction_s(files.pair, volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
-        condensed = volumes.condensed()
-        figures = pair_figures.measure(vectors, condensed, volumes.warnings)
+        condensed, found = volumes.condensed(), volumes.warnings
+        if files.particles is not None and self.weights is not None:
+            found = (*found, *self._track(files, volumes, vectors))
+            vectors.attrs["warnings"] = warn.to_text(found)
+        figures = pair_figures.measure(vectors, condensed, found)
         self._log(files.pair, volumes.between)
         if figures.lost_unseeded > 0:
             self._log(files.pair, [figures.unseeded_warning(files.pair)])
@@ -315,6 +380,30 @@ class PairWork:
 
         self.write(write)
 
+    def _track(self, files: PairFiles, volumes: PairVolumes, vectors: xr.Dataset) -> list[Warning]:
+        """Find and link the particles of both frames and write them; return the warnings about them."""
+        table, found = track(self.search, [self.light_again(file.frame) for file in files.frames], volumes, vectors)
+        self.write(partial(files.write_particles, table))
+        name, linked = self.experiment.name_of(files.pair), table.sizes["particle"]
+        log.info(
+            "%s: %d and %d particles found, %d linked, %d of them valid; %.3g per microlens, %.0f %% of the light "
+            "explained",
+            name,
+            *table.attrs["found"],
+            linked,
+            table.attrs["valid_links"],
+            np.mean(table.attrs["per_microlens"]),
+            100 * np.mean(table.attrs["explained"]),
+        )
+        self._log(files.pair, found)
+        return found
+
+    @cached_property
+    def search(self) -> ParticleSearch:
+        """Search for particles of this rig, made once for all pairs."""
+        assert self.weights is not None and self.experiment.tracking is not None
+        return ParticleSearch(self.weights, **self.experiment.tracking.model_dump())
+
     def _reconstruction_s(self, pair: int, volumes: PairVolumes) -> float:
         """Return the time that the volumes of a pair took [s].
 
@@ -324,6 +413,23 @@ class PairWork:
         first, second = (record.seconds for record in volumes.records)
         series = self.experiment.series
         return second if series is not None and pair - series.step in self.experiment.numbers else first + second
+
+
+@dataclass(eq=False)
+class LastVectors:
+    """Correlation of two volumes, which is not repeated if it was the last one."""
+
+    dt_s: float
+    """Time between the volumes [s]."""
+    _last: tuple[xr.DataArray, xr.DataArray, dict[str, Any], xr.Dataset] | None = None
+
+    def __call__(self, first: xr.DataArray, second: xr.DataArray, settings: Mapping[str, Any]) -> xr.Dataset:
+        """Return the vectors between two volumes; `settings` are those of `correlate`."""
+        known = self._last
+        if known is None or known[0] is not first or known[1] is not second or known[2] != settings:
+            known = first, second, dict(settings), correlate(first, second, dt_s=self.dt_s, **settings)
+            self._last = known
+        return known[3].copy()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -376,18 +482,12 @@ def _reconstruct_frames(
     return first, second
 
 
-def _without_guard(volume: xr.DataArray, grid: Grid, padded: Grid) -> xr.DataArray:
-    """Cut the guard layers off a volume."""
-    if padded == grid:
-        return volume
-    cut = volume[grid.within(padded)]
-    for name in volume.coords:
-        if cut.coords[name].ndim == 3:  # HDF5 and the kernels take contiguous arrays
-            cut = cut.assign_coords({name: cut.coords[name].copy(data=np.ascontiguousarray(cut.coords[name].values))})
-    cut = cut.copy(data=np.ascontiguousarray(cut.values))
-    if VIEWS in cut.coords and cut.coords[VIEWS].values.min() >= 2:
-        cut = cut.drop_vars(VIEWS)
-    return cut
+def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
+    """Return a reconstructed volume on the voxels that are written, ``views`` only if some are seen by one camera."""
+    written = volume_on(volume, grid)
+    if VIEWS in written.coords and written.coords[VIEWS].values.min() >= 2:
+        written = written.drop_vars(VIEWS)
+    return written
 
 
 def _with_motion(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:

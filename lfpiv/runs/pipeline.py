@@ -149,7 +149,7 @@ def correlate(
     """
     with open_run(experiment, out, device, progress, pairs) as current:
         calibrated = rig.load_calibration(current)
-        todo = current.unfinished()
+        todo = current.unfinished(particles=False)
         if (known := todo.ahead()) and not current.has_some_volumes():
             first = known[0]
             raise InputError(
@@ -195,12 +195,12 @@ def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None)
     planned = worker_plan.plan(length_hint(todo), workers, current.device, gpus)
     failed = current.check_images(todo) if some else None
     if some and failed is None:
-        guarded = current.guarded_experiment
-        needed = memory.weights_bytes(guarded) if current.need_weights(todo) else 0
+        finest = current.reconstructed_experiment
+        needed = memory.weights_bytes(finest) if current.need_weights(todo) else 0
         if workers is None:
             planned = worker_plan.fit_installation(planned, current.device)
-            planned = worker_plan.fit_memory(planned, guarded, needed, current.device)
-        worker_plan.require_memory(guarded, needed, 1 if scheduler else planned.workers)
+            planned = worker_plan.fit_memory(planned, finest, needed, current.device)
+        worker_plan.require_memory(finest, needed, 1 if scheduler else planned.workers)
         if planned.workers > 1 and not scheduler:
             local_workers.start_preloading(planned.kind)
     return _Checked(todo=todo, failed=failed, workers=scheduler or planned)
@@ -218,8 +218,8 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     if current.need_weights(todo):
         weights, figures = rig.build_weights(current, prepared, todo.ahead())
         if isinstance(workers, Plan):
-            guarded = current.guarded_experiment
-            workers = worker_plan.fit_memory(workers, guarded, weights.memory_bytes, current.device)
+            finest = current.reconstructed_experiment
+            workers = worker_plan.fit_memory(workers, finest, weights.memory_bytes, current.device)
     work = _work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration)
     if isinstance(workers, Plan) and workers.workers == 1:
         return Invocation(tried=_sequential(current, work, todo), weights=figures)
@@ -267,6 +267,7 @@ def _work(
         folder=current.folder,
         calibration_hash=current.calibration_stamp.hash,
         guard=current.guard_layers,
+        refinement=current.refinement_factor,
         weights=weights,
         cameras=cameras,
         darks=read_darks(current.experiment) if cameras else {},

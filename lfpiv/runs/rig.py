@@ -5,6 +5,7 @@ Each step reuses the result in the output folder if it still fits the experiment
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import logging
@@ -21,7 +22,8 @@ from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import MIB, writing
 from lfpiv.records import RecordError, validate
 from lfpiv.results import netcdf, provenance
-from lfpiv.runs import background, guard, memory, moved_cameras
+from lfpiv.runs import background, guard, memory, moved_cameras, refinement
+from lfpiv.runs.frame_light import sampled_light
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.warn import Code, Warning, collected, warn
@@ -136,7 +138,7 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
 
 
 def prepare(run: Run, board: Calibration) -> tuple[Run, Prepared]:
-    """Make what all pairs depend on beside the settings: subtracted light, corrected cameras and guard layers.
+    """Make what all pairs depend on beside the settings: subtracted light, corrected cameras, guard layers, voxels.
 
     `board` is the calibration from the board. Return also the run whose results depend on them.
     """
@@ -144,8 +146,10 @@ def prepare(run: Run, board: Calibration) -> tuple[Run, Prepared]:
     run = replace(run, background=standing.content)
     board = standing.seen_by(board)
     calibration, self_calibration = self_calibrate(run, board)
-    stamp = run.calibration_stamp.hash
-    run = replace(run, guard=guard.decide(run.experiment, run.folder, stamp, standing.content, calibration))
+    given = run.experiment, run.folder, run.calibration_stamp.hash, standing.content, calibration
+    light = functools.cache(functools.partial(sampled_light, run.experiment, calibration.cameras))
+    run = replace(run, guard=guard.decide(*given, light))
+    run = replace(run, refinement=refinement.decide(*given, light, run.guard_layers))
     return run, Prepared(board=board, calibration=calibration, self_calibration=self_calibration)
 
 
@@ -154,13 +158,13 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
     from lfpiv.calibration.coverage import require_seen, warn_outside
     from lfpiv.weights.operator import build_weights, compare_with_count
 
-    experiment, compute, guarded = run.experiment, run.experiment.compute, run.guarded_experiment
+    experiment, compute, finest = run.experiment, run.experiment.compute, run.reconstructed_experiment
     calibration, self_calibration = prepared.calibration, prepared.self_calibration
     require_seen(experiment.path, calibration, experiment.grid)
     warn_outside(calibration, experiment.grid)
     if len(calibration.cameras) == 1:
         log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
-    for warning in guard.warnings(experiment, run.guard):
+    for warning in guard.warnings(experiment, run.guard) + refinement.warnings(experiment, run.refinement):
         log.warning("%s", warning.sentence)
     start = time.perf_counter()
     with collected() as warnings:
@@ -168,10 +172,10 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
             warn(log, warning)
         weights = build_weights(
             calibration,
-            guarded.grid,
+            finest.grid,
             compute.weights,
             form=compute.weights_form,
-            limit_bytes=memory.left_for_weights(guarded),
+            limit_bytes=memory.left_for_weights(finest),
             progress=run.step("weights"),
         )
         weights.volume = experiment.grid

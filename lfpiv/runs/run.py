@@ -27,11 +27,12 @@ from lfpiv.results import finished, provenance
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
-from lfpiv.runs import guard, memory, pair_figures, summary
+from lfpiv.runs import guard, memory, pair_figures, refinement, summary
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
 from lfpiv.runs.pair import Outcome
+from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.summary import Contents, EarlierSummary
 from lfpiv.runs.todo import Todo
 from lfpiv.warn import NAMED_PAIRS, Gathering, Warning, collected, name_pairs
@@ -88,6 +89,7 @@ def open_run(
                 finished=FinishedPairs(experiment.numbers, folder.path),
                 background=provenance.background_content(folder.background),
                 guard=None if (measured := guard.read(folder)) is None else measured[0],
+                refinement=None if (sized := refinement.read(folder)) is None else sized[0],
             )
     finally:
         for path in made:
@@ -131,6 +133,8 @@ class Run:
     """Hash of the light that is subtracted from the images; None if there is none."""
     guard: Guard | None = None
     """Light beyond the volume and the guard layers that it demands; None before it was measured."""
+    refinement: Refinement | None = None
+    """Size of the particles and the refinement that it demands; None before it was measured."""
 
     def step(self, name: str) -> StepProgress:
         """Return the progress of one step of the run."""
@@ -138,17 +142,23 @@ class Run:
 
     @property
     def guard_layers(self) -> Layers:
-        """Guard layers of the volumes; none if they are yet to be measured."""
+        """Guard layers of the volumes; the least ones if they are yet to be measured."""
         return guard.layers(self.experiment, self.guard if self.experiment.guard_mm == "auto" else None)
 
+    @property
+    def refinement_factor(self) -> float:
+        """Edge of a voxel over that of the reconstructed ones; 1 if it is yet to be measured."""
+        return refinement.factor(self.experiment, self.refinement)
+
     def has_light_of(self, other: Run) -> bool:
-        """Return whether the volumes of both runs have the same subtracted light and the same guard layers."""
-        return self.background == other.background and self.guard_layers == other.guard_layers
+        """Return whether the volumes of both runs have the same subtracted light and the same reconstructed grid."""
+        own, others = ((run.background, run.guard_layers, run.refinement_factor) for run in (self, other))
+        return own == others
 
     @property
-    def guarded_experiment(self) -> Experiment:
-        """The experiment with the grid that is reconstructed."""
-        return guard.with_guard(self.experiment, self.guard_layers)
+    def reconstructed_experiment(self) -> Experiment:
+        """The experiment with the grid that is reconstructed: with guard layers, of smaller voxels."""
+        return refinement.refined(guard.with_guard(self.experiment, self.guard_layers), self.refinement_factor)
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
@@ -159,25 +169,29 @@ class Run:
             pair,
             background=self.background,
             guard=self.guard_layers,
+            refinement=self.refinement_factor,
         )
 
     def has_volumes(self, pair: int) -> bool:
         """Return whether both volumes of a pair are in the folder and fit."""
         return self.files(pair).fitting_volumes() is not None
 
-    def unfinished(self, *, vectors: bool = True, volumes: bool = False, quiet: bool = False) -> Todo:
-        """Find the selected pairs whose vectors or volumes are missing or do not fit; log changes unless `quiet`."""
+    def unfinished(
+        self, *, vectors: bool = True, volumes: bool = False, particles: bool = True, quiet: bool = False
+    ) -> Todo:
+        """Find the selected pairs whose results are missing or do not fit; log changes unless `quiet`."""
         self.finished.clear()
 
         def changes(pair: int) -> list[str] | None:
             found = self.files(pair)
-            changed = found.outdated(vectors=vectors, volumes=volumes)
+            changed = found.outdated(vectors=vectors, volumes=volumes, particles=particles)
             if changed is None:
                 self._keep(found)
             return changed
 
         stored = self.folder.stored(self.numbers, vectors=vectors, volumes=volumes)
-        step = 1 if self.experiment.series is None else self.experiment.series.step
+        series = self.experiment.series
+        step = 1 if series is None or self.experiment.in_sequence else series.step
         todo = Todo(self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun)
         todo.quiet = quiet
         return todo
@@ -193,7 +207,9 @@ class Run:
         return any(self.has_volumes(pair) for pair, there in zip(self.numbers, stored, strict=True) if there)
 
     def need_weights(self, todo: Todo) -> bool:
-        """Return whether a pair to do has no volumes that fit."""
+        """Return whether a pair to do has no volumes that fit, or particles are to be found in its images."""
+        if self.experiment.tracking is not None and todo.ahead():
+            return True
         if not all(map(self.has_volumes, todo.ahead())):
             return True
         if todo.whole:
@@ -311,6 +327,7 @@ class Run:
             background=light,
             background_warnings=warnings,
             guard=self.guard,
+            refinement=self.refinement,
         )
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:

@@ -23,12 +23,14 @@ from lfpiv.files import writing
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
+from lfpiv.results import particles
 from lfpiv.results.folder import Folder
-from lfpiv.runs import guard
+from lfpiv.runs import guard, refinement
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.runs.pair_figures import PairFigures
+from lfpiv.runs.refinement import Refinement
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import Code, Gathering, Warning, from_list, gather
 
@@ -65,6 +67,8 @@ class Contents:
     """Warnings about light that stands still and is not subtracted."""
     guard: Guard | None = None
     """Light beyond the volume and guard layers; None if they were not measured."""
+    refinement: Refinement | None = None
+    """Size of the particles and refinement; None if it was not measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,6 +189,7 @@ def build(
         "weights": weights,
         "background": dict(contents.background),
         "guard": _guard(experiment, contents.guard),
+        "refinement": _refinement(experiment, contents.refinement),
         "pairs_finished": pairs.count,
         "pairs_file": folder.pairs.name if pairs.count > MOST_LISTED else None,
         "pairs": pairs.listed,
@@ -217,10 +222,12 @@ class _Survey:
 def _survey(contents: Contents, folder: Folder) -> _Survey:
     """Go through the figures of all finished pairs once. If they are too many for the summary, write them to a file."""
     total, images, vectors = len(contents.vectors), Gathering(), Gathering()
+    tracked = folder.particles(0).parent.is_dir()
     totals, listed = dict.fromkeys(_SUMMED, 0.0), []
     with _lines(folder.pairs if total > MOST_LISTED else None) as write:
         for place, (pair, figures) in enumerate(contents.vectors.items()):
             entry = {"pair": pair, "file": folder.vectors(pair).name, **figures.to_json()}
+            entry |= particles.figures(folder.particles(pair)) if tracked else {}
             write(entry)
             if total <= MOST_LISTED or place in (0, total - 1) or _is_sampled(place, total):
                 listed.append(entry)
@@ -291,6 +298,7 @@ def _warnings(
     found = [
         *rig_warnings(calibrated.calibration, experiment.grid),
         *guard.warnings(experiment, contents.guard),
+        *refinement.warnings(experiment, contents.refinement),
         *map(Warning.from_json, weights.get("warnings", ())),
         *contents.background_warnings,
         *of_pairs,
@@ -308,6 +316,17 @@ def _guard(experiment: Experiment, found: Guard | None) -> dict[str, Any]:
     thickness = [[round(count * experiment.grid.voxel_mm, 6) for count in pair] for pair in reversed(used)]
     light = {} if found is None else found.to_json()
     return {"thickness_mm": thickness, "pairs": list(light.get("pairs", ())), "faces": list(light.get("faces", ()))}
+
+
+def _refinement(experiment: Experiment, found: Refinement | None) -> dict[str, Any]:
+    """Return the reconstructed voxels and the size of the particles [voxel of the experiment]."""
+    factor = refinement.factor(experiment, found)
+    return {
+        "factor": factor,
+        "voxel_mm": experiment.grid.voxel_mm / factor,
+        "particle_size_voxel": None if found is None else found.size_voxel,
+        "pairs": [] if found is None else list(found.pairs),
+    }
 
 
 def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:

@@ -48,6 +48,7 @@ class Task(BaseModel):
     folder: Folder
     calibration_hash: str
     guard: Layers
+    refinement: float
     keep_volumes: bool
     background: str | None
     vectors: bool
@@ -73,6 +74,7 @@ class Task(BaseModel):
             folder=self.folder,
             calibration_hash=self.calibration_hash,
             guard=self.guard,
+            refinement=self.refinement,
             weights=None,
             cameras={},
             darks={},
@@ -112,6 +114,7 @@ def write_task(work: PairWork, device: str, threads: int | None) -> Path:
         folder=dataclasses.replace(work.folder, path=work.folder.path.absolute()),
         calibration_hash=work.calibration_hash,
         guard=work.guard,
+        refinement=work.refinement,
         keep_volumes=work.keep_volumes,
         background=work.background,
         vectors=work.vectors,

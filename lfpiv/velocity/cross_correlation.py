@@ -135,7 +135,8 @@ def correlate(
         (`lfpiv.velocity.seeding`).
         ``masked``: true where less than half of the window is fluid, so that nothing is measured; ``valid`` is false.
         ``fluid_share``: part of the window that is fluid. ``seeded_share``: part of this fluid that holds particles.
-        ``peak_ratio``: highest correlation over the highest one more than two lags away.
+        ``peak_ratio``: highest correlation over the highest one beyond the reach of its peak: two lags, or more where
+        particles are sampled finely (`lfpiv.velocity.peak_width`).
         ``correlation``: coefficient at the peak.
         ``uncertainty`` [voxel]: standard deviation of the displacement vector, the root of the summed variances of
         ``uncertainty_x``, ``_y``, ``_z``. NaN where the vector was replaced and after a single pass. A variance is
@@ -225,7 +226,7 @@ def _variables(result: Pass, deviation: np.ndarray, axes: VoxelAxes, dt_s: float
         fields[f"uncertainty_{axis}"] = (deviation[..., k], "voxel", text)
     text = f"standard deviation of the displacement vector: {UNCERTAINTY_PARTS}"
     fields["uncertainty"] = (np.sqrt((deviation**2).sum(-1)), "voxel", text)
-    text = "highest correlation over the highest more than two lags away"
+    text = f"highest correlation over the highest more than {result.given.reach} lags away"
     fields["peak_ratio"] = (peak_ratio(result.peaks) * known, "1", text)
     fields["correlation"] = (result.peaks.correlation * known, "1", "correlation coefficient at the peak")
     fields["fluid_share"] = (coverage.fluid_share, "1", "part of the window that is fluid")

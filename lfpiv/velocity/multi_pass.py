@@ -15,11 +15,12 @@ import numpy as np
 from lfpiv.velocity import validation
 from lfpiv.velocity.continuation import continued
 from lfpiv.velocity.coverage import Coverage, MaskedPair, Voxels
+from lfpiv.velocity.peak_width import peak_reach, refine_search
 from lfpiv.velocity.predictor import Predictor
-from lfpiv.velocity.settings import REFINE_SEARCH, CorrelationSettings, Triple, triple
+from lfpiv.velocity.settings import CorrelationSettings, Triple, triple
 from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation import deform
-from lfpiv_kernels.correlation.correlate import WindowPeaks, correlate_windows
+from lfpiv_kernels.correlation.correlate import PEAK_REACH, WindowPeaks, correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 
 log = logging.getLogger(__name__)
@@ -45,6 +46,8 @@ class PassInput:
     """The two volumes, deformed onto each other in all passes but the first, with a mask less their local mean."""
     fluid: np.ndarray | None = None
     """True for voxels that hold fluid in both volumes, shape (z, y, x); None without a mask."""
+    reach: int = PEAK_REACH
+    """Lags around the highest coefficient that belong to its peak."""
     predicted: np.ndarray | None = None
     """Displacement removed by the deformation, as window means, shape (z, y, x, 3) [voxel]; None in the first pass."""
 
@@ -161,6 +164,7 @@ def correlate_passes(
     """
     shape, last = triple(first.shape), len(settings.windows) - 1
     pair = UndeformedPair((first, second), voxels.solid)
+    reach = peak_reach(first, second, settings.windows[-1])
     coarse = max(settings.overlap, COARSE_OVERLAP)
     overlaps = [coarse] * last + [settings.overlap]
     windows = _cover(shape, settings.windows[0], overlaps[0])
@@ -172,6 +176,7 @@ def correlate_passes(
         search=settings.first_search(shape),
         volumes=volumes,
         fluid=fluid,
+        reach=reach,
     )
     flags = [voxels.coarse] * last + [voxels]
     coverage = flags[0].coverage(windows, settings.windows[-1])
@@ -237,9 +242,10 @@ def _deform(pair: UndeformedPair, before: Pass, window: Triple, overlap: float) 
         windows=windows,
         overlap=overlap,
         centres=[centre + deform.OFFSET for centre in windows.centres],
-        search=(REFINE_SEARCH,) * 3,
+        search=refine_search(before.given.reach),
         volumes=volumes,
         fluid=fluid,
+        reach=before.given.reach,
         predicted=predictor.window_means(windows),
     )
 
@@ -248,7 +254,12 @@ def _correlate_pass(given: PassInput, coverage: Coverage, *, symmetric: bool) ->
     """Correlate the windows of two volumes and validate the peaks."""
     grid, predicted = given.windows, given.predicted
     peaks = correlate_windows(
-        *given.volumes, window=grid.window, step=grid.step, search=given.search, symmetric=symmetric
+        *given.volumes,
+        window=grid.window,
+        step=grid.step,
+        search=given.search,
+        symmetric=symmetric,
+        reach=given.reach,
     )
     offset = np.zeros(3) if predicted is None else predicted
     field, valid = validation.validate(

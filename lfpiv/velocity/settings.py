@@ -25,7 +25,7 @@ DEFAULT_WINDOWS = (32, 16, 12, 12)
 FIRST_SEARCH = 0.25
 """Default search range of the first pass, as a part of its window: the one-quarter rule."""
 REFINE_SEARCH = 3
-"""Largest lag of every pass after the first [voxel]."""
+"""Largest lag of every pass after the first, for particles of about a voxel [voxel]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,6 +43,7 @@ class Code(enum.Enum):
     ONE_CAMERA = "one_camera"
     LIGHT_GUARDED = "light_guarded"
     LIGHT_UNGUARDED = "light_unguarded"
+    COARSE_VOXELS = "coarse_voxels"
     APART = "apart"
     NOTHING_IN_COMMON = "nothing_in_common"
     NOT_SELF_CALIBRATED = "not_self_calibrated"
@@ -55,7 +56,10 @@ class Code(enum.Enum):
     UNEXPLAINED = "unexplained"
     MOTION_LOST = "motion_lost"
     FEW_VALID = "few_valid"
+    NOT_FOLLOWED = "not_followed"
+    REPEATED = "repeated"
     UNSEEDED = "unseeded"
+    CROWDED = "crowded"
     # the run
     FEWER_WORKERS = "fewer_workers"
     ONE_GPU = "one_gpu"
@@ -169,6 +173,10 @@ SENTENCES: Mapping[Code, str] = {
         "volume's light), farther than the guard layers of {guard_mm:.2g} mm: their light falls into the volume and "
         "biases vectors near its faces; {reason}"
     ),
+    Code.COARSE_VOXELS: (
+        "particles of {size:.2f} voxel demand that voxels of {demanded_mm:.3g} mm are reconstructed, the memory allows "
+        "{used_mm:.3g} mm: expect more ghosts; raise compute.memory_gib or shrink volume.size_mm"
+    ),
     Code.APART: (
         "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: a camera moved since the board was "
         "recorded; {advice}."
@@ -197,10 +205,24 @@ SENTENCES: Mapping[Code, str] = {
         "on their vectors before the report shows why"
     ),
     Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
+    Code.NOT_FOLLOWED: (
+        "the particles are not where the instant before and the flow put them (the misfit is {ratio:.2f} times that of "
+        "particles in other places), so the volume starts from its images alone. Check the laser's pulses, and whether "
+        "images are missing or the flow changed"
+    ),
+    Code.REPEATED: (
+        "the image of {camera} is the one of instant {before}, pixel by pixel, so the volume starts from its images "
+        "alone. Check the recording for repeated images"
+    ),
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
     Code.UNSEEDED: (
         "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
         "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"
+    ),
+    Code.CROWDED: (
+        "the image of a particle overlaps those of {crowding:.2g} others by half or more ({limit:g} is the limit; "
+        "{per_microlens:.2g} particles per microlens were found): some particles are missed and some found are none. "
+        "Rely on the correlation, or use less seeding"
     ),
     Code.FEWER_WORKERS: (
         "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "

@@ -94,7 +94,7 @@ class Weights:
         self._counted = dict(counted or {})
         self._camera_sums = camera_sums
         self.volume = stored.grid
-        """Part of the grid that is kept, about which warnings are; without guard layers the whole."""
+        """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
 
     def of_camera(self, name: str) -> Weights:
         """Return the weights of one of the cameras. They share memory with these."""
@@ -212,7 +212,7 @@ class Weights:
             for own, name in zip(sums, self.cameras, strict=True):
                 self.projector(name).back_project(self.gain(name), own)
             self._camera_sums = sums
-            warn_seen_by_one(self.views[self.volume.within(self.grid)], self.volume, len(self.cameras))
+            warn_seen_by_one(self.views[self.volume.nearest_in(self.grid)], self.volume, len(self.cameras))
         return self._camera_sums
 
     @property

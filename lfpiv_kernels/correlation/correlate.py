@@ -22,6 +22,8 @@ from lfpiv_kernels.correlation.spectra import SpectralProducts
 
 __all__ = ["WindowPeaks", "correlate_by_plan", "correlate_windows", "window_grid"]
 
+PEAK_REACH = 2
+"""Lags around the highest coefficient that belong to its peak, for particles of about a voxel."""
 SLAB_BYTES = 1 << 26
 """Memory for sums of products [byte]. Larger problems are split into slabs of window layers."""
 
@@ -37,7 +39,7 @@ class WindowPeaks:
     correlation: np.ndarray
     """Correlation coefficient at the highest peak, -1..1."""
     rival: np.ndarray
-    """Highest coefficient more than two lags away from the highest peak, a peak of its own or not; at least 0."""
+    """Highest coefficient beyond the reach of the highest peak, a peak of its own or not; at least 0."""
     measured: np.ndarray
     """True where the window holds signal and its highest peak lies inside the search range, not on its border."""
 
@@ -50,6 +52,7 @@ def correlate_windows(
     step: Triple,
     search: Triple,
     symmetric: bool = False,
+    reach: int = PEAK_REACH,
 ) -> WindowPeaks:
     """Correlate all windows of two volumes and find the two highest peaks of each.
 
@@ -69,6 +72,9 @@ def correlate_windows(
         Largest lag per axis, >= 2; peaks are found up to ``search - 1`` [voxel].
     symmetric : bool
         Use the symmetric coefficient, at twice the cost.
+    reach : int
+        Lags around the highest coefficient that belong to its peak, >= 1: the rival lies farther along some axis, the
+        second peak at least as far.
 
     Returns
     -------
@@ -78,15 +84,20 @@ def correlate_windows(
     Raises
     ------
     ValueError
-        If shapes differ, values are not finite, a window does not fit, or `search` is below 2.
+        If shapes differ, values are not finite, a window does not fit, `search` is below 2, or `reach` below 1.
     """
     if first.shape != second.shape or first.ndim != 3:
         shapes = f"{first.shape} and {second.shape}"
         raise ValueError(f"second: expected two volumes of equal shape (z, y, x), got {shapes}.")
-    return correlate_by_plan(make_plan(first.shape, window, step, search), first, second, symmetric=symmetric)
+    if reach < 1:
+        raise ValueError(f"reach: expected a whole number >= 1, got {reach}.")
+    plan = make_plan(first.shape, window, step, search)
+    return correlate_by_plan(plan, first, second, symmetric=symmetric, reach=reach)
 
 
-def correlate_by_plan(plan: Plan, first: np.ndarray, second: np.ndarray, *, symmetric: bool = False) -> WindowPeaks:
+def correlate_by_plan(
+    plan: Plan, first: np.ndarray, second: np.ndarray, *, symmetric: bool = False, reach: int = PEAK_REACH
+) -> WindowPeaks:
     """Do what `correlate_windows` does, by a given plan for the volumes' shape."""
     flat = first.ravel(), second.ravel()
     squares = [float(np.dot(values, values)) for values in flat]
@@ -95,7 +106,7 @@ def correlate_by_plan(plan: Plan, first: np.ndarray, second: np.ndarray, *, symm
             raise ValueError(f"{name}: expected finite values whose squares add up to a float32, got others.")
     free_memory()
     searches = (plan.search if symmetric else (0, 0, 0)), plan.search
-    peaks = _find_peaks(plan, make_sides(plan, (first, second), squares, searches), symmetric)
+    peaks = _find_peaks(plan, make_sides(plan, (first, second), squares, searches), symmetric, reach)
     return WindowPeaks(
         displacement=np.moveaxis(peaks[:3], 0, -1).copy(),
         second_displacement=np.moveaxis(peaks[3:6], 0, -1).copy(),
@@ -105,13 +116,13 @@ def correlate_by_plan(plan: Plan, first: np.ndarray, second: np.ndarray, *, symm
     )
 
 
-def _find_peaks(plan: Plan, sides: tuple[Side, Side], symmetric: bool) -> np.ndarray:
+def _find_peaks(plan: Plan, sides: tuple[Side, Side], symmetric: bool, reach: int) -> np.ndarray:
     """Two displacements (z, y, x), highest coefficient and its rival of all windows, (8, z, y, x)."""
     depth = _slab_depth(plan, symmetric)
     ring = (depth - 1) * plan.block_step[0] + plan.block_count[0]
     past = plan.block_count[1] * plan.pitch + plan.block_count[2] + 2 * LANES  # read by lanes that hold no window
     sums = [new_array(ring * math.prod(plan.lags) * plan.lanes + past) for _ in range(1 + symmetric)]
-    finder = PeakFinder.prepare(plan, sides, symmetric, ring, depth)
+    finder = PeakFinder.prepare(plan, sides, symmetric, reach, ring, depth)
     if plan.spectral:
         products = SpectralProducts.prepare(plan, ring, max(side.surroundings.plane for side in sides))
     else:

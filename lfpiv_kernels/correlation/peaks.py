@@ -1,8 +1,8 @@
 """Correlation coefficients of windows from the sums of products of their blocks, and the two highest peaks of each.
 
 In: sums of products (`blocks`, `spectra`) and the statistics of the windows (`windows`). Out: displacement of the two
-highest peaks by a three-point Gaussian fit along each axis, the highest coefficient, and the highest one that lies more
-than two lags away from it. Inner loops are C++.
+highest peaks by a three-point Gaussian fit along each axis, the highest coefficient, and the highest one that lies
+beyond the reach of its peak. Inner loops are C++.
 """
 
 import math
@@ -42,6 +42,7 @@ class Windows:
     blocks: wp.vec3i  # blocks per window and axis that are still to be added up
     block_step: int  # layers of blocks from one layer of windows to the next
     stride: int  # distance of layers of blocks [voxel]
+    reach: int  # lags around the highest coefficient that belong to its peak
     lags: wp.vec3i
     begin: int  # first layer of windows
     ring: int  # layers of blocks that the sums have memory for: layer i lies at i % ring
@@ -90,6 +91,8 @@ class PeakFinder:
     plan: Plan
     sides: tuple[Side, Side]
     symmetric: bool
+    reach: int
+    """Lags around the highest coefficient that belong to its peak."""
     ring: int
     """Layers of blocks that the sums have memory for."""
     group: int
@@ -100,7 +103,9 @@ class PeakFinder:
     peaks: wp.array
 
     @classmethod
-    def prepare(cls, plan: Plan, sides: tuple[Side, Side], symmetric: bool, ring: int, depth: int) -> "PeakFinder":
+    def prepare(
+        cls, plan: Plan, sides: tuple[Side, Side], symmetric: bool, reach: int, ring: int, depth: int
+    ) -> "PeakFinder":
         """Allocate memory for the coefficients of at most `depth` layers of windows at once, and for all peaks."""
         lags, group = math.prod(plan.lags), 1
         rows = lags + math.prod(plan.lags[:2])
@@ -110,7 +115,7 @@ class PeakFinder:
         else:
             size = depth * plan.lanes * rows
         peaks = new_array(8 * plan.count[0] * plan.lanes)
-        return cls(plan, sides, symmetric, ring, group, rows, new_array(size), peaks)
+        return cls(plan, sides, symmetric, reach, ring, group, rows, new_array(size), peaks)
 
     def find(self, ahead: wp.array, behind: wp.array, layers: range) -> None:
         """Find the peaks of some layers of windows from the sums of products of their blocks in both directions."""
@@ -125,6 +130,7 @@ class PeakFinder:
         windows.voxels, windows.lags = math.prod(plan.window), wp.vec3i(*plan.lags)
         windows.blocks = wp.vec3i(*((plan.block_count[0], 1, 1) if is_gathered(plan) else plan.block_count))
         windows.block_step, windows.stride = plan.block_step[0], plan.stride[0]
+        windows.reach = self.reach
         windows.begin, windows.ring = layers.start, self.ring
         windows.groups, windows.group = -(-plan.lanes // self.group), self.group
         windows.pitch, windows.lanes = plan.pitch, plan.lanes

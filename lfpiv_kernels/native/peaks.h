@@ -111,7 +111,7 @@ LFPIV_INLINE void score_windows(const Sums& sums, const Statistics& first, const
             }
 }
 
-/// Highest coefficient, the highest one more than two lags away from it, and the second peak, of a vector of windows.
+/// Highest coefficient, the highest one beyond the reach of its peak, and the second peak, of a vector of windows.
 struct Peaks {
     V best = V{}, rival = V{}, second = V{};
     M best_lag = M{}, rival_lag = M{}, second_lag = M{};
@@ -134,19 +134,19 @@ LFPIV_INLINE Peaks find_best(const Scores& scores, int k) {
     return peaks;
 }
 
-/// Find the highest coefficient more than two lags away from the highest, and the highest one of every row of lags.
-LFPIV_INLINE void find_rival(const Scores& scores, int k, Peaks& peaks) {
+/// Find the highest coefficient more than `reach` lags away from the highest, and the highest one of every row of lags.
+LFPIV_INLINE void find_rival(const Scores& scores, int k, int reach, Peaks& peaks) {
     float* high = scores.highest + k;
     const float* p = scores.score + k;
     for (int z = 0; z < scores.nz; ++z)
         for (int y = 0; y < scores.ny; ++y, high += scores.pitch) {
             const M dz = z - peaks.best_z, dy = y - peaks.best_y;
-            const M apart = (dz > 2) | (dz < -2) | (dy > 2) | (dy < -2);
+            const M apart = (dz > reach) | (dz < -reach) | (dy > reach) | (dy < -reach);
             V row = V{};
             M lag = M{} + (z * scores.ny + y) * scores.nx, dx = -peaks.best_x;
             for (int x = 0; x < scores.nx; ++x, p += scores.pitch, lag += 1, dx += 1) {
                 const V value = load(p);
-                const M higher = (apart | (dx > 2) | (dx < -2)) & (value > peaks.rival);
+                const M higher = (apart | (dx > reach) | (dx < -reach)) & (value > peaks.rival);
                 row = value > row ? value : row;
                 peaks.rival = higher ? value : peaks.rival;
                 peaks.rival_lag = higher ? lag : peaks.rival_lag;
@@ -155,9 +155,9 @@ LFPIV_INLINE void find_rival(const Scores& scores, int k, Peaks& peaks) {
         }
 }
 
-/// Take a lag as second peak in the windows `among` where it is a peak, higher than those so far, and not beside the
-/// highest one.
-LFPIV_INLINE void consider(const Scores& scores, int k, int z, int y, int x, M among, Peaks& peaks) {
+/// Take a lag as second peak in the windows `among` where it is a peak, higher than those so far, and at least `reach`
+/// lags away from the highest one.
+LFPIV_INLINE void consider(const Scores& scores, int k, int reach, int z, int y, int x, M among, Peaks& peaks) {
     const int nz = scores.nz, ny = scores.ny, nx = scores.nx, lag = (z * ny + y) * nx + x;
     if (z == 0 || y == 0 || x == 0 || z == nz - 1 || y == ny - 1 || x == nx - 1) return;
     const int64_t pitch_x = scores.pitch, pitch_y = nx * pitch_x, pitch_z = ny * pitch_y;
@@ -166,7 +166,8 @@ LFPIV_INLINE void consider(const Scores& scores, int k, int z, int y, int x, M a
     M peak = among & (value > peaks.second);
     if (!any(peak)) return;
     const M dz = z - peaks.best_z, dy = y - peaks.best_y, dx = x - peaks.best_x;
-    peak = peak & ((dz > 1) | (dz < -1) | (dy > 1) | (dy < -1) | (dx > 1) | (dx < -1));
+    const int near = reach - 1;
+    peak = peak & ((dz > near) | (dz < -near) | (dy > near) | (dy < -near) | (dx > near) | (dx < -near));
     if (!any(peak)) return;
     peak = peak & (value >= load(p - pitch_z)) & (value >= load(p + pitch_z)) & (value >= load(p - pitch_y));
     peak = peak & (value >= load(p + pitch_y)) & (value >= load(p - pitch_x)) & (value >= load(p + pitch_x));
@@ -175,18 +176,18 @@ LFPIV_INLINE void consider(const Scores& scores, int k, int z, int y, int x, M a
 }
 
 /// Find the second peak. Often it is the rival, and no lag with a lower coefficient is read then.
-LFPIV_INLINE void find_second(const Scores& scores, int k, Peaks& peaks) {
+LFPIV_INLINE void find_second(const Scores& scores, int k, int reach, Peaks& peaks) {
     const int ny = scores.ny, nx = scores.nx;
     for (int j = 0; j < WIDTH; ++j) {
         const int lag = lane(peaks.rival_lag, j);
         if (j > 0 && lag == lane(peaks.rival_lag, j - 1)) continue;
-        consider(scores, k, lag / (ny * nx), lag / nx % ny, lag % nx, peaks.rival_lag == lag, peaks);
+        consider(scores, k, reach, lag / (ny * nx), lag / nx % ny, lag % nx, peaks.rival_lag == lag, peaks);
     }
     const float* high = scores.highest + k;
     for (int z = 1; z < scores.nz - 1; ++z)
         for (int y = 1; y < ny - 1; ++y) {
             if (!any(load(high + (int64_t)(z * ny + y) * scores.pitch) > peaks.second)) continue;
-            for (int x = 1; x < nx - 1; ++x) consider(scores, k, z, y, x, ~M{}, peaks);
+            for (int x = 1; x < nx - 1; ++x) consider(scores, k, reach, z, y, x, ~M{}, peaks);
         }
 }
 
@@ -239,8 +240,8 @@ LFPIV_INLINE void find_peaks(const Sums& sums, const Statistics& first, const St
     float* peak = out + (int64_t)layer * windows.lanes + lane;
     for (int k = 0; k < where.lanes; k += WIDTH) {
         Peaks peaks = find_best(scores, k);
-        find_rival(scores, k, peaks);
-        find_second(scores, k, peaks);
+        find_rival(scores, k, windows.reach, peaks);
+        find_second(scores, k, windows.reach, peaks);
         write_peaks(scores, k, peaks, windows.peak_pitch, peak + k);
     }
 }

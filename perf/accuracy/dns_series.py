@@ -1,4 +1,7 @@
-"""A time series of tracers in a turbulent flow, through simulator and run: error of each instant's vectors."""
+"""A time series of tracers in a turbulent flow, through simulator and run: error of each instant's vectors and Q.
+
+The series is measured twice: each instant by itself, and each from the one before (`smart.predict`).
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,9 @@ import hashlib
 import json
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +20,22 @@ import imperfect_scenes
 import numpy as np
 import xarray as xr
 from imperfections import BAD_VOXEL
+from scipy import ndimage
 
+from lfpiv import metrics
 from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import open_experiment
+from lfpiv.geometry.grid import Grid
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.reproduce import page, plots, store
+from lfpiv.results import netcdf
 from lfpiv.results.folder import Folder
 from lfpiv.runs import pipeline
 from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene
+from lfpiv.simulation.series import place_series
 from lfpiv.simulation.simulator import simulate
 
 TITLE = "Time series of a turbulent flow"
@@ -40,6 +50,18 @@ STEP = 4
 VOXEL_MM = imperfect_scenes.VOXEL_MM
 GOALS = {"within": 90.0, "bad": 1.0}
 """Goals as those of the case `imperfections`."""
+WAYS = {"alone": False, "predicted": True}
+"""Way of reconstructing the instants -> `smart.predict`."""
+CAPTION = (
+    "Mean length of the error against the mean displacement of all tracers over each window, of all vectors and of "
+    "those that are not at the border [voxel]; mean displacement [voxel]; correlation coefficient of measured and true "
+    "components; valid [%]; within two stated sigma [%]; valid vectors "
+    f"off by more than {BAD_VOXEL:g} voxel [%]; Q of the instant's volume."
+)
+GAIN = 0.8
+"""Goal of error, 1 - Q and twice the passes of predicted instants, relative to those of instants by themselves."""
+BLOB_VOXEL, BLUR_VOXEL = 0.7, 0.6
+"""Standard deviation of a particle in the true volume, and of the blur that gives points that size [voxel]."""
 
 
 def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[str, Any]:
@@ -51,7 +73,7 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
     measure = functools.partial(_measure, scene, work, progress)
     measured = store.cached(work / "series.json", settings, measure)
     progress("series", 1.0)
-    _draw(measured["instants"], work / "dns_series.png")
+    _draw(measured, work / "dns_series.png")
     return _result(scene, measured)
 
 
@@ -76,9 +98,13 @@ def series_scene(scale: str, seed: int) -> Scene:
 
 
 @contextmanager
-def counted_reconstructions(cameras: int) -> Iterator[Counter[str]]:
-    """Count how often SMART is started on each instant's images of all cameras in this process."""
+def counted_reconstructions(cameras: int) -> Iterator[tuple[Counter[str], list[int]]]:
+    """Count how often SMART iterates on each instant's images of all cameras in this process, and list its passes.
+
+    A pass is an iteration, or a first guess.
+    """
     count: Counter[str] = Counter()
+    passes: list[int] = []
     original = SmartSolver.solve
 
     def solve(self: SmartSolver, images: Mapping[str, np.ndarray], **options: Any) -> Any:
@@ -86,33 +112,66 @@ def counted_reconstructions(cameras: int) -> Iterator[Counter[str]]:
             digest = hashlib.sha256()
             for name in sorted(images):
                 digest.update(np.ascontiguousarray(images[name]).tobytes())
-            count[digest.hexdigest()] += 1
-        return original(self, images, **options)
+            count[digest.hexdigest()] += options.get("iterations") != 0
+        found = original(self, images, **options)
+        if len(self.weights.cameras) == cameras:
+            passes.append(found.iterations + 1)
+        return found
 
     SmartSolver.solve = solve  # type: ignore[method-assign]
     try:
-        yield count
+        yield count, passes
     finally:
         SmartSolver.solve = original  # type: ignore[method-assign]
 
 
 def _measure(scene: Scene, work: Path, progress: Progress) -> dict[str, Any]:
-    """Simulate the series, run the whole method on it, and judge the vectors of every instant."""
-    data, out = work / "data", work / "run"
+    """Simulate the series, run the whole method on it in each way, and judge vectors and volumes."""
+    data = work / "data"
     shutil.rmtree(data, ignore_errors=True)
-    shutil.rmtree(out, ignore_errors=True)
     path = simulate(scene, data, progress=lambda step, fraction: progress(step, fraction / 4))
     experiment = open_experiment(path)
-    with counted_reconstructions(len(experiment.cameras)) as count:
-        summary = pipeline.run(experiment, out)
+    at = [instant.position_mm for instant in place_series(scene)]
+    measured = {}
+    for number, (way, predict) in enumerate(WAYS.items()):
+        out = work / f"run_{way}"
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir(parents=True)
+        if number:
+            shutil.copy2(work / f"run_{next(iter(WAYS))}" / "calibration.h5", out)
+        part = replace(experiment, smart=experiment.smart.model_copy(update={"predict": predict}))
+        measured[way] = _measure_way(scene, part, out, at)
+        progress("series", 0.25 + 0.75 * (number + 1) / len(WAYS))
+    shutil.rmtree(data / "particles")
+    return measured
+
+
+def _measure_way(scene: Scene, experiment: Experiment, out: Path, at: Sequence[np.ndarray]) -> dict[str, Any]:
+    """Run the method on the series in one way, and judge vectors and volumes."""
+    with counted_reconstructions(len(experiment.cameras)) as (count, passes):
+        summary = pipeline.run(experiment, out, keep_volumes=True)
     folder = Folder(out, experiment.series)
     judged = [{"instant": number, **_judge(scene, number, folder.vectors(number))} for number in experiment.numbers]
-    shutil.rmtree(data / "particles")
+    volumes = {number: netcdf.read_volume(folder.volume(number, 0)) for number in _used(experiment)}
     return {
         "instants": judged,
+        "quality": {str(number): _quality(volume, at[number], experiment.grid) for number, volume in volumes.items()},
         "reconstructed": sorted(count.values()),
+        "passes": sum(passes) / len(volumes),
         "warnings": sorted({record["code"] for record in summary["warning_records"]}),
     }
+
+
+def _used(experiment: Experiment) -> list[int]:
+    """Return the instants of all pairs."""
+    return sorted({frame.number for pair in experiment.numbers for frame in experiment.pair_frames(pair)})
+
+
+def _quality(volume: xr.DataArray, position_mm: np.ndarray, grid: Grid) -> float:
+    """Return Q of a volume of points, after a blur, against blobs at the true positions."""
+    truth = metrics.truth_volume(position_mm, None, grid, BLOB_VOXEL)
+    blurred = ndimage.gaussian_filter(volume.values, BLUR_VOXEL, mode="constant")
+    return float(metrics.reconstruction_quality(blurred, truth.values))
 
 
 def _judge(scene: Scene, number: int, path: Path) -> dict[str, float]:
@@ -142,48 +201,62 @@ def _judge(scene: Scene, number: int, path: Path) -> dict[str, float]:
 
 
 def _result(scene: Scene, measured: Mapping[str, Any]) -> dict[str, Any]:
-    judged, counts = measured["instants"], measured["reconstructed"]
-    needed = {instant for one in judged for instant in (one["instant"], one["instant"] + scene.particles.step)}
     columns = ("all", "interior", "moved", "correlation", "valid", "within", "bad")
-    mean = {name: float(np.mean([one[name] for one in judged])) for name in columns}
+    mean = {
+        way: {name: float(np.mean([one[name] for one in found["instants"]])) for name in columns}
+        | {"lost": 1 - float(np.mean(list(found["quality"].values()))), "passes": found["passes"]}
+        for way, found in measured.items()
+    }
+    alone, predicted = (mean[way] for way in WAYS)
+    counts = measured["alone"]["reconstructed"]
+    judged = measured["alone"]["instants"]
+    needed = {instant for one in judged for instant in (one["instant"], one["instant"] + scene.particles.step)}
     comparison = [
-        page.compare("mean error of all vectors", mean["all"], unit="voxel"),
-        page.compare("mean error of interior vectors", mean["interior"], unit="voxel"),
-        page.compare("part within two stated sigma", mean["within"], at_least=GOALS["within"], unit="%"),
-        page.compare("part of valid vectors that are bad", mean["bad"], at_most=GOALS["bad"], unit="%"),
+        page.compare("mean error of all vectors", alone["all"], unit="voxel"),
+        page.compare("mean error of interior vectors", alone["interior"], unit="voxel"),
+        page.compare("part within two stated sigma", alone["within"], at_least=GOALS["within"], unit="%"),
+        page.compare("part of valid vectors that are bad", alone["bad"], at_most=GOALS["bad"], unit="%"),
         page.compare("instants reconstructed", float(len(counts)), at_least=float(len(needed))),
         page.compare("most reconstructions of one instant", float(max(counts)), at_most=1.0),
+        page.compare("error predicted over alone", predicted["all"] / alone["all"], at_most=GAIN),
+        page.compare("1 - Q predicted over alone", predicted["lost"] / alone["lost"], at_most=GAIN),
+        page.compare("twice the passes predicted over alone", 2 * predicted["passes"] / alone["passes"], at_most=1.0),
+        page.compare("predicted: part within two sigma", predicted["within"], at_least=GOALS["within"], unit="%"),
     ]
-    rows = [[f"{one['instant']}", *(one[name] for name in columns)] for one in judged]
-    rows.append(["mean", *(mean[name] for name in columns)])
+    tables = []
+    for way, found in measured.items():
+        rows = [
+            [f"{one['instant']}", *(one[name] for name in columns), found["quality"][str(one["instant"])]]
+            for one in found["instants"]
+        ]
+        rows.append(["mean", *(mean[way][name] for name in columns), 1 - mean[way]["lost"]])
+        tables.append({"caption": f"Instants {way}. {CAPTION}", "columns": ["instant", *columns, "Q"], "rows": rows})
+    warnings = sorted({code for found in measured.values() for code in found["warnings"]})
     return page.result(
-        {"instants": judged, "reconstructed": counts},
+        dict(measured),
         comparison=comparison,
-        figures=[("dns_series.png", "Mean error of all and of interior vectors at each instant.")],
-        tables=[
-            {
-                "caption": "Mean length of the error against the mean displacement of all tracers over each window, of "
-                "all vectors and of those that are not at the border [voxel]; mean displacement [voxel]; correlation "
-                "coefficient of measured and true components; valid [%]; within two stated sigma [%]; valid vectors "
-                f"off by more than {BAD_VOXEL:g} voxel [%].",
-                "columns": ["instant", *columns],
-                "rows": rows,
-            }
-        ],
+        figures=[("dns_series.png", "Mean error of all vectors at each instant, and Q.")],
+        tables=tables,
         notes=[
-            f"Warnings of the run: {', '.join(measured['warnings']) or 'none'}.",
+            f"Warnings of the runs: {', '.join(warnings) or 'none'}.",
+            f"Passes over the rays for an instant: {alone['passes']:.1f} alone, {predicted['passes']:.1f} predicted.",
             f"The rig of imperfect experiments with ideal images; the tracers' cube is {CUBE_MM:g} mm wide, and "
             f"instant k is correlated with instant k + {STEP}.",
         ],
     )
 
 
-def _draw(judged: list[dict[str, float]], path: Path) -> None:
-    drawn = plots.figure(6, 3)
-    axes = drawn.subplots()
-    for part, colour in (("all", plots.COLOURS["network"]), ("interior", plots.COLOURS["no_sieve"])):
-        axes.plot([one["instant"] for one in judged], [one[part] for one in judged], "o-", color=colour, label=part)
-    axes.set(xlabel="instant", ylabel="mean error [voxel]", ylim=(0, None))
-    axes.legend(frameon=False, fontsize=8)
-    plots.plain(axes)
+def _draw(measured: Mapping[str, Any], path: Path) -> None:
+    drawn = plots.figure(6, 4)
+    error, quality = drawn.subplots(2, 1, sharex=True)
+    for way, colour in zip(WAYS, (plots.COLOURS["no_sieve"], plots.COLOURS["network"]), strict=True):
+        errors = {one["instant"]: one["all"] for one in measured[way]["instants"]}
+        error.plot(list(errors), list(errors.values()), "o-", color=colour, label=way)
+        of = measured[way]["quality"]
+        quality.plot([int(number) for number in of], list(of.values()), "o-", color=colour, label=way)
+    error.set(ylabel="mean error [voxel]", ylim=(0, None))
+    quality.set(xlabel="instant", ylabel="Q")
+    error.legend(frameon=False, fontsize=8)
+    for axes in (error, quality):
+        plots.plain(axes)
     plots.save(drawn, path)

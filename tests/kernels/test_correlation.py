@@ -48,7 +48,7 @@ def coefficients_twin(first, second, window, step, search):
     return result
 
 
-def peaks_twin(score, search):
+def peaks_twin(score, search, reach=2):
     """Displacement of the two highest peaks of one window, NaN where there is none; highest value and its rival."""
 
     def refine(lag):
@@ -64,9 +64,9 @@ def peaks_twin(score, search):
     first = np.unravel_index(score.argmax(), score.shape)
     second, best, rival = None, 0.0, 0.0
     for lag in np.ndindex(*score.shape):
-        if np.abs(np.subtract(lag, first)).max() > 2:
+        if np.abs(np.subtract(lag, first)).max() > reach:
             rival = max(rival, score[lag])
-        if (np.array(lag) == 0).any() or (lag == top).any() or np.abs(np.subtract(lag, first)).max() <= 1:
+        if (np.array(lag) == 0).any() or (lag == top).any() or np.abs(np.subtract(lag, first)).max() < reach:
             continue
         around = [score[tuple(np.add(lag, sign * unit))] for unit in np.eye(3, dtype=int) for sign in (-1, 1)]
         if score[lag] > best and score[lag] >= max(around):
@@ -109,6 +109,20 @@ def test_peaks_equal_the_definition(monkeypatch, window, step, search, symmetric
             np.testing.assert_allclose(found.displacement[cell], displacement, atol=TOLERANCE_PEAK)
             np.testing.assert_allclose(found.second_displacement[cell], second_displacement, atol=TOLERANCE_PEAK)
             assert found.measured[cell] == np.isfinite(displacement).all()
+
+
+@pytest.mark.parametrize("reach", [1, 3])
+def test_the_reach_of_a_peak_holds_no_rival_and_no_second_peak(reach):
+    window, step, search = (10, 10, 10), (6, 6, 6), (5, 5, 5)
+    first, second = particle_pair((20, 24, 28), uniform(0.4, -1.2, 0.8), seed=1, ghosts=0.5, noise=0.05)
+    score = coefficients_twin(first, second, window, step, search)
+    found = correlate.correlate_windows(first, second, window=window, step=step, search=search, reach=reach)
+    for cell in np.ndindex(*score.shape[:3]):
+        _, second_displacement, _, rival = peaks_twin(score[cell], search, reach)
+        np.testing.assert_allclose(found.rival[cell], rival, atol=TOLERANCE_SUM)
+        np.testing.assert_allclose(found.second_displacement[cell], second_displacement, atol=TOLERANCE_PEAK)
+    with pytest.raises(ValueError, match="reach"):
+        correlate.correlate_windows(first, second, window=window, step=step, search=search, reach=0)
 
 
 def planes_twin(transform, values):

@@ -173,11 +173,16 @@ def test_imperfect_images_are_measured_and_judged(figures):
 @pytest.mark.slow
 def test_each_instant_of_a_series_is_reconstructed_once_and_judged(figures):
     case = figures["dns_series"]
-    assert case["reconstructed"] == [1] * 4  # instants 2 and 3 have no partner four instants apart
-    assert [one["instant"] for one in case["instants"]] == [0, 1]
-    for one in case["instants"]:
-        assert one["all"] < one["moved"] and one["correlation"] > 0.8
-    assert [row[0] for row in case["tables"][0]["rows"]] == ["0", "1", "mean"]
+    assert case["alone"]["reconstructed"] == [1] * 4  # instants 2 and 3 have no partner four instants apart
+    assert len(case["predicted"]["reconstructed"]) == 6  # they lead to the ones after them
+    for number, way in enumerate(("alone", "predicted")):
+        assert [one["instant"] for one in case[way]["instants"]] == [0, 1]
+        for one in case[way]["instants"]:
+            assert one["all"] < one["moved"] and one["correlation"] > 0.8
+        assert list(case[way]["quality"]) == ["0", "1", "4", "5"]
+        assert all(0 < quality < 1 for quality in case[way]["quality"].values())
+        assert [row[0] for row in case["tables"][number]["rows"]] == ["0", "1", "mean"]
+    assert case["alone"]["quality"]["0"] == case["predicted"]["quality"]["0"], "the first one starts from its images"
 
 
 @pytest.mark.parametrize("scale", ["small", "paper"])

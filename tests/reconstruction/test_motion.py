@@ -14,7 +14,7 @@ from lfpiv import metrics
 from lfpiv.reconstruction import motion, shared_light
 from lfpiv.results import netcdf
 from lfpiv.runs import pipeline
-from lfpiv.simulation.flows import Shear, Swirl, window_mean
+from lfpiv.simulation.flows import Shear, Swirl, Uniform, window_mean
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.8, 2.6, 2.4), voxel_mm=0.1)
 VOXEL_MM = GRID.voxel_mm
@@ -42,7 +42,16 @@ def vectors_of(flow, step=5, valid=None):
     moved = flow(np.stack([x, y, z], -1).reshape(-1, 3)).reshape(*x.shape, 3) / VOXEL_MM
     dims, valid = ("z", "y", "x"), np.ones(x.shape, bool) if valid is None else np.full(x.shape, valid)
     variables = {f"displacement_{axis}": (dims, moved[..., k]) for k, axis in enumerate("xyz")}
-    return xr.Dataset(variables | {"valid": (dims, valid)}, dict(zip(dims, nodes, strict=True)))
+    edges = {"voxel_mm": [VOXEL_MM] * 3}
+    return xr.Dataset(variables | {"valid": (dims, valid)}, dict(zip(dims, nodes, strict=True)), edges)
+
+
+def test_motion_is_in_the_voxels_of_the_volume_that_it_moves():
+    fine, displacement = GRID.refined(1.25), (0.3, -0.2, 0.1)
+    volume = xr.DataArray(np.zeros(fine.shape, np.float32), fine.coordinates(), ("z", "y", "x"))
+    field = shared_light.MotionField(volume, vectors_of(Uniform(displacement_mm=displacement))).midway.field
+    expected = np.array(displacement[::-1]) / fine.voxel_mm
+    assert np.allclose(field, expected, atol=TOLERANCE_F32)
 
 
 def spread(count, seed, share=0.8):

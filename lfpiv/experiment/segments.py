@@ -1,0 +1,29 @@
+"""Segments of a time series: instants that are reconstructed one after the other, each from the one before.
+
+Segments begin at fixed numbers of instants, whatever pairs a run is asked for. A few instants are reconstructed before
+the first one of a segment, only to lead into it. So the volume of an instant depends on its own images and on those of
+a known range of instants before it, and on nothing else.
+"""
+
+from __future__ import annotations
+
+from lfpiv.experiment.settings import Series
+
+SEGMENT = 32
+"""Number of instants of a segment. The number of its first one is a multiple of it."""
+LEAD_IN = 6
+"""Largest number of instants before a segment that lead into it."""
+
+
+def segment_of(instant: int) -> int:
+    """Return the number of the segment of an instant."""
+    return instant // SEGMENT
+
+
+def followed(series: Series, instant: int) -> range:
+    """Return the instants that are reconstructed one after the other up to one, that one included.
+
+    They begin with those that lead into its segment, as far as the series has them.
+    """
+    start = max(segment_of(instant) * SEGMENT - LEAD_IN, series.first)
+    return range(start, instant + 1)

@@ -1,0 +1,58 @@
+"""Particles of a pair: found in the images of both frames, linked with the pair's vectors as predictor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.reconstruction.recording import checked_images
+from lfpiv.results.pair_files import PairVolumes
+from lfpiv.runs.frame_light import FrameLight
+from lfpiv.tracking.finding import ParticleSearch
+from lfpiv.tracking.linking import link_particles
+from lfpiv.warn import Code, Warning
+
+CROWDED, CROWDED_ONE = 0.7, 0.15
+"""Mean number of overlapping neighbours of a particle above which particles are mixed up; the second for one camera."""
+
+
+def track(
+    search: ParticleSearch, light: Sequence[FrameLight], volumes: PairVolumes, vectors: xr.Dataset
+) -> tuple[xr.Dataset, list[Warning]]:
+    """Find and link the particles of a pair.
+
+    Parameters
+    ----------
+    search : ParticleSearch
+        Search for particles of the rig.
+    light : sequence of FrameLight
+        Images of both frames.
+    volumes : PairVolumes
+        Volumes of both frames, whose peaks are the first candidates.
+    vectors : Dataset
+        Vectors of the pair.
+
+    Returns
+    -------
+    table : Dataset
+        Linked particles.
+    warnings : list of Warning
+        Doubts whether particles can be told apart.
+    """
+    first, second = (
+        search.find(checked_images(search.weights, frame.images), volume, noise=frame.noise)
+        for frame, volume in zip(light, volumes.volumes, strict=True)
+    )
+    table = link_particles(first, second, vectors, dt_s=float(vectors.attrs["dt_s"]))
+    return table, crowded_warnings(table, len(search.weights.cameras))
+
+
+def crowded_warnings(table: xr.Dataset, cameras: int) -> list[Warning]:
+    """Return a warning if images of particles overlap too much for particles to be told apart."""
+    crowding, limit = float(np.max(table.attrs["crowding"])), CROWDED_ONE if cameras == 1 else CROWDED
+    if crowding <= limit:
+        return []
+    figures = {"crowding": crowding, "limit": limit, "per_microlens": float(np.mean(table.attrs["per_microlens"]))}
+    return [Warning(code=Code.CROWDED, figures=figures)]

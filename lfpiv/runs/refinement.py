@@ -1,0 +1,187 @@
+"""Refinement of a run: how much smaller than the voxels of the experiment the reconstructed ones are.
+
+A particle smaller than a voxel is no sum of voxels: its images do not fit, and light that is left over makes ghosts. So
+``smart.refinement = "auto"`` measures the particles' size once per output folder, before the weights are built, and
+stores the outcome. The grid of the experiment stays that of the volumes that are written.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lfpiv import files
+from lfpiv.files import writing
+from lfpiv.geometry.grid import Layers
+from lfpiv.reconstruction.refinement import LARGEST, STEP, measure_size, needed_refinement
+from lfpiv.records import RecordError, digest, read_object, read_text, validate
+from lfpiv.results import provenance
+from lfpiv.results.provenance import Marks
+from lfpiv.runs import memory
+from lfpiv.runs.guard import SampledLight, with_guard
+from lfpiv.warn import Code, Warning
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import Calibration
+    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.results.folder import Folder
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """Size of the particles, and the refinement that follows from it."""
+
+    pairs: tuple[int, ...]
+    """Pairs that the size was measured in; empty if no pair shows particles."""
+    size_voxel: float | None
+    """Standard deviation of the particles [voxel of the experiment]; 0 for points, None if it could not be measured."""
+    factor: float
+    """Edge of a voxel over that of the reconstructed ones, >= 1."""
+    demanded: float
+    """The same without regard to the memory."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the form that a file stores."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, stored: dict[str, Any]) -> Refinement:
+        """Read the form that a file stores.
+
+        Raises
+        ------
+        RecordError
+            If it has another form, or its numbers are out of range.
+        """
+        found = validate(cls, stored)
+        size = 0.0 if found.size_voxel is None else found.size_voxel
+        if not (math.isfinite(size) and size >= 0 and 1 <= found.factor <= found.demanded <= LARGEST):
+            raise RecordError("its size or its factors are out of range")
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """Content of the file."""
+
+    settings_hash: str
+    depends_on: str
+    refinement: dict[str, Any]
+    digest: str
+
+
+def read(folder: Folder) -> tuple[Refinement, Marks] | None:
+    """Read the stored outcome, whether it fits or not, and its marks; None if it is missing or damaged.
+
+    The log names a damaged file and the reason.
+    """
+    try:
+        content = read_object(read_text(folder.refinement))
+        found = validate(_Stored, content)
+        if found.digest != digest(content):
+            raise RecordError("its entries are not those that were written: the digest differs")
+        read_object(found.depends_on)
+        marks = Marks(settings_hash=found.settings_hash, depends_on=found.depends_on)
+        return Refinement.from_json(found.refinement), marks
+    except FileNotFoundError:
+        return None
+    except RecordError as error:
+        provenance.reject(folder.refinement, str(error))
+        return None
+
+
+def factor(experiment: Experiment, found: Refinement | None) -> float:
+    """Return the refinement of an experiment: that of its file, or the measured one; 1 before `decide`."""
+    stated = experiment.smart.refinement
+    if stated != "auto":
+        return float(stated)
+    return 1.0 if found is None else found.factor
+
+
+def refined(experiment: Experiment, factor: float) -> Experiment:
+    """Return the experiment with smaller voxels; one is solid where the voxel around its centre is."""
+    grid = experiment.grid.refined(factor)
+    solid = (
+        None if experiment.solid is None else np.ascontiguousarray(experiment.solid[grid.nearest_in(experiment.grid)])
+    )
+    return replace(experiment, grid=grid, solid=solid)
+
+
+def decide(
+    experiment: Experiment,
+    folder: Folder,
+    stamp_hash: str,
+    background: str | None,
+    calibration: Calibration,
+    light: SampledLight,
+    guard: Layers,
+) -> Refinement | None:
+    """Return the stored outcome, or measure the size of the particles and store the outcome; None if not "auto".
+
+    `stamp_hash` is the hash of the stamp of the board's calibration, `background` that of the subtracted light, `guard`
+    are the guard layers.
+    """
+    if experiment.smart.refinement != "auto":
+        return None
+    if (known := read(folder)) is not None:
+        found, marks = known
+        if provenance.of_guard(experiment, stamp_hash, found.pairs, background).fits(marks):
+            log.info("size of the particles: measured before, kept")
+            return found
+    start = time.perf_counter()
+    instants = light()
+    images = [image for instant in instants.values() for image in instant]
+    size = measure_size(calibration, experiment.grid, images) if images else None
+    demanded = needed_refinement(size)
+    found = Refinement(
+        pairs=tuple(instants),
+        size_voxel=None if size is None else round(size, 3),
+        factor=_fitting(with_guard(experiment, guard), demanded),
+        demanded=demanded,
+    )
+    _log(experiment, found, time.perf_counter() - start)
+    stamp = provenance.of_guard(experiment, stamp_hash, found.pairs, background)
+    with writing(folder.refinement):
+        content = {**stamp.attributes, "refinement": found.to_json()}
+        files.write_json({**content, "digest": digest(content)}, folder.refinement)
+    return found
+
+
+def warnings(experiment: Experiment, found: Refinement | None) -> list[Warning]:
+    """Return a warning if the memory allows larger voxels only than the particles demand."""
+    if found is None or experiment.smart.refinement != "auto" or found.factor == found.demanded:
+        return []
+    voxel_mm = experiment.grid.voxel_mm
+    figures = {
+        "size": found.size_voxel or 0.0,
+        "demanded_mm": voxel_mm / found.demanded,
+        "used_mm": voxel_mm / found.factor,
+    }
+    return [Warning(code=Code.COARSE_VOXELS, figures=figures)]
+
+
+def _fitting(experiment: Experiment, demanded: float) -> float:
+    """Return the largest refinement up to the demanded one that fits into the memory of one process."""
+    limit, tried = memory.allowed_bytes(experiment), demanded
+    while tried > 1:
+        finer = refined(experiment, tried)
+        if memory.run_bytes(finer, memory.weights_bytes(finer), 1) <= limit:
+            return tried
+        tried = round(tried - STEP, 2)
+    return 1.0
+
+
+def _log(experiment: Experiment, found: Refinement, seconds: float) -> None:
+    """Log the size of the particles and the price of the refinement."""
+    size = "cannot be measured" if found.size_voxel is None else f"{found.size_voxel:.2f} voxel"
+    log.info("size of the particles: %s, measured in %.1f s", size, seconds)
+    if found.factor > 1:
+        more, edge = found.factor**3, experiment.grid.voxel_mm / found.factor
+        log.info("volumes are reconstructed on voxels of %.3g mm: %.1f times as many as are written", edge, more)

@@ -1,0 +1,1 @@
+"""Particles: found and refined on the raw images, linked between frames, joined to tracks."""

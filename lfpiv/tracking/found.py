@@ -1,0 +1,102 @@
+"""`FoundParticles`: the particles of one instant with standard errors and figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfpiv.tracking.particle_images import ParticleImages
+from lfpiv.tracking.refinement import Cloud, Normal, Scene, covariances, overlaps
+from lfpiv.weights.operator import Weights
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundParticles:
+    """Particles of one instant, in no particular order."""
+
+    positions_mm: np.ndarray
+    """Positions (x, y, z) [mm], shape (particle, 3)."""
+    errors_mm: np.ndarray
+    """Standard errors of the positions along (x, y, z) [mm], shape (particle, 3). They contain noise and what the
+    particles leave unexplained, but no errors of the calibration."""
+    light: np.ndarray
+    """Light of each particle, mean of the cameras [counts, summed over pixels], shape (particle,)."""
+    residual: np.ndarray
+    """Root mean square of each particle's weighted residuals; 1 where noise alone explains them, shape (particle,)."""
+    sigma_voxel: float
+    """Standard deviation of the particles [voxel]."""
+    voxel_mm: float
+    """Edge of a voxel [mm]."""
+    explained: float
+    """Share of the images' squared light, noise subtracted, that the particles explain."""
+    crowding: float
+    """Mean number of particles whose images overlap the image of one by half or more."""
+    per_microlens: float
+    """Particles per microlens of the volume's x-y face."""
+
+    def __len__(self) -> int:
+        return len(self.positions_mm)
+
+    @classmethod
+    def of(
+        cls, weights: Weights, model: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal | None
+    ) -> FoundParticles:
+        """Return the particles inside the volume of the weights, with their figures."""
+        grid, count = weights.grid, len(cloud)
+        if normal is None or not count:
+            empty = np.zeros((0, 3))
+            return cls(
+                positions_mm=empty,
+                errors_mm=empty,
+                light=np.zeros(0),
+                residual=np.zeros(0),
+                sigma_voxel=model.sigma_voxel,
+                voxel_mm=grid.voxel_mm,
+                explained=0.0,
+                crowding=0.0,
+                per_microlens=0.0,
+            )
+        errors = np.sqrt(np.maximum(np.einsum("pii->pi", covariances(normal))[:, :3], 0)) * grid.voxel_mm
+        residual = _residuals(model, scene, cloud, normal)
+        left = scene.counts - normal.model
+        noise = float(scene.variance(normal.model).sum(dtype=np.float64))
+        whole = float(np.square(scene.counts, dtype=np.float64).sum()) - noise
+        explained = 1 - (float(np.square(left, dtype=np.float64).sum()) - noise) / whole if whole > 0 else 0.0
+        return cls(
+            positions_mm=cloud.positions_mm,
+            errors_mm=errors * np.maximum(residual, 1)[:, None],
+            light=cloud.light.mean(1),
+            residual=residual,
+            sigma_voxel=model.sigma_voxel,
+            voxel_mm=grid.voxel_mm,
+            explained=float(np.clip(explained, 0, 1)),
+            crowding=_crowding(normal),
+            per_microlens=count / _microlenses(weights),
+        )
+
+
+def _residuals(model: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal) -> np.ndarray:
+    square = np.square(scene.counts - normal.model) / scene.variance(normal.model)
+    above, below = np.zeros(len(cloud)), np.zeros(len(cloud))
+    for camera, own in enumerate(model.lists(cloud.positions_mm)):
+        particle = np.repeat(np.arange(len(cloud)), np.diff(own.first))
+        share = own.values[:, 3]
+        above += np.bincount(particle, share * square[own.pixel + model.first_pixel[camera]], minlength=len(cloud))
+        below += np.bincount(particle, share, minlength=len(cloud))
+    found: np.ndarray = np.sqrt(above / np.maximum(below, 1e-12))
+    return found
+
+
+def _crowding(normal: Normal) -> float:
+    """Return the mean number of other particles whose images overlap a particle's by half or more, in any camera."""
+    _, _, overlap = overlaps(normal)
+    return float(2 * (overlap > 0.5).any(1).sum() / max(len(normal.right), 1))
+
+
+def _microlenses(weights: Weights) -> float:
+    """Return the number of microlenses that the volume's x-y face covers in a camera, mean of the cameras."""
+    grid = weights.grid
+    face = grid.shape[1] * grid.shape[2] * grid.voxel_mm**2
+    every = [camera.optics for camera in weights.cameras.values()]
+    return float(np.mean([face * (one.magnification / one.microlens_pitch_mm) ** 2 for one in every]))

@@ -1,0 +1,194 @@
+"""`link_particles`: the displacement of single particles between two frames, with a correlation field as predictor.
+
+Particles are linked where each is the other's best match in position and light, and no other match is nearly as good.
+The first pass measures how far links lie from the predictor, the second one searches as far as that. A normalised
+median test on the nearest links [1]_ finds outliers.
+
+.. [1] J. Duncan et al., "Universal outlier detection for particle image velocimetry (PIV) and particle tracking
+   velocimetry (PTV) data", Meas. Sci. Technol. 21 (2010) 057002, doi:10.1088/0957-0233/21/5/057002.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from scipy.interpolate import NearestNDInterpolator, RegularGridInterpolator
+from scipy.spatial import cKDTree
+
+from lfpiv.geometry.grid import AXES
+from lfpiv.geometry.volume import is_finite
+from lfpiv.tracking.found import FoundParticles
+from lfpiv.tracking.table import link_table
+
+FIRST_SPREAD_VOXEL = 0.7
+"""Standard deviation of true displacements about the predictor that the first pass assumes [voxel]."""
+SPREAD_PERCENTILE = 95.0
+"""Percentile of the distances of links from their neighbours' median that counts as two standard deviations."""
+LEAST_SPREAD_VOXEL = 0.1
+"""Least spread that the second pass assumes [voxel]."""
+REACH = 4.0
+"""Largest distance of a link from the predictor [standard deviation]."""
+LIGHT_SPREAD = 0.35
+"""Standard deviation of the logarithm of a particle's light between two frames."""
+AMBIGUOUS = 6.0
+"""Least difference of cost between a link and the next best one; smaller ones are dropped."""
+NEIGHBOURS = 10
+"""Links about a link that judge it."""
+MEDIAN_LIMIT = 4.0
+"""Largest normalised residual of a valid link."""
+MEDIAN_FLOOR_VOXEL = 0.1
+"""Least scatter of neighbours that is assumed [voxel]."""
+NORMAL_MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+
+def link_particles(
+    first: FoundParticles,
+    second: FoundParticles,
+    vectors: xr.Dataset | None = None,
+    *,
+    dt_s: float,
+    spread_voxel: float = FIRST_SPREAD_VOXEL,
+) -> xr.Dataset:
+    """Link the particles of two frames.
+
+    Parameters
+    ----------
+    first, second : FoundParticles
+        From `find_particles`, with equal voxels.
+    vectors : Dataset, optional
+        Displacement field of the pair, from `correlate`. Default: no displacement, so that only particles that move
+        less than about `REACH` times `spread_voxel` are linked.
+    dt_s : float
+        Time between the frames, > 0 [s].
+    spread_voxel : float
+        Standard deviation of true displacements about the predictor that is assumed at first, > 0 [voxel].
+
+    Returns
+    -------
+    Dataset
+        A table over ``particle``, see `lfpiv.tracking.table`. Positions are midway between both frames.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of its range, or the voxels differ.
+    """
+    for name, value in (("dt_s", dt_s), ("spread_voxel", spread_voxel)):
+        if not (is_finite(value) and value > 0):
+            raise ValueError(f"{name}: expected a number > 0, got {value!r}.")
+    if not np.isclose(first.voxel_mm, second.voxel_mm, rtol=1e-6):
+        raise ValueError(f"second: expected voxels of {first.voxel_mm:g} mm, got {second.voxel_mm:g} mm.")
+    predicted = _Predictor(vectors, first.voxel_mm)(first.positions_mm)
+    links = np.zeros((0, 2), int)
+    if len(first) and len(second):
+        links = _matched(first, second, predicted, np.full(3, spread_voxel))
+        if len(links) > NEIGHBOURS:
+            predicted, spread = _corrected(first, second, links, predicted)
+            links = _matched(first, second, predicted, spread)
+    valid = _validated(first, second, links, predicted)
+    return link_table(first, second, links, valid, dt_s=dt_s)
+
+
+@dataclass
+class _Predictor:
+    """Displacement field between the centres of windows, nearest valid vectors beyond them."""
+
+    vectors: xr.Dataset | None
+    voxel_mm: float
+
+    def __call__(self, positions_mm: np.ndarray) -> np.ndarray:
+        """Return the displacement of particles of the first frame, shape (particle, 3) [voxel]."""
+        if self.vectors is None or not bool(self.vectors["valid"].any()):
+            return np.zeros_like(positions_mm)
+        found = np.zeros_like(positions_mm)
+        for _ in range(2):  # the field is known midway
+            found = self._at(positions_mm + found * self.voxel_mm / 2)
+        return found
+
+    def _at(self, positions_mm: np.ndarray) -> np.ndarray:
+        assert self.vectors is not None
+        axes = [self.vectors[axis].values for axis in AXES]
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        valid = self.vectors["valid"].values.reshape(-1)
+        scale = np.atleast_1d(self.vectors.attrs["voxel_mm"])[::-1] / self.voxel_mm
+        field = np.stack([self.vectors[f"displacement_{axis}"].values.reshape(-1) for axis in "xyz"], axis=1) * scale
+        filled = NearestNDInterpolator(nodes[valid], field[valid])(nodes)
+        several = [len(axis) > 1 for axis in axes]
+        place = np.clip(positions_mm[:, ::-1], [axis[0] for axis in axes], [axis[-1] for axis in axes])
+        if not any(several):
+            return np.repeat(filled[:1], len(positions_mm), axis=0)
+        grid = filled.reshape(*map(len, axes), 3).squeeze(axis=tuple(np.flatnonzero(~np.array(several))))
+        kept = [axis for axis, more in zip(axes, several, strict=True) if more]
+        found: np.ndarray = RegularGridInterpolator(kept, grid)(place[:, several])
+        return found
+
+
+def _matched(
+    first: FoundParticles, second: FoundParticles, predicted: np.ndarray, spread_voxel: np.ndarray
+) -> np.ndarray:
+    """Return unambiguous mutual best matches, shape (link, 2), in the order of the first particles."""
+    at = first.positions_mm / first.voxel_mm + predicted
+    to = second.positions_mm / first.voxel_mm
+    error_a, error_b = first.errors_mm / first.voxel_mm, second.errors_mm / first.voxel_mm
+    widest = np.sqrt(np.square(spread_voxel).max() + np.square(error_a).max() + np.square(error_b).max())
+    near = cKDTree(at).sparse_distance_matrix(cKDTree(to), REACH * widest, output_type="coo_matrix")
+    row, column = near.row, near.col
+    variance = np.square(spread_voxel) + np.square(error_a[row]) + np.square(error_b[column])
+    distance = (np.square(to[column] - at[row]) / variance).sum(1)
+    ratio = np.log(np.maximum(second.light[column], 1e-9) / np.maximum(first.light[row], 1e-9))
+    cost = distance + np.square(ratio / LIGHT_SPREAD) + np.log(variance).sum(1)
+    close = distance < REACH**2
+    row, column, cost = row[close], column[close], cost[close]
+    best_row, margin_row = _best(row, cost, len(at))
+    best_column, margin_column = _best(column, cost, len(to))
+    entry = best_row[best_row >= 0]
+    mutual = entry[best_column[column[entry]] == entry]
+    clear = mutual[(margin_row[row[mutual]] > AMBIGUOUS) & (margin_column[column[mutual]] > AMBIGUOUS)]
+    return np.stack([row[clear], column[clear]], axis=1)
+
+
+def _best(group: np.ndarray, cost: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the entry of least cost of each group, -1 for none, and how much more the next one costs."""
+    order = np.lexsort((cost, group))
+    ordered = group[order]
+    first = np.searchsorted(ordered, np.arange(size))
+    count = np.searchsorted(ordered, np.arange(size), side="right") - first
+    best, margin = np.full(size, -1), np.full(size, np.inf)
+    some, more = count > 0, count > 1
+    best[some] = order[first[some]]
+    margin[more] = cost[order[first[more] + 1]] - cost[order[first[more]]]
+    return best, margin
+
+
+def _corrected(
+    first: FoundParticles, second: FoundParticles, links: np.ndarray, predicted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the predictor corrected by the median of the links nearby, and the spread about it [voxel]."""
+    places = first.positions_mm[links[:, 0]] / first.voxel_mm
+    off = second.positions_mm[links[:, 1]] / first.voxel_mm - places - predicted[links[:, 0]]
+    tree = cKDTree(places)
+    _, own = tree.query(places, NEIGHBOURS + 1)
+    around = off[own[:, 1:]]
+    median = np.median(around, axis=1)
+    spread = np.percentile(np.abs(off - median), SPREAD_PERCENTILE, axis=0) / 2
+    _, near = tree.query(first.positions_mm / first.voxel_mm, NEIGHBOURS)
+    return predicted + np.median(off[near], axis=1), np.maximum(spread, LEAST_SPREAD_VOXEL)
+
+
+def _validated(first: FoundParticles, second: FoundParticles, links: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Return which links agree with their neighbours' median, normalised by scatter and standard error."""
+    if len(links) <= NEIGHBOURS:
+        return np.ones(len(links), bool)
+    places = first.positions_mm[links[:, 0]] / first.voxel_mm
+    off = second.positions_mm[links[:, 1]] / first.voxel_mm - places - predicted[links[:, 0]]
+    error = np.sqrt(np.square(first.errors_mm[links[:, 0]]) + np.square(second.errors_mm[links[:, 1]])) / first.voxel_mm
+    _, own = cKDTree(places).query(places, NEIGHBOURS + 1)
+    around = off[own[:, 1:]]
+    median = np.median(around, axis=1)
+    scatter = NORMAL_MAD * np.median(np.abs(around - median[:, None]), axis=1)
+    limit = MEDIAN_LIMIT * np.sqrt(np.square(np.maximum(scatter, MEDIAN_FLOOR_VOXEL)) + np.square(error))
+    valid: np.ndarray = (np.abs(off - median) < limit).all(1)
+    return valid

@@ -1,0 +1,57 @@
+"""Reach of correlation peaks: how many lags around a peak belong to it.
+
+A correlation peak is as wide as the particles' autocorrelation. The peak ratio compares it with the highest coefficient
+elsewhere, so it must leave out the whole peak. Two lags suit particles of about a voxel. Particles that are sampled
+more finely have wider peaks: their flanks would count as rivals, and no peak would be clear.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import ndimage
+
+from lfpiv.velocity.settings import REFINE_SEARCH, Triple
+from lfpiv_kernels.correlation.correlate import PEAK_REACH
+
+OWN = 0.2
+"""Autocorrelation of the volumes below which a lag no longer belongs to a peak."""
+LARGEST_REACH = 8
+"""Largest reach [voxel]. Particles as large as that take more than a window."""
+
+
+def peak_reach(first: np.ndarray, second: np.ndarray, window: Triple) -> int:
+    """Return the number of lags around a correlation peak that belong to it.
+
+    It is the smallest one, from `PEAK_REACH` on, beyond which the autocorrelation of the volumes is below `OWN` along
+    some axis. The axis with the narrowest peak counts: lines of sight stretch particles along the others.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (z, y, x), float32
+        Volumes as they are correlated.
+    window : (int, int, int)
+        Last window (z, y, x) [voxel]. The mean over it is subtracted: light that varies slowly is no particle.
+    """
+    fluctuations = [volume - ndimage.uniform_filter(volume, window) for volume in (first, second)]
+    power = sum(float(np.square(one, dtype=np.float64).sum()) for one in fluctuations)
+    if not power > 0:
+        return PEAK_REACH
+    for reach in range(PEAK_REACH, LARGEST_REACH):
+        lags = [(axis, reach + 1) for axis in range(3) if first.shape[axis] > 2 * (reach + 1)]
+        if not lags or min(sum(_product(one, *lag) for one in fluctuations) for lag in lags) < OWN * power:
+            return reach
+    return LARGEST_REACH
+
+
+def refine_search(reach: int) -> Triple:
+    """Return the largest lag of a pass after the first [voxel]: as far beyond the peak as for the least reach."""
+    lag = math.ceil(REFINE_SEARCH * reach / PEAK_REACH)
+    return lag, lag, lag
+
+
+def _product(values: np.ndarray, axis: int, lag: int) -> float:
+    """Return the sum of products of voxels that lie `lag` apart along an axis."""
+    moved = np.moveaxis(values, axis, 0)
+    return float((moved[lag:] * moved[:-lag]).sum(dtype=np.float64))

@@ -1,0 +1,347 @@
+"""Warp: images of Gaussian particles and their derivatives by the position, as lists of pixels.
+
+A pixel at X under the lens centred at c looks through the lens's centre at the pupil point P, and a particle's ray
+through P misses the lens's centre by g = (I - K)^-1 ((s, t)(P) - c), see ``footprint``. The particle and the pixel
+smear g. The weight is the amplitude of the pixel's cell on the pupil times the probability that g lies in the lens's
+cell: differences of error functions along the cell's axes. A shift of the particle shifts g, so its derivative is a
+difference of normal densities. Unlike the weights of voxels these are not rounded to levels.
+
+Twin: ``reference.gaussian_image``.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.weights.microimages import LAYERS, Microimages
+
+wp.set_module_options({"enable_backward": False})
+
+REACH = 2.8
+"""Distance from a cell at which a Gaussian is cut off [standard deviation]."""
+VALUES = 4
+"""Numbers of a pixel: derivatives by x, y, z, and the weight."""
+PARTS = 16
+"""Parts of a launch on the CPU: the work differs from particle to particle."""
+
+
+@wp.struct
+class Inputs:
+    """What the kernels read: ray models of the particles and the camera."""
+
+    model: wp.array2d(dtype=float)
+    """Ray models, (particle, MODEL_SIZE)."""
+    scale: float
+    """Standard deviation of the particles over the length of the models' edges."""
+    ratio: float
+    """r = f_m / s_i."""
+    pixel_mm: float
+    half: wp.vec2f
+    """Half the sensor (columns, rows) [pixel]."""
+    radius: float
+    """Of the pupil [mm]."""
+    origin: wp.vec2f
+    basis: wp.mat22f
+    """Columns: (s, t) from a lens to the next along i and along j [mm]."""
+    inverse: wp.mat22f
+    """From (s, t) to lattice indices [1/mm]."""
+    frame: wp.mat22f
+    """From (s, t) to the axes (a, b) of a lens's cell [pitch]."""
+    lenses: wp.vec4i
+    """First i and j, lenses along i and j."""
+    corners: wp.array(dtype=int)
+    rectangles: wp.array2d(dtype=float)
+    """Rectangles of a lens's cell, (a_low, a_high, b_low, b_high) [pitch]."""
+    extent: wp.vec2f
+    """Half extents of the cell along a and b [pitch]."""
+    edge: int
+    """Side of a microimage's block [pixel]."""
+    pixel: wp.array(dtype=int)
+    share: wp.array(dtype=float)
+    gain: wp.array(dtype=float)
+
+
+@wp.struct
+class View:
+    """How a camera sees one particle: about the same for all of its pixels, because K is small and hardly varies."""
+
+    to_cell: wp.mat22f
+    """From (s, t) to the axes of a lens's cell, F (I - K)^-1 [pitch / mm]."""
+    at: wp.vec2f
+    """(s, t) of the ray through the pupil's centre [mm]."""
+    fan: wp.vec2f
+    """Largest change of a and b over the pupil [pitch]."""
+    sigma: wp.vec2f
+    """Standard deviation of the particle's image along a and b [pitch]."""
+    amplitude: float
+    """Share of the light that reaches a pixel if all of it passes the lens."""
+    bounds: wp.vec4i
+    """First i and j, last i and j of the lenses that the light can reach, counted from the first lens."""
+
+
+@wp.func
+def _position(inputs: Inputs, particle: int, p: wp.vec2f):
+    """Return (s, t) of the particle's ray through a pupil point [mm]."""
+    m = inputs.model[particle]
+    u, v = p[0], p[1]
+    s = m[0] + u * (m[1] + u * m[3] + v * m[4]) + v * (m[2] + v * m[5])
+    t = m[6] + u * (m[7] + u * m[9] + v * m[10]) + v * (m[8] + v * m[11])
+    return wp.vec2f(s, t)
+
+
+@wp.func
+def _slope(inputs: Inputs, particle: int, p: wp.vec2f):
+    """Return K = d(s, t)/d(u, v)."""
+    m = inputs.model[particle]
+    u, v = p[0], p[1]
+    return wp.mat22f(
+        m[1] + 2.0 * m[3] * u + m[4] * v,
+        m[2] + m[4] * u + 2.0 * m[5] * v,
+        m[7] + 2.0 * m[9] * u + m[10] * v,
+        m[8] + m[10] * u + 2.0 * m[11] * v,
+    )
+
+
+@wp.func
+def _edge(inputs: Inputs, particle: int, axis: int, p: wp.vec2f):
+    """Return the change of (s, t) over a voxel along an axis [mm]."""
+    m = inputs.model[particle]
+    k, c = 12 + 2 * axis, 18 + 4 * axis
+    return wp.vec2f(m[k] + m[c] * p[0] + m[c + 1] * p[1], m[k + 1] + m[c + 2] * p[0] + m[c + 3] * p[1])
+
+
+@wp.func
+def _view(inputs: Inputs, particle: int):
+    """Return how the camera sees a particle."""
+    view = View()
+    middle = wp.vec2f(0.0, 0.0)
+    k = _slope(inputs, particle, middle)
+    turned = wp.inverse(wp.mat22f(1.0, 0.0, 0.0, 1.0) - k)
+    cell = inputs.pixel_mm / inputs.ratio
+    view.to_cell = inputs.frame @ turned
+    view.at = _position(inputs, particle, middle)
+    view.amplitude = wp.abs(wp.determinant(turned)) * cell * cell / (3.14159265 * inputs.radius * inputs.radius)
+    m = inputs.model[particle]
+    bend = wp.vec2f(wp.abs(m[3]) + wp.abs(m[4]) + wp.abs(m[5]), wp.abs(m[9]) + wp.abs(m[10]) + wp.abs(m[11]))
+    outer = inputs.radius + cell
+    along = view.to_cell @ k
+    back = inputs.inverse
+    centre = back @ (view.at - inputs.origin)
+    for axis in range(2):
+        smear = wp.vec2f(along[axis, 0], along[axis, 1])
+        variance = wp.dot(smear, smear) * cell * cell / 12.0
+        for direction in range(3):
+            edge = view.to_cell @ _edge(inputs, particle, direction, middle)
+            variance += edge[axis] * edge[axis] * inputs.scale * inputs.scale
+        row = wp.vec2f(wp.abs(view.to_cell[axis, 0]), wp.abs(view.to_cell[axis, 1]))
+        view.sigma[axis] = wp.sqrt(variance)
+        view.fan[axis] = wp.length(smear) * outer + wp.dot(row, bend) * outer * outer
+    reach = inputs.extent + view.fan + REACH * view.sigma
+    farthest = wp.length(reach) / wp.min(wp.length(view.to_cell[0]), wp.length(view.to_cell[1]))
+    for axis in range(2):
+        half = farthest * wp.length(back[axis])
+        view.bounds[axis] = wp.max(int(wp.ceil(centre[axis] - half)) - inputs.lenses[axis], 0)
+        view.bounds[2 + axis] = wp.min(
+            int(wp.floor(centre[axis] + half)) - inputs.lenses[axis], inputs.lenses[2 + axis] - 1
+        )
+    return view
+
+
+@wp.func
+def _lens_centre(inputs: Inputs, i: int, j: int):
+    """Return the centre of a lens, counted from the first one [mm]."""
+    return inputs.origin + inputs.basis @ wp.vec2f(float(i + inputs.lenses[0]), float(j + inputs.lenses[1]))
+
+
+@wp.func
+def _reaches(inputs: Inputs, view: View, centre: wp.vec2f):
+    """Return whether light of the particle can reach a lens."""
+    at = view.to_cell @ (view.at - centre)
+    reach = inputs.extent + view.fan + REACH * view.sigma
+    return wp.abs(at[0]) < reach[0] and wp.abs(at[1]) < reach[1]
+
+
+@wp.func
+def _pupil_point(inputs: Inputs, centre: wp.vec2f, column: int, row: int, share: float):
+    """Return the pupil point of the part of a pixel inside the pupil [mm]."""
+    pixel = wp.vec2f(float(column) + 0.5 - inputs.half[0], float(row) + 0.5 - inputs.half[1]) * inputs.pixel_mm
+    p = (centre * (1.0 + inputs.ratio) - pixel) / inputs.ratio
+    if share < 1.0:
+        cell = inputs.pixel_mm / inputs.ratio
+        p = p * (1.0 - (1.0 - share) * 0.5 * cell / wp.max(wp.length(p), cell))
+    return p
+
+
+@wp.func
+def _below(x: float, density: float):
+    """Return the probability of a standard normal variable below x, from its density (Hastings; error 1e-7)."""
+    t = 1.0 / (1.0 + 0.2316419 * wp.abs(x))
+    series = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))))
+    tail = density * series
+    return wp.where(x > 0.0, 1.0 - tail, tail)
+
+
+@wp.func
+def _within(low: float, high: float, at: float, sigma: float):
+    """Return the probability that a normal variable lies between two limits, and its derivative by the mean."""
+    inverse = 1.0 / sigma
+    x, y = (low - at) * inverse, (high - at) * inverse
+    density_x = 0.39894228 * wp.exp(-0.5 * x * x)
+    density_y = 0.39894228 * wp.exp(-0.5 * y * y)
+    return wp.vec2f(_below(y, density_y) - _below(x, density_x), (density_x - density_y) * inverse)
+
+
+@wp.func
+def _weights(inputs: Inputs, particle: int, view: View, p: wp.vec2f, at: wp.vec2f):
+    """Return the derivatives of a pixel's weight by x, y, z [1 / voxel] and the weight, without share and gain."""
+    inside, slope_a, slope_b = float(0.0), float(0.0), float(0.0)
+    for k in range(inputs.rectangles.shape[0]):
+        along_a = _within(inputs.rectangles[k, 0], inputs.rectangles[k, 1], at[0], view.sigma[0])
+        along_b = _within(inputs.rectangles[k, 2], inputs.rectangles[k, 3], at[1], view.sigma[1])
+        inside += along_a[0] * along_b[0]
+        slope_a += along_a[1] * along_b[0]
+        slope_b += along_a[0] * along_b[1]
+    weights = wp.vec4f(0.0, 0.0, 0.0, inside)
+    for axis in range(3):
+        shift = view.to_cell @ _edge(inputs, particle, axis, p)
+        weights[axis] = slope_a * shift[0] + slope_b * shift[1]
+    return weights * view.amplitude
+
+
+@wp.kernel
+def _bound_pixels(
+    # in
+    inputs: Inputs,
+    first_particle: int,
+    # out
+    most_out: wp.array(dtype=int),
+):
+    particle = first_particle + wp.tid()
+    view = _view(inputs, particle)
+    lenses = wp.int32(0)
+    for j in range(view.bounds[1], view.bounds[3] + 1):
+        for i in range(view.bounds[0], view.bounds[2] + 1):
+            if _reaches(inputs, view, _lens_centre(inputs, i, j)):
+                lenses += 1
+    most_out[particle] = lenses * inputs.edge * inputs.edge
+
+
+@wp.kernel
+def _write_pixels(
+    # in
+    inputs: Inputs,
+    first_entry: wp.array(dtype=wp.int64),
+    first_particle: int,
+    # out
+    count_out: wp.array(dtype=int),
+    pixel_out: wp.array(dtype=int),
+    values_out: wp.array(dtype=wp.vec4f),
+):
+    particle = first_particle + wp.tid()
+    view = _view(inputs, particle)
+    first = int(first_entry[particle])
+    entry = wp.int32(0)
+    for j in range(view.bounds[1], view.bounds[3] + 1):
+        for i in range(view.bounds[0], view.bounds[2] + 1):
+            centre = _lens_centre(inputs, i, j)
+            if _reaches(inputs, view, centre):
+                lens = j * inputs.lenses[2] + i
+                ray = ((j * LAYERS + 1) * inputs.lenses[2] + i) * inputs.edge * inputs.edge
+                for row in range(inputs.edge):
+                    for column in range(inputs.edge):
+                        share = inputs.share[ray]
+                        pixel = inputs.pixel[ray]
+                        ray += 1
+                        if share > 0.0 and pixel >= 0:
+                            p = _pupil_point(
+                                inputs,
+                                centre,
+                                inputs.corners[2 * lens] + column,
+                                inputs.corners[2 * lens + 1] + row,
+                                share,
+                            )
+                            at = view.to_cell @ (_position(inputs, particle, p) - centre)
+                            beyond_a = wp.abs(at[0]) - inputs.extent[0] - REACH * view.sigma[0]
+                            beyond_b = wp.abs(at[1]) - inputs.extent[1] - REACH * view.sigma[1]
+                            if beyond_a < 0.0 and beyond_b < 0.0 and inputs.gain[pixel] > 0.0:
+                                weights = _weights(inputs, particle, view, p, at)
+                                pixel_out[first + entry] = pixel
+                                values_out[first + entry] = weights * (share * inputs.gain[pixel])
+                                entry += 1
+    count_out[particle] = entry
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageLists:
+    """Pixels of some particles in one camera."""
+
+    first: np.ndarray
+    """First entry of each particle, and the end of the last, shape (particle + 1,), int64."""
+    pixel: np.ndarray
+    """Pixels, shape (entry,), int32. A pixel that a particle lights through two lenses occurs twice."""
+    values: np.ndarray
+    """Derivatives of the weight by x, y, z [1 / voxel] and the weight, shape (entry, 4), float32."""
+
+
+class GaussianImages:
+    """Images of Gaussian particles in one camera.
+
+    Parameters
+    ----------
+    camera, lattice
+        From ``ray_model.pack_optics`` and ``lattice.pack_lattice``.
+    microimages : Microimages
+        Where the pixels of a lens lie in memory.
+    frame : ndarray, shape (2, 2)
+        From ``lattice.cell_frame``.
+    rectangles : ndarray, shape (rectangle, 4)
+        From ``lattice.cell_rectangles``.
+    gain : ndarray, shape (pixel,)
+        White-image gain. Pixels without gain are left out.
+    """
+
+    def __init__(self, camera, lattice, microimages: Microimages, *, frame, rectangles, gain):
+        optics, lens = camera.to_numpy(), lattice.to_numpy()
+        rows, columns = microimages.corner.shape[:2]
+        inputs = Inputs()
+        inputs.ratio, inputs.pixel_mm = float(optics[0]), float(optics[1])
+        inputs.half, inputs.radius = wp.vec2f(*map(float, optics[2:4])), float(optics[4])
+        inputs.origin = wp.vec2f(*map(float, lens[:2]))
+        inputs.basis = wp.mat22f(*map(float, lens[2:6].reshape(2, 2).T.ravel()))
+        inputs.inverse = wp.mat22f(*map(float, lens[6:10]))
+        inputs.frame = wp.mat22f(*map(float, np.ravel(frame)))
+        inputs.lenses = wp.vec4i(*map(int, microimages.first_lens), columns, rows)
+        inputs.corners = to_device(np.ascontiguousarray(microimages.corner.ravel()))
+        inputs.rectangles = to_device(np.ascontiguousarray(rectangles, np.float32))
+        inputs.extent = wp.vec2f(float(rectangles[:, 1].max()), float(rectangles[:, 3].max()))
+        inputs.edge = int(microimages.edge)
+        inputs.pixel, inputs.share = to_device(microimages.pixel), to_device(microimages.share)
+        inputs.gain = to_device(np.ascontiguousarray(gain, np.float32).reshape(-1))
+        self._inputs = inputs
+
+    def __call__(self, model: np.ndarray, sigma: float) -> ImageLists:
+        """Compute the images of particles.
+
+        Parameters
+        ----------
+        model : ndarray, shape (particle, MODEL_SIZE), float32
+            Ray models at the particles, see ``ray_model.MODEL_SIZE``.
+        sigma : float
+            Standard deviation of the particles [edge of the models].
+        """
+        inputs, count = self._inputs, len(model)
+        inputs.model = to_device(np.ascontiguousarray(model, np.float32))
+        inputs.scale = float(sigma)
+        most = to_device(np.zeros(count, np.int32))
+        launch(Call(_bound_pixels, count, [inputs], [most]), parts=PARTS)
+        room = np.concatenate([[0], np.cumsum(most.numpy(), dtype=np.int64)])
+        used = to_device(np.zeros(count, np.int32))
+        pixel = to_device(np.empty(room[-1], np.int32))
+        values = to_device(np.empty((room[-1], VALUES), np.float32), wp.vec4f)
+        launch(Call(_write_pixels, count, [inputs, to_device(room)], [used, pixel, values]), parts=PARTS)
+        length = used.numpy()
+        first = np.concatenate([[0], np.cumsum(length, dtype=np.int64)])
+        chosen = np.arange(first[-1]) + np.repeat(room[:-1] - first[:-1], length)
+        return ImageLists(first=first, pixel=pixel.numpy()[chosen], values=values.numpy()[chosen])

@@ -1,0 +1,185 @@
+"""A series in sequence: the guess is the moved volume before, volumes gain in fewer iterations, changes are noticed."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import ndimage
+from support.ideal_rig import optics, two_cameras
+
+import lfpiv
+from lfpiv import metrics
+from lfpiv.reconstruction import sequence
+from lfpiv.reconstruction.sequence import Before, SequenceSolver, Start
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.simulation.flows import Swirl, Uniform
+
+GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.4, 2.4, 2.0), voxel_mm=0.1)
+VOXEL_MM = GRID.voxel_mm
+BLOB = 0.7  # standard deviation of the particles [voxel]
+FLOW = Swirl(peak_mm=0.15, core_mm=0.8, axial_mm=0.08)
+INSTANTS = 5
+ITERATIONS = 20
+CORRELATION = {"windows": (16, 12, 12), "smoothing_voxel": 0.5, "intensity_power": 0.5}
+
+TOLERANCE_SPLINE = 0.1  # cubic splines flatten blobs of 0.7 voxel by 5 to 10 %; particles that rest are 0.6 off
+TOLERANCE_F32 = 1e-4  # powers and sums of float32 volumes
+UNBLURRED = 0.5  # error left of points by five steps of Richardson and Lucy, the hardest case; 0.40 here
+GAIN = 0.85  # 1 - Q left by 0.3 times the iterations; 0.74 here
+
+
+def blobs(positions):
+    return metrics.truth_volume(positions, None, GRID, BLOB)
+
+
+def vectors_of(flow, valid=True):
+    """What `correlate` would return for a flow it measures without error."""
+    nodes = [GRID.axis_mm(axis)[2:-2:5] + VOXEL_MM / 2 for axis in range(3)]
+    z, y, x = np.meshgrid(*nodes, indexing="ij")
+    moved = flow(np.stack([x, y, z], -1).reshape(-1, 3)).reshape(*x.shape, 3) / VOXEL_MM
+    dims = ("z", "y", "x")
+    variables = {f"displacement_{axis}": (dims, moved[..., k]) for k, axis in enumerate("xyz")}
+    variables["valid"] = (dims, np.full(x.shape, valid))
+    shares = {"valid_fraction": 1.0, "measurable_fraction": 1.0, "voxel_mm": [VOXEL_MM] * 3}
+    return xr.Dataset(variables, dict(zip(dims, nodes, strict=True)), shares)
+
+
+def uniform(*displacement_voxel, valid=True):
+    return vectors_of(Uniform(displacement_mm=tuple(VOXEL_MM * part for part in displacement_voxel)), valid)
+
+
+@pytest.fixture(scope="module")
+def weights(device):
+    return lfpiv.build_weights(two_cameras(optics=optics(460, 640)), GRID)
+
+
+def images_of(weights, positions, seed):
+    """Images of blobs as the weights have them, with shot and read noise."""
+    rng, images = np.random.default_rng(seed), {}
+    for name, image in weights(blobs(positions).values * np.float32(3e5)).items():
+        images[name] = (image + rng.standard_normal(image.shape) * np.sqrt(0.4 * image + 4)).astype(np.float32)
+    return images
+
+
+@pytest.fixture(scope="module")
+def series(weights):
+    """Positions and images of a densely seeded flow at several instants, and of other particles."""
+    size = np.array([2.4, 2.4, 2.0])
+    draw = np.random.default_rng(7).uniform(-0.5, 0.5, (2, 330, 3)) * (size + 0.4) + [0.1, -0.1, 0.2]
+    positions = [draw[0]]
+    for _ in range(INSTANTS - 1):
+        halfway = positions[-1] + FLOW(positions[-1]) / 2
+        positions.append(positions[-1] + FLOW(halfway))
+    return positions, [images_of(weights, at, [7, k]) for k, at in enumerate(positions)], images_of(weights, draw[1], 8)
+
+
+@pytest.fixture
+def solver(weights):
+    return SequenceSolver(SmartSolver(weights, SmartSettings(iterations=ITERATIONS)), CORRELATION)
+
+
+def along(solver, images):
+    """Solve instants one after the other; return all of them, and what follows from the last one."""
+    before, done = None, []
+    for one in images:
+        done.append(solver.solve(one, before))
+        before = done[-1].before(done[-1].found.to_dataarray(), before)
+    return done, before
+
+
+def test_volumes_gain_by_fewer_iterations_if_the_flow_is_known(solver, series):
+    positions, images, _ = series
+    exact = SequenceSolver(solver.smart, CORRELATION, lambda first, second, settings: vectors_of(FLOW))
+    done, _ = along(exact, images)
+    assert [one.start for one in done] == [Start.FIRST] * 2 + [Start.PREDICTED] * (INSTANTS - 2)
+    most = np.ceil(sequence.ITERATION_SHARE * ITERATIONS)
+    assert all(one.found.iterations <= most for one in done[2:]) and done[0].found.iterations == ITERATIONS
+    alone = solver.solve(images[-1], None).found
+    lost = [1 - metrics.reconstruction_quality(one.volume, blobs(positions[-1])) for one in (alone, done[-1].found)]
+    assert lost[1] < GAIN * lost[0]
+
+
+def test_a_change_of_the_scene_is_noticed_and_the_instant_starts_from_its_images(solver, series):
+    _, images, others = series
+    done, before = along(solver, images[:3])
+    changed = solver.solve(others, before)
+    assert changed.start is Start.MISSED and changed.misfit_ratio > sequence.LEAST_AGREEMENT
+    alone = solver.solve(others, None).found
+    assert np.array_equal(changed.found.volume, alone.volume)
+    after = changed.before(changed.found.to_dataarray(), before)
+    assert after.earlier is None, "the flow is not measured between different particles"
+    assert after.flow is not None, "the flow stays known"
+    expected = solver.solve(images[3], before)
+    assert expected.start is Start.PREDICTED and np.isnan(expected.misfit_ratio) and done[2].flow is not None
+
+
+def test_nothing_is_predicted_before_the_flow_is_known(solver, series):
+    _, images, others = series
+    first = solver.solve(images[0], None)
+    second = solver.solve(images[1], first.before(first.found.to_dataarray(), None))
+    assert first.start is second.start is Start.FIRST
+    strange = solver.solve(others, second.before(second.found.to_dataarray(), None))
+    assert strange.start is Start.FIRST, "no earlier volume"
+
+
+def plain_guess(solver, images):
+    return solver.smart.solve(images, iterations=0)
+
+
+def test_the_guess_is_the_moved_volume_times_the_guess_from_the_images(solver, series):
+    positions, images, _ = series
+    plain, moved = plain_guess(solver, images[0]), np.array([1.3, -0.7, 0.4])
+    inner = positions[0][np.all(np.abs(positions[0] - [0.1, -0.1, 0.2]) < 0.7, axis=1)]
+    volume, there = blobs(inner).values, blobs(inner + moved * VOXEL_MM).values
+    guess = sequence.predicted_guess(volume, plain, uniform(*moved))
+    light = plain.volume.sum(dtype=np.float64)
+    assert guess.sum(dtype=np.float64) == pytest.approx(light, rel=TOLERANCE_F32)
+    lifted = np.maximum(there * light / there.sum(), sequence.DIMMEST * plain.volume.mean())
+    core = (slice(3, -3),) * 3  # light comes in through the faces
+    expected = (lifted**sequence.PERSISTENCE * plain.volume ** (1 - sequence.PERSISTENCE))[core]
+    gap = guess[core] / np.linalg.norm(guess[core]) - expected / np.linalg.norm(expected)
+    assert np.linalg.norm(gap) < TOLERANCE_SPLINE
+
+
+def test_where_the_flow_is_not_known_or_comes_from_outside_the_images_alone_count(solver, series):
+    positions, images, _ = series
+    plain, volume = plain_guess(solver, images[0]), blobs(positions[0]).values
+    unknown = sequence.predicted_guess(volume, plain, uniform(1.0, 0.0, 0.0, valid=False))
+    assert np.abs(unknown - plain.volume).max() < TOLERANCE_F32 * plain.volume.max()
+    guess = sequence.predicted_guess(volume, plain, uniform(6.0, 0.0, 0.0))
+    ratio = guess[:, :, :5] / plain.volume[:, :, :5]  # particles that were outside the volume before
+    assert np.ptp(ratio) < TOLERANCE_F32 * ratio.max()
+    assert guess[plain.volume > 0].min() > 0, "SMART could not raise it"
+    dark = sequence.predicted_guess(np.zeros_like(volume), plain, uniform(1.0, 0.0, 0.0))
+    assert np.array_equal(dark, plain.volume)
+
+
+def test_the_sieve_is_undone():
+    rng = np.random.default_rng(3)
+    sharp = np.zeros((16, 16, 16), np.float32)
+    sharp[tuple(rng.integers(3, 13, (3, 20)))] = 1.0
+    blurred = ndimage.gaussian_filter(sharp, 0.6, mode="constant", truncate=3.5)
+    again = ndimage.gaussian_filter(sequence.coefficients(blurred, 0.6), 0.6, mode="constant", truncate=3.5)
+    twice = ndimage.gaussian_filter(blurred, 0.6, mode="constant", truncate=3.5)
+    assert np.linalg.norm(again - blurred) < UNBLURRED * np.linalg.norm(twice - blurred)
+    assert np.array_equal(sequence.coefficients(blurred, 0.0), blurred)
+
+
+def test_the_flow_is_a_mean_over_time(solver, series):
+    positions, _, _ = series
+    volumes = [blobs(at) for at in positions[:2]]
+    found = lfpiv.correlate(*volumes, dt_s=1.0, **CORRELATION)
+    known = found.assign({f"displacement_{axis}": found[f"displacement_{axis}"] + 1 for axis in "zyx"})
+    given = []
+
+    def correlate(first, second, settings):
+        given.append((first, second, settings))
+        return found
+
+    averaging = SequenceSolver(solver.smart, CORRELATION, correlate)
+    images = series[1][2]
+    before = Before(volume=volumes[1].values, measured=volumes[1], earlier=volumes[0], flow=known)
+    solved = averaging.solve(images, before)
+    shift = solved.flow["displacement_x"] - found["displacement_x"]
+    assert np.allclose(shift, sequence.FLOW_MEMORY, atol=1e-5)
+    assert given[0][0] is volumes[0] and given[0][1] is volumes[1] and given[0][2] == CORRELATION

@@ -1,0 +1,215 @@
+"""Instants reconstructed one after the other: the numbers do not depend on where a run began, on workers or deaths."""
+
+import dataclasses
+import shutil
+from collections import Counter
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.series_run import FIRST, Processes, changed, make_work, write_series
+from support.small_run import damage, same_vectors
+
+from lfpiv.experiment import segments
+from lfpiv.experiment.settings import Series
+from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.results import netcdf, provenance
+from lfpiv.runs import dispatch
+from lfpiv.runs.stretches import cut_at_segments
+from lfpiv.warn import Code
+
+INSTANTS = 7
+"""Number of instants of a run; with those below they are 3 to 5, 6 to 8 and 9, the last two with one to lead in."""
+
+
+@pytest.fixture(autouse=True)
+def short_segments(monkeypatch):
+    monkeypatch.setattr(segments, "SEGMENT", 3)
+    monkeypatch.setattr(segments, "LEAD_IN", 1)
+
+
+@pytest.fixture(scope="module")
+def made(small_run, tmp_path_factory):
+    """Experiment file of the series and the work on all its pairs, with prediction."""
+    folder = tmp_path_factory.mktemp("sequence")
+    file = write_series(small_run, folder / "data")
+    return file, predicting(make_work(small_run, file, folder / "out"))
+
+
+def predicting(work, predict=True):
+    smart = work.experiment.smart.model_copy(update={"predict": predict})
+    return dataclasses.replace(work, experiment=dataclasses.replace(work.experiment, smart=smart))
+
+
+def at(work, file):
+    return dataclasses.replace(work, experiment=dataclasses.replace(work.experiment, path=file))
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """Count the reconstructions, without first guesses alone."""
+    counts, solve = Counter(), SmartSolver.solve
+
+    def counted(self, *arguments, **settings):
+        counts["volumes"] += settings.get("iterations") != 0
+        return solve(self, *arguments, **settings)
+
+    monkeypatch.setattr(SmartSolver, "solve", counted)
+    return counts
+
+
+def sequential(work, todo=None):
+    return list(dispatch.sequential(work, todo or list(work.experiment.numbers), lambda fraction: None))
+
+
+def in_segments(work, workers, deaths=None):
+    """Do all pairs in stretches of a segment each; return their outcomes by pair, and the client."""
+    client, todo = Processes(work, deaths), list(work.experiment.numbers)
+    stretches = cut_at_segments(todo, work.experiment.series.step)
+    found = dispatch.Dispatch(client, lambda: workers, work.folder.path, stretches, len(todo), "instant")
+    return {outcome.pair: outcome for outcome in found.outcomes(lambda fraction: None)}, client
+
+
+@pytest.fixture(scope="module")
+def reference(made, tmp_path_factory):
+    """Output folder of one process, step 1, with volumes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(segments, "SEGMENT", 3)
+        patch.setattr(segments, "LEAD_IN", 1)
+        work = changed(made[1], tmp_path_factory.mktemp("reference"), instants=INSTANTS, keep_volumes=True)
+        assert [outcome.reason for outcome in sequential(work)] == [""] * (INSTANTS - 1)
+    return work.folder.path
+
+
+def volumes(folder):
+    return {path.name: netcdf.read_volume(path).values for path in sorted((folder / "volumes").iterdir())}
+
+
+@hypothesis.settings(deadline=None)
+@given(st.sets(st.integers(0, 200), min_size=1), st.integers(1, 90))
+def test_stretches_are_segments_and_cover_each_pair_once(chosen, step):
+    todo = sorted(chosen)
+    stretches = list(cut_at_segments(todo, step))
+    seams = Counter(pair for stretch in stretches for pair in stretch.seams)
+    assert set(seams.values()) <= {2}, "a seam lies between two stretches"
+    assert sorted([*seams, *(pair for stretch in stretches for pair in stretch.pairs)]) == todo
+    stored = Counter()
+    for stretch in stretches:
+        assert len({segments.segment_of(pair) for pair in stretch.pairs}) == 1
+        assert stretch.pairs == tuple(sorted(stretch.pairs))
+        reached = {instant for pair in stretch.pairs for instant in (pair, pair + step)}
+        assert set(stretch.stored) <= reached, "an instant that nobody reconstructs"
+        stored.update(stretch.stored)
+    assert set(stored) == {instant for pair in seams for instant in (pair, pair + step)}
+
+
+@given(st.integers(0, 100), st.integers(2, 300), st.data())
+def test_an_instant_follows_from_the_beginning_of_its_segment(first, instants, data):
+    series = Series(instants=instants, first=first)
+    instant = data.draw(st.sampled_from(series.numbers))
+    found = segments.followed(series, instant)
+    assert found[-1] == instant and found[0] >= first
+    begins = instant - instant % segments.SEGMENT
+    assert found[0] == max(begins - segments.LEAD_IN, first)
+
+
+def test_the_numbers_are_those_of_one_process_for_any_beginning(made, reference, tmp_path, solved):
+    work = changed(made[1], tmp_path / "out", instants=INSTANTS)
+    for pair in reversed(work.experiment.numbers):  # each in an invocation of its own, the last one first
+        assert not sequential(work, [pair])[0].reason
+    assert same_vectors(reference, tmp_path / "out") == INSTANTS - 1
+    solved.clear()
+    shutil.rmtree(tmp_path / "out")
+    sequential(changed(work, tmp_path / "out", instants=INSTANTS))
+    missed = sum(Code.NOT_FOLLOWED is warning.code for warning in warnings_of(reference))
+    assert solved["volumes"] == INSTANTS + 2 + missed, "two instants lead in"
+
+
+def warnings_of(folder):
+    for path in sorted((folder / "volumes").iterdir()):
+        yield from provenance.read_marks(path).warnings
+
+
+@pytest.mark.parametrize("workers", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_the_numbers_are_those_of_one_process_for_several_workers_and_deaths(made, reference, tmp_path, workers):
+    work = changed(made[1], tmp_path / "out", instants=INSTANTS, scratch=tmp_path / "scratch")
+    outcomes, client = in_segments(work, workers, {FIRST: [1]})
+    assert sorted(outcomes) == list(work.experiment.numbers) and not any(one.reason for one in outcomes.values())
+    assert any(stretch.seams for stretch in client.submitted)
+    assert client.submitted.count(client.submitted[0]) == 2, "a worker died"
+    assert not list((tmp_path / "scratch").iterdir()), "volumes that no one needs any more"
+    assert same_vectors(reference, tmp_path / "out") == INSTANTS - 1
+
+
+@pytest.mark.parametrize("step", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_the_step_changes_no_volume(made, reference, tmp_path, step):
+    one = changed(made[1], tmp_path / "one", step=step, instants=INSTANTS, keep_volumes=True)
+    assert not any(outcome.reason for outcome in sequential(one))
+    found, expected = volumes(tmp_path / "one"), volumes(reference)
+    assert list(found) == list(expected)
+    assert all(np.array_equal(found[name], expected[name]) for name in found)
+    if step == 2:  # seams whose two instants are both within a segment of pairs to do
+        many = changed(one, tmp_path / "many", step=step, instants=INSTANTS, scratch=tmp_path / "scratch")
+        many = dataclasses.replace(many, keep_volumes=False)
+        outcomes, _ = in_segments(many, 2)
+        assert not any(one.reason for one in outcomes.values())
+        assert same_vectors(tmp_path / "one", tmp_path / "many") == INSTANTS - step
+
+
+def test_without_prediction_an_instant_depends_on_its_images_only(made, reference, tmp_path):
+    work = changed(predicting(made[1], False), tmp_path / "out", instants=INSTANTS, keep_volumes=True)
+    sequential(work, [FIRST + 4])
+    sequential(dataclasses.replace(work, vectors=False), [FIRST])
+    alone, follow = volumes(tmp_path / "out"), volumes(reference)
+    equal = [number for number in (0, 1, 4, 5) if np.array_equal(*(of[name(number)] for of in (alone, follow)))]
+    assert equal == [0, 1, 4], "the first two of a sequence, one with other particles, and one that is predicted"
+
+
+def name(number):
+    return f"instant_{FIRST + number:06d}.nc"
+
+
+def test_a_new_image_concerns_the_rest_of_its_segment_and_what_it_leads_into(made, small_run, tmp_path):
+    file = write_series(small_run, tmp_path / "data")
+    work = at(changed(made[1], tmp_path / "out", instants=INSTANTS, keep_volumes=True), file)
+
+    def hashes():
+        return {
+            frame.frame.number: frame.stamp.hash
+            for pair in work.experiment.numbers
+            for frame in work.files(pair).frames
+        }
+
+    before = hashes()
+    path = file.parent / f"run/left/{FIRST + 2:05d}.tif"  # the last one of its segment
+    shutil.copy(path, tmp_path / "copy")
+    path.unlink()
+    assert work.files(FIRST + 5).frames[0].stamp.parts[provenance.IMAGES_BEFORE] == hash_of(work, FIRST + 5)
+    (tmp_path / "copy").rename(path)
+    after = hashes()
+    assert [number for number in before if before[number] != after[number]] == [5, 6, 7, 8]
+
+
+def hash_of(work, instant):
+    return work.files(instant).frames[0].stamp.parts[provenance.IMAGES_BEFORE]
+
+
+def test_after_a_bad_or_repeated_image_the_sequence_begins_anew(made, small_run, tmp_path):
+    file = write_series(small_run, tmp_path / "data")
+    damage(file.parent / f"run/left/{FIRST + 1:05d}.tif")
+    shutil.copy(file.parent / f"run/right/{FIRST + 3:05d}.tif", file.parent / f"run/right/{FIRST + 4:05d}.tif")
+    work = at(changed(made[1], tmp_path / "out", instants=INSTANTS, step=2, keep_volumes=True), file)
+    outcomes = {outcome.pair: outcome.reason for outcome in sequential(work)}
+    assert [pair for pair, reason in outcomes.items() if reason] == [FIRST + 1]
+    repeated = [warning for warning in warnings_of(tmp_path / "out") if warning.code is Code.REPEATED]
+    assert [(one.instants, one.figures["camera"]) for one in repeated] == [((FIRST + 4,), "right")]
+    assert f"instant {FIRST + 3}" in repeated[0].sentence
+
+
+def test_particles_that_were_exchanged_are_noticed_and_warned_of(reference):
+    """The series shows the same particles at instants 3 and 4, others at 5 and 6, and so on."""
+    missed = [warning for warning in warnings_of(reference) if warning.code is Code.NOT_FOLLOWED]
+    assert [warning.instants for warning in missed] == [(FIRST + 2,), (FIRST + 4,)]
+    assert all(warning.figures["ratio"] > 0.9 for warning in missed)

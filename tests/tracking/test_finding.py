@@ -1,0 +1,81 @@
+"""Particles found in rendered images: positions, standard errors, ghosts, and arguments that cannot be used."""
+
+import numpy as np
+import pytest
+from support.tracking_rig import LIGHT, READ_NOISE, SIGMA_VOXEL, VOXEL_MM, TrackingRig
+
+from lfpiv import find_particles
+from lfpiv.metrics.particles import match_particles
+
+
+@pytest.fixture(scope="module")
+def rig(device):
+    return TrackingRig()
+
+
+@pytest.fixture(scope="module")
+def thin(rig):
+    """A volume of 0.05 particles per microlens, and what is found in it."""
+    true = rig.random(13, 5)
+    return true, find_particles(rig.weights, rig.images(true, 1), noise=READ_NOISE, sigma_voxel=SIGMA_VOXEL)
+
+
+def test_thin_seeding_is_found_whole_and_within_a_tenth_of_a_voxel(thin):
+    true, found = thin
+    pairs = match_particles(found.positions_mm, true, VOXEL_MM)
+    assert len(pairs) == len(true) == len(found)
+    miss = (found.positions_mm[pairs[:, 0]] - true[pairs[:, 1]]) / VOXEL_MM
+    assert np.sqrt((miss**2).sum(1).mean()) < 0.1
+
+
+def test_standard_errors_are_those_of_the_positions(thin):
+    true, found = thin
+    pairs = match_particles(found.positions_mm, true, VOXEL_MM)
+    miss = (found.positions_mm[pairs[:, 0]] - true[pairs[:, 1]]) / found.errors_mm[pairs[:, 0]]
+    assert 0.4 < np.median(np.abs(miss)) / 0.6745 < 1.6
+
+
+def test_light_and_figures(rig, thin):
+    _, found = thin
+    radius_px = 12.5 * 0.8 / 200 / 0.011
+    assert np.median(found.light) == pytest.approx(LIGHT * np.pi * radius_px**2, rel=0.05)
+    assert found.explained > 0.98
+    assert found.per_microlens == pytest.approx(len(found) / 18**2, rel=1e-6)
+    assert np.all(found.residual < 3)
+
+
+def test_light_that_one_camera_does_not_confirm_is_no_particle(rig):
+    true = np.array([[0.2, 0.1, -0.1], [-0.4, 0.3, 0.2]])
+    images = rig.images(true, 2)
+    ghost = rig.images(np.array([[0.45, -0.45, 0.3]]), 3, cameras=("cam0",))
+    images["cam0"] = images["cam0"] + ghost["cam0"]
+    found = find_particles(rig.weights, images, noise=READ_NOISE, sigma_voxel=SIGMA_VOXEL)
+    assert len(found) == 2
+    assert len(match_particles(found.positions_mm, true, VOXEL_MM)) == 2
+
+
+def test_noise_holds_no_particles(rig):
+    found = find_particles(rig.weights, rig.images(np.zeros((0, 3)), 4), noise=READ_NOISE, rounds=1)
+    assert len(found) == 0 and found.explained == 0.0
+
+
+@pytest.mark.slow
+def test_size_is_fitted(rig):
+    found = find_particles(rig.weights, rig.images(rig.random(10, 7), 1), noise=READ_NOISE)
+    assert found.sigma_voxel == pytest.approx(SIGMA_VOXEL, abs=0.08)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"rounds": 0}, "rounds"),
+        ({"weakest": 1.0}, "weakest"),
+        ({"sigma_voxel": 0.0}, "sigma_voxel"),
+        ({"noise": {"cam0": 1.0}}, "noise"),
+        ({"images": {}}, "images"),
+    ],
+)
+def test_bad_arguments_are_named(rig, arguments, name):
+    images = {camera: np.ones((220, 260), np.float32) for camera in rig.cameras}
+    with pytest.raises(ValueError, match=name):
+        find_particles(rig.weights, **({"images": images} | arguments))
