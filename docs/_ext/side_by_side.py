@@ -22,7 +22,6 @@ STYLES = {
     ("printed", 2): ("the same, Eq. 5 as printed", svg.SERIES[1], ":"),
     ("mlos", 2): ("first guess (MLOS)", svg.SERIES[4], "-"),
     ("refocused", 2): ("refocused stacks", svg.SERIES[3], "-"),
-    ("ours", 1): ("this software, one camera", svg.SERIES[0], "--"),
     ("refocused", 1): ("refocused, one camera", svg.SERIES[3], "--"),
     ("truth", 2): ("true particles", svg.INK, ":"),
 }

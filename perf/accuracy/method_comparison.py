@@ -26,7 +26,6 @@ from lfpiv import files
 
 METHODS = (
     ("refocused", 1),
-    ("ours", 1),
     ("refocused", 2),
     ("mlos", 2),
     ("printed", 2),
