@@ -22,7 +22,6 @@ STYLES = {
     ("printed", 2): ("the same, Eq. 5 as printed", svg.SERIES[1], ":"),
     ("mlos", 2): ("first guess (MLOS)", svg.SERIES[4], "-"),
     ("refocused", 2): ("refocused stacks", svg.SERIES[3], "-"),
-    ("ours", 1): ("this software, one camera", svg.SERIES[0], "--"),
     ("refocused", 1): ("refocused, one camera", svg.SERIES[3], "--"),
     ("truth", 2): ("true particles", svg.INK, ":"),
 }
@@ -98,15 +97,13 @@ def _time(rows: Sequence[Mapping[str, Any]]) -> str:
     error = [passes[way][1] or 0.0 for way in names]
     values = [passes[way][0] for way in names]
     axes.barh(place, values, xerr=error, height=0.6, color=[STYLES[way, 2][1] for way in names], ecolor=svg.INK)
-    for at, value in zip(place, values, strict=True):
-        axes.annotate(
-            f"{value:.1f}", (value, at), (4, 0), textcoords="offset points", va="center", color=svg.INK,
-            fontsize=svg.SMALL_POINT,
-        )  # fmt: skip
+    for at, value, beyond in zip(place, values, error, strict=True):
+        spot = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+        axes.annotate(f"{value:.1f}", (value + beyond, at), color=svg.INK, fontsize=svg.SMALL_POINT, **spot)
     svg.style(axes, title="time of a frame", xlabel="times a pass over all rays")
     axes.set_yticks(place, [STYLES[way, 2][0] for way in names])
     axes.invert_yaxis()
-    axes.set_xlim(0, 1.3 * max(values))
+    axes.set_xlim(0, 1.35 * max(values))
     return svg.to_svg(figure, "Time of a frame by each method in passes over all rays; the table has the numbers")
 
 

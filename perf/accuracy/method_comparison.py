@@ -3,7 +3,7 @@
     python perf/accuracy/method_comparison.py --out docs/_static/methods.json [--seeds 1,2,3] [--time-scale paper]
 
 The errors are means over flows and seeds, with the standard error of the mean over seeds. `--only time` or
-`--only seeding` computes one part anew and keeps the other one of the file.
+`--only seeding` computes one part anew and keeps the other one of the file; `--ways ours` measures some methods only.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,6 @@ from lfpiv import files
 
 METHODS = (
     ("refocused", 1),
-    ("ours", 1),
     ("refocused", 2),
     ("mlos", 2),
     ("printed", 2),
@@ -42,46 +42,58 @@ ROUNDS = {"small": 3, "paper": 1}
 """Rounds of the timing. In each, all methods take turns with a pass over the rays."""
 
 
-def seeding(seeds: Sequence[int], folder: Path) -> list[dict[str, Any]]:
-    """Measure all methods at every seeding: mean figures, standard errors, and differences to ours."""
-    rows = []
-    for ppm in PPM:
-        scores = {}
-        for name, cameras in METHODS:
-            cases = {
-                flow: [Case(flow=flow, ppm=ppm, seed=seed, angles_deg=ANGLES_DEG[cameras]) for seed in seeds]
-                for flow in FLOWS
-            }
-            scores[name, cameras] = {
-                flow: [score(case, WAYS[name], folder) for case in members] for flow, members in cases.items()
-            }
-            figures = {key: _mean(scores[name, cameras], key) for key in FIGURES}
-            rows.append({"way": name, "cameras": cameras, "ppm": ppm, "figures": figures})
-            print(f"{ppm:4g} ppm {name:9s} {cameras}", {key: round(figures[key][0], 3) for key in FIGURES}, flush=True)
-        for row in rows[-len(METHODS) :]:
-            own, other = scores["ours", 2], scores[row["way"], row["cameras"]]
-            row["beyond_ours"] = {key: _mean(other, key, own) for key in ("error", "q")}
-    return rows
+def seeding(
+    seeds: Sequence[int], folder: Path, ways: Sequence[str], known: Sequence[Mapping[str, Any]] = ()
+) -> list[dict[str, Any]]:
+    """Measure methods at every seeding: mean figures, standard errors, and differences to ours.
+
+    Rows of `known` stand for the methods that are not among `ways`.
+    """
+    stored = {(row["way"], row["cameras"], row["ppm"]): row for row in known}
+    rows: dict[tuple[str, int, float], dict[str, Any]] = {}
+    for ppm, (name, cameras) in product(PPM, METHODS):
+        key = name, cameras, ppm
+        if name not in ways and key in stored:
+            rows[key] = dict(stored[key])
+            continue
+        cases = {
+            flow: [Case(flow=flow, ppm=ppm, seed=one, angles_deg=ANGLES_DEG[cameras]) for one in seeds]
+            for flow in FLOWS
+        }
+        scores = {flow: [score(case, WAYS[name], folder) for case in members] for flow, members in cases.items()}
+        figures = {figure: _mean(_values(scores, figure)) for figure in FIGURES}
+        single = {figure: _values(scores, figure) for figure in ("error", "q")}
+        rows[key] = {"way": name, "cameras": cameras, "ppm": ppm, "figures": figures, "by_flow": single}
+        print(
+            f"{ppm:4g} ppm {name:9s} {cameras}", {key: round(value[0], 3) for key, value in figures.items()}, flush=True
+        )
+    for (_, _, ppm), row in rows.items():
+        own = rows["ours", 2, ppm]["by_flow"]
+        row["beyond_ours"] = {figure: _mean(values, own[figure]) for figure, values in row["by_flow"].items()}
+    return list(rows.values())
+
+
+def _values(scores: Mapping[str, Sequence[Mapping[str, float]]], figure: str) -> dict[str, list[float]]:
+    """Return one figure of every seed by flow."""
+    return {flow: [one[figure] for one in members] for flow, members in scores.items()}
 
 
 def _mean(
-    scores: Mapping[str, Sequence[Mapping[str, float]]],
-    key: str,
-    reference: Mapping[str, Sequence[Mapping[str, float]]] | None = None,
+    values: Mapping[str, Sequence[float | None]], reference: Mapping[str, Sequence[float | None]] | None = None
 ) -> tuple[float, float]:
     """Return the mean of a figure over flows and its standard error by the scatter over seeds within each flow.
 
     With a reference, of the differences to it, seed by seed. Figures that are unknown are left out.
     """
     means, squares = [], []
-    for flow, members in scores.items():
-        values = np.array([one[key] for one in members], float)
+    for flow, given in values.items():
+        members = np.array(given, float)
         if reference is not None:
-            values = values - np.array([one[key] for one in reference[flow]], float)
-        values = values[np.isfinite(values)]
-        if len(values):
-            means.append(values.mean())
-            squares.append(values.var(ddof=1) / len(values) if len(values) > 1 else np.nan)
+            members = members - np.array(reference[flow], float)
+        members = members[np.isfinite(members)]
+        if len(members):
+            means.append(members.mean())
+            squares.append(members.var(ddof=1) / len(members) if len(members) > 1 else np.nan)
     if not means:
         return float("nan"), float("nan")
     return float(np.mean(means)), float(np.sqrt(np.sum(squares)) / len(means))
@@ -120,14 +132,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", default="1,2,3")
     parser.add_argument("--time-scale", choices=tuple(ROUNDS), default="small", help="size of the rig that is timed")
     parser.add_argument("--only", choices=("seeding", "time"), help="the part that is computed")
+    parser.add_argument(
+        "--ways", help="names of `WAYS` that are measured anew; the others keep the figures of the file"
+    )
     parser.add_argument("--cache", type=Path, default=CACHE, help="folder of images and figures")
     options = parser.parse_args(arguments)
-    stored = json.loads(options.out.read_text("utf-8")) if options.only and options.out.exists() else {}
+    keeps = options.only or options.ways
+    stored = json.loads(options.out.read_text("utf-8")) if keeps and options.out.exists() else {}
     if options.only != "seeding":
         stored["time"] = timing(options.time_scale, options.cache)
     if options.only != "time":
         seeds = [int(seed) for seed in options.seeds.split(",")]
-        stored |= {"seeds": seeds, "flows": FLOWS, "seeding": seeding(seeds, options.cache)}
+        known = stored.get("seeding", []) if options.ways else []
+        ways = options.ways.split(",") if options.ways else list(WAYS)
+        stored |= {"seeds": seeds, "flows": FLOWS, "seeding": seeding(seeds, options.cache, ways, known)}
     files.write_json(files.plain(stored), options.out)
     return 0
 

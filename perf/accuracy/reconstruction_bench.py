@@ -146,8 +146,8 @@ def code_state() -> str:
     for folder in (package, package.parent / "lfpiv_kernels"):
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.h")]):
             digest.update(path.read_bytes())
-    for path in sorted(Path(__file__).parent.glob("reconstruction_*.py")):
-        digest.update(path.read_bytes())
+    for name in ("reconstruction_cases", "reconstruction_ways", "refocused"):
+        digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -122,6 +122,10 @@ class Rig:
         """Return a camera's image above its dark level [count]."""
         return image - np.float32(self.calibration.cameras[name].decoder.background(image)[0])
 
+    def noise(self, name: str, image: np.ndarray) -> float:
+        """Return the noise of a camera's image where it is dark [count]."""
+        return self.calibration.cameras[name].decoder.background(image)[1]
+
 
 @cache
 def make_rig(scale: str, angles_deg: tuple[float, ...]) -> Rig:

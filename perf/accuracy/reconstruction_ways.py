@@ -19,9 +19,12 @@ from refocused import refocused_volume
 from lfpiv import metrics
 from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.grid import AXES, Grid, Layers
+from lfpiv.geometry.resampling import volume_on
 from lfpiv.reconstruction.beyond import light_beyond
+from lfpiv.reconstruction.refinement import measure_size, needed_refinement
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import rigs
+from lfpiv.runs.guard import LEAST_LAYERS
 from lfpiv.weights.operator import Weights, build_weights
 
 _KEYS_SINCE = {"subsets": 1, "refinement": 1.0, "predict": False}
@@ -79,13 +82,17 @@ def by_smart(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) -> Measu
     """Reconstruct each frame by SMART, as `lfpiv run` does."""
     smart = Smart(**table_of(settings, "smart"))
     guard = settings.get("volume.guard_mm", "auto")
-    grid = rig.grid.padded(_guard_layers(rig, recorded) if guard == "auto" else rig.grid.layers(guard))
-    weights = weights_of(rig, grid)
-    start = time.process_time()
-    found = [rigs.reconstruct_images(weights, images, smart) for images in recorded.images]
+    guarded = rig.grid.padded(_guard_layers(rig, recorded) if guard == "auto" else rig.grid.layers(guard))
+    factor = _refinement(rig, recorded) if smart.refinement == "auto" else float(smart.refinement)
+    weights = weights_of(rig, guarded.refined(factor))
+    start, found = time.process_time(), []
+    for images in recorded.images:
+        light = {name: rig.light(name, image) for name, image in images.items()}
+        noise = {name: rig.noise(name, image) for name, image in images.items()}
+        found.append(reconstruct(weights, light, floor=noise, **smart.of_one_frame(factor)))
     return Measured(
         cpu_s=(time.process_time() - start) / len(found),
-        volumes=[_cut(volume, rig.grid, grid) for volume in found],
+        volumes=[_as_written(volume, rig.grid) for volume in found],
         passes=float(np.mean([volume.attrs["iterations"] for volume in found])),
         misfit=float(np.mean([volume.attrs["misfit"][-1] for volume in found])),
     )
@@ -160,14 +167,21 @@ def table_of(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
 def _guard_layers(rig: Rig, recorded: Recorded) -> Layers:
     """Return the guard layers that the images demand, as a run finds them."""
     light = [{name: rig.light(name, image) for name, image in images.items()} for images in recorded.images]
-    counts = [[0, 0], [0, 0], [0, 0]]
+    counts = [[LEAST_LAYERS, LEAST_LAYERS] for _ in range(3)]
     for face in light_beyond(rig.calibration, rig.grid, [light[:2]]):
-        counts[face.axis][face.side] = round(face.guard_mm / rig.grid.voxel_mm)
+        count = round(face.guard_mm / rig.grid.voxel_mm)
+        counts[face.axis][face.side] = max(count, LEAST_LAYERS)
     z, y, x = ((low, high) for low, high in counts)
     return z, y, x
 
 
-def _cut(volume: xr.DataArray, grid: Grid, padded: Grid) -> xr.DataArray:
-    cut = volume[grid.within(padded)]
-    cut = cut.copy(data=np.ascontiguousarray(cut.values))
-    return cut.drop_vars([name for name in cut.coords if cut.coords[name].ndim == 3])
+@lru_cache(maxsize=64)
+def _refinement(rig: Rig, recorded: Recorded) -> float:
+    """Return the refinement that the images demand, as a run finds it."""
+    light = [{name: rig.light(name, image) for name, image in images.items()} for images in recorded.images]
+    return needed_refinement(measure_size(rig.calibration, rig.grid, light))
+
+
+def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
+    written = volume_on(volume, grid)
+    return written.drop_vars([name for name in written.coords if written.coords[name].ndim == 3])
