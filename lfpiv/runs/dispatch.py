@@ -23,7 +23,8 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import StepProgress
 from lfpiv.runs import cluster_workers, local_workers, worker
 from lfpiv.runs.local_workers import Capacity
-from lfpiv.runs.pair import Outcome, PairWork
+from lfpiv.runs.pair import PairWork
+from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut, cut_at_segments
 from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan

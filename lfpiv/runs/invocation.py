@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from lfpiv.runs.moved_cameras import CameraDisparity, SelfCalibrationFigures
-from lfpiv.runs.pair import Outcome
+from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.warn import Warning
 
 if TYPE_CHECKING:

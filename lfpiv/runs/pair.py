@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -23,28 +23,21 @@ from threadpoolctl import threadpool_limits
 from lfpiv import warn
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment, Frame
-from lfpiv.experiment.settings import Correlation
-from lfpiv.geometry.grid import Grid, Layers
-from lfpiv.geometry.resampling import volume_on
-from lfpiv.geometry.volume import VIEWS
-from lfpiv.lightfield import image_checks
+from lfpiv.geometry.grid import Layers
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.reconstruction.motion import Motion, PairSolver, unshared_quality
-from lfpiv.reconstruction.sequence import Before, SequenceSolver, Start
-from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.sequence import Before
 from lfpiv.results.folder import Folder
-from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairFiles, PairVolumes, VolumeFile
+from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
 from lfpiv.runs import pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
-from lfpiv.runs.guard import with_guard
 from lfpiv.runs.instants import Instants, failure
+from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
+from lfpiv.runs.pair_vectors import LastVectors, measure_vectors, without_unmeasured
+from lfpiv.runs.pair_volumes import Reconstruction, reconstruction_s
 from lfpiv.runs.particles import track
-from lfpiv.runs.refinement import refined
-from lfpiv.runs.sequences import SequentialInstants, restarted
+from lfpiv.runs.sequences import SequentialInstants
 from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.tracking.finding import ParticleSearch
-from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.velocity.settings import DEFAULT_WINDOWS, FIRST_SEARCH
 from lfpiv.warn import FirstOfEachCode, Warning
 
 if TYPE_CHECKING:
@@ -52,31 +45,6 @@ if TYPE_CHECKING:
     from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
-
-RECONSTRUCTED = 0.9
-"""Finished fraction of a pair when its volumes are reconstructed, for progress bars."""
-
-CORRELATED = 0.99
-"""Finished fraction of a pair when only its vectors remain to be written."""
-
-PairProgress = Callable[[int, float], None]
-"""Called as ``progress(number, fraction)``: the place of a pair in its stretch, from 0, and its finished fraction."""
-
-NO_PARTICLES = "no particles in the images: none of the vectors counts"
-"""Verdict on the vectors of a pair if the images of one frame show only noise."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """Result of the work on a pair."""
-
-    pair: int
-    reason: str = ""
-    """Why the pair failed; empty if it is finished."""
-    died: bool = False
-    """Whether the worker process died, perhaps after it finished the pair."""
-    peak_memory_mib: float = 0.0
-    """Largest memory that the worker process held so far; 0 for pairs done in the process of the run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +88,7 @@ class PairWork:
         instants: Instants | None = None
         if self.experiment.series is not None:
             instants = SequentialInstants(self, stored) if self.experiment.in_sequence else Instants(self, stored)
-        computed: _Computed | None = None
+        computed: Computed | None = None
         try:
             for number, (pair, coming) in enumerate(_with_next(pairs)):
                 self._read_ahead(pair, coming)
@@ -136,7 +104,7 @@ class PairWork:
         if instants is not None:
             instants.clear()
 
-    def _compute(self, pair: int, instants: Instants | None, progress: StepProgress) -> _Computed:
+    def _compute(self, pair: int, instants: Instants | None, progress: StepProgress) -> Computed:
         """Compute the results of one pair and start to write them."""
         self.written.clear()
         try:
@@ -146,8 +114,8 @@ class PairWork:
         except StorageError:
             raise
         except Exception as error:  # an error in one pair must not end the others
-            return _Computed(pair=pair, reason=str(failure(error)), written=tuple(self.written), progress=progress)
-        return _Computed(pair=pair, reason="", written=tuple(self.written), progress=progress)
+            return Computed(pair=pair, reason=str(failure(error)), written=tuple(self.written), progress=progress)
+        return Computed(pair=pair, reason="", written=tuple(self.written), progress=progress)
 
     def _read_ahead(self, pair: int, coming: int | None) -> None:
         """Start to read the images of the coming pair whose volumes are not in the folder."""
@@ -179,33 +147,16 @@ class PairWork:
         return []
 
     @cached_property
-    def solver(self) -> PairSolver:
-        """SMART for this rig, made once for all pairs.
-
-        The motion passes use default windows, so that other windows in `[correlation]` do not change the volumes. They
-        correlate the reconstructed voxels.
-        """
+    def reconstruction(self) -> Reconstruction:
+        """Reconstruction of images with the weights, made once for all pairs."""
         assert self.weights is not None
-        self.weights.volume = self.experiment.grid
-        smart, farthest = self.experiment.smart, self.experiment.correlation.max_displacement_voxel
-        if farthest is None and self.refinement > 1:
-            farthest = FIRST_SEARCH * DEFAULT_WINDOWS[0]
-        if farthest is not None:
-            farthest *= self.refinement
-        return PairSolver(
-            self.weights,
-            SmartSettings(**smart.of_one_frame(self.refinement)),
-            motion_passes=smart.motion_passes,
-            correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
-            mask=refined(with_guard(self.experiment, self.guard), self.refinement).solid,
+        return Reconstruction(
+            experiment=self.experiment,
+            weights=self.weights,
+            guard=self.guard,
+            refinement=self.refinement,
+            between=self.between,
         )
-
-    @cached_property
-    def sequence(self) -> SequenceSolver:
-        """SMART along a series, made once."""
-        farthest = self.experiment.correlation.max_displacement_voxel
-        correlation = Correlation(max_displacement_voxel=farthest).model_dump()
-        return SequenceSolver(self.solver.smart, correlation, self.between)
 
     @cached_property
     def between(self) -> LastVectors:
@@ -260,11 +211,7 @@ class PairWork:
         light = pair_light(self.experiment, self.cameras, self.darks, files.pair, self.images.image)
         self.writer.wait_large()
         self._log(files.pair, [warning for frame in light for warning in frame.warnings])
-        start = time.perf_counter()
-        found = _reconstruct_frames(self.solver, light, files.pair, progress)
-        seconds = (time.perf_counter() - start) / 2
-        first, second = (self._frame_volume(volume, frame, seconds) for volume, frame in zip(found, light, strict=True))
-        return first, second
+        return self.reconstruction.pair(light, files.pair, progress)
 
     def read_light(self, file: VolumeFile) -> FrameLight:
         """Read and check the images of an instant whose volume is to be reconstructed.
@@ -299,17 +246,9 @@ class PairWork:
         InputError
             If its images cannot be reconstructed.
         """
-        instant = light.frame.number
-        self._log(instant, light.warnings)
+        self._log(light.frame.number, light.warnings)
         self.writer.wait_large()
-        start = time.perf_counter()
-        try:
-            found = self.solver.smart.solve(light.images, floor=light.noise, progress=progress)
-        except ValueError as error:
-            raise InputError(f"instant {instant}: {error}") from error
-        seconds = time.perf_counter() - start
-        log.info("instant %d: reconstructed in %.1f s", instant, seconds)
-        return self._frame_volume(found.to_dataarray(), light, seconds)
+        return self.reconstruction.instant(light, progress)
 
     def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
         """Reconstruct one instant of a series from the one before; return it and what the next one needs.
@@ -322,24 +261,9 @@ class PairWork:
         instant = light.frame.number
         self._log(instant, light.warnings)
         self.writer.wait_large()
-        start = time.perf_counter()
-        try:
-            solved = self.sequence.solve(light.images, before, floor=light.noise, progress=progress)
-        except ValueError as error:
-            raise InputError(f"instant {instant}: {error}") from error
-        seconds = time.perf_counter() - start
-        log.info("instant %d: reconstructed in %.1f s; %s", instant, seconds, solved.start.value)
-        found = self._frame_volume(solved.found.to_dataarray(), light, seconds)
-        if solved.start is Start.MISSED:
-            found = restarted(found, solved.misfit_ratio, instant)
-            self._log(instant, found.record.warnings[-1:])
-        return found, solved.before(found.volume, before)
-
-    def _frame_volume(self, found: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
-        """Return a volume on the voxels of the experiment, with its record."""
-        volume = _as_written(found, self.experiment.grid)
-        record = FrameRecord(structure=light.structure, warnings=light.warnings, seconds=seconds + light.seconds)
-        return FrameVolume(volume=volume, record=record)
+        found, coming = self.reconstruction.follow(light, before, progress)
+        self._log(instant, found.record.warnings[len(light.warnings) :])
+        return found, coming
 
     def _log(self, pair: int, warnings: Iterable[Warning]) -> None:
         """Log the first warning of each code about a pair or an instant."""
@@ -354,31 +278,14 @@ class PairWork:
         ValueError
             If the images cannot be reconstructed.
         """
-        assert self.weights is not None
-        grid = self.experiment.grid
-        if self.experiment.series is None:
-            first, second = self.solver.solve(images, noise).to_dataarrays()
-        else:
-            first, second = (
-                self.solver.smart.solve(frame, floor=floor).to_dataarray()
-                for frame, floor in zip(images, noise, strict=True)
-            )
-        return self._vectors(_as_written(first, grid), _as_written(second, grid))
-
-    def _vectors(self, first: xr.DataArray, second: xr.DataArray) -> xr.Dataset:
-        """Correlate the volumes of two frames."""
-        settings = self.experiment.correlation.model_dump()
-        if self.experiment.in_sequence:
-            vectors = self.between(first, second, settings)
-        else:
-            vectors = correlate(first, second, dt_s=self.experiment.dt_s, **settings)
-        return _with_motion(vectors, (first, second))
+        first, second = self.reconstruction.volumes(images, noise)
+        return measure_vectors(first, second, self.experiment, self.between)
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment, start = self.experiment, time.perf_counter()
-        vectors = _without_unmeasured(self._vectors(*volumes.volumes), volumes)
+        vectors = without_unmeasured(measure_vectors(*volumes.volumes, experiment, self.between), volumes)
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
-        vectors.attrs["reconstruction_s"] = self._reconstruction_s(files.pair, volumes)
+        vectors.attrs["reconstruction_s"] = reconstruction_s(experiment, files.pair, volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         condensed, found = volumes.condensed(), volumes.warnings
         if files.particles is not None and self.weights is not None:
@@ -427,59 +334,6 @@ class PairWork:
         assert self.weights is not None and self.experiment.tracking is not None
         return ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.model_dump())
 
-    def _reconstruction_s(self, pair: int, volumes: PairVolumes) -> float:
-        """Return the time that the volumes of a pair took [s].
-
-        In a series the second instant counts, and the first one only if it is the second of no other pair: the sum over
-        all pairs then counts each instant once.
-        """
-        first, second = (record.seconds for record in volumes.records)
-        series = self.experiment.series
-        return second if series is not None and pair - series.step in self.experiment.numbers else first + second
-
-
-@dataclass(eq=False)
-class LastVectors:
-    """Correlation of two volumes, which is not repeated if it was the last one."""
-
-    dt_s: float
-    """Time between the volumes [s]."""
-    _last: tuple[xr.DataArray, xr.DataArray, dict[str, Any], xr.Dataset] | None = None
-
-    def __call__(self, first: xr.DataArray, second: xr.DataArray, settings: Mapping[str, Any]) -> xr.Dataset:
-        """Return the vectors between two volumes; `settings` are those of `correlate`."""
-        known = self._last
-        if known is None or known[0] is not first or known[1] is not second or known[2] != settings:
-            known = first, second, dict(settings), correlate(first, second, dt_s=self.dt_s, **settings)
-            self._last = known
-        return known[3].copy()
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Computed:
-    """A pair whose results are computed and perhaps not written yet."""
-
-    pair: int
-    reason: str
-    """Why it failed; empty if it did not."""
-    written: tuple[Future[None], ...]
-    """Its results that are being written."""
-    progress: StepProgress
-
-    def outcome(self) -> Outcome:
-        """Wait until the results are written and return the outcome; raise StorageError if they cannot be written."""
-        reason = self.reason
-        for future in self.written:
-            try:
-                future.result()
-            except StorageError:
-                raise
-            except Exception as error:  # such as values that no file may hold
-                reason = reason or str(failure(error))
-        if not reason:
-            self.progress(1.0)
-        return Outcome(pair=self.pair, reason=reason)
-
 
 def _with_next(pairs: Iterable[int]) -> Iterator[tuple[int, int | None]]:
     """Yield each pair with the one that comes after it, None for the last one."""
@@ -489,47 +343,3 @@ def _with_next(pairs: Iterable[int]) -> Iterator[tuple[int, int | None]]:
         coming = next(source, None)
         yield present, coming
         present = coming
-
-
-def _reconstruct_frames(
-    solver: PairSolver, light: tuple[FrameLight, FrameLight], pair: int, progress: StepProgress
-) -> tuple[xr.DataArray, xr.DataArray]:
-    """Reconstruct both volumes."""
-    try:
-        result = solver.solve([frame.images for frame in light], [frame.noise for frame in light], progress)
-    except ValueError as error:
-        raise InputError(f"pair {pair}: {error}") from error
-    if solver.motion_passes:
-        log.info("pair %d: %s", pair, result.motion.value)
-    first, second = result.to_dataarrays()
-    return first, second
-
-
-def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
-    """Return a reconstructed volume on the voxels that are written, ``views`` only if some are seen by one camera."""
-    written = volume_on(volume, grid)
-    if VIEWS in written.coords and written.coords[VIEWS].values.min() >= 2:
-        written = written.drop_vars(VIEWS)
-    return written
-
-
-def _with_motion(vectors: xr.Dataset, volumes: tuple[xr.DataArray, xr.DataArray]) -> xr.Dataset:
-    """Return vectors with the outcome of the motion passes and with a quality that does not count shared light."""
-    attributes = volumes[0].attrs
-    if attributes.get("motion", Motion.OFF.value) == Motion.OFF.value:
-        return vectors
-    shares = np.atleast_1d(attributes["motion_valid"]).tolist()
-    return unshared_quality(vectors, volumes).assign_attrs(motion=attributes["motion"], motion_valid=shares)
-
-
-def _without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:
-    """Mark all vectors as not valid if fewer than two of several cameras saw particles in a frame."""
-    cameras = len(volumes.records[0].structure)
-    if not image_checks.unmeasured([record.warnings for record in volumes.records], cameras):
-        return vectors
-    valid = xr.zeros_like(vectors["valid"])  # keeps its attributes
-    names = [name for name in vectors.data_vars if str(name).startswith("uncertainty")]
-    changed = {"valid": valid, **{str(name): vectors[name].where(valid) for name in names}}
-    seen = vectors.attrs["seen_fraction"]  # no part of the volume is blamed for it
-    attributes = {"valid_fraction": 0.0, "measurable_fraction": seen, "unseeded_fraction": 0.0}
-    return vectors.assign(changed).assign_attrs(verdict=NO_PARTICLES, **attributes)

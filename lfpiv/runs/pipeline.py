@@ -18,7 +18,8 @@ from lfpiv.progress import Progress
 from lfpiv.runs import bootstrap, dispatch, local_workers, memory, rig, task, worker_plan
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
-from lfpiv.runs.pair import Outcome, PairWork
+from lfpiv.runs.pair import PairWork
+from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.rig import Prepared
 from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.todo import Todo

@@ -31,7 +31,7 @@ from lfpiv.runs import bootstrap, guard, memory, pair_figures, refinement, summa
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
-from lfpiv.runs.pair import Outcome
+from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.summary import Contents, EarlierSummary
 from lfpiv.runs.todo import Todo

@@ -19,7 +19,8 @@ from pathlib import Path
 from lfpiv.errors import InputError, StorageError
 from lfpiv.runs import background, memory
 from lfpiv.runs.frame_light import read_darks
-from lfpiv.runs.pair import CORRELATED, Outcome, PairProgress, PairWork
+from lfpiv.runs.pair import PairWork
+from lfpiv.runs.pair_outcome import CORRELATED, Outcome, PairProgress
 from lfpiv.runs.stretches import Stretch
 from lfpiv.runs.task import TASK, WEIGHTS, read_task
 from lfpiv.version import __version__

@@ -15,7 +15,7 @@ from lfpiv import statistics
 from lfpiv.lightfield import image_checks
 from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, SATURATED, dark_blocks, gap_light, saturated_share
 from lfpiv.results import netcdf
-from lfpiv.runs import pair, pipeline
+from lfpiv.runs import pair_vectors, pipeline
 from lfpiv.simulation.simulator import simulate
 from lfpiv.warn import Code, Warning
 
@@ -172,7 +172,7 @@ def test_a_pair_of_noise_enters_no_mean(spoilt):
     file, out, summary = spoilt
     vectors = netcdf.read_vectors(out / "vectors" / "pair_0000.nc")
     assert not vectors["valid"].any() and np.isnan(vectors["uncertainty"]).all()
-    assert vectors.attrs["verdict"] == summary["pairs"][0]["verdict"] == pair.NO_PARTICLES
+    assert vectors.attrs["verdict"] == summary["pairs"][0]["verdict"] == pair_vectors.NO_PARTICLES
     assert summary["pairs"][0]["valid_fraction"] == 0 < summary["pairs"][1]["valid_fraction"]
     results = lfpiv.open_results(out)
     mean, good = statistics.mean(results), statistics.mean(results.sel(pair=[2, 3]))

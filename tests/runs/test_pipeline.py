@@ -250,7 +250,7 @@ def test_a_failure_leaves_no_part_and_no_other_pair_undone(small_run, tmp_path, 
             raise RuntimeError("the power went off")
         return correlate(first, second, **settings)
 
-    monkeypatch.setattr("lfpiv.runs.pair.correlate", fail)
+    monkeypatch.setattr("lfpiv.runs.pair_vectors.correlate", fail)
     monkeypatch.setattr(netcdf, "read_volume", numbered(netcdf.read_volume))
     result = pipeline.correlate(small_run.experiment, out)
     assert result["failed"] == [{"pair": 1, "reason": "unexpected RuntimeError: the power went off"}]

@@ -24,7 +24,7 @@ from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import cluster_workers, dispatch, local_workers, memory, pipeline, worker_plan
-from lfpiv.runs.pair import Outcome
+from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.stretches import cut
 from lfpiv.runs.worker import Result
 from lfpiv.weights import storage

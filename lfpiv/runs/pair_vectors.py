@@ -1,0 +1,77 @@
+"""Vectors of a pair: correlate its volumes and state what the vectors cannot show.
+
+The motion passes share light between the frames, and a camera may have recorded no particles: both change what the
+vectors are worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.lightfield import image_checks
+from lfpiv.reconstruction.motion import Motion, unshared_quality
+from lfpiv.results.pair_files import PairVolumes
+from lfpiv.velocity.cross_correlation import correlate
+
+NO_PARTICLES = "no particles in the images: none of the vectors counts"
+"""Verdict on the vectors of a pair if the images of one frame show only noise."""
+
+
+@dataclass(eq=False)
+class LastVectors:
+    """Correlation of two volumes, which is not repeated if it was the last one."""
+
+    dt_s: float
+    """Time between the volumes [s]."""
+    _last: tuple[xr.DataArray, xr.DataArray, dict[str, Any], xr.Dataset] | None = None
+
+    def __call__(self, first: xr.DataArray, second: xr.DataArray, settings: Mapping[str, Any]) -> xr.Dataset:
+        """Return the vectors between two volumes; `settings` are those of `correlate`."""
+        known = self._last
+        if known is None or known[0] is not first or known[1] is not second or known[2] != settings:
+            known = first, second, dict(settings), correlate(first, second, dt_s=self.dt_s, **settings)
+            self._last = known
+        return known[3].copy()
+
+
+def measure_vectors(
+    first: xr.DataArray, second: xr.DataArray, experiment: Experiment, between: LastVectors
+) -> xr.Dataset:
+    """Correlate the volumes of two frames.
+
+    `between` correlates those of a sequence, where the second volume may follow from the same vectors.
+    """
+    settings = experiment.correlation.model_dump()
+    if experiment.in_sequence:
+        vectors = between(first, second, settings)
+    else:
+        vectors = correlate(first, second, dt_s=experiment.dt_s, **settings)
+    return _with_motion(vectors, (first, second))
+
+
+def without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:
+    """Mark all vectors as not valid if fewer than two of several cameras saw particles in a frame."""
+    cameras = len(volumes.records[0].structure)
+    if not image_checks.unmeasured([record.warnings for record in volumes.records], cameras):
+        return vectors
+    valid = xr.zeros_like(vectors["valid"])  # keeps its attributes
+    names = [name for name in vectors.data_vars if str(name).startswith("uncertainty")]
+    changed = {"valid": valid, **{str(name): vectors[name].where(valid) for name in names}}
+    seen = vectors.attrs["seen_fraction"]  # no part of the volume is blamed for it
+    attributes = {"valid_fraction": 0.0, "measurable_fraction": seen, "unseeded_fraction": 0.0}
+    return vectors.assign(changed).assign_attrs(verdict=NO_PARTICLES, **attributes)
+
+
+def _with_motion(vectors: xr.Dataset, volumes: tuple[xr.DataArray, xr.DataArray]) -> xr.Dataset:
+    """Return vectors with the outcome of the motion passes and with a quality that does not count shared light."""
+    attributes = volumes[0].attrs
+    if attributes.get("motion", Motion.OFF.value) == Motion.OFF.value:
+        return vectors
+    shares = np.atleast_1d(attributes["motion_valid"]).tolist()
+    return unshared_quality(vectors, volumes).assign_attrs(motion=attributes["motion"], motion_valid=shares)

@@ -1,0 +1,182 @@
+"""Volumes of a pair or of an instant: reconstruct its images and return them on the voxels of the experiment.
+
+The grid of the weights has guard layers and perhaps finer voxels than the experiment. `Reconstruction` makes the
+solvers for that grid once. It samples each volume on the voxels that are written.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.settings import Correlation
+from lfpiv.geometry.grid import Grid, Layers
+from lfpiv.geometry.resampling import volume_on
+from lfpiv.geometry.volume import VIEWS
+from lfpiv.progress import StepProgress
+from lfpiv.reconstruction.motion import PairSolver
+from lfpiv.reconstruction.sequence import Before, SequenceSolver, Start
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes
+from lfpiv.runs.frame_light import FrameLight
+from lfpiv.runs.guard import with_guard
+from lfpiv.runs.pair_vectors import LastVectors
+from lfpiv.runs.refinement import refined
+from lfpiv.runs.sequences import restarted
+from lfpiv.velocity.settings import DEFAULT_WINDOWS, FIRST_SEARCH
+
+if TYPE_CHECKING:
+    from lfpiv.weights.operator import Weights
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction:
+    """Reconstruction of the images of a run, whose solvers are made once."""
+
+    experiment: Experiment
+    weights: Weights
+    guard: Layers
+    """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
+    refinement: float
+    """Edge of a voxel of the experiment over that of the weights, which volumes are sampled from."""
+    between: LastVectors
+    """Correlation along a sequence."""
+
+    @cached_property
+    def solver(self) -> PairSolver:
+        """SMART for this rig, made once for all pairs.
+
+        The motion passes use default windows, so that other windows in `[correlation]` do not change the volumes. They
+        correlate the reconstructed voxels.
+        """
+        self.weights.volume = self.experiment.grid
+        smart, farthest = self.experiment.smart, self.experiment.correlation.max_displacement_voxel
+        if farthest is None and self.refinement > 1:
+            farthest = FIRST_SEARCH * DEFAULT_WINDOWS[0]
+        if farthest is not None:
+            farthest *= self.refinement
+        return PairSolver(
+            self.weights,
+            SmartSettings(**smart.of_one_frame(self.refinement)),
+            motion_passes=smart.motion_passes,
+            correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
+            mask=refined(with_guard(self.experiment, self.guard), self.refinement).solid,
+        )
+
+    @cached_property
+    def sequence(self) -> SequenceSolver:
+        """SMART along a series, made once."""
+        farthest = self.experiment.correlation.max_displacement_voxel
+        correlation = Correlation(max_displacement_voxel=farthest).model_dump()
+        return SequenceSolver(self.solver.smart, correlation, self.between)
+
+    def pair(
+        self, light: tuple[FrameLight, FrameLight], pair: int, progress: StepProgress
+    ) -> tuple[FrameVolume, FrameVolume]:
+        """Reconstruct both frames of an image pair together.
+
+        Raises
+        ------
+        InputError
+            If their images cannot be reconstructed.
+        """
+        start = time.perf_counter()
+        solver = self.solver
+        try:
+            result = solver.solve([frame.images for frame in light], [frame.noise for frame in light], progress)
+        except ValueError as error:
+            raise InputError(f"pair {pair}: {error}") from error
+        if solver.motion_passes:
+            log.info("pair %d: %s", pair, result.motion.value)
+        volumes = result.to_dataarrays()
+        seconds = (time.perf_counter() - start) / 2
+        first, second = (self._frame(volume, frame, seconds) for volume, frame in zip(volumes, light, strict=True))
+        return first, second
+
+    def instant(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one instant of a series from its images alone; raise as `pair`."""
+        number, start = light.frame.number, time.perf_counter()
+        try:
+            found = self.solver.smart.solve(light.images, floor=light.noise, progress=progress)
+        except ValueError as error:
+            raise InputError(f"instant {number}: {error}") from error
+        seconds = time.perf_counter() - start
+        log.info("instant %d: reconstructed in %.1f s", number, seconds)
+        return self._frame(found.to_dataarray(), light, seconds)
+
+    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
+        """Reconstruct one instant of a series from the one before; raise as `pair`.
+
+        Returns
+        -------
+        volume : FrameVolume
+            Its record has a warning more than `light` if the instant was not where it was predicted.
+        before : Before
+            What the next instant needs.
+        """
+        number, start = light.frame.number, time.perf_counter()
+        try:
+            solved = self.sequence.solve(light.images, before, floor=light.noise, progress=progress)
+        except ValueError as error:
+            raise InputError(f"instant {number}: {error}") from error
+        seconds = time.perf_counter() - start
+        log.info("instant %d: reconstructed in %.1f s; %s", number, seconds, solved.start.value)
+        found = self._frame(solved.found.to_dataarray(), light, seconds)
+        if solved.start is Start.MISSED:
+            found = restarted(found, solved.misfit_ratio, number)
+        return found, solved.before(found.volume, before)
+
+    def volumes(
+        self, images: Sequence[Mapping[str, np.ndarray]], noise: Sequence[Mapping[str, float]]
+    ) -> tuple[xr.DataArray, xr.DataArray]:
+        """Return the volumes of the images of two frames, reconstructed as those of the experiment.
+
+        Raises
+        ------
+        ValueError
+            If the images cannot be reconstructed.
+        """
+        if self.experiment.series is None:
+            first, second = self.solver.solve(images, noise).to_dataarrays()
+        else:
+            first, second = (
+                self.solver.smart.solve(frame, floor=floor).to_dataarray()
+                for frame, floor in zip(images, noise, strict=True)
+            )
+        return _as_written(first, self.experiment.grid), _as_written(second, self.experiment.grid)
+
+    def _frame(self, found: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
+        """Return a volume on the voxels of the experiment, with its record."""
+        volume = _as_written(found, self.experiment.grid)
+        record = FrameRecord(structure=light.structure, warnings=light.warnings, seconds=seconds + light.seconds)
+        return FrameVolume(volume=volume, record=record)
+
+
+def reconstruction_s(experiment: Experiment, pair: int, volumes: PairVolumes) -> float:
+    """Return the time that the volumes of a pair took [s].
+
+    In a series the second instant counts, and the first one only if it is the second of no other pair: the sum over
+    all pairs then counts each instant once.
+    """
+    first, second = (record.seconds for record in volumes.records)
+    series = experiment.series
+    return second if series is not None and pair - series.step in experiment.numbers else first + second
+
+
+def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
+    """Return a reconstructed volume on the voxels that are written, ``views`` only if some are seen by one camera."""
+    written = volume_on(volume, grid)
+    if VIEWS in written.coords and written.coords[VIEWS].values.min() >= 2:
+        written = written.drop_vars(VIEWS)
+    return written
