@@ -19,7 +19,7 @@ from lfpiv import records
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Frame
 from lfpiv.records import RecordError
-from lfpiv.results import netcdf, provenance
+from lfpiv.results import datasets, netcdf, provenance
 from lfpiv.results.folder import Folder, make_writable
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, VolumeFile
 from lfpiv.runs import background, guard, refinement, summary
@@ -313,7 +313,7 @@ def test_attributes_of_vectors_in_any_form(tmp_path, name, value):
     rewrite(path, set_attribute(name, value), sealed=True)
     marks = provenance.read_marks(path)
     assert marks is None or provenance.Stamp({"volume": 1}).changes(marks) is not None
-    for read in (netcdf.read_vectors, lambda path: lfpiv.open_results(tmp_path).u.load(), netcdf.read_attributes):
+    for read in (netcdf.read_vectors, lambda path: lfpiv.open_results(tmp_path).u.load(), datasets.read_attributes):
         try:
             assert read(path) is not None
         except InputError as error:

@@ -25,7 +25,7 @@ from lfpiv.files import replacing, writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.records import read_object
-from lfpiv.results import netcdf, particles, provenance, stores
+from lfpiv.results import datasets, netcdf, particles, provenance, stores
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.reader import open_results
 from lfpiv.results.stacked_files import INSTANT, PAIR, TIME_ATTRIBUTES, StackedFiles
@@ -337,7 +337,7 @@ def _write_particle_csv(tables: dict[int, Path], target: Path) -> list[Path]:
     written = []
     for path in tables.values():
         written.append(target / f"particles_{path.stem}.csv")
-        particles.write_csv(netcdf.read_particles(path), written[-1], CSV_DIGITS)
+        particles.write_csv(particles.read_particles(path), written[-1], CSV_DIGITS)
     return written
 
 
@@ -345,7 +345,7 @@ def _write_vtp(tables: dict[int, Path], target: Path, times: dict[int, float]) -
     files = {}
     for number, path in tables.items():
         written = target / f"particles_{path.stem}.vtp"
-        particles.write_vtp(netcdf.read_particles(path), written)
+        particles.write_vtp(particles.read_particles(path), written)
         files[written] = times.get(number, float(number))
     collection = target / "particles.pvd"
     _write_collection(files, collection)
@@ -359,7 +359,7 @@ def _write_pivpy(
     for number, depth in enumerate(depths):
         progress(number / len(depths))
         path = target / f"plane_z{depth:+.3f}mm.nc"
-        netcdf.write_dataset(_plane(results.sel(z=depth), interval_s), path)
+        datasets.write_dataset(_plane(results.sel(z=depth), interval_s), path)
         written.append(path)
     progress(1.0)
     return written

@@ -1,15 +1,7 @@
-"""NetCDF files of vectors and volumes: their writers, readers and validator.
-
-A file gets its name when it is complete. So an existing file is a finished result, which a rerun does not repeat.
-"""
+"""NetCDF files of vectors and volumes: their writers, readers and validator."""
 
 from __future__ import annotations
 
-import errno
-import io
-import json
-import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,18 +11,9 @@ import xarray as xr
 
 from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.files import plain, replacing, write_bytes
 from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.results import datasets
 from lfpiv.version import versions
-
-SCHEMA_VERSION = 4
-"""Version of the files. 2: the group has its own dimensions. 3: adds ``profile_z``. 4: sealed, and states its name."""
-
-SEALED_SINCE = 4
-"""First version whose files are sealed, see `lfpiv.hdf5`."""
-
-FILE = "file"
-"""Attribute with the name under which a file was written: a copy under another name is recognised by it."""
 
 VECTOR_UNITS = {
     "u": "m/s",
@@ -45,19 +28,6 @@ VECTOR_UNITS = {
 }
 """Variables of a vector dataset and their units."""
 
-PARTICLE = "particle"
-"""Dimension of a table of linked particles."""
-
-PARTICLE_UNITS = {
-    **dict.fromkeys("xyz", "mm"),
-    **dict.fromkeys("uvw", "m/s"),
-    **{f"{kind}_{axis}": "voxel" for kind in ("displacement", "uncertainty") for axis in "xyz"},
-    "intensity": "counts",
-    "residual": "1",
-    "valid": "1",
-}
-"""Variables of a table of linked particles and their units."""
-
 ROUNDING = 1e-5
 """Largest difference between a velocity and its displacement, relative or [voxel]: both have single precision."""
 
@@ -65,17 +35,6 @@ RECONSTRUCTION = "reconstruction"
 """NetCDF group in the file of a pair's vectors: projections, profiles and residuals of its two volumes."""
 
 _GROUP_AXES = {axis: f"voxel_{axis}" for axis in AXES}  # in the file z, y, x are the axes of the vectors
-_DESCRIPTIONS: dict[str, dict[str, Any]] = {
-    "z": {"axis": "Z"},
-    "y": {"axis": "Y"},
-    "x": {"axis": "X"},
-    "valid": {
-        "standard_name": "quality_flag",
-        "flag_values": np.array([0, 1], np.int8),
-        "flag_meanings": "replaced measured",
-    },
-    "masked": {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "fluid masked"},
-}  # attributes of the CF conventions, for plotting and geometry tools
 
 OF_IMAGES = ("structure", "camera_gain", "light_outside")
 """Figures of each camera's image: correlation of near pixels, brightness relative to the brightest camera, and the
@@ -250,10 +209,10 @@ def write_vectors(
     """
     check_vectors(vectors)
     path.parent.mkdir(parents=True, exist_ok=True)
-    groups = {"": _packed(vectors, {**attributes, "versions": versions(), FILE: path.name})}
+    groups = {"": datasets.packed(vectors, {**attributes, "versions": versions(), datasets.FILE: path.name})}
     if reconstruction is not None:
-        groups[RECONSTRUCTION] = _packed(reconstruction.rename(_GROUP_AXES), {})
-    _write(groups, path)
+        groups[RECONSTRUCTION] = datasets.packed(reconstruction.rename(_GROUP_AXES), {})
+    datasets.write_groups(groups, path)
 
 
 def read_vectors(path: Path, *, grid: Grid | None = None) -> xr.Dataset:
@@ -270,7 +229,7 @@ def read_vectors(path: Path, *, grid: Grid | None = None) -> xr.Dataset:
     InputError
         If the file is missing, of a newer schema, damaged, or no vector dataset.
     """
-    vectors = _read(path, None)
+    vectors = datasets.read_group(path)
     try:
         check_vectors(vectors)
         if grid is not None:
@@ -283,7 +242,7 @@ def read_vectors(path: Path, *, grid: Grid | None = None) -> xr.Dataset:
 def read_reconstruction(path: Path) -> xr.Dataset | None:
     """Read the condensed volumes in the file of a pair's vectors; None if the file has none."""
     try:
-        stored = _read(path, RECONSTRUCTION)
+        stored = datasets.read_group(path, RECONSTRUCTION)
     except InputError:
         return None
     return stored.rename({name: axis for axis, name in _GROUP_AXES.items() if name in stored.dims})
@@ -293,8 +252,8 @@ def write_volume(volume: xr.DataArray, path: Path, *, attributes: Mapping[str, A
     """Write one volume (z, y, x) [counts] as NetCDF4, atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     check_volume(volume)
-    own = {**attributes, "versions": versions(), FILE: path.name}
-    _write({"": _packed(volume.rename("intensity").to_dataset(), own)}, path)
+    own = {**attributes, "versions": versions(), datasets.FILE: path.name}
+    datasets.write_groups({"": datasets.packed(volume.rename("intensity").to_dataset(), own)}, path)
 
 
 def read_volume(path: Path, *, grid: Grid | None = None) -> xr.DataArray:
@@ -315,7 +274,7 @@ def read_volume(path: Path, *, grid: Grid | None = None) -> xr.DataArray:
         with hdf5.opened(path) as file:
             if (shape := file["intensity"].shape) != grid.shape:
                 raise DamagedFile(path, f"it has {shape} voxels, the volume {grid.shape}")
-    dataset = _read(path, None)
+    dataset = datasets.read_group(path)
     if "intensity" not in dataset or dataset["intensity"].dims != AXES:
         raise InputError(f"{path}: expected a volume 'intensity' over (z, y, x), found {list(dataset.data_vars)}.")
     try:
@@ -325,165 +284,3 @@ def read_volume(path: Path, *, grid: Grid | None = None) -> xr.DataArray:
     except ValueError as error:
         raise DamagedFile(path, str(error)) from None
     return dataset["intensity"]
-
-
-def check_particles(table: xr.Dataset) -> None:
-    """Check the form of a table of linked particles.
-
-    Raises
-    ------
-    ValueError
-        If a variable or a unit is missing or wrong, or a value is not finite.
-    """
-    for name, unit in PARTICLE_UNITS.items():
-        if name not in table or table[name].dims != (PARTICLE,):
-            raise ValueError(
-                f"particles: expected the variable {name!r} over {PARTICLE}, found {list(table.data_vars)}."
-            )
-        if (found := table[name].attrs.get("units")) != unit:
-            raise ValueError(f"particles: expected {name!r} in {unit}, found {found}.")
-        if not np.isfinite(table[name].values).all():
-            raise ValueError(f"particles: expected finite numbers in {name!r}, found others.")
-    if table["valid"].dtype != bool:
-        raise ValueError(f"particles: expected 'valid' to be boolean, found {table['valid'].dtype}.")
-
-
-def write_particles(table: xr.Dataset, path: Path, *, attributes: Mapping[str, Any]) -> None:
-    """Write the linked particles of one pair as NetCDF4, atomically.
-
-    Raises
-    ------
-    ValueError
-        If the table does not have the form that `check_particles` requires.
-    """
-    check_particles(table)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _write({"": _packed(table, {**attributes, "versions": versions(), FILE: path.name})}, path)
-
-
-def read_particles(path: Path) -> xr.Dataset:
-    """Read the linked particles of one pair into memory, verified.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, of a newer schema, damaged, or no table of particles.
-    """
-    table = _read(path, None)
-    try:
-        check_particles(table)
-    except ValueError as error:
-        raise DamagedFile(path, str(error)) from None
-    return table
-
-
-def read_attributes(path: Path) -> dict[str, Any]:
-    """Read the attributes of a finished NetCDF or HDF5 file.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    DamagedFile
-        If it is damaged.
-    """
-    with hdf5.opened(path, values=False) as file:
-        found = dict(file.attrs)
-    return {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in found.items()}
-
-
-def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, Any] | None = None) -> None:
-    """Write a dataset of any form as NetCDF4, atomically; attributes of other types become JSON.
-
-    Raises
-    ------
-    OSError
-        If the disk has less space than the dataset takes uncompressed: HDF5 does not survive a disk that fills up.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if dataset.nbytes > shutil.disk_usage(path.parent).free:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-    with replacing(path) as scratch:  # straight to disk: it may be larger than the memory
-        _packed(dataset, attributes or {}).to_netcdf(scratch, engine="h5netcdf")
-        hdf5.seal(scratch)
-
-
-def for_file(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """Return a dataset with the attributes and encodings of a file, for writers that write it in parts."""
-    return _packed(dataset, attributes)
-
-
-def _packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """Return a dataset with the attributes and the compression that it has in a file."""
-    dataset = dataset.copy()
-    own = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
-    dataset.attrs = {key: _attribute(value) for key, value in own.items()}
-    summed = {"fletcher32": True}
-    packed = {**summed, "zlib": True, "complevel": 1, "shuffle": True}
-    for name, item in dataset.variables.items():
-        described = {**item.attrs, **_DESCRIPTIONS.get(str(name), {})}
-        item.attrs = {key: _attribute(value) for key, value in described.items()}
-        numbers = item.ndim and item.size and item.dtype.kind in "fiub"
-        item.encoding = {} if not numbers else packed if item.ndim >= 2 else summed
-    return dataset
-
-
-def _write(groups: Mapping[str, xr.Dataset], path: Path) -> None:
-    """Write datasets as the groups of a NetCDF4 file; "" is its root. It is built in memory: see `write_bytes`."""
-    import h5netcdf
-    from xarray.backends import H5NetCDFStore
-
-    content = io.BytesIO()
-    with h5netcdf.File(content, "w") as file:
-        for group, dataset in groups.items():
-            dataset.dump_to_store(H5NetCDFStore(file.create_group(group) if group else file))
-    hdf5.seal(content)
-    write_bytes(content.getbuffer(), path)
-
-
-def _attribute(value: Any) -> Any:
-    """Return a value as a NetCDF attribute: numbers, lists of numbers and text as they are, all else as JSON."""
-    if isinstance(value, (str, int, float, np.number)) and not isinstance(value, bool):
-        return value
-    if isinstance(value, (list, tuple, np.ndarray)) and len(value) > 0:
-        numbers = value if isinstance(value, np.ndarray) else list(value)
-        if all(isinstance(item, (int, float, np.number)) and not isinstance(item, bool) for item in numbers):
-            return np.asarray(numbers)
-    return json.dumps(plain(value))
-
-
-def _read(path: Path, group: str | None) -> xr.Dataset:
-    import h5netcdf
-    from xarray.backends import H5NetCDFStore
-
-    try:
-        with hdf5.opened(path) as file:
-            require_schema(file.attrs.get("schema_version", 0), path)
-            _check_flags(file if group is None else file[group], path)
-            with h5netcdf.File(file, "r", decode_vlen_strings=True) as opened:  # the verified file, opened once
-                dataset = xr.load_dataset(H5NetCDFStore(opened if group is None else opened[group]))
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: expected a NetCDF file of a run, found no such file. Run the step that writes it."
-        ) from None
-    dataset.attrs.pop(hdf5.SEALED, None)
-    return dataset
-
-
-def _check_flags(group: Any, path: Path) -> None:
-    """Refuse flags other than 0 and 1, which reading as a dataset would hide."""
-    for name, item in group.items():
-        if item.attrs.get("dtype") == "bool" and not np.isin(item[()], (0, 1)).all():
-            raise DamagedFile(path, f"{name!r} holds values other than 0 and 1")
-
-
-def require_schema(version: Any, path: Path) -> None:
-    """Refuse a file of a newer schema, or of none, and one without the seal that its schema has."""
-    number = np.ravel(version)
-    whole = int(number[0]) if number.size == 1 and number.dtype.kind in "iu" else 0
-    if not 1 <= whole <= SCHEMA_VERSION:
-        raise InputError(
-            f"{path}: expected schema version 1 to {SCHEMA_VERSION}, found {str(version)[:40]}. Update lfpiv."
-        )
-    if whole >= SEALED_SINCE and not hdf5.is_sealed(path):
-        raise DamagedFile(path, "it has no seal: it is cut off, or another program changed it")

@@ -22,8 +22,9 @@ from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import NO_LAYERS, Grid, Layers
 from lfpiv.records import read_json, validate
-from lfpiv.results import finished, netcdf, provenance
+from lfpiv.results import datasets, finished, netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
+from lfpiv.results.particles import write_particles
 from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.warn import Warning
 
@@ -256,7 +257,8 @@ class PairFiles:
         """Write the linked particles, atomically."""
         assert self.particles is not None and self.particles_stamp is not None
         with writing(self.particles):
-            netcdf.write_particles(table, self.particles, attributes={**self.particles_stamp.attributes, **self.origin})
+            attributes = {**self.particles_stamp.attributes, **self.origin}
+            write_particles(table, self.particles, attributes=attributes)
             self.particles.with_suffix(RETIRED).unlink(missing_ok=True)
 
 
@@ -273,7 +275,7 @@ def _instant(experiment: Experiment, instant: int) -> dict[str, Any]:
 
 
 def _read_record(volume: xr.DataArray, path: Path) -> FrameRecord:
-    stored = netcdf.read_attributes(path)
+    stored = datasets.read_attributes(path)
     try:
         cameras = volume.attrs.get("cameras", [])
         names = read_json(cameras) if isinstance(cameras, str) else cameras

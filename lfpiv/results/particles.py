@@ -1,8 +1,8 @@
-"""`open_particles`: the linked particles of all pairs of a run as one table, and their files for other programs."""
+"""Tables of linked particles: their NetCDF files, those of a run as one table, and files for other programs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -12,11 +12,76 @@ import xarray as xr
 
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import plain, replacing
-from lfpiv.results import netcdf
+from lfpiv.results import datasets
 from lfpiv.results.stacked_files import NAME
+from lfpiv.version import versions
 
 FOLDER = "particles"
 """Folder of the tables inside the folder of a run."""
+
+PARTICLE = "particle"
+"""Dimension of a table of linked particles."""
+
+PARTICLE_UNITS = {
+    **dict.fromkeys("xyz", "mm"),
+    **dict.fromkeys("uvw", "m/s"),
+    **{f"{kind}_{axis}": "voxel" for kind in ("displacement", "uncertainty") for axis in "xyz"},
+    "intensity": "counts",
+    "residual": "1",
+    "valid": "1",
+}
+"""Variables of a table of linked particles and their units."""
+
+
+def check_particles(table: xr.Dataset) -> None:
+    """Check the form of a table of linked particles.
+
+    Raises
+    ------
+    ValueError
+        If a variable or a unit is missing or wrong, or a value is not finite.
+    """
+    for name, unit in PARTICLE_UNITS.items():
+        if name not in table or table[name].dims != (PARTICLE,):
+            raise ValueError(
+                f"particles: expected the variable {name!r} over {PARTICLE}, found {list(table.data_vars)}."
+            )
+        if (found := table[name].attrs.get("units")) != unit:
+            raise ValueError(f"particles: expected {name!r} in {unit}, found {found}.")
+        if not np.isfinite(table[name].values).all():
+            raise ValueError(f"particles: expected finite numbers in {name!r}, found others.")
+    if table["valid"].dtype != bool:
+        raise ValueError(f"particles: expected 'valid' to be boolean, found {table['valid'].dtype}.")
+
+
+def write_particles(table: xr.Dataset, path: Path, *, attributes: Mapping[str, Any]) -> None:
+    """Write the linked particles of one pair as NetCDF4, atomically.
+
+    Raises
+    ------
+    ValueError
+        If the table does not have the form that `check_particles` requires.
+    """
+    check_particles(table)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    own = {**attributes, "versions": versions(), datasets.FILE: path.name}
+    datasets.write_groups({"": datasets.packed(table, own)}, path)
+
+
+def read_particles(path: Path) -> xr.Dataset:
+    """Read the linked particles of one pair into memory, verified.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, of a newer schema, damaged, or no table of particles.
+    """
+    table = datasets.read_group(path)
+    try:
+        check_particles(table)
+    except ValueError as error:
+        raise DamagedFile(path, str(error)) from None
+    return table
 
 
 def open_particles(folder: str | Path, *, pairs: tuple[int, int | None] | None = None) -> xr.Dataset:
@@ -44,13 +109,13 @@ def open_particles(folder: str | Path, *, pairs: tuple[int, int | None] | None =
     files = particle_files(Path(folder), pairs)
     tables = []
     for number, path in files.items():
-        table = netcdf.read_particles(path).drop_vars(netcdf.PARTICLE, errors="ignore")
+        table = read_particles(path).drop_vars(PARTICLE, errors="ignore")
         kind = path.name.partition("_")[0]
         about = {"units": "1", "long_name": f"number of the {kind}"}
-        tables.append(table.assign({kind: (netcdf.PARTICLE, np.full(table.sizes[netcdf.PARTICLE], number), about)}))
+        tables.append(table.assign({kind: (PARTICLE, np.full(table.sizes[PARTICLE], number), about)}))
     shared = ("title", "dt_s", "voxel_mm", "step")
     first = tables[0].attrs
-    result = xr.concat(tables, netcdf.PARTICLE, combine_attrs="drop", join="override")
+    result = xr.concat(tables, PARTICLE, combine_attrs="drop", join="override")
     return result.assign_attrs({name: first[name] for name in shared if name in first})
 
 
@@ -79,7 +144,7 @@ def particle_files(folder: Path, pairs: tuple[int, int | None] | None = None) ->
 def figures(path: Path) -> dict[str, Any]:
     """Return the figures of a pair's linked particles as entry ``particles`` of the summary; none without a file."""
     try:
-        stored = netcdf.read_attributes(path)
+        stored = datasets.read_attributes(path)
     except (FileNotFoundError, DamagedFile):
         return {}
     kept = ("found", "linked", "valid_links", "per_microlens", "explained", "crowding", "sigma_voxel")
@@ -88,8 +153,8 @@ def figures(path: Path) -> dict[str, Any]:
 
 def write_csv(table: xr.Dataset, path: Path, digits: int) -> None:
     """Write a table of particles as text, a row per particle, units in the header."""
-    names = list(netcdf.PARTICLE_UNITS)
-    titles = [name if (unit := netcdf.PARTICLE_UNITS[name]) == "1" else f"{name} [{unit}]" for name in names]
+    names = list(PARTICLE_UNITS)
+    titles = [name if (unit := PARTICLE_UNITS[name]) == "1" else f"{name} [{unit}]" for name in names]
     frame = table.assign(valid=table["valid"].astype(np.uint8)).to_dataframe()
     with replacing(path) as scratch:
         frame.to_csv(scratch, columns=names, header=titles, index=False, float_format=f"%.{digits}g", encoding="utf-8")
@@ -97,7 +162,7 @@ def write_csv(table: xr.Dataset, path: Path, digits: int) -> None:
 
 def write_vtp(table: xr.Dataset, path: Path) -> None:
     """Write a table of particles as VTK poly data: a vertex per particle, for ParaView and pyvista."""
-    count = table.sizes[netcdf.PARTICLE]
+    count = table.sizes[PARTICLE]
     root = ElementTree.Element("VTKFile", type="PolyData", version="0.1", byte_order="LittleEndian")
     sizes = {
         "NumberOfPoints": count,

@@ -19,7 +19,7 @@ from lfpiv import hdf5
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import AXES
 from lfpiv.records import read_object
-from lfpiv.results import finished, netcdf, provenance, stored_damping
+from lfpiv.results import datasets, finished, netcdf, provenance, stored_damping
 from lfpiv.velocity.damping import ATTRIBUTE
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def _read_signature(path: Path) -> Signature:
 
 
 def _signature(file: h5py.File, path: Path) -> Signature:
-    netcdf.require_schema(file.attrs.get("schema_version", 0), path)
+    datasets.require_schema(file.attrs.get("schema_version", 0), path)
     provenance.require_name(path, file.attrs)
     attributes = {key: file.attrs[key] for key in COMMON if key in file.attrs}
     depends_on = read_object(file.attrs.get("depends_on", "{}"))

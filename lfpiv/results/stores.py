@@ -24,7 +24,7 @@ from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import replacing
 from lfpiv.progress import StepProgress
-from lfpiv.results import netcdf, store_seal
+from lfpiv.results import datasets, netcdf, store_seal
 from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
 
 log = logging.getLogger(__name__)
@@ -146,7 +146,7 @@ def write_netcdf(
             block = _with_times(files.block(first, after), interval_s)
             _require_space(block.nbytes, path)
             if first == 0:
-                packed = netcdf.for_file(block, {**attributes, FORM: LAYOUT})
+                packed = datasets.packed(block, {**attributes, FORM: LAYOUT})
                 for variable in packed.variables.values():
                     if variable.dims and variable.dims[0] == files.dimension:
                         chunks = (pairs, *tile) if variable.ndim > 1 else (CHUNK_NUMBERS,)
@@ -310,7 +310,7 @@ def _create(
     import zarr
     from numcodecs import Shuffle, Zstd  # type: ignore[import-untyped]
 
-    packed = netcdf.for_file(block.isel({dimension: slice(0, 0)}), attributes)
+    packed = datasets.packed(block.isel({dimension: slice(0, 0)}), attributes)
     packed.attrs = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in packed.attrs.items()}
     encoding: dict[str, dict[str, Any]] = {}
     plural = _is_plural(zarr)

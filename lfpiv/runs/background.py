@@ -26,7 +26,7 @@ from lfpiv.lightfield.background import Series
 from lfpiv.lightfield.standing_light import StandingLight, nothing
 from lfpiv.progress import StepProgress
 from lfpiv.records import RecordError, read_object, validate
-from lfpiv.results import netcdf, provenance
+from lfpiv.results import datasets, provenance
 from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.warn import Code, Warning, to_text, warn
 
@@ -354,7 +354,7 @@ def write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
     with h5py.File(content, "w") as file:
-        file.attrs.update({**attributes, netcdf.FILE: path.name})
+        file.attrs.update({**attributes, datasets.FILE: path.name})
         file.attrs["figures"] = json.dumps({"content": found.content, "cameras": found.figures})
         file.attrs["warnings"] = to_text(found.warnings)
         for name, light in found.cameras.items():

@@ -21,7 +21,7 @@ from lfpiv import files, hdf5
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import MIB, writing
 from lfpiv.records import RecordError, validate
-from lfpiv.results import netcdf, provenance
+from lfpiv.results import datasets, provenance
 from lfpiv.runs import background, guard, memory, moved_cameras, refinement
 from lfpiv.runs.frame_light import sampled_light
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
@@ -74,7 +74,7 @@ def load_calibration(run: Run) -> Calibrated:
     calibration = load_calibration(path)
     _require_cameras(calibration, run.experiment, path)
     try:
-        seconds = validate(float, netcdf.read_attributes(path).get("seconds"))
+        seconds = validate(float, datasets.read_attributes(path).get("seconds"))
     except RecordError as error:
         raise DamagedFile(path, f"seconds: {error}", "Calibrate again") from None
     log.info("calibration: finished before with the same settings, kept")
@@ -216,7 +216,7 @@ def _write(calibration: Calibration, path: Path, attributes: Mapping[str, Any]) 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
     calibration.save(content)
     with h5py.File(content, "a") as opened:
-        opened.attrs.update({**attributes, netcdf.FILE: path.name})
+        opened.attrs.update({**attributes, datasets.FILE: path.name})
     hdf5.seal(content)  # last: attributes are sealed too
     with writing(path):
         files.write_bytes(content.getbuffer(), path)

@@ -15,7 +15,7 @@ import lfpiv
 from lfpiv import derived
 from lfpiv.cli import commands
 from lfpiv.errors import StorageError
-from lfpiv.results import export, netcdf
+from lfpiv.results import datasets, export, netcdf
 
 NUMBERS = (0, 2, 3)
 SINGLE = 1e-6  # relative rounding of single precision, in which images are stored
@@ -203,7 +203,7 @@ def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(export.os, "replace", full)  # of this module and of `dataset`: the last step of every writer
+    monkeypatch.setattr(export.os, "replace", full)  # of `export` and of `files`: the last step of every writer
     for name in ("old", "new"):
         with pytest.raises(StorageError, match=r"(?i)cannot be written: no space left"):
             lfpiv.export_results(folder, to, out=tmp_path / name)
@@ -213,7 +213,7 @@ def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
 
 def test_a_full_disk_is_refused_before_the_netcdf_library_writes(run, tmp_path, monkeypatch):
     free = lfpiv.open_results(run[0]).nbytes // 2  # a plane takes less than that, all pairs take more
-    monkeypatch.setattr(netcdf.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
+    monkeypatch.setattr(datasets.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
     with pytest.raises(StorageError, match=r"(?i)no space left"):
         lfpiv.export_results(run[0], "netcdf", out=tmp_path)
     assert not any(tmp_path.iterdir())

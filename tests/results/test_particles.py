@@ -8,7 +8,7 @@ import pytest
 
 import lfpiv
 from lfpiv.errors import InputError
-from lfpiv.results import netcdf, particles
+from lfpiv.results import particles
 from lfpiv.tracking.found import FoundParticles
 
 
@@ -35,7 +35,7 @@ def table(shift, count=5):
 def folder(tmp_path):
     for pair in (0, 2):
         path = tmp_path / "particles" / f"pair_{pair:04d}.nc"
-        netcdf.write_particles(table(0.01 * pair), path, attributes={"pair": pair})
+        particles.write_particles(table(0.01 * pair), path, attributes={"pair": pair})
     return tmp_path
 
 
@@ -63,7 +63,7 @@ def test_damage_is_noticed(folder):
 def test_tables_of_another_form_are_refused(tmp_path):
     wrong = table(0.0).drop_vars("w")
     with pytest.raises(ValueError, match="'w'"):
-        netcdf.write_particles(wrong, tmp_path / "pair_0000.nc", attributes={})
+        particles.write_particles(wrong, tmp_path / "pair_0000.nc", attributes={})
 
 
 def test_figures_stand_in_the_summary(folder):

@@ -11,7 +11,7 @@ from support.stored import rewrite
 from support.vector_sets import random_vectors, write_run
 
 import lfpiv
-from lfpiv.results import netcdf
+from lfpiv.results import datasets, netcdf
 
 NUMBERS = (0, 1, 3, 7)  # pairs may be missing
 
@@ -171,7 +171,7 @@ def test_velocities_that_contradict_their_displacements_are_refused(tmp_path, sp
     spoil(vectors)
     with pytest.raises(ValueError, match=words):
         netcdf.write_vectors(vectors, tmp_path / "bad.nc", attributes={})
-    netcdf.write_dataset(vectors, tmp_path / "bad.nc")
+    datasets.write_dataset(vectors, tmp_path / "bad.nc")
     with pytest.raises(lfpiv.InputError, match=rf"bad\.nc.*{words}"):
         netcdf.read_vectors(tmp_path / "bad.nc")
 

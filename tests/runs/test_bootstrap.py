@@ -8,7 +8,7 @@ import pytest
 
 import lfpiv
 from lfpiv.experiment.settings import Bootstrap
-from lfpiv.results import netcdf, stored_damping
+from lfpiv.results import datasets, netcdf, stored_damping
 from lfpiv.results.folder import Folder
 from lfpiv.runs import pipeline
 from lfpiv.velocity.damping import AxisDamping, Damping
@@ -72,7 +72,7 @@ def test_it_is_measured_once_and_again_if_lost_or_damaged(simulated, caplog):
 def with_damping(small_run, folder, **parts):
     """Copy results and give them a damping whose stamp has the parts of their vectors, some of them changed."""
     out = small_run.results(folder)
-    depends_on = json.loads(netcdf.read_attributes(Folder(out).vectors(0))["depends_on"])
+    depends_on = json.loads(datasets.read_attributes(Folder(out).vectors(0))["depends_on"])
     found = stored_damping.StoredDamping(
         damping=Damping(axes=dict.fromkeys("xyz", AXIS), simulated=2), pairs=(0, 2), seconds=1.5
     )

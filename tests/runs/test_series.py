@@ -23,7 +23,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.reconstruction.solver import SmartSolver
-from lfpiv.results import netcdf, provenance
+from lfpiv.results import datasets, netcdf, provenance
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume
 from lfpiv.runs import background, dispatch, guard, pipeline, refinement
@@ -207,14 +207,14 @@ def test_an_instant_has_one_volume_which_both_its_pairs_use(made, reference, tmp
     names = [f"instant_{FIRST + number:06d}.nc" for number in range(INSTANTS)]
     assert sorted(path.name for path in (tmp_path / "volumes").iterdir()) == names
     stored = netcdf.read_volume(tmp_path / "volumes" / names[2])
-    about = netcdf.read_attributes(tmp_path / "volumes" / names[2])
+    about = datasets.read_attributes(tmp_path / "volumes" / names[2])
     assert about["instant"] == FIRST + 2 and about["time_s"] == pytest.approx(2e-3) and stored.dims == ("z", "y", "x")
     (tmp_path / "volumes" / names[5]).unlink()
     solved.clear()
     assert not any(outcome.reason for outcome in sequential(only, [FIRST + 4])) and solved["volumes"] == 1
     sequential(dataclasses.replace(work, weights=None))
     assert solved["volumes"] == 1 and same_vectors(reference, tmp_path) == INSTANTS - 1
-    found = netcdf.read_attributes(tmp_path / "vectors" / names[2])
+    found = datasets.read_attributes(tmp_path / "vectors" / names[2])
     assert (found["instant"], found["step"], found["time_s"]) == (FIRST + 2, 1, pytest.approx(2e-3))
     assert "pair" not in found
     (tmp_path / "volumes" / names[5]).unlink()
@@ -260,7 +260,7 @@ def test_what_two_instants_show_together_is_kept_with_their_vectors_only(small_r
     assert not any(outcome.reason for outcome in sequential(work))
     uneven = {}
     for pair in work.experiment.numbers:
-        found = from_text(netcdf.read_attributes(work.folder.vectors(pair))["warnings"])
+        found = from_text(datasets.read_attributes(work.folder.vectors(pair))["warnings"])
         uneven[pair] = [warning.subject for warning in found if warning.code is Code.UNEVEN]
     assert uneven == {FIRST: [], FIRST + 1: ["left"], FIRST + 2: ["left"], FIRST + 3: []}
     marks = provenance.read_marks(work.folder.volume(dark, 0))
