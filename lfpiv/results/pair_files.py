@@ -26,6 +26,7 @@ from lfpiv.results import datasets, finished, netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
 from lfpiv.results.particles import write_particles
 from lfpiv.results.provenance import Marks, Stamp
+from lfpiv.results.stamps import of_pair
 from lfpiv.warn import Warning
 
 
@@ -169,9 +170,7 @@ class PairFiles:
         has the guard layers of the volumes, `refinement` is the edge of their voxels over that of the reconstructed
         ones.
         """
-        stamps = provenance.of_pair(
-            experiment, calibration, pair, background=background, guard=guard, refinement=refinement
-        )
+        stamps = of_pair(experiment, calibration, pair, background=background, guard=guard, refinement=refinement)
         frames = experiment.pair_frames(pair)
         first, second = (
             VolumeFile(

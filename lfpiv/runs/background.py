@@ -26,7 +26,7 @@ from lfpiv.lightfield.background import Series
 from lfpiv.lightfield.standing_light import StandingLight, nothing
 from lfpiv.progress import StepProgress
 from lfpiv.records import RecordError, read_object, validate
-from lfpiv.results import datasets, provenance
+from lfpiv.results import datasets, provenance, stamps
 from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.warn import Code, Warning, to_text, warn
 
@@ -74,7 +74,7 @@ def prepare(run: Run, calibration: Calibration) -> Background:
     """Estimate the standing light of all cameras and store it, unless the folder holds one that fits."""
     experiment, path = run.experiment, run.folder.background
     pairs = series(experiment)
-    stamp = provenance.of_background(experiment, run.calibration_stamp.hash, pairs)
+    stamp = stamps.of_background(experiment, run.calibration_stamp.hash, pairs)
     marks, found = provenance.read_marks(path), None
     if marks is not None and marks.figures is not None and (stamp.fits(marks) or _images_lost(stamp, marks)):
         try:
@@ -116,7 +116,7 @@ def estimate(
     for number, (name, camera) in enumerate(cameras.items()):
         dark = experiment.dark(name)
         if experiment.camera(name).background is not None:
-            images = [experiment.background_image(name, frame) for frame in provenance.lit_frames(experiment)]
+            images = [experiment.background_image(name, frame) for frame in stamps.lit_frames(experiment)]
             found[name] = background.recorded_light(
                 [_without_dark(image, dark, camera) for image in images if image is not None], camera.decoder
             )
@@ -229,7 +229,7 @@ def _read_series(
     series = Series(camera.decoder, 0), Series(camera.decoder, 1)
     kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for pair in pairs:
-        frames = provenance.background_frames(experiment, pair)
+        frames = stamps.background_frames(experiment, pair)
         try:
             images = [experiment.particle_image(camera.name, *frame) for frame in frames]
         except InputError as error:  # the pair fails when it is reconstructed

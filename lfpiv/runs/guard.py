@@ -20,7 +20,7 @@ from lfpiv.files import writing
 from lfpiv.geometry.grid import AXES, NO_LAYERS, Layers
 from lfpiv.reconstruction.beyond import FaceLight, light_beyond
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
-from lfpiv.results import provenance
+from lfpiv.results import provenance, stamps
 from lfpiv.results.provenance import Marks
 from lfpiv.runs import memory
 from lfpiv.warn import Code, Warning
@@ -133,7 +133,7 @@ def decide(
     """
     if (found := read(folder)) is not None:
         known, marks = found
-        if provenance.of_guard(experiment, stamp_hash, known.pairs, background).fits(marks):
+        if stamps.of_guard(experiment, stamp_hash, known.pairs, background).fits(marks):
             log.info("light beyond the volume: measured before, kept")
             return known
     start = time.perf_counter()
@@ -143,7 +143,7 @@ def decide(
     allowed = _fitting(experiment, demanded)
     guard = Guard(pairs=tuple(instants), faces=faces, layers=allowed, short=allowed != demanded)
     log.info("light beyond the volume: measured in %.1f s", time.perf_counter() - start)
-    stamp = provenance.of_guard(experiment, stamp_hash, guard.pairs, background)
+    stamp = stamps.of_guard(experiment, stamp_hash, guard.pairs, background)
     with writing(folder.guard):
         content = {**stamp.attributes, "guard": guard.to_json()}
         files.write_json({**content, "digest": digest(content)}, folder.guard)

@@ -20,7 +20,7 @@ from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.reconstruction.refinement import LARGEST, STEP, measure_size, needed_refinement
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
-from lfpiv.results import provenance
+from lfpiv.results import provenance, stamps
 from lfpiv.results.provenance import Marks
 from lfpiv.runs import memory
 from lfpiv.runs.guard import SampledLight, with_guard
@@ -132,7 +132,7 @@ def decide(
         return None
     if (known := read(folder)) is not None:
         found, marks = known
-        if provenance.of_guard(experiment, stamp_hash, found.pairs, background).fits(marks):
+        if stamps.of_guard(experiment, stamp_hash, found.pairs, background).fits(marks):
             log.info("size of the particles: measured before, kept")
             return found
     start = time.perf_counter()
@@ -147,7 +147,7 @@ def decide(
         demanded=demanded,
     )
     _log(experiment, found, time.perf_counter() - start)
-    stamp = provenance.of_guard(experiment, stamp_hash, found.pairs, background)
+    stamp = stamps.of_guard(experiment, stamp_hash, found.pairs, background)
     with writing(folder.refinement):
         content = {**stamp.attributes, "refinement": found.to_json()}
         files.write_json({**content, "digest": digest(content)}, folder.refinement)

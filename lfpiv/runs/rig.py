@@ -21,7 +21,7 @@ from lfpiv import files, hdf5
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import MIB, writing
 from lfpiv.records import RecordError, validate
-from lfpiv.results import datasets, provenance
+from lfpiv.results import datasets, provenance, stamps
 from lfpiv.runs import background, guard, memory, moved_cameras, refinement
 from lfpiv.runs.frame_light import sampled_light
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
@@ -119,7 +119,7 @@ def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, Sel
     """Correct the calibration by particle images. Return it unchanged, and no figures, without self-calibration."""
     from lfpiv.calibration.camera import load_calibration
 
-    stamp = provenance.of_self_calibration(run.experiment, run.calibration_stamp.hash, run.background)
+    stamp = stamps.of_self_calibration(run.experiment, run.calibration_stamp.hash, run.background)
     if stamp is None:
         return calibration, None
     path = run.folder.self_calibration

@@ -23,7 +23,7 @@ from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import finished, provenance
+from lfpiv.results import finished, provenance, stamps
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
@@ -84,7 +84,7 @@ def open_run(
                 device=running,
                 warnings=warnings,
                 start_s=start_s,
-                calibration_stamp=provenance.of_calibration(experiment),
+                calibration_stamp=stamps.of_calibration(experiment),
                 earlier=summary.read(folder.summary),
                 finished=FinishedPairs(experiment.numbers, folder.path),
                 background=provenance.background_content(folder.background),
@@ -175,7 +175,7 @@ class Run:
     def damping_stamp(self, pairs: Sequence[int]) -> Stamp:
         """Return the stamp of the damping by ghosts that was measured with some pairs."""
         first = next(iter(pairs), self.numbers[0])
-        return provenance.of_bootstrap(self.experiment, self.files(first).stamp, pairs)
+        return stamps.of_bootstrap(self.experiment, self.files(first).stamp, pairs)
 
     def pairs_with_vectors(self) -> list[int]:
         """Return the selected pairs whose vectors are finished and fit."""

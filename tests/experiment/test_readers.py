@@ -19,7 +19,7 @@ from lfpiv import InputError
 from lfpiv.experiment import images
 from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.experiment.settings import RawImages
-from lfpiv.results import provenance
+from lfpiv.results import stamps
 
 COUNT, ROWS, COLUMNS = 5, 12, 20
 LABEL = "particles.images, camera 'left'"
@@ -413,10 +413,10 @@ def test_an_experiment_of_recordings_opens(tiny_experiment):
     np.testing.assert_array_equal(experiment.dark("right"), dark[1])
     np.testing.assert_array_equal(experiment.board_image("right", 1), boards["right"][1])
     np.testing.assert_array_equal(experiment.particle_image("left", 1, "b"), particles["left"][3])
-    before = provenance.of_calibration(experiment)
+    before = stamps.of_calibration(experiment)
     boards["right"][2] += 1
     write_stack(folder / "board_right.tif", boards["right"])
-    after = provenance.of_calibration(experiment)
+    after = stamps.of_calibration(experiment)
     assert before.hash != after.hash  # the white image is a page of this file
 
 
@@ -425,12 +425,12 @@ def test_parts_of_files_have_their_own_identity(tmp_path, frames):
     path = tmp_path / "board.tif"
     write_stack(path, frames)
     parts = [split(path.with_name(f"board.tif#{number}")) for number in range(COUNT)]
-    before = [provenance.content_hash([part]) for part in parts]
+    before = [stamps.content_hash([part]) for part in parts]
     assert len(set(before)) == COUNT
     changed = frames.copy()
     changed[1] += 1
     write_stack(path, changed)
-    after = [provenance.content_hash([part]) for part in parts]
+    after = [stamps.content_hash([part]) for part in parts]
     assert [old != new for old, new in zip(before, after, strict=True)] == [False, True, False, False, False]
 
 

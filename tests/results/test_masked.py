@@ -10,7 +10,7 @@ from support.vector_sets import random_vectors
 import lfpiv
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.report import vectors as report
-from lfpiv.results import netcdf, provenance
+from lfpiv.results import netcdf, provenance, stamps
 from lfpiv.runs import pair_figures
 
 DIMS = ("z", "y", "x")
@@ -94,9 +94,9 @@ def test_another_mask_makes_another_volume(tiny_experiment):
     plain = open_experiment(tiny_experiment)
     box = '[[volume.solid]]\nkind = "box"\ncentre_mm = [0.4, 0.3, {z}]\nsize_mm = [0.2, 0.2, 0.2]\n'
     text = tiny_experiment.read_text()
-    stamps = [provenance.of_pair(plain, "", 0)]
+    found = [stamps.of_pair(plain, "", 0)]
     for z in (0.3, 0.25):
         tiny_experiment.write_text(text.replace("[particles]", box.format(z=z) + "\n[particles]"))
-        stamps.append(provenance.of_pair(open_experiment(tiny_experiment), "", 0))
-    assert len({stamp.volumes[0].hash for stamp in stamps}) == 3
-    assert "mask" in stamps[1].volumes[0].changes(provenance.Marks(**stamps[2].volumes[0].attributes))
+        found.append(stamps.of_pair(open_experiment(tiny_experiment), "", 0))
+    assert len({stamp.volumes[0].hash for stamp in found}) == 3
+    assert "mask" in found[1].volumes[0].changes(provenance.Marks(**found[2].volumes[0].attributes))

@@ -8,7 +8,7 @@ import pytest
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import NO_LAYERS
 from lfpiv.reconstruction.beyond import FaceLight
-from lfpiv.results import netcdf, provenance
+from lfpiv.results import netcdf, provenance, stamps
 from lfpiv.results.folder import Folder
 from lfpiv.runs import guard, memory, pipeline
 from lfpiv.runs.guard import Guard
@@ -23,13 +23,13 @@ def experiment(small_run):
 
 
 def test_the_outcome_is_stored_and_fits_until_the_volume_changes(small_run, experiment, tmp_path):
-    stamp = provenance.of_calibration(experiment).hash
+    stamp = stamps.of_calibration(experiment).hash
     found, marks = guard.read(Folder(small_run.out))
     assert found.pairs and Guard.from_json(json.loads(json.dumps(found.to_json()))) == found
     moved = dataclasses.replace(experiment.grid, first_centre_mm=(0.0, 0.0, 0.0))
 
     def fits(experiment, stamp, background=None):
-        return provenance.of_guard(experiment, stamp, found.pairs, background).fits(marks)
+        return stamps.of_guard(experiment, stamp, found.pairs, background).fits(marks)
 
     assert fits(experiment, stamp) and not fits(experiment, "another calibration")
     assert not fits(experiment, stamp, "other light") and not fits(dataclasses.replace(experiment, grid=moved), stamp)
@@ -37,9 +37,7 @@ def test_the_outcome_is_stored_and_fits_until_the_volume_changes(small_run, expe
 
 
 def test_results_with_guard_layers_are_others(experiment):
-    plain, guarded = (
-        provenance.of_pair(experiment, "c", 0, guard=one) for one in (NO_LAYERS, ((1, 2), (0, 0), (0, 0)))
-    )
+    plain, guarded = (stamps.of_pair(experiment, "c", 0, guard=one) for one in (NO_LAYERS, ((1, 2), (0, 0), (0, 0))))
     marks = provenance.Marks(**plain.volumes[0].attributes)
     assert guarded.volumes[0].changes(marks) == ["guard"] and plain.volumes[0].fits(marks)
 

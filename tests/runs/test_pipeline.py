@@ -14,7 +14,7 @@ from support.small_run import DISPLACEMENT_VOXEL, PAIRS
 import lfpiv
 from lfpiv import files
 from lfpiv.experiment.opening import read_experiment
-from lfpiv.results import netcdf, provenance
+from lfpiv.results import netcdf, provenance, stamps
 from lfpiv.results.folder import Folder
 from lfpiv.results.provenance import Marks
 from lfpiv.runs import guard, pair_figures, pipeline, refinement, rig
@@ -161,10 +161,10 @@ EDITS = {
 def test_each_setting_concerns_what_depends_on_it(small_run, tmp_path, case):
     old, new, concerned = EDITS[case]
     experiment = read_experiment(changed(small_run.experiment, tmp_path, old, new))
-    wanted = provenance.of_calibration(experiment)
+    wanted = stamps.of_calibration(experiment)
     folder = Folder(small_run.out)
     (measured, _), (sized, _) = guard.read(folder), refinement.read(folder)
-    of_pair = provenance.of_pair(
+    of_pair = stamps.of_pair(
         experiment,
         wanted.hash,
         1,
@@ -209,7 +209,7 @@ def test_images_are_told_apart_by_their_whole_path(small_run, tmp_path):
     experiment = read_experiment(file)
 
     def stamp(experiment):
-        return provenance.of_pair(experiment, "calibration", 0).vectors
+        return stamps.of_pair(experiment, "calibration", 0).vectors
 
     made = Marks(**stamp(experiment).attributes)
     exchanged = dataclasses.replace(experiment, frames=("b", "a"))

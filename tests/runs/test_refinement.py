@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lfpiv.experiment.opening import read_experiment
-from lfpiv.results import netcdf, provenance
+from lfpiv.results import netcdf, provenance, stamps
 from lfpiv.results.folder import Folder
 from lfpiv.runs import guard, memory, pipeline, refinement
 from lfpiv.runs.refinement import Refinement
@@ -24,19 +24,19 @@ def stated(experiment, value):
 
 
 def test_the_outcome_is_stored_and_fits_until_the_volume_changes(small_run, experiment):
-    stamp = provenance.of_calibration(experiment).hash
+    stamp = stamps.of_calibration(experiment).hash
     found, marks = refinement.read(Folder(small_run.out))
     assert found.pairs and Refinement.from_json(json.loads(json.dumps(found.to_json()))) == found
     moved = dataclasses.replace(experiment.grid, first_centre_mm=(0.0, 0.0, 0.0))
-    assert provenance.of_guard(experiment, stamp, found.pairs).fits(marks)
-    assert not provenance.of_guard(dataclasses.replace(experiment, grid=moved), stamp, found.pairs).fits(marks)
+    assert stamps.of_guard(experiment, stamp, found.pairs).fits(marks)
+    assert not stamps.of_guard(dataclasses.replace(experiment, grid=moved), stamp, found.pairs).fits(marks)
     told = small_run.summary["refinement"]
     assert told["factor"] == found.factor > 1 and told["particle_size_voxel"] == found.size_voxel
     assert told["voxel_mm"] == pytest.approx(experiment.grid.voxel_mm / found.factor)
 
 
 def test_results_of_other_voxels_are_others(experiment):
-    plain, finer = (provenance.of_pair(experiment, "c", 0, refinement=one) for one in (1.0, 1.25))
+    plain, finer = (stamps.of_pair(experiment, "c", 0, refinement=one) for one in (1.0, 1.25))
     marks = provenance.Marks(**plain.volumes[0].attributes)
     assert finer.volumes[0].changes(marks) == ["refinement"] and plain.volumes[0].fits(marks)
 

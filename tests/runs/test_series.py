@@ -23,7 +23,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.reconstruction.solver import SmartSolver
-from lfpiv.results import datasets, netcdf, provenance
+from lfpiv.results import datasets, netcdf, provenance, stamps
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume
 from lfpiv.runs import background, dispatch, guard, pipeline, refinement
@@ -235,12 +235,12 @@ def test_a_new_image_concerns_its_volume_and_two_pairs(made, small_run, tmp_path
     (tmp_path / "copy").rename(path)
     after = {pair: work.files(pair) for pair in numbers}
     assert [pair for pair in numbers if before[pair].stamp.hash != after[pair].stamp.hash] == [FIRST + 2, FIRST + 3]
-    stamps = {
+    hashes = {
         file.frame: (file.stamp.hash, again.stamp.hash)
         for pair in numbers
         for file, again in zip(before[pair].frames, after[pair].frames, strict=True)
     }
-    assert [frame for frame, (one, other) in stamps.items() if one != other] == [Frame(FIRST + 3, "a")]
+    assert [frame for frame, (one, other) in hashes.items() if one != other] == [Frame(FIRST + 3, "a")]
     step = changed(work, tmp_path / "out", step=2).files(FIRST)
     assert step.frames[0].stamp.hash == after[FIRST].frames[0].stamp.hash, "the step does not change a volume"
     assert step.stamp.hash != after[FIRST].stamp.hash
@@ -283,7 +283,7 @@ def test_standing_light_comes_from_images_of_one_laser(made):
     file, work = made
     experiment = read_experiment(file)
     pairs = background.series(experiment)
-    images = [frame for pair in pairs for frame in provenance.background_frames(experiment, pair)]
+    images = [frame for pair in pairs for frame in stamps.background_frames(experiment, pair)]
     assert len(set(images)) == len(images) == len(pairs) == PAIRS, "an image is used twice, or a neighbour of it"
     median = dataclasses.replace(experiment, background="median")
     light = background.estimate(median, work.cameras, pairs, lambda fraction: None).cameras["left"].light

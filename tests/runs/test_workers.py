@@ -22,7 +22,7 @@ from lfpiv.cli import commands
 from lfpiv.errors import ClusterError, InputError, StorageError
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import Grid
-from lfpiv.results import datasets, netcdf, provenance
+from lfpiv.results import datasets, netcdf, provenance, stamps
 from lfpiv.runs import cluster_workers, dispatch, local_workers, memory, pipeline, worker_plan
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.stretches import cut
@@ -287,12 +287,12 @@ def test_finishing_thousands_of_pairs_opens_each_file_at_most_twice(small_run, t
     file.write_text(file.read_text().replace(f"pairs = {PAIRS}", f"pairs = {pairs}"))
     out, experiment = small_run.calibrated(tmp_path / "out"), read_experiment(file)
     (out / "vectors").mkdir()
-    calibration = provenance.of_calibration(experiment).hash
+    calibration = stamps.of_calibration(experiment).hash
     content = (small_run.out / "vectors" / "pair_0000.nc").read_bytes()
     for pair in range(pairs):
         path = out / "vectors" / f"pair_{pair:04d}.nc"
         path.write_bytes(content)
-        stamp = provenance.of_pair(experiment, calibration, pair).vectors.attributes | {datasets.FILE: path.name}
+        stamp = stamps.of_pair(experiment, calibration, pair).vectors.attributes | {datasets.FILE: path.name}
         rewrite(path, lambda file, stamp=stamp: file.attrs.update(stamp), sealed=True)
     opened, read_marks = [], provenance.read_marks
     monkeypatch.setattr(provenance, "read_marks", lambda path: opened.append(path) or read_marks(path))

@@ -1,0 +1,275 @@
+"""Stamps of an experiment: what the calibration, the other steps of a run and each pair depend on.
+
+A step of a run depends on the hash of the steps before it. A pair depends on all of them and on its own images.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv import files
+from lfpiv.experiment import images
+from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
+from lfpiv.experiment.readers.source import ImagePath, split
+from lfpiv.experiment.segments import followed
+from lfpiv.geometry.grid import NO_LAYERS, Layers
+from lfpiv.results.provenance import IMAGES_BEFORE, OF_PAIR, Stamp
+from lfpiv.version import __version__
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairStamps:
+    """Stamps of the results of one pair."""
+
+    volumes: tuple[Stamp, Stamp]
+    """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
+    vectors: Stamp
+    particles: Stamp | None = None
+    """Of the linked particles; None without tracking."""
+
+
+def _orientation(camera: CameraSetup) -> float | list[float] | None:
+    """Return the nominal angle about y [degree], yaw, pitch and roll if there is more to state, None if nothing is."""
+    stated = camera.orientation
+    if stated is None or not (stated.pitch_deg or stated.roll_deg):
+        return None if stated is None else stated.yaw_deg
+    return [stated.yaw_deg, stated.pitch_deg, stated.roll_deg]
+
+
+def of_calibration(experiment: Experiment) -> Stamp:
+    """Return the stamp of the calibration."""
+    cameras = {
+        camera.name: [dataclasses.asdict(camera.optics), _orientation(camera), camera.image_flip]
+        + ([camera.raw.model_dump()] if camera.raw else [])
+        for camera in experiment.cameras
+    }
+    return Stamp(
+        {
+            "version": __version__,
+            "camera": cameras,
+            "board": experiment.board.model_dump(exclude=None if experiment.board.mark else {"mark"}),
+            "network": experiment.network.model_dump(),
+            "images": content_hash(experiment.calibration_images()),
+        }
+    )
+
+
+def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]) -> Stamp:
+    """Return the stamp of the standing light.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    calibration : str
+        Hash of the calibration's stamp.
+    pairs : sequence of int
+        Pairs from which the light is estimated.
+    """
+    recorded = {camera.name: camera.background for camera in experiment.cameras}
+    paths = [
+        path
+        for pair in pairs
+        for frame in background_frames(experiment, pair)
+        for path in experiment.frame_paths(frame)
+    ]
+    images = [
+        path
+        for name in recorded
+        for frame in lit_frames(experiment)
+        if (path := experiment.background_path(name, frame)) is not None
+    ]
+    return Stamp(
+        {
+            "calibration": calibration,
+            "background": experiment.background,
+            "background_image": recorded if images else None,
+            "recorded": _identity(images, experiment.path.parent),
+            "images": _identity(_existing(paths), experiment.path.parent) if None in recorded.values() else None,
+        }
+    )
+
+
+def lit_frames(experiment: Experiment) -> tuple[str, ...]:
+    """Return the names of the frames that each have a laser. One laser lights all instants of a series."""
+    return experiment.frames if experiment.series is None else experiment.frames[:1]
+
+
+def background_frames(experiment: Experiment, pair: int) -> tuple[Frame, ...]:
+    """Return the frames of a pair from which standing light is estimated: both, or the first instant of a series."""
+    return experiment.pair_frames(pair)[: len(lit_frames(experiment))]
+
+
+def _existing(paths: Iterable[Path]) -> list[Path]:
+    return [path for path in paths if split(path).file.is_file()]
+
+
+def of_self_calibration(experiment: Experiment, calibration: str, background: str | None = None) -> Stamp | None:
+    """Return the stamp of the self-calibration; None if the experiment has none.
+
+    `calibration` is a stamp's hash, `background` that of the subtracted light.
+    """
+    if not experiment.self_calibration.pairs:
+        return None
+    volume = dataclasses.asdict(experiment.grid)
+    parts = {"calibration": calibration, "volume": volume, "self_calibration": _self_calibration(experiment)}
+    return Stamp(parts | {"background": background})
+
+
+def of_guard(experiment: Experiment, calibration: str, pairs: Sequence[int], background: str | None = None) -> Stamp:
+    """Return the stamp of what is measured in some pairs before volumes are reconstructed: guard layers, refinement.
+
+    `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light.
+    """
+    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    return Stamp(
+        {
+            "calibration": calibration,
+            "self_calibration": _self_calibration(experiment),
+            "volume": dataclasses.asdict(experiment.grid),
+            "background": background,
+            "images": _identity(paths, experiment.path.parent),
+        }
+    )
+
+
+def of_pair(
+    experiment: Experiment,
+    calibration: str,
+    pair: int,
+    *,
+    background: str | None = None,
+    guard: Layers = NO_LAYERS,
+    refinement: float = 1.0,
+) -> PairStamps:
+    """Return the stamps of the volumes and of the vectors of a pair.
+
+    `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
+    the guard layers of the volumes, `refinement` the edge of their voxels over that of the reconstructed ones.
+    """
+    light, start = _of_light(experiment, calibration, background), experiment.path.parent
+    parts = light | {
+        "guard": guard if guard != NO_LAYERS else None,
+        "refinement": refinement if refinement != 1 else None,
+    }
+    of_pair = parts | {"images": _identity(experiment.pair_paths(pair), start)}
+    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    if experiment.series is None:
+        volumes = Stamp(of_pair)
+        return PairStamps(
+            volumes=(volumes, volumes),
+            vectors=Stamp(of_pair | of_vectors),
+            particles=_of_particles(experiment, of_pair | of_vectors),
+        )
+    first, second = (
+        Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
+        for instant in experiment.pair_frames(pair)
+    )
+    of_vectors["step"] = experiment.series.step
+    if experiment.in_sequence:
+        before = [_images_before(experiment, instant.number) for instant in experiment.pair_frames(pair)]
+        first, second = (
+            Stamp({**stamp.parts, IMAGES_BEFORE: hashed}) for stamp, hashed in zip((first, second), before, strict=True)
+        )
+        of_vectors[IMAGES_BEFORE] = None if None in before else before
+    return PairStamps(
+        volumes=(first, second),
+        vectors=Stamp(of_pair | of_vectors),
+        particles=_of_particles(experiment, of_pair | of_vectors),
+    )
+
+
+def of_bootstrap(experiment: Experiment, vectors: Stamp, pairs: Sequence[int]) -> Stamp:
+    """Return the stamp of the damping that was measured with the flow of some pairs.
+
+    It has the parts of `vectors`, the stamp of a pair's vectors, so that readers can compare the two; but the images
+    are those of the pairs.
+    """
+    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    parts = {name: part for name, part in vectors.parts.items() if name not in OF_PAIR}
+    images = _identity(paths, experiment.path.parent)
+    return Stamp(parts | {"images": images, "bootstrap": experiment.simulated_pairs})
+
+
+def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp | None:
+    """Return the stamp of the linked particles, for which the vectors are the predictor."""
+    tracking = experiment.tracking
+    return None if tracking is None else Stamp(of_vectors | {"tracking": tracking.model_dump()})
+
+
+def _images_before(experiment: Experiment, instant: int) -> str | None:
+    """Hash the identity of the images from which an instant of a sequence follows; None if one is missing."""
+    assert experiment.series is not None
+    name = experiment.frames[0]
+    frames = (Frame(number, name) for number in followed(experiment.series, instant)[:-1])
+    found = _identity([path for frame in frames for path in experiment.frame_paths(frame)], experiment.path.parent)
+    return None if found is None else files.settings_hash(images=found)
+
+
+def _of_light(experiment: Experiment, calibration: str, background: str | None) -> dict[str, Any]:
+    """Return the parts of the stamp of volumes; the identity of the images is None and to be filled in."""
+    compute = experiment.compute
+    reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
+    particles: dict[str, Any] = {"images": experiment.particle_images}
+    if experiment.series is None:
+        particles["frames"] = list(experiment.frames)
+    return {
+        "calibration": calibration,
+        "self_calibration": _self_calibration(experiment),
+        "volume": dataclasses.asdict(experiment.grid),
+        "mask": _mask_hash(experiment.solid),
+        "smart": experiment.smart.model_dump(),
+        "motion": reach if experiment.smart.motion_passes or experiment.in_sequence else None,
+        "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
+        "particles": particles,
+        "images": None,
+        "background": background,
+    }
+
+
+def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
+    """Return settings and images of the self-calibration; None if the experiment has none."""
+    if not experiment.self_calibration.pairs:
+        return None
+    images = [
+        experiment.particle_path(camera.name, pair, experiment.frames[0])
+        for pair in experiment.self_calibration_pairs
+        for camera in experiment.cameras
+    ]
+    return {**experiment.self_calibration.model_dump(), "images": _identity(images, experiment.path.parent)}
+
+
+def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
+    """Return path from `start`, size and time of the last change of images; None if one is missing."""
+    try:
+        found = [(path, split(path).file.stat()) for path in paths]
+    except OSError:
+        return None
+    return [[os.path.relpath(path, start), status.st_size, status.st_mtime_ns] for path, status in found]
+
+
+def content_hash(sources: Iterable[ImagePath]) -> str:
+    """Hash several images, in order: the bytes of whole files, the grey values of parts of files."""
+    digest = hashlib.blake2b(digest_size=16)
+    for source in sources:
+        if source.part:
+            grey = images.read_image(source.path, "part of a file", raw=source.raw)
+            digest.update(repr(grey.shape).encode() + grey.tobytes())
+        else:
+            with source.file.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+        digest.update(b"end of file" + source.part.encode())
+    return digest.hexdigest()
+
+
+def _mask_hash(solid: np.ndarray | None) -> str | None:
+    """Hash the flags of the voxels without fluid; None without a mask."""
+    return None if solid is None else hashlib.blake2b(np.packbits(solid).tobytes(), digest_size=16).hexdigest()
