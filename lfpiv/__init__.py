@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.geometry.resampling import volume_on as volume_on
     from lfpiv.lightfield.lens_array import LensArray as LensArray
     from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
+    from lfpiv.reconstruction.bootstrap import measure_damping as measure_damping
     from lfpiv.reconstruction.motion import reconstruct_pair as reconstruct_pair
     from lfpiv.reconstruction.volume import reconstruct as reconstruct
     from lfpiv.report import write_report as write_report
@@ -57,6 +58,7 @@ _MODULES = {
     "find_particles": "lfpiv.tracking.finding",
     "link_particles": "lfpiv.tracking.linking",
     "load_calibration": "lfpiv.calibration.camera",
+    "measure_damping": "lfpiv.reconstruction.bootstrap",
     "open_experiment": "lfpiv.experiment.opening",
     "open_results": "lfpiv.results.reader",
     "open_particles": "lfpiv.results.particles",

@@ -214,3 +214,33 @@ def smart(matrix, image, volume, *, iterations, relaxation=1.0, floor=0.0, paper
         scale = matrix.max() * pixels if paper else column_sum
         volume = volume * np.exp(relaxation * exponent / scale)
     return volume
+
+
+def ordered_subsets(matrices, images, volume, *, column_sum, epochs, floor, shortening, momentum, leap):
+    """Return SMART's volume after epochs over subsets with momentum, each subset a dense matrix (pixel, voxel).
+
+    Parameters
+    ----------
+    matrices, images : list of ndarray
+        Rows of the weights, shape (pixel, voxel), and their counts, shape (pixel,), of each subset.
+    volume : ndarray, shape (voxel,)
+        First guess, above zero.
+    column_sum : ndarray, shape (voxel,)
+        Sum of each voxel's weights over all pixels, those of no subset included.
+    epochs : int
+        Passes over all subsets.
+    floor, shortening, momentum, leap : float
+        Noise floor, `SHORTENING`, momentum's largest exponent, largest ratio of two iterates that it repeats.
+    """
+    ahead = last = volume
+    time = 1.0
+    for epoch in range(epochs):
+        for matrix, image in zip(matrices, images, strict=True):
+            exponent = matrix.T @ np.log((image + floor) / (matrix @ ahead + floor))
+            step = 1 / np.maximum(matrix.sum(0), column_sum / len(matrices)) / (1 + shortening * epoch)
+            following = ahead * np.exp(step * exponent)
+            later = (1 + np.sqrt(1 + 4 * time**2)) / 2
+            ratio = np.clip(following / last, 1 / leap, leap)
+            ahead, last = following * ratio ** min((time - 1) / later, momentum), following
+            time = later
+    return ahead

@@ -22,11 +22,12 @@ from lfpiv.records import RecordError
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import Folder, make_writable
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, VolumeFile
-from lfpiv.runs import background, guard, summary
+from lfpiv.runs import background, guard, refinement, summary
 from lfpiv.runs.background import Background
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.moved_cameras import MovementFigures, SelfCalibrationFigures
 from lfpiv.runs.pair_figures import MotionFigures, PairFigures, Spread
+from lfpiv.runs.refinement import Refinement
 from lfpiv.warn import Code, Warning
 
 FEWER = settings(max_examples=settings().max_examples // 3, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -130,6 +131,7 @@ SELF_CALIBRATION = SelfCalibrationFigures(
 )
 FACE = {"axis": 0, "side": 1, "reach_mm": 0.5, "share": 0.1, "guard_mm": 0.4, "farther": False, "limit": "the sight"}
 GUARD = Guard.from_json({"pairs": [0, 1], "faces": [FACE], "layers": [[0, 2], [0, 0], [0, 0]], "short": False})
+REFINEMENT = Refinement(pairs=(0, 1), size_voxel=0.7, factor=1.2, demanded=1.35)
 OLD_FINDING = {"what": "saturated", "camera": "left", "frame": "a", "value": 0.25}
 CASES = {
     "warning": (Warning.from_json, WARNING.to_json()),
@@ -137,6 +139,7 @@ CASES = {
     "pair": (PairFigures.from_json, FIGURES.to_json()),
     "self-calibration": (SelfCalibrationFigures.from_json, SELF_CALIBRATION.to_json()),
     "guard": (Guard.from_json, GUARD.to_json()),
+    "refinement": (Refinement.from_json, REFINEMENT.to_json()),
 }
 
 
@@ -208,6 +211,7 @@ def test_hostile_summaries_and_guards_are_left_out_by_name(tmp_path, text, caplo
     for path, read in (
         (folder.summary, lambda: summary.read(folder.summary)),
         (folder.guard, lambda: guard.read(folder)),
+        (folder.refinement, lambda: refinement.read(folder)),
     ):
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         found = read()
@@ -227,6 +231,16 @@ def test_guard_layers_that_were_changed_are_measured_again(tmp_path, caplog):
     assert guard.read(folder)[0] == GUARD and not caplog.text
     folder.guard.write_text(json.dumps(sealed).replace("[0, 2]", "[0, 3]"))
     assert guard.read(folder) is None and "digest differs" in caplog.text
+
+
+def test_a_refinement_that_was_changed_is_measured_again(tmp_path, caplog):
+    folder = Folder(tmp_path)
+    content = json.loads(json.dumps({"settings_hash": "01", "depends_on": "{}", "refinement": REFINEMENT.to_json()}))
+    sealed = json.dumps(content | {"digest": records.digest(content)})
+    folder.refinement.write_text(sealed)
+    assert refinement.read(folder)[0] == REFINEMENT and not caplog.text
+    folder.refinement.write_text(sealed.replace("1.2", "1.3"))
+    assert refinement.read(folder) is None and "digest differs" in caplog.text
 
 
 # -- attributes of files -----------------------------------------------------------------------------------------------

@@ -69,6 +69,8 @@ LARGEST_REFINEMENT = 4
 """Largest edge of a voxel over that of the voxels that are reconstructed: 64 times as many."""
 MOST_STEPS = 10**6
 """Largest number of iterations or epochs."""
+MOST_SUBSETS = 64
+"""Largest number of ordered subsets."""
 MOST_PASSES = 32
 """Largest number of passes of the correlation."""
 LARGEST_WINDOW = 4096

@@ -15,6 +15,7 @@ from lfpiv.experiment import images
 from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.experiment.settings import (
     Board,
+    Bootstrap,
     Compute,
     Correlation,
     Network,
@@ -91,6 +92,8 @@ class Experiment:
     """Path pattern of the particle images, relative to the experiment file."""
     solid: np.ndarray | None = field(default=None, compare=False, repr=False)
     """True for voxels without fluid, shape (z, y, x); None without a mask."""
+    bootstrap: Bootstrap = field(default_factory=Bootstrap)
+    """How many pairs are simulated to measure the damping by ghosts."""
     background: str = "none"
     """Estimate of the light that stands still: "auto", "none", "minimum" or "median"."""
     series: Series | None = None
@@ -224,6 +227,11 @@ class Experiment:
         count = min(count, self.pairs)
         spread = (self.numbers[(2 * number + 1) * self.pairs // (2 * count)] for number in range(count))
         return list(self.disjoint(spread))
+
+    @property
+    def simulated_pairs(self) -> int:
+        """Number of pairs that are simulated to measure the damping by ghosts; 0 for none."""
+        return self.bootstrap.count(self.pairs)
 
     def pair_paths(self, pair: int) -> list[Path]:
         """Return the paths of all images of one pair, in a fixed order."""

@@ -103,6 +103,7 @@ def read_experiment(path: str | Path) -> Experiment:
         series=series,
         smart=table.smart,
         self_calibration=table.self_calibration,
+        bootstrap=table.bootstrap,
         correlation=table.correlation,
         tracking=table.tracking,
         network=table.network,

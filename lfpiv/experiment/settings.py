@@ -53,8 +53,10 @@ class Table(BaseModel):
 class Smart(Table):
     """Table ``[smart]``: settings of the reconstruction (Eq. 5)."""
 
-    iterations: Steps = 40
-    """Largest number of SMART iterations; `tolerance` usually stops them earlier."""
+    iterations: Steps = 14
+    """Largest number of SMART iterations, passes over all rays; without `subsets` some 40 are needed."""
+    subsets: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SUBSETS)] | Literal["auto"] = "auto"
+    """Number of ordered subsets of the rays: 1 for plain SMART, the number of cameras or twice that; "auto" chooses."""
     relaxation: Annotated[float, Field(strict=True, gt=0, le=3)] = 1.0
     """Relaxation mu of Eq. 5; values near 3 diverge."""
     normalisation: Literal["column", "paper"] = "column"
@@ -172,6 +174,26 @@ class SelfCalibration(Table):
     pairs: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] = 0
     """Number of pairs, evenly spread, whose particles correct the cameras' poses; 0 corrects nothing and warns of
     cameras that moved."""
+
+
+SHARE_SIMULATED = 10
+"""Number of pairs of a run for each one that is simulated, the pilot included."""
+MOST_SIMULATED = 12
+"""Largest number of pairs that "auto" simulates."""
+
+
+class Bootstrap(Table):
+    """Table ``[bootstrap]``: damping of the flow's fluctuations by ghosts, measured in simulated pairs."""
+
+    pairs: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] | Literal["auto"] = "auto"
+    """Number of pairs that are simulated after a pilot, each at the cost of a recorded one; "auto" takes one for ten
+    recorded pairs, the pilot included, at most 12 and none in runs of fewer than 20 pairs, 0 measures nothing."""
+
+    def count(self, pairs: int) -> int:
+        """Return the number of simulated pairs for a number of recorded ones."""
+        if isinstance(self.pairs, int):
+            return self.pairs
+        return min(max(pairs // SHARE_SIMULATED - 1, 0), MOST_SIMULATED)
 
 
 class NominalCamera(Table):
@@ -476,4 +498,5 @@ class ExperimentTable(Table):
     tracking: Tracking | None = None
     network: Network = Network()
     self_calibration: SelfCalibration = SelfCalibration()
+    bootstrap: Bootstrap = Bootstrap()
     compute: Compute = Compute()

@@ -25,6 +25,8 @@ class Momentum:
     """Coefficients after the last step, before they were extrapolated, shape (voxel,), float32."""
     time: float = 1.0
     """Nesterov's t_k; 1 when the momentum starts."""
+    largest: float = MOMENTUM
+    """Largest exponent beta."""
 
     @property
     def following_time(self) -> float:
@@ -34,7 +36,7 @@ class Momentum:
     @property
     def exponent(self) -> float:
         """Exponent beta of the next extrapolation; 0 when the momentum starts."""
-        return min((self.time - 1) / self.following_time, MOMENTUM)
+        return min((self.time - 1) / self.following_time, self.largest)
 
     def extrapolate(self, coefficients: np.ndarray) -> tuple[np.ndarray, Momentum]:
         """Return extrapolated coefficients after a step, and the momentum after it.
@@ -43,4 +45,4 @@ class Momentum:
         """
         ahead = self.previous.copy()
         extrapolate(coefficients, ahead, self.exponent)
-        return ahead, Momentum(coefficients, self.following_time)
+        return ahead, Momentum(coefficients, self.following_time, self.largest)

@@ -136,24 +136,24 @@ class ParticleSizer:
     ----------
     weights : Weights
         The operator.
-    partial : bool
-        Whether its grid is a part of the volume that the images show.
+    even : mapping of str to ndarray, optional
+        Images of the evenly lit volume that the cameras record. Default: projected; required if the weights are those
+        of a part of the volume.
     """
 
-    def __init__(self, weights: Weights, *, partial: bool = False):
-        even = weights(_evenly_lit(weights))
-        self._sub_apertures = {name: SubApertures(camera, even[name]) for name, camera in weights.cameras.items()}
+    def __init__(self, weights: Weights, even: Mapping[str, np.ndarray] | None = None):
+        own = weights(_evenly_lit(weights))
+        self._sub_apertures = {name: SubApertures(camera, own[name]) for name, camera in weights.cameras.items()}
         known = self._sub_apertures
-        if partial:
-            white = {name: np.asarray(camera.gain, np.float32) for name, camera in weights.cameras.items()}
-            self._sub_apertures = {name: SubApertures(one, white[name]) for name, one in weights.cameras.items()}
+        if even is not None:
+            self._sub_apertures = {name: SubApertures(one, even[name]) for name, one in weights.cameras.items()}
         size = weights.grid.size
         lit = np.random.default_rng(0).choice(size, min(size, max(LEAST_LIT, size // SPARSITY)), replace=False)
         points = np.zeros(size, np.float32)
         points[lit] = 1.0
         ratios: dict[str, list[float]] = {name: [] for name in self._sub_apertures}
         for width in WIDTHS_VOXEL:
-            images = weights(Sieve(width, weights.grid.shape)(points).reshape(weights.grid.shape), out=even)
+            images = weights(Sieve(width, weights.grid.shape)(points).reshape(weights.grid.shape), out=own)
             for name, sub_apertures in known.items():
                 same, next_lens = sub_apertures.covariances(images[name]).sum(1)
                 ratios[name].append(next_lens / same if same > 0 else 0.0)

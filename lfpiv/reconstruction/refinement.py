@@ -38,7 +38,8 @@ def measure_size(calibration: Calibration, grid: Grid, images: Sequence[Mapping[
     calibration : Calibration
         Cameras.
     grid : Grid
-        The volume. The weights of its middle, at most `LARGEST_PART` voxels along each axis, are built.
+        The volume. The weights of its middle, at most `LARGEST_PART` voxels along each axis, are built, and those of as
+        many coarse voxels for the light of the whole.
     images : sequence of dict
         Some instants: camera name -> image, shape (rows, columns) [counts], background subtracted, its noise included.
 
@@ -48,12 +49,22 @@ def measure_size(calibration: Calibration, grid: Grid, images: Sequence[Mapping[
         Standard deviation of the particles [voxel of the grid], as of `ParticleSizer.size`: root mean square over the
         instants. None if it can be measured in none of them.
     """
-    x, y, z = grid.centre_mm.tolist()
-    along_z, along_y, along_x = (min(n, LARGEST_PART) * grid.voxel_mm for n in grid.shape)
-    middle = Grid.from_extent(centre_mm=(x, y, z), size_mm=(along_x, along_y, along_z), voxel_mm=grid.voxel_mm)
-    sizer = ParticleSizer(build_weights(calibration, middle, form="pixels"), partial=True)
+    middle = _central(grid, min(LARGEST_PART * grid.voxel_mm, max(grid.shape) * grid.voxel_mm), grid.voxel_mm)
+    weights, even = build_weights(calibration, middle, form="pixels"), None
+    if max(grid.shape) > LARGEST_PART:
+        longest_mm = max(grid.shape) * grid.voxel_mm
+        coarse = build_weights(calibration, _central(grid, longest_mm, longest_mm / LARGEST_PART), form="pixels")
+        even = coarse(np.ones(coarse.grid.shape, np.float32))
+    sizer = ParticleSizer(weights, even)
     found = [size for image in images if (size := sizer.size(image)) is not None]
     return float(np.sqrt(np.mean(np.square(found)))) if found else None
+
+
+def _central(grid: Grid, largest_mm: float, voxel_mm: float) -> Grid:
+    """Return the middle of a grid, at most `largest_mm` along each axis, in voxels of another size."""
+    x, y, z = grid.centre_mm.tolist()
+    along_z, along_y, along_x = (max(min(n * grid.voxel_mm, largest_mm), voxel_mm) for n in grid.shape)
+    return Grid.from_extent(centre_mm=(x, y, z), size_mm=(along_x, along_y, along_z), voxel_mm=voxel_mm)
 
 
 def needed_refinement(size_voxel: float | None) -> float:

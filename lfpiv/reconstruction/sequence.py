@@ -143,19 +143,22 @@ class SequenceSolver:
         flow = None if before is None else self._flow(before)
         if before is None or flow is None:
             return Solved(found=self.smart.solve(images, floor=floor, progress=progress), start=Start.FIRST)
-        plain = self.smart.solve(images, floor=floor, iterations=0)
-        count = math.ceil(ITERATION_SHARE * self.smart.settings.iterations)
+
+        def tried(first: np.ndarray | None) -> Reconstruction:
+            return self.smart.solve(images, floor=floor, iterations=0, first=first)
+
+        plain = tried(None)
         guess = predicted_guess(before.volume, plain, flow)
+        misfit = tried(guess).misfit[0]
+        if not misfit < plain.misfit[0]:
+            chance = tried(predicted_guess(_exchanged(before.volume), plain, flow)).misfit[0]
+            if not misfit < LEAST_AGREEMENT * chance:
+                found = self.smart.solve(images, floor=floor, progress=progress)
+                ratio = misfit / chance if chance > 0 else 1.0
+                return Solved(found=found, start=Start.MISSED, flow=flow, misfit_ratio=ratio)
+        count = math.ceil(ITERATION_SHARE * self.smart.settings.iterations)
         found = self.smart.solve(images, floor=floor, iterations=count, first=guess, progress=progress)
-        if found.misfit[0] < plain.misfit[0]:
-            return Solved(found=found, start=Start.PREDICTED, flow=flow)
-        elsewhere = predicted_guess(_exchanged(before.volume), plain, flow)
-        chance = self.smart.solve(images, floor=floor, iterations=0, first=elsewhere).misfit[0]
-        if found.misfit[0] < LEAST_AGREEMENT * chance:
-            return Solved(found=found, start=Start.PREDICTED, flow=flow)
-        ratio = found.misfit[0] / chance if chance > 0 else 1.0
-        found = self.smart.solve(images, floor=floor, progress=progress)
-        return Solved(found=found, start=Start.MISSED, flow=flow, misfit_ratio=ratio)
+        return Solved(found=found, start=Start.PREDICTED, flow=flow)
 
     def _flow(self, before: Before) -> xr.Dataset | None:
         """Return the displacement by which the next instant is predicted; None if it is not known."""

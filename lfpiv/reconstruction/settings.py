@@ -35,6 +35,12 @@ class SmartSettings:
     sieve_voxel: float | str = 0.0
     active_share: float = 0.0
     tolerance: float = 0.0
+    subsets: int | str = 1
+
+    @property
+    def allows_subsets(self) -> bool:
+        """Whether the other settings leave ordered subsets possible."""
+        return self.accelerate and self.normalisation == "column" and self.smoothing_voxel == 0
 
     def __post_init__(self) -> None:
         require_whole("iterations", self.iterations)
@@ -44,6 +50,15 @@ class SmartSettings:
             raise ValueError(f"normalisation: expected one of {', '.join(NORMALISATIONS)}, got {self.normalisation!r}.")
         if not (is_finite(self.active_share) and 0 <= self.active_share < 1):
             raise ValueError(f"active_share: expected a number from 0 to below 1, got {self.active_share!r}.")
+        if self.subsets != AUTO:
+            require_whole("subsets", self.subsets)
+            if self.subsets == 0:
+                raise ValueError(f'subsets: expected a whole number >= 1 or "{AUTO}", got 0.')
+            if self.subsets != 1 and not self.allows_subsets:
+                raise ValueError(
+                    "subsets: ordered subsets need momentum (`accelerate`), the normalisation by column sums and no "
+                    "smoothing between iterations."
+                )
         for name in ("floor_share", "intensity_cap", "smoothing_voxel", "sieve_voxel", "tolerance"):
             value, choice = getattr(self, name), f' or "{AUTO}"' if name in ("sieve_voxel", "intensity_cap") else ""
             if choice and isinstance(value, str) and value == AUTO:

@@ -79,6 +79,16 @@ class ImageEquations:
             camera.projector.gather(exponent, active=volume)
         return exponent
 
+    def compare_subset(self, camera: int, lenses: int, volume: np.ndarray) -> Misfit:
+        """Do as `compare` for the rays of one camera through some lenses only, see ``projector.ALL``."""
+        return Misfit(*self._comparisons[camera].compare(volume, lenses))
+
+    def back_project_subset(self, camera: int, lenses: int, volume: np.ndarray) -> np.ndarray:
+        """Do as `back_project` for the rays of one camera through some lenses only."""
+        exponent = np.zeros_like(volume)
+        self.cameras[camera].projector.gather(exponent, active=volume, lenses=lenses)
+        return exponent
+
 
 @dataclass(frozen=True)
 class State:

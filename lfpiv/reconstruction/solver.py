@@ -14,6 +14,7 @@ from lfpiv.geometry.volume import checked_mask
 from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
 from lfpiv.reconstruction.momentum import Momentum
+from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Subset, iterate_epochs, step_sizes, subsets_of
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import Recording, checked_images, record
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
@@ -22,11 +23,16 @@ from lfpiv.reconstruction.sieve import Sieve, Smoothing
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations, Misfit, State, iterate
 from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
 from lfpiv.weights.operator import Weights
+from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
 
 log = logging.getLogger(__name__)
 
 LEAST_COLUMN_SUM = 1e-6
 """Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
+FEW_CAMERAS = 2
+"""Number of cameras up to which "auto" cuts the rays of each camera into two subsets."""
+LEAST_ALONE = 0.8
+"""Least share of a camera's pixels that see lenses of one half only."""
 DIVERGENCE = 1.5
 """Rise of the misfit over its first value that counts as divergence. Smoothing may raise it a little."""
 
@@ -39,6 +45,8 @@ class _History:
     iterations: int
     squares: list[float] = field(default_factory=list)
     divergence: list[float] = field(default_factory=list)
+    epochs: int = 0
+    """Number of iterations over subsets, which come first. Their misfits are sums over subsets, so not quite exact."""
 
     def append(self, misfit: Misfit) -> None:
         self.squares.append(misfit.squares)
@@ -50,9 +58,17 @@ class _History:
         count, misfit, tolerance = len(self.divergence) - 1, self.divergence, self.settings.tolerance
         if count > 0 and not misfit[-1] <= DIVERGENCE * misfit[0]:  # true for NaN
             return SmartStop.DIVERGED
-        if tolerance > 0 and 0 < count < self.iterations and misfit[-2] - misfit[-1] < tolerance * misfit[-2]:
+        whole = self.epochs < count  # both misfits are those of all rays
+        if tolerance > 0 and whole and count < self.iterations and misfit[-2] - misfit[-1] < tolerance * misfit[-2]:
             return SmartStop.CONVERGED
         return None
+
+    def settled(self, subsets: int) -> bool:
+        """Return whether the last epoch of so many subsets hardly lowered the misfit, or made it no number."""
+        if len(self.divergence) < 2:
+            return False
+        before, after = self.divergence[-2:]
+        return not before - after >= subsets * self.settings.tolerance * before if self.settings.tolerance else False
 
 
 class SmartSolver:
@@ -115,17 +131,12 @@ class SmartSolver:
             guess[guess < settings.active_share * guess.max()] = 0.0
         momentum = Momentum(guess) if settings.accelerate else None
         state = State(guess, momentum, self._steps(column_sum, lit, sieve))
-        smooth = Smoothing(settings.smoothing_voxel, stored.shape, lit)
-        states = iterate(equations, state, sieve, iterations=count, smooth=smooth)
-        history, stop = _History(settings, count), None
+        history = _History(settings, count)
+        subset_steps = self._subset_steps(column_sum, recordings, sieve) if len(self.subsets) > 1 else ()
         with equations.locked():
-            for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
-                history.append(misfit)
-                if progress is not None:
-                    progress((number + 1) / (count + 1))
-                stop = history.early_stop
-                if stop is not None:
-                    break
+            if subset_steps:
+                state = self._solve_subsets(equations, state, sieve, subset_steps, history, progress)
+            volume, stop = self._solve_whole(equations, state, sieve, lit, history, progress)
         if stop is SmartStop.DIVERGED:
             log.warning("SMART: %s", stop.value)
         last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
@@ -144,6 +155,96 @@ class SmartSolver:
             intensity_cap=cap,
             settings=settings,
         )
+
+    def _solve_subsets(
+        self,
+        equations: ImageEquations,
+        state: State,
+        sieve: Sieve,
+        steps: Sequence[Step],
+        history: _History,
+        progress: Callable[[float], None] | None,
+    ) -> State:
+        """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
+        epochs = history.iterations - min(WHOLE_PASSES, -(-history.iterations // 2))
+        if epochs:
+            history.append(equations.compare(sieve(state.coefficients)))  # exact, as all steps begin here
+        states = iterate_epochs(equations, state, sieve, subsets=self.subsets, steps=steps, epochs=epochs)
+        for state, misfit in states:  # noqa: B007 - the last state is the result
+            if history.epochs:
+                history.append(misfit)
+            history.epochs += 1
+            if progress is not None:
+                progress(history.epochs / (history.iterations + 1))
+            if history.settled(len(self.subsets)):
+                break
+        return state
+
+    def _solve_whole(
+        self,
+        equations: ImageEquations,
+        state: State,
+        sieve: Sieve,
+        lit: np.ndarray,
+        history: _History,
+        progress: Callable[[float], None] | None,
+    ) -> tuple[np.ndarray, SmartStop | None]:
+        """Iterate over all rays in the iterations that are left. Return the last volume, and why it stopped early."""
+        smooth = Smoothing(self.settings.smoothing_voxel, self.weights.stored.shape, lit)
+        left, done = history.iterations - history.epochs, history.epochs
+        states = iterate(equations, state, sieve, iterations=left, smooth=smooth)
+        for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
+            history.append(misfit)
+            if progress is not None:
+                progress((done + number + 1) / (history.iterations + 1))
+            stop = history.early_stop
+            if stop is not None:
+                break
+        return volume, stop
+
+    @cached_property
+    def subsets(self) -> tuple[Subset, ...]:
+        """The ordered subsets; one without any.
+
+        Raises
+        ------
+        ValueError
+            If the rays cannot be cut into the number of subsets that the settings ask for.
+        """
+        cameras, wanted = len(self.weights.cameras), self.settings.subsets
+        halves = all(self._can_halve(name) for name in self.weights.cameras)
+        possible = sorted({1, cameras, 2 * cameras if halves else 1})
+        if isinstance(wanted, str):
+            few = cameras <= FEW_CAMERAS or not halves
+            wanted = (possible[-1] if few else cameras) if self.settings.allows_subsets else 1
+        if wanted not in possible:
+            numbers = ", ".join(map(str, possible))
+            raise ValueError(f"subsets: with these cameras expected one of {numbers}, got {wanted}.")
+        return subsets_of(cameras, wanted == 2 * cameras) if wanted > 1 else subsets_of(1, False)
+
+    def _can_halve(self, name: str) -> bool:
+        """Return whether most of a camera's pixels see only even or only odd lenses."""
+        projector = self.weights.projector(name)
+        if projector.lens_sets == 1:
+            return False
+        even, odd, every = (len(projector.see_only(lenses)) for lenses in (EVEN, ODD, ALL))
+        return min(even, odd) > 0 and even + odd >= LEAST_ALONE * every
+
+    def _subset_steps(
+        self, column_sum: np.ndarray, recordings: Mapping[str, Recording], sieve: Sieve
+    ) -> tuple[Step, ...]:
+        """Return the step of each subset."""
+        names = list(self.weights.cameras)
+        sums = (
+            np.float32(recordings[names[one.camera]].camera_gain)
+            * self.weights.sums_of_lenses(names[one.camera], one.lenses)
+            for one in self.subsets
+        )
+        sizes = step_sizes(column_sum, list(sums), column_sum > LEAST_COLUMN_SUM * column_sum.max())
+        mu = np.float32(self.settings.relaxation)
+        if sieve.sigma_voxel > 0:
+            return tuple(SharpenedStep(mu * size, sieve.shape) for size in sizes)
+        return tuple(SmartStep(mu * size, sieve) for size in sizes)
 
     def _without_solid(self, volume: np.ndarray) -> np.ndarray:
         """Return a volume (z, y, x) without the light that the sieve spreads into the solid."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
 from lfpiv_kernels.reconstruction.blur import GaussianBlur
-from lfpiv_kernels.reconstruction.update import update
+from lfpiv_kernels.reconstruction.update import sharpened, update
 
 SHARPENING = 0.5
 """Share of a correction's fine part that a sharpened step adds to it."""
@@ -59,8 +59,8 @@ class SharpenedStep:
     def __call__(self, coefficients: np.ndarray, exponent: np.ndarray) -> np.ndarray:
         """Return the next coefficients."""
         logarithm = exponent * self.size
-        sharp: np.ndarray = logarithm + np.float32(SHARPENING) * (logarithm - self._blur(logarithm))
-        following: np.ndarray = coefficients * np.exp(np.clip(sharp, -LARGEST_STEP, LARGEST_STEP, out=sharp))
+        blurred = self._blur(logarithm)
+        following: np.ndarray = sharpened(coefficients.copy(), logarithm, blurred, SHARPENING, LARGEST_STEP)
         return following
 
     @cached_property

@@ -27,6 +27,7 @@ def reconstruct(
     sieve_voxel: float | str = 0.0,
     active_share: float = 0.0,
     tolerance: float = 0.0,
+    subsets: int | str = 1,
     first: np.ndarray | None = None,
     mask: np.ndarray | xr.DataArray | None = None,
     progress: Callable[[float], None] | None = None,
@@ -88,6 +89,11 @@ def reconstruct(
         0 keeps all.
     tolerance : float
         Stop when the misfit falls by less than this fraction in an iteration; 0 runs all iterations.
+    subsets : int or "auto"
+        Number of ordered subsets of the rays, each of which makes a step (`lfpiv.reconstruction.ordered_subsets`): 1
+        for SMART as above, the number of cameras, or twice that. An iteration is a pass over all subsets; the last
+        two iterations, at most half of them, are SMART's own. "auto": twice the number of cameras for one or two of
+        them, the number of cameras for more; 1 without `accelerate`, with smoothing, or with "paper".
     first : ndarray, shape (z, y, x), optional
         First guess, to continue an iteration or to start from your own; with a sieve, of c. Finite and >= 0. Voxels
         that are zero stay zero and cost no time.
@@ -103,7 +109,8 @@ def reconstruct(
         the coordinate ``views`` is the number of cameras that see each voxel. With a mask the coordinate ``masked`` is
         true where there is no fluid; `correlate` reads it. Attributes: `residual`, ||I - P|| /
         ||I||, and `misfit`, the Kullback-Leibler divergence sum P' log(P'/I') - P' + I' with P' = P + b, I' = I + b,
-        which SMART lowers [counts]: both before each iteration and after the last, over the pixels that voxels light;
+        which SMART lowers [counts]: both before each iteration and after the last, over the pixels that voxels light,
+        and of iterations over subsets but the first the sums of each subset's own before its step;
         `light_outside`, by camera, the part of an image's light in the other pixels: from particles beyond the volume,
         or reflections; `camera_gain`, by camera, its brightness relative to the brightest, in whose counts the volume
         is; `stop`, why the iteration ended; the settings.
@@ -127,6 +134,7 @@ def reconstruct(
         sieve_voxel=sieve_voxel,
         active_share=active_share,
         tolerance=tolerance,
+        subsets=subsets,
     )
     solver = SmartSolver(weights, settings, mask)
     return solver.solve(images, floor=floor, first=first, progress=progress).to_dataarray()

@@ -9,7 +9,7 @@ import numpy as np
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.report import markup
 from lfpiv.report.markup import number, percent
-from lfpiv.report.summary import Summary, WeightFigures
+from lfpiv.report.summary import DampingFigures, Summary, WeightFigures
 
 WARNINGS_SHOWN, WARNINGS_MOST = 12, 300
 """Warnings shown openly, and shown in total with the folded ones. ``summary.json`` holds all."""
@@ -118,6 +118,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         ("Motion passes", _motion(summary)),
         ("Weights", _weights(summary.weights)),
         ("Cameras against each other", _agreement(summary.weights, experiment.noun)),
+        ("Damping by ghosts", _damping(summary.damping)),
         ("Computed on", f"{summary.device.kind}, {summary.device.threads} threads"),
     ]
     return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
@@ -210,6 +211,23 @@ def _agreement(weights: WeightFigures, noun: str) -> str:
     return text
 
 
+def _damping(damping: DampingFigures | None) -> str:
+    """State the slope of measured on true fluctuations along each axis, and whether it is taken off."""
+    if damping is None or not damping.axes:
+        return "not measured" + (f": {damping.reason}" if damping is not None else "")
+    slopes = ", ".join(
+        f"{axis} {found.slope:.3f} ± {found.slope_error:.3f}{'' if found.applied else ' (not significant)'}"
+        for axis, found in sorted(damping.axes.items())
+    )
+    offsets = ", ".join(
+        f"{axis} {found.offset:.3f} ± {found.offset_error:.3f}" for axis, found in sorted(damping.axes.items())
+    )
+    return (
+        f"slope of measured on true fluctuations, from {markup.count(damping.simulated, 'simulated pair')}: {slopes}; "
+        f"offset [voxel]: {offsets}. This report shows the raw vectors; open_results has both"
+    ).replace("-", "−")
+
+
 def timings(summary: Summary, noun: str = "pair") -> str:
     """Tabulate the time of each stage; list what was reused, and the peak memory."""
     names = {
@@ -218,6 +236,7 @@ def timings(summary: Summary, noun: str = "pair") -> str:
         "weights": "weights",
         "reconstruction": "reconstruction, all volumes",
         "correlation": f"correlation, all {noun}s",
+        "bootstrap": "damping by ghosts, simulated pairs",
         "total": "this run, until the report",
     }
     rows = [[text, number(summary.timings_s.get(key), 1)] for key, text in names.items()]

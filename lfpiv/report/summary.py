@@ -102,6 +102,26 @@ class Failure(_Figures):
     reason: str
 
 
+class AxisDamping(_Figures):
+    """Damping of one component of the displacement by ghosts."""
+
+    slope: float
+    slope_error: float
+    offset: float
+    offset_error: float
+    applied: bool
+
+
+class DampingFigures(_Figures):
+    """Damping by ghosts, of the axes x, y, z."""
+
+    axes: dict[str, AxisDamping]
+    """Empty if it could not be measured."""
+    simulated: int
+    reason: str = ""
+    """Why it could not be measured."""
+
+
 class DeviceFigures(_Figures):
     """Device of the kernels."""
 
@@ -119,6 +139,8 @@ class Summary(_Figures):
     peak_memory_mib: float | None
     calibration: dict[str, CameraFigures]
     weights: WeightFigures = WeightFigures()
+    damping: DampingFigures | None = None
+    """None if it was not measured."""
     pairs: tuple[PairFigures, ...]
     """Finished pairs; of very many an evenly chosen part."""
     pairs_finished: int | None = None

@@ -67,6 +67,11 @@ class Folder:
         return self.path / "guard.json"
 
     @property
+    def bootstrap(self) -> Path:
+        """Damping by ghosts, measured in simulated pairs."""
+        return self.path / "bootstrap.json"
+
+    @property
     def refinement(self) -> Path:
         """Size of the particles, and the voxels that it demands."""
         return self.path / "refinement.json"

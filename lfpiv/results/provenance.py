@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 
 IMAGES, IMAGES_BEFORE = "images", "images_before"
 """Parts of a stamp: the images of a result, and those of the instants before it from which it follows."""
+OF_PAIR = (IMAGES, IMAGES_BEFORE)
+"""Parts of a stamp that differ from pair to pair of a run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -383,6 +385,18 @@ def of_pair(
         vectors=Stamp(of_pair | of_vectors),
         particles=_of_particles(experiment, of_pair | of_vectors),
     )
+
+
+def of_bootstrap(experiment: Experiment, vectors: Stamp, pairs: Sequence[int]) -> Stamp:
+    """Return the stamp of the damping that was measured with the flow of some pairs.
+
+    It has the parts of `vectors`, the stamp of a pair's vectors, so that readers can compare the two; but the images
+    are those of the pairs.
+    """
+    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    parts = {name: part for name, part in vectors.parts.items() if name not in OF_PAIR}
+    images = _identity(paths, experiment.path.parent)
+    return Stamp(parts | {"images": images, "bootstrap": experiment.simulated_pairs})
 
 
 def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp | None:

@@ -40,7 +40,9 @@ def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = N
     Dataset
         The variables of the vector files (docs/conventions.md) over pair, z, y, x. Coordinate ``pair``: numbers of the
         pairs. Of a time series the first dimension is ``instant``, the number of the first of the two instants, with a
-        coordinate ``time`` [s]. Attributes: those that all pairs share.
+        coordinate ``time`` [s]. Attributes: those that all pairs share. If the run measured the damping by ghosts, the
+        variables of `lfpiv.velocity.damping.Damping.unbiased` are added, ``uncertainty`` includes the damping, and the
+        attribute ``damping`` states it.
 
     Raises
     ------

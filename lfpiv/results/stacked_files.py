@@ -19,7 +19,8 @@ from lfpiv import hdf5
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import AXES
 from lfpiv.records import read_object
-from lfpiv.results import finished, netcdf, provenance
+from lfpiv.results import finished, netcdf, provenance, stored_damping
+from lfpiv.velocity.damping import ATTRIBUTE
 
 if TYPE_CHECKING:
     import h5py
@@ -59,8 +60,14 @@ class StackedFiles:
     def __init__(self, folder: Path, pairs: tuple[int, int | None] | None = None):
         self.folder = folder / "vectors"
         self.dimension, self.numbers, self.width = _listed(folder, pairs)
-        self.first = netcdf.read_vectors(self.path(0))
-        """Vectors of the first file."""
+        first = netcdf.read_vectors(self.path(0))
+        self.stored_names = {str(name) for name in first.data_vars}
+        """Variables that the files hold. The others follow from them and the damping by ghosts."""
+        depends_on = read_object(first.attrs.get("depends_on", "{}"))
+        self.damping = stored_damping.of_vectors(folder / stored_damping.FILE, depends_on)
+        """Damping by ghosts of these vectors; None if it was not measured."""
+        self.first = first if self.damping is None else self.damping.unbiased(first)
+        """Vectors of the first file, the damping taken off beside them."""
         self.names = [
             name
             for name in dict.fromkeys([*netcdf.VECTOR_UNITS, *map(str, self.first.data_vars)])
@@ -100,14 +107,16 @@ class StackedFiles:
     def attributes(self) -> dict[str, Any]:
         """Attributes that all files share."""
         names = ("title", "experiment", "step", *COMMON)
-        return {key: self.first.attrs[key] for key in names if key in self.first.attrs}
+        return {key: self.first.attrs[key] for key in (*names, ATTRIBUTE) if key in self.first.attrs}
 
     @property
     def signature(self) -> str:
         """Everything that the files must share, as JSON."""
         axes = {name: values.tolist() for name, values in self._reference.axes.items()}
         attributes = {name: np.asarray(value).tolist() for name, value in self._reference.attributes.items()}
-        return json.dumps([self.dimension, attributes, axes, sorted(self._reference.names)], sort_keys=True)
+        damping = None if self.damping is None else self.damping.to_json()
+        known = [self.dimension, attributes, axes, sorted(self._reference.names)]
+        return json.dumps(known if damping is None else [*known, damping], sort_keys=True)
 
     def read(self, place: int, names: Sequence[str]) -> list[np.ndarray]:
         """Read variables (z, y, x) of one file.
@@ -121,13 +130,26 @@ class StackedFiles:
         finished.require_vectors(path)
         with hdf5.opened(path) as file:
             signature = None if self._compared[place] else _signature(file, path)
-            found = [np.asarray(file[name][...], self.first[name].dtype) for name in names]
+            found = self._values(file, names)
         if signature is not None:
             self._compare(place, signature)
         for name, values in zip(names, found, strict=True):
             if values.shape != self.shape:
                 raise InputError(f"{path}: expected {name} of shape {self.shape}, found {values.shape}.")
         return found
+
+    def _values(self, file: h5py.File, names: Sequence[str]) -> list[np.ndarray]:
+        """Return variables of an open file, or those that follow from them."""
+
+        def stored(name: str) -> np.ndarray:
+            return np.asarray(file[name][...], self.first[name].dtype)
+
+        if self.damping is None or not set(names) & self.damping.derived:
+            return [stored(name) for name in names]
+        needed = {name: (AXES, stored(name)) for name in self.damping.sources}
+        attributes = {key: self.first.attrs[key] for key in ("voxel_mm", "dt_s")}
+        derived = self.damping.unbiased(xr.Dataset(needed, attrs=attributes))
+        return [derived[name].values if name in derived else stored(name) for name in names]
 
     def block(self, first: int, after: int) -> xr.Dataset:
         """Read the files at places `first` to `after` - 1, each once, as a dataset with all variables."""

@@ -32,6 +32,9 @@ BYTES_PER_VOXEL_AND_CAMERA = LEAST_BYTES_PER_VOXEL
 BYTES_PER_PIXEL = 72
 """Memory per sensor pixel [byte]: images, those of the next pair, light-field blocks, the decoder's arrays."""
 
+BYTES_PER_VALUE = 4
+"""Memory of a voxel or a pixel of an instant that is held [byte]."""
+
 BASE_BYTES = GIB // 2
 """Memory of Python, its libraries and compiled kernels [byte]."""
 
@@ -65,7 +68,19 @@ def weights_bytes(experiment: Experiment) -> int:
 def worker_bytes(experiment: Experiment) -> int:
     """Estimate the memory of one worker process without the weights, which all workers share [byte]."""
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
-    return BASE_BYTES + BYTES_PER_VOXEL * experiment.grid.size + BYTES_PER_PIXEL * pixels
+    pair = BYTES_PER_VOXEL * experiment.grid.size + BYTES_PER_PIXEL * pixels
+    return BASE_BYTES + pair + _sequence_bytes(experiment, pixels)
+
+
+def _sequence_bytes(experiment: Experiment, pixels: int) -> int:
+    """Estimate the memory of the instants that a process holds beyond a pair, to reconstruct others from them [byte].
+
+    These are the instants between those of a pair, with their images, and the three volumes of a prediction.
+    """
+    if not experiment.in_sequence or experiment.series is None:
+        return 0
+    between = experiment.series.step - 1
+    return BYTES_PER_VALUE * ((between + 3) * experiment.grid.size + between * pixels)
 
 
 def run_bytes(experiment: Experiment, weights: int, workers: int) -> int:

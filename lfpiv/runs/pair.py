@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -346,14 +346,37 @@ class PairWork:
         found = [warning.of_pair(pair) for warning in warnings]
         self.log_first(found if self.experiment.series is None else [warning.by_instant() for warning in found])
 
+    def measure(self, images: Sequence[Mapping[str, np.ndarray]], noise: Sequence[Mapping[str, float]]) -> xr.Dataset:
+        """Return the vectors of the images of two frames, measured as those of the experiment; nothing is written.
+
+        Raises
+        ------
+        ValueError
+            If the images cannot be reconstructed.
+        """
+        assert self.weights is not None
+        grid = self.experiment.grid
+        if self.experiment.series is None:
+            first, second = self.solver.solve(images, noise).to_dataarrays()
+        else:
+            first, second = (
+                self.solver.smart.solve(frame, floor=floor).to_dataarray()
+                for frame, floor in zip(images, noise, strict=True)
+            )
+        return self._vectors(_as_written(first, grid), _as_written(second, grid))
+
+    def _vectors(self, first: xr.DataArray, second: xr.DataArray) -> xr.Dataset:
+        """Correlate the volumes of two frames."""
+        settings = self.experiment.correlation.model_dump()
+        if self.experiment.in_sequence:
+            vectors = self.between(first, second, settings)
+        else:
+            vectors = correlate(first, second, dt_s=self.experiment.dt_s, **settings)
+        return _with_motion(vectors, (first, second))
+
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment, start = self.experiment, time.perf_counter()
-        settings = experiment.correlation.model_dump()
-        if experiment.in_sequence:
-            vectors = self.between(*volumes.volumes, settings)
-        else:
-            vectors = correlate(*volumes.volumes, dt_s=experiment.dt_s, **settings)
-        vectors = _without_unmeasured(_with_motion(vectors, volumes), volumes)
+        vectors = _without_unmeasured(self._vectors(*volumes.volumes), volumes)
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
         vectors.attrs["reconstruction_s"] = self._reconstruction_s(files.pair, volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
@@ -402,7 +425,7 @@ class PairWork:
     def search(self) -> ParticleSearch:
         """Search for particles of this rig, made once for all pairs."""
         assert self.weights is not None and self.experiment.tracking is not None
-        return ParticleSearch(self.weights, **self.experiment.tracking.model_dump())
+        return ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.model_dump())
 
     def _reconstruction_s(self, pair: int, volumes: PairVolumes) -> float:
         """Return the time that the volumes of a pair took [s].
@@ -490,13 +513,13 @@ def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
     return written
 
 
-def _with_motion(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:
+def _with_motion(vectors: xr.Dataset, volumes: tuple[xr.DataArray, xr.DataArray]) -> xr.Dataset:
     """Return vectors with the outcome of the motion passes and with a quality that does not count shared light."""
-    attributes = volumes.volumes[0].attrs
+    attributes = volumes[0].attrs
     if attributes.get("motion", Motion.OFF.value) == Motion.OFF.value:
         return vectors
     shares = np.atleast_1d(attributes["motion_valid"]).tolist()
-    return unshared_quality(vectors, volumes.volumes).assign_attrs(motion=attributes["motion"], motion_valid=shares)
+    return unshared_quality(vectors, volumes).assign_attrs(motion=attributes["motion"], motion_valid=shares)
 
 
 def _without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:

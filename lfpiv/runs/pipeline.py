@@ -6,7 +6,7 @@ Each function opens a run on an output folder, does the unfinished work, and ret
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from operator import length_hint
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import dispatch, local_workers, memory, rig, task, worker_plan
+from lfpiv.runs import bootstrap, dispatch, local_workers, memory, rig, task, worker_plan
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import Outcome, PairWork
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 PAIRS = "image pairs"
 """Name of the step that works on pairs, for progress."""
+SIMULATED = "simulated pairs"
+"""The same for pairs that are simulated."""
 INSTANTS = "instants"
 """The same for a time series."""
 
@@ -93,7 +95,8 @@ def run(
             todo = current.unfinished(volumes=keep_volumes, quiet=True)
             checked = _check(current, todo, workers, scheduler)
         calibrated = replace(calibrated, calibration=prepared.board)
-        done = _process(current, prepared, checked, keep_volumes)
+        done, weights = _process(current, prepared, checked, keep_volumes)
+        done = _bootstrap(current, prepared, done, weights)
         return current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
 
 
@@ -206,13 +209,17 @@ def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None)
     return _Checked(todo=todo, failed=failed, workers=scheduler or planned)
 
 
-def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: bool) -> Invocation:
+_Weights = Callable[[], "Weights | None"]
+"""Returns the weights that pairs were reconstructed with; None if they were not built."""
+
+
+def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: bool) -> tuple[Invocation, _Weights]:
     """Do the pairs in this process or in several; the weights are built once for all of them."""
     todo, workers = checked.todo, checked.workers
     if checked.failed is not None:
-        return Invocation(tried=checked.failed)
+        return Invocation(tried=checked.failed), lambda: None
     if not todo.ahead():
-        return Invocation(tried=Tried(current.numbers))
+        return Invocation(tried=Tried(current.numbers)), lambda: None
     weights: Weights | None = None
     figures: WeightsFigures | None = None
     if current.need_weights(todo):
@@ -222,7 +229,7 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
             workers = worker_plan.fit_memory(workers, finest, weights.memory_bytes, current.device)
     work = _work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration)
     if isinstance(workers, Plan) and workers.workers == 1:
-        return Invocation(tried=_sequential(current, work, todo), weights=figures)
+        return Invocation(tried=_sequential(current, work, todo), weights=figures), _known(weights)
     if isinstance(workers, Plan):
         used = Workers(count=workers.workers, threads=workers.threads)
     else:
@@ -233,9 +240,35 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     tried = _collect(
         current, dispatch.parallel(shared, current.experiment, todo, workers, current.step(_step_name(current)))
     )
-    return Invocation(
-        tried=tried, weights=figures, workers=replace(used, peak_memory_mib=tried.peak_memory_mib or None)
+    used = replace(used, peak_memory_mib=tried.peak_memory_mib or None)
+    done = Invocation(tried=tried, weights=figures, workers=used)
+    return done, lambda: task.open_weights_of(shared, prepared.calibration.cameras)
+
+
+def _known(weights: Weights | None) -> _Weights:
+    return lambda: weights
+
+
+def _bootstrap(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> Invocation:
+    """Measure the damping by ghosts in simulated pairs; return the invocation with the weights built for them."""
+    built: list[WeightsFigures] = []
+
+    def work() -> PairWork:
+        known = weights()
+        if known is None:
+            known, figures = rig.build_weights(current, prepared, list(current.numbers[:1]))
+            built.append(figures)
+        return _work(current, known, keep_volumes=False, calibration=prepared.calibration)
+
+    bootstrap.decide(
+        current.experiment,
+        current.folder,
+        current.damping_stamp,
+        current.pairs_with_vectors,
+        work,
+        current.step(SIMULATED),
     )
+    return replace(done, weights=built[0]) if built else done
 
 
 def _with_reused(current: Run, done: Invocation, todo: Todo, kind: str) -> Invocation:

@@ -27,7 +27,7 @@ from lfpiv.results import finished, provenance
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
-from lfpiv.runs import guard, memory, pair_figures, refinement, summary
+from lfpiv.runs import bootstrap, guard, memory, pair_figures, refinement, summary
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
@@ -171,6 +171,17 @@ class Run:
             guard=self.guard_layers,
             refinement=self.refinement_factor,
         )
+
+    def damping_stamp(self, pairs: Sequence[int]) -> Stamp:
+        """Return the stamp of the damping by ghosts that was measured with some pairs."""
+        first = next(iter(pairs), self.numbers[0])
+        return provenance.of_bootstrap(self.experiment, self.files(first).stamp, pairs)
+
+    def pairs_with_vectors(self) -> list[int]:
+        """Return the selected pairs whose vectors are finished and fit."""
+        there = self.folder.stored(self.numbers, vectors=True, volumes=False)
+        stored = (pair for pair, one in zip(self.numbers, there, strict=True) if one)
+        return [pair for pair in stored if self.files(pair).fitting_vectors() is not None]
 
     def has_volumes(self, pair: int) -> bool:
         """Return whether both volumes of a pair are in the folder and fit."""
@@ -327,6 +338,7 @@ class Run:
             background=light,
             background_warnings=warnings,
             guard=self.guard,
+            damping=bootstrap.stored(self.experiment, self.folder, self.damping_stamp),
             refinement=self.refinement,
         )
 

@@ -25,6 +25,7 @@ from lfpiv.reconstruction.result import SmartStop
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
 from lfpiv.results import particles
 from lfpiv.results.folder import Folder
+from lfpiv.results.stored_damping import StoredDamping
 from lfpiv.runs import guard, refinement
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation
@@ -67,6 +68,8 @@ class Contents:
     """Warnings about light that stands still and is not subtracted."""
     guard: Guard | None = None
     """Light beyond the volume and guard layers; None if they were not measured."""
+    damping: StoredDamping | None = None
+    """Damping by ghosts; None if it was not measured."""
     refinement: Refinement | None = None
     """Size of the particles and refinement; None if it was not measured."""
 
@@ -183,12 +186,14 @@ def build(
             "weights": done.weights.seconds if done.weights else earlier.weights_s,
             "reconstruction": pairs.totals["reconstruction_s"],
             "correlation": pairs.totals["correlation_s"],
+            "bootstrap": contents.damping.seconds if contents.damping else 0.0,
         },
         "calibration": reports,
         "board": {} if calibrated.calibration.board is None else calibrated.calibration.board.to_json(),
         "weights": weights,
         "background": dict(contents.background),
         "guard": _guard(experiment, contents.guard),
+        "damping": None if contents.damping is None else contents.damping.to_json(),
         "refinement": _refinement(experiment, contents.refinement),
         "pairs_finished": pairs.count,
         "pairs_file": folder.pairs.name if pairs.count > MOST_LISTED else None,

@@ -13,8 +13,9 @@ import os
 import secrets
 import shutil
 import stat
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -27,6 +28,10 @@ from lfpiv.geometry.grid import Layers
 from lfpiv.results.folder import Folder
 from lfpiv.runs.pair import PairWork
 from lfpiv.version import __version__
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
+    from lfpiv.weights.operator import Weights
 
 TASK, INSTANTS, WEIGHTS, SOLID = "task.json", "instants", "weights", "solid.npy"
 """Names of the task and of the volumes in its folder, and of the arrays beside that folder."""
@@ -152,6 +157,14 @@ def read_task(shared: Path) -> Task:
         return Task.model_validate_json(content)
     except ValidationError:
         raise InputError(f"{shared / TASK}: expected the task of lfpiv {__version__}, found another form.") from None
+
+
+def open_weights_of(shared: Path, cameras: Mapping[str, CalibratedCamera]) -> Weights | None:
+    """Return the weights that the workers of a run mapped; None if it needed none."""
+    from lfpiv.weights.storage import open_weights
+
+    content = read_task(shared).weights
+    return None if content is None else open_weights(shared.parent / WEIGHTS, cameras, content)
 
 
 def _make_private(root: Path) -> None:

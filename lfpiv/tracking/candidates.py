@@ -66,7 +66,5 @@ def reconstructed(
 def inside(weights: Weights, positions_mm: np.ndarray, margin_voxel: float) -> np.ndarray:
     """Return which positions lie in the grid of the weights or up to a margin beside it."""
     place = voxel_place(positions_mm, weights.grid)
-    found: np.ndarray = (
-        (place > -0.5 - margin_voxel) & (place < np.array(weights.grid.shape) - 0.5 + margin_voxel)
-    ).all(1)
-    return found
+    above, below = place > -0.5 - margin_voxel, place < np.array(weights.grid.shape) - 0.5 + margin_voxel
+    return np.asarray((above & below).all(1))

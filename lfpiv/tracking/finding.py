@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import is_finite
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import checked_images
@@ -44,7 +45,10 @@ SEEN = 0.3
 FIRST_STEPS, STEPS, LAST_STEPS = 4, 4, 4
 """Iterations of the first round, of the later rounds, and after the last one."""
 EARLY = 0.5
-"""Part of the limits of light that applies after the first iteration of a round."""
+"""Part of the limits of light that applies after the very first iteration."""
+LEFT_SHARE = 0.03
+"""Least light of a candidate in the residual images, as a share of the typical particle's: one of two particles that
+were found as one leaves little there."""
 SIZED_ROUNDS = 2
 """Rounds after which the particles' size is fitted."""
 OUTLIER_SIGMA = 5.0
@@ -128,9 +132,13 @@ class _State:
 
 @dataclass
 class ParticleSearch:
-    """Search for the particles of many instants with one rig; `find_particles` describes the settings."""
+    """Search for the particles of many instants with one rig; `find_particles` describes the settings.
+
+    `grid` is the volume whose voxels are the unit of lengths; default: the grid of the weights.
+    """
 
     weights: Weights
+    grid: Grid | None = None
     sigma_voxel: float | None = None
     rounds: int = ROUNDS
     weakest: float = WEAKEST
@@ -138,10 +146,14 @@ class ParticleSearch:
     def __post_init__(self) -> None:
         self.images = ParticleImages(
             cameras=self.weights.cameras,
-            voxel_mm=self.weights.grid.voxel_mm,
+            voxel_mm=self._grid.voxel_mm,
             sigma_voxel=self.sigma_voxel or USUAL_SIGMA_VOXEL,
         )
         self._sizer: ParticleSizer | None = None
+
+    @property
+    def _grid(self) -> Grid:
+        return self.weights.grid if self.grid is None else self.grid
 
     def find(
         self,
@@ -170,7 +182,8 @@ class ParticleSearch:
             if not len(state.cloud):
                 break
             state.refine(1)
-            state.cloud = self._pruned(state, EARLY)
+            if number == 0:
+                state.cloud = self._pruned(state, EARLY)
             if len(state.cloud):
                 state.refine(FIRST_STEPS - 1 if number == 0 else STEPS - 1)
                 state.cloud = self._pruned(state)
@@ -187,11 +200,12 @@ class ParticleSearch:
             state.cloud = self._pruned(state)
         if len(state.cloud):
             state.refine(2)
-        return FoundParticles.of(self.weights, state.model, state.scene, state.cloud, state.normal)
+        return FoundParticles.of(self.weights.cameras, self._grid, state.model, state.scene, state.cloud, state.normal)
 
     def _first_size(self, images: Mapping[str, np.ndarray]) -> float:
         self._sizer = self._sizer or ParticleSizer(self.weights)
-        return self._sizer.size(images) or USUAL_SIGMA_VOXEL
+        found = self._sizer.size(images)
+        return found * self.weights.grid.voxel_mm / self._grid.voxel_mm if found else USUAL_SIGMA_VOXEL
 
     def _new(self, state: _State, noise: Mapping[str, float]) -> Cloud:
         """Return candidates from the light that the particles leave."""
@@ -205,7 +219,7 @@ class ParticleSearch:
         count = cloud.light.shape[1]
         if volume is None:
             return Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, count)))
-        return candidates.volume_peaks(volume, count, self.weakest * candidates.typical(cloud.light.mean(1)))
+        return candidates.volume_peaks(volume, count, LEFT_SHARE * candidates.typical(cloud.light.mean(1)))
 
     def _pruned(self, state: _State, part: float = 1.0) -> Cloud:
         """Return the particles that all cameras confirm, those closer than one particle's size merged.
@@ -280,5 +294,5 @@ def _better_size(state: _State) -> ParticleImages:
         chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2).sum(dtype=np.float64)))
     below, here, above = chi2
     curvature, slope = below - 2 * here + above, (below - above) / 2
-    power = float(np.clip(slope / curvature, -2, 2)) if curvature > 0 else 2 * float(np.sign(slope))
-    return state.model.of_size(state.model.sigma_voxel * SIZE_STEP**power)
+    change = float(np.clip(slope / curvature, -2, 2)) if curvature > 0 else 2 * float(np.sign(slope))
+    return state.model.of_size(state.model.sigma_voxel * SIZE_STEP**change)

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.volume import voxel_place
 from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Normal, Scene, covariances, overlaps
-from lfpiv.weights.operator import Weights
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +46,16 @@ class FoundParticles:
 
     @classmethod
     def of(
-        cls, weights: Weights, model: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal | None
+        cls,
+        cameras: Mapping[str, CalibratedCamera],
+        grid: Grid,
+        model: ParticleImages,
+        scene: Scene,
+        cloud: Cloud,
+        normal: Normal | None,
     ) -> FoundParticles:
-        """Return the particles inside the volume of the weights, with their figures."""
-        grid, count = weights.grid, len(cloud)
+        """Return the particles with their figures. `grid` is the volume that their density refers to."""
+        count = len(cloud)
         if normal is None or not count:
             empty = np.zeros((0, 3))
             return cls(
@@ -72,7 +84,7 @@ class FoundParticles:
             voxel_mm=grid.voxel_mm,
             explained=float(np.clip(explained, 0, 1)),
             crowding=_crowding(normal),
-            per_microlens=count / _microlenses(weights),
+            per_microlens=int(_inside(cloud.positions_mm, grid).sum()) / _microlenses(cameras, grid),
         )
 
 
@@ -94,9 +106,14 @@ def _crowding(normal: Normal) -> float:
     return float(2 * (overlap > 0.5).any(1).sum() / max(len(normal.right), 1))
 
 
-def _microlenses(weights: Weights) -> float:
+def _inside(positions_mm: np.ndarray, grid: Grid) -> np.ndarray:
+    """Return which particles lie in a volume."""
+    place = voxel_place(positions_mm, grid)
+    return np.asarray(((place > -0.5) & (place < np.array(grid.shape) - 0.5)).all(1))
+
+
+def _microlenses(cameras: Mapping[str, CalibratedCamera], grid: Grid) -> float:
     """Return the number of microlenses that the volume's x-y face covers in a camera, mean of the cameras."""
-    grid = weights.grid
     face = grid.shape[1] * grid.shape[2] * grid.voxel_mm**2
-    every = [camera.optics for camera in weights.cameras.values()]
+    every = [camera.optics for camera in cameras.values()]
     return float(np.mean([face * (one.magnification / one.microlens_pitch_mm) ** 2 for one in every]))

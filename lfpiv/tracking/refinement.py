@@ -71,7 +71,8 @@ class Scene:
 
     def variance(self, model: np.ndarray) -> np.ndarray:
         """Return the variance of each pixel for a model of the images [counts^2]."""
-        return self.read_variance + np.float32(self.counts_per_photon) * np.maximum(model, 0)
+        variance: np.ndarray = self.read_variance + np.float32(self.counts_per_photon) * np.maximum(model, 0)
+        return variance
 
     def calibrated(self, model: np.ndarray) -> Scene:
         """Return the scene with the variance over mean that the residuals of lit pixels show."""

@@ -37,7 +37,7 @@ class Predictor:
         counts = [max(2, math.ceil((n - 1) / CONTROL_SPACING) + 1) for n in shape]
         points = tuple(np.linspace(0, max(n - 1, 1), count) for n, count in zip(shape, counts, strict=True))
         for axis in range(3):
-            field = _apply(_spline_matrix(nodes[axis], points[axis]), field, axis)
+            field = _apply(spline_matrix(nodes[axis], points[axis]), field, axis)
         return cls(points=points, field=field.astype(np.float32), shape=shape)
 
     @property
@@ -61,7 +61,7 @@ def _apply(matrix: np.ndarray, field: np.ndarray, axis: int) -> np.ndarray:
     return np.moveaxis(np.tensordot(matrix, field, (1, axis)), 0, axis)
 
 
-def _spline_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+def spline_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the matrix from values at nodes to values at points: natural cubic spline, linear beyond the nodes."""
     if len(nodes) == 1:
         return np.ones((len(points), 1))

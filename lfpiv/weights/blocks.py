@@ -40,7 +40,7 @@ SAMPLED_VOXELS = 1024
 """Number of voxels from which the memory of all voxels is estimated."""
 MOST_BLOCKS = np.iinfo(np.int32).max
 """Largest number of blocks of a camera: block indices have 32 bits."""
-BLOCK_BYTES, VOXEL_BYTES = 6, 16
+BLOCK_BYTES, VOXEL_BYTES = 6, 24
 """Memory of a block without its values, and of a voxel without its blocks [byte]."""
 
 
@@ -196,19 +196,21 @@ def blocks_of(
     blocks, values = (int(1.02 * count) + BLOCK_WIDTH for count in expected)
     ray, height, width = (_Growing(dtype, blocks) for dtype in (np.int32, np.uint8, np.uint8))
     value = _Growing(np.uint8, values)
-    counts, scales = [], []
+    counts, per_voxel = [], []
     for model in models:
         for count in footprints.compute(model):
-            some, scale = int(count[0].sum(dtype=np.int64)), np.empty(len(count[0]), np.float32)
+            some = int(count[0].sum(dtype=np.int64))
+            own = tuple(np.empty(len(count[0]), dtype) for dtype in (np.float32, np.int32, np.int32))
             room = value.take(int(count[1].sum(dtype=np.int64)))
-            footprints.write(ray.take(some), height.take(some), width.take(some), room, scale)
+            footprints.write(ray.take(some), height.take(some), width.take(some), room, own)
             counts.append(count)
-            scales.append(scale)
+            per_voxel.append(own)
     value.take(BLOCK_WIDTH)[:] = 0
     first_block, first_value = (
         np.concatenate([[0], *(count[k] for count in counts)]).cumsum(dtype=np.int64) for k in range(2)
     )
     require_numbers(first_block[-1], (len(first_block) - 1,))
+    scale, even_blocks, even_values = (np.concatenate(parts) for parts in zip(*per_voxel, strict=True))
     return Blocks(
         form=form,
         first_block=first_block.astype(np.int32),
@@ -217,7 +219,9 @@ def blocks_of(
         height=height.done(),
         width=width.done(),
         value=value.done(),
-        scale=np.concatenate(scales),
+        scale=scale,
+        even_blocks=even_blocks,
+        even_values=even_values,
         microimages=packed.calibrated.microimages,
     )
 

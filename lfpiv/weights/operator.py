@@ -93,6 +93,7 @@ class Weights:
         self._choices = dict(choices or {})
         self._counted = dict(counted or {})
         self._camera_sums = camera_sums
+        self._lens_sums: dict[tuple[str, int], np.ndarray] = {}
         self.volume = stored.grid
         """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
 
@@ -214,6 +215,29 @@ class Weights:
             self._camera_sums = sums
             warn_seen_by_one(self.views[self.volume.nearest_in(self.grid)], self.volume, len(self.cameras))
         return self._camera_sums
+
+    def sums_of_lenses(self, name: str, lenses: int) -> np.ndarray:
+        """Return the sum of each voxel's weights over one camera's pixels that see some lenses only.
+
+        Parameters
+        ----------
+        name : str
+            The camera.
+        lenses : int
+            ``projector.EVEN``, ``ODD`` or ``ALL``.
+
+        Returns
+        -------
+        ndarray, shape (voxel,), float32
+            In stored order.
+        """
+        if (name, lenses) not in self._lens_sums:
+            projector, gain = self.projector(name), self.gain(name)
+            pixels = projector.see_only(lenses)
+            image, sums = np.zeros_like(gain), np.zeros(self.grid.size, np.float32)
+            image[pixels] = gain[pixels]
+            self._lens_sums[name, lenses] = projector.back_project(image, sums, lenses)
+        return self._lens_sums[name, lenses]
 
     @property
     def column_sum(self) -> np.ndarray:

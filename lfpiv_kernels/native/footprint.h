@@ -3,11 +3,13 @@
 #define LFPIV_FOOTPRINT_H
 
 #include "lens_group.h"
+#include "microimages.h"
 
 namespace lfpiv {
 
 /// Rows of a block at most.
 constexpr int TALLEST = 64;
+static_assert(TALLEST % ROW_GROUP == 0, "the tallest block needs no filling");
 /// Parts of a voxel at most.
 constexpr int MOST_PARTS = 64;
 /// Steps of a cell's outline at most.
@@ -27,7 +29,8 @@ LFPIV_INLINE void measure(const WeightInputs& in, int index, int* blocks_out, in
         const V tiles = floor((box.last_column - box.first_column + (float)BLOCK_WIDTH) / (float)BLOCK_WIDTH);
         const V rows = box.last_row - box.first_row + 1.0f, none = V{};
         const V parts = floor((rows + (float)(TALLEST - 1)) / (float)TALLEST);
-        const V values = in.profiles ? tiles * (rows + parts * (float)BLOCK_WIDTH) : tiles * rows * (float)BLOCK_WIDTH;
+        const V filled = rows + parts * (float)(BLOCK_WIDTH + ROW_GROUP - 1);
+        const V values = in.profiles ? tiles * filled : tiles * rows * (float)BLOCK_WIDTH;
         const V lit_blocks = lit ? tiles * parts : none, lit_values = lit ? values : none;
         for (int k = 0; k < WIDTH; ++k) {
             blocks += (int)lane(lit_blocks, k);
@@ -175,7 +178,7 @@ struct LensTile {
 
     /// Write the block of rows from `first` on as two profiles. Nothing is written where all weights round to zero.
     LFPIV_INLINE void write_profiles(uint64_t across, int first, int height, BlockWriter& out) const {
-        unsigned char level[TALLEST + 16];
+        unsigned char level[TALLEST + 24] = {};
         const float to_b = of(values.to_b);
         int top = -1, bottom = -1;
         for (int y = 0; y < height; y += WIDTH) {
@@ -190,12 +193,14 @@ struct LensTile {
             if (top < 0) top = y + lowest_bit(word) / 8;
         }
         if (top < 0) return;
-        const int left = lowest_bit(across) / 8, wide = highest_bit(across) / 8 - left + 1;
+        const int left = lowest_bit(across) / 8, lit = bottom - top + 1;
+        const int rows = (lit + ROW_GROUP - 1) / ROW_GROUP * ROW_GROUP;
         store_word(out.value, across >> (8 * left));
-        out.value += wide;
-        for (int y = top; y <= bottom; y += 8) store_word(out.value + y - top, load_word(level + y));
-        out.value += bottom - top + 1;
-        out.finish(ray, first + top, left, bottom - top + 1, wide);
+        out.value += BLOCK_WIDTH;
+        for (int y = 0; y < lit; y += 8) store_word(out.value + y, load_word(level + top + y) & bytes_below(lit - y));
+        if ((lit - 1) / 8 != (rows - 1) / 8) store_word(out.value + rows / 8 * 8, 0);
+        out.value += rows;
+        out.finish(ray, first + top, left, rows, BLOCK_WIDTH);
     }
 
     /// Return the probability, times the widest smears, that rays at (a, b) lie in the lens's cell.
@@ -266,7 +271,7 @@ struct LensTile {
         for (int first = low; first <= last; first += TALLEST) {
             const int height = min(last, first + TALLEST - 1) - first + 1;
             // rounding may differ from that of `measure`: never write past what it counted
-            const int needed = (profiles ? 8 + height : 8 * height) + BLOCK_WIDTH;
+            const int needed = (profiles ? 8 + height + ROW_GROUP - 1 : 8 * height) + BLOCK_WIDTH;
             if (out.block >= out.last_block || out.value + needed > out.end) break;
             if (profiles)
                 write_profiles(across, first, height, out);
@@ -348,19 +353,57 @@ LFPIV_INLINE void fill(const WeightInputs& in, const Outline& outline, int index
     bytes_out[index] = (int)(out.value - first_value);
 }
 
-/// Copy the blocks of a voxel to where they lie without gaps.
-LFPIV_INLINE void pack(const BlockArrays& from, const BlockArrays& to, int voxel) {
+/// Where the blocks of a voxel go: those of even lenses before those of odd ones; of these, profiles by their height.
+struct BlockOrder {
+    static constexpr int HEIGHTS = TALLEST / ROW_GROUP + 1;
+    int block[2 * HEIGHTS + 1] = {};
+    int value[2 * HEIGHTS + 1] = {};
+    const bool profiles;
+    const int lens_rays, lenses_i;
+
+    LFPIV_INLINE BlockOrder(bool profiles, int edge, int lenses_i)
+        : profiles(profiles), lens_rays(edge * edge), lenses_i(lenses_i) {}
+
+    /// Return the place of a block's lens and height in the order.
+    LFPIV_INLINE int place(int ray, int height) const {
+        const int lens = ray / lens_rays, row = lens / lenses_i;
+        const int odd = (lens - row * lenses_i + row / LAYERS) & 1;
+        return odd * HEIGHTS + (profiles ? height / ROW_GROUP : 0);
+    }
+
+    /// Return the bytes of a block's values.
+    LFPIV_INLINE int bytes(int height, int width) const { return profiles ? height + width : height * width; }
+};
+
+/// Copy the blocks of a voxel in their order to where they lie without gaps.
+LFPIV_INLINE void pack(const BlockArrays& from, const BlockArrays& to, int voxel, bool profiles, int edge, int lenses_i,
+                       int* even_blocks_out, int* even_values_out) {
+    BlockOrder order(profiles, edge, lenses_i);
     const int from_block = from.first_block[voxel], to_block = to.first_block[voxel];
     const int blocks = to.first_block[voxel + 1] - to_block;
-    for (int k = 0; k < blocks; ++k) {
-        to.ray[to_block + k] = from.ray[from_block + k];
-        to.height[to_block + k] = from.height[from_block + k];
-        to.width[to_block + k] = from.width[from_block + k];
+    for (int k = from_block; k < from_block + blocks; ++k) {
+        const int place = order.place(from.ray[k], from.height[k]);
+        order.block[place + 1] += 1;
+        order.value[place + 1] += order.bytes(from.height[k], from.width[k]);
     }
+    for (int place = 0; place < 2 * BlockOrder::HEIGHTS; ++place) {
+        order.block[place + 1] += order.block[place];
+        order.value[place + 1] += order.value[place];
+    }
+    even_blocks_out[voxel] = order.block[BlockOrder::HEIGHTS];
+    even_values_out[voxel] = order.value[BlockOrder::HEIGHTS];
     const unsigned char* value = from.value + from.first_value[voxel];
-    unsigned char* out = to.value + to.first_value[voxel];
-    const int values = to.first_value[voxel + 1] - to.first_value[voxel];
-    for (int k = 0; k < values; ++k) out[k] = value[k];
+    for (int k = from_block; k < from_block + blocks; ++k) {
+        const int height = from.height[k], width = from.width[k], bytes = order.bytes(height, width);
+        const int place = order.place(from.ray[k], height), block = to_block + order.block[place]++;
+        to.ray[block] = from.ray[k];
+        to.height[block] = (unsigned char)height;
+        to.width[block] = (unsigned char)width;
+        unsigned char* out = to.value + to.first_value[voxel] + order.value[place];
+        for (int n = 0; n < bytes; ++n) out[n] = value[n];
+        order.value[place] += bytes;
+        value += bytes;
+    }
 }
 
 }  // namespace lfpiv

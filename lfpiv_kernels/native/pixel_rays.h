@@ -2,7 +2,7 @@
 #ifndef LFPIV_PIXEL_RAYS_H
 #define LFPIV_PIXEL_RAYS_H
 
-#include "simd.h"
+#include "microimages.h"
 
 namespace lfpiv {
 
@@ -16,7 +16,9 @@ struct PixelRun {
     const int* place;
     const float* share;
     const int* dark;
-    int pixels, darks, runs;
+    int start, pixels;  // the pixels from here to here
+    int aside, asides;  // pixels that take no part though their rays do, and their end
+    int darks, runs;
     int run;
 
     /// Return the light of a pixel: the sum of its rays, each times its share.
@@ -31,8 +33,11 @@ struct PixelRun {
         for (int n = first[pixel]; n < first[pixel + 1]; ++n) rays_out[place[n]] = share[n] * light;
     }
 
-    /// Write zero on this run's part of the rays that no pixel sees.
+    /// Write zero on this run's part of the rays that no pixel sees, or pixels that take no part.
     LFPIV_INLINE void darken(float* rays_out) const {
+        const int end = aside + (int)((int64_t)(asides - aside) * (run + 1) / runs);
+        const int begin = aside + (int)((int64_t)(asides - aside) * run / runs);
+        for (int n = begin < end ? first[begin] : 0; n < (begin < end ? first[end] : 0); ++n) rays_out[place[n]] = 0.0f;
         const int last = (int)((int64_t)darks * (run + 1) / runs);
         for (int n = (int)((int64_t)darks * run / runs); n < last; ++n) rays_out[dark[n]] = 0.0f;
     }
@@ -40,29 +45,28 @@ struct PixelRun {
 #if defined(__CUDA_ARCH__)
     /// Pixels that `for_pixels` gives at once. Neighbouring threads have neighbouring pixels.
     static constexpr int GROUP = 1;
-    LFPIV_INLINE int begin() const { return run; }
+    LFPIV_INLINE int begin() const { return start + run; }
     LFPIV_INLINE int step() const { return runs; }
 #else
     /// Pixels that `for_pixels` gives at once: all of the run, so that the compiler's vectors are full.
     static constexpr int GROUP = RUN;
-    LFPIV_INLINE int begin() const { return run * RUN; }
+    LFPIV_INLINE int begin() const { return start + run * RUN; }
     LFPIV_INLINE int step() const { return RUN; }
 #endif
 
     /// Call work(first pixel, number of pixels) for the run's pixels, `GROUP` at a time.
     template <class Work>
     LFPIV_INLINE void for_pixels(Work work) const {
-        for (int done = 0, start = begin(); done < RUN && start < pixels; done += GROUP, start += step())
-            work(start, pixels - start < GROUP ? pixels - start : GROUP);
+        for (int done = 0, next = begin(); done < RUN && next < pixels; done += GROUP, next += step())
+            work(next, pixels - next < GROUP ? pixels - next : GROUP);
     }
 };
 
 /// Return one thread's part of the map from Warp's struct.
 template <class Map>
 LFPIV_INLINE PixelRun pixel_run(const Map& map, int run) {
-    return {map.pixel.data,    map.first.data, map.place.data,
-            map.share.data,    map.dark.data,  map.pixel.shape[0],
-            map.dark.shape[0], map.runs,       run};
+    return {map.pixel.data, map.first.data, map.place.data, map.share.data,         map.dark.data, map.start,
+            map.end,        map.aside,      map.asides,     (int)map.dark.shape[0], map.runs,      run};
 }
 
 /// Sum the rays of every pixel of a run.
@@ -88,6 +92,15 @@ struct PlacedRays {
     const int* starts;
     const int* pixel;  // per ray
     const float* share;
+    int size;       // pixels of the sensor
+    int lens_rays;  // in the microimage of one lens
+    int lenses;     // in a row of lenses
+
+    /// Return 1 for an even lens's ray, 2 for an odd one's: neighbours in a row or column of lenses differ.
+    LFPIV_INLINE int lens_bit(int ray) const {
+        const int lens = ray / lens_rays, row = lens / lenses;
+        return 1 + ((lens - row * lenses + row / LAYERS) & 1);
+    }
 
     /// Call lit(place, ray) for rays with light that a pixel sees, dark(place) for those that none sees.
     template <class Lit, class Dark>
@@ -109,28 +122,39 @@ struct PlacedRays {
 /// Return the rays from Warp's struct.
 template <class Placed>
 LFPIV_INLINE PlacedRays placed_rays(const Placed& placed) {
-    return {placed.light.data,  placed.parts.data, (int)placed.parts.shape[0],
-            placed.starts.data, placed.pixel.data, placed.share.data};
+    return {placed.light.data, placed.parts.data, (int)placed.parts.shape[0], placed.starts.data, placed.pixel.data,
+            placed.share.data, placed.size,       placed.lens_rays,           placed.lenses};
 }
 
-/// Number the pixels that see light in the order of their first rays, and count their rays.
-/// `number_out` and `first_out` must hold zeros.
+/// Number the pixels that see light, and count their rays: those of even lenses, those of odd lenses, then those that
+/// see both. Within each they are in the order of their first rays. `number_out` and `first_out` must hold zeros.
 LFPIV_INLINE void number_pixels(const PlacedRays& placed, int* number_out, int* pixel_out, int* first_out,
                                 int* count_out) {
-    int pixels = 0, rays = 0, darks = 0;
+    int rays = 0, darks = 0, next[5] = {};
+    placed.for_places(
+        [&](int, int ray) {
+            int& lenses = number_out[placed.pixel[ray]];
+            lenses = -(-lenses | placed.lens_bit(ray));
+        },
+        [&](int) { ++darks; });
+    for (int pixel = 0; pixel < placed.size; ++pixel) ++next[1 - number_out[pixel]];
+    next[1] = 0;
+    for (int lenses = 2; lenses < 5; ++lenses) next[lenses] += next[lenses - 1];
+    const int even = next[2], odd = next[3], pixels = next[4];
     placed.for_places(
         [&](int, int ray) {
             int& number = number_out[placed.pixel[ray]];
-            if (!number) {
-                pixel_out[pixels] = placed.pixel[ray];
-                number = ++pixels;
+            if (number < 0) {
+                int& last = next[-number];
+                pixel_out[last] = placed.pixel[ray];
+                number = ++last;
             }
             ++first_out[number + 1];
             ++rays;
         },
-        [&](int) { ++darks; });
+        [&](int) {});
     for (int k = 2; k < pixels + 2; ++k) first_out[k] += first_out[k - 1];
-    count_out[0] = pixels, count_out[1] = rays, count_out[2] = darks;
+    count_out[0] = even, count_out[1] = odd, count_out[2] = pixels, count_out[3] = rays, count_out[4] = darks;
 }
 
 /// Put each pixel's rays side by side. Moves `first_out[n]` from where the rays of pixel n begin to where they end.

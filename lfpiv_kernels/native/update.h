@@ -6,6 +6,9 @@
 
 namespace lfpiv {
 
+/// In place of -infinity, which a level of zero would not take away [counts].
+constexpr float LEAST_CORRECTION = -1e30f;
+
 /// One pixel's misfit.
 struct Misfit {
     float correction;  // gain * log(I / P): what the volume's exponent gathers
@@ -36,7 +39,8 @@ LFPIV_INLINE Misfit compare_pixel(float counts, float gain, float floor, float p
     logarithm = quotient > 0.0f ? logarithm : -infinite;
     logarithm = below > 0.0f ? logarithm : 0.0f;
     const float other = difference - below * logarithm;
-    return {gain > 0.0f ? gain * logarithm : 0.0f, difference * difference,
+    const float correction = max(gain * logarithm, LEAST_CORRECTION);
+    return {gain > 0.0f ? correction : 0.0f, difference * difference,
             (exponent || !(below > 0.0f)) ? other : below * (excess * t - rest)};
 }
 

@@ -22,7 +22,11 @@ RUN: int = native.constant("pixel_rays.h", "RUN")
 
 @wp.struct
 class PixelRays:
-    """The rays of every pixel. Pixels are in the order in which their first rays lie in memory."""
+    """The rays of every pixel.
+
+    Pixels under even lenses come first, then those under odd lenses, then those that see an even and an odd one. Within
+    each they are in the order in which their first rays lie in memory.
+    """
 
     pixel: wp.array(dtype=int)
     """Sensor pixel."""
@@ -34,8 +38,16 @@ class PixelRays:
     """Fraction of the pixel's cell that the ray stands for."""
     dark: wp.array(dtype=int)
     """Where rays lie that voxels light but no pixel sees: corners of blocks."""
+    start: int
+    """The first pixel that takes part."""
+    end: int
+    """The end of the pixels that take part."""
+    aside: int
+    """The first pixel whose rays stay dark."""
+    asides: int
+    """The end of the pixels whose rays stay dark."""
     runs: int
-    """Threads that go through all pixels."""
+    """Threads that go through the pixels."""
 
 
 @wp.struct
@@ -52,6 +64,12 @@ class PlacedRays:
     """Sensor pixel of each ray."""
     share: wp.array(dtype=float)
     """Fraction of the pixel's cell that each ray stands for."""
+    size: int
+    """Pixels of the sensor."""
+    lens_rays: int
+    """Rays of a lens."""
+    lenses: int
+    """Lenses in a row."""
 
 
 @wp.func_native("lfpiv::collect(lfpiv::pixel_run(map, run), rays.data, image_out.data);")
@@ -118,10 +136,10 @@ def _number_pixels(
     # in
     placed: PlacedRays,
     # out
-    number_out: wp.array(dtype=int),  # (sensor pixel,): 1, 2, ... in the order of their first rays; 0 without light
+    number_out: wp.array(dtype=int),  # (sensor pixel,): 1, 2, ... in their order; 0 without light
     pixel_out: wp.array(dtype=int),  # sensor pixel of each number
     first_out: wp.array(dtype=int),  # (sensor pixel + 2,): where the rays of each number begin
-    count_out: wp.array(dtype=int),  # numbers of pixels, rays and dark places
+    count_out: wp.array(dtype=int),  # ends of even and odd lenses' pixels and of all; rays, dark places
 ):
     _number(placed, number_out, pixel_out, first_out, count_out)
 
@@ -153,21 +171,32 @@ class RayMap:
         Where each part's rays begin, and the end of the last.
     starts : sequence of int
         The first ray of each part. A ray may lie in several parts; their light adds up.
+    two_sets : bool
+        Whether rays belong to even or odd lenses. Otherwise all count as those of even lenses.
     """
 
-    def __init__(self, microimages: Microimages, light: np.ndarray, parts: Sequence[int], starts: Sequence[int]):
+    def __init__(
+        self,
+        microimages: Microimages,
+        light: np.ndarray,
+        parts: Sequence[int],
+        starts: Sequence[int],
+        *,
+        two_sets: bool,
+    ):
         size = int(np.prod(microimages.sensor_shape))
         placed = PlacedRays()
         placed.light, placed.pixel, placed.share = map(_on_cpu, (light, microimages.pixel, microimages.share))
         placed.parts, placed.starts = (_on_cpu(np.array(ends, np.int32)) for ends in (parts, starts))
-        number, seen, first, count = (np.zeros(length, np.int32) for length in (size, size, size + 2, 3))
+        placed.size, placed.lenses = size, microimages.lenses
+        placed.lens_rays = microimages.edge**2 if two_sets else max(microimages.size, 1)
+        number, seen, first, count = (np.zeros(length, np.int32) for length in (size, size, size + 2, 5))
         _run_once(_number_pixels, [placed], [number, seen, first, count])
-        pixels, lit, darks = (int(n) for n in count)
+        even, odd, pixels, lit, darks = (int(n) for n in count)
         place, share, dark = np.empty(lit, np.int32), np.empty(lit, np.float32), np.empty(darks, np.int32)
         _run_once(_sort_rays, [placed, _on_cpu(number)], [first, place, share, dark])
         self.pixel: np.ndarray = seen[:pixels].copy()
-        """Sensor pixels that voxels light, in the order of their first rays, shape (pixel,), int32."""
-        self.rays = PixelRays()
+        """Sensor pixels that voxels light, in the order of `PixelRays`, shape (pixel,), int32."""
         arrays = {
             "pixel": self.pixel,
             "first": first[: pixels + 1].copy(),
@@ -175,9 +204,11 @@ class RayMap:
             "share": share,
             "dark": dark,
         }
-        for name, array in arrays.items():
-            setattr(self.rays, name, to_device(array))
-        self.rays.runs = -(-max(pixels, min(darks, 1)) // RUN)
+        on_device = {name: to_device(array) for name, array in arrays.items()}
+        self.rays = _pixels(on_device, 0, pixels, pixels)
+        """The rays of all pixels."""
+        self.of_lenses = _pixels(on_device, 0, even, odd), _pixels(on_device, even, odd, odd)
+        """The rays of the pixels that see even lenses only, and of those that see odd ones only."""
 
     def spread(self, image: wp.array, rays_out: wp.array) -> None:
         """Write each pixel's light, times their shares, on its rays: the adjoint of `collect`."""
@@ -186,6 +217,16 @@ class RayMap:
     def collect(self, rays: wp.array, image_out: wp.array) -> None:
         """Sum the rays of every pixel, each times its share. Pixels without rays do not change."""
         launch(Call(_collect, self.rays.runs, [self.rays, rays], [image_out]), parts=runtime.CHUNKS)
+
+
+def _pixels(arrays: dict[str, wp.array], start: int, end: int, aside: int) -> PixelRays:
+    """Return the rays of the pixels from `start` to `end`. Those of pixels from `aside` on stay dark."""
+    rays = PixelRays()
+    for name, array in arrays.items():
+        setattr(rays, name, array)
+    rays.start, rays.end, rays.aside, rays.asides = start, end, aside, arrays["pixel"].size
+    rays.runs = -(-max(end - start, min(arrays["dark"].size + rays.asides - aside, 1)) // RUN)
+    return rays
 
 
 def _on_cpu(array: np.ndarray) -> wp.array:

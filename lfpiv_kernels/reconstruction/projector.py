@@ -1,7 +1,8 @@
 """Warp: projection of voxels to pixels and its adjoint, with weights stored as 8-bit blocks of rays.
 
 A block is at most `BLOCK_WIDTH` rays wide, so that its row is one vector. It holds one value per ray, or a profile
-along the columns and one along the rows, whose products are the values. The adjoint gathers per voxel. The projection
+along the columns and one along the rows, whose products are the values. Blocks under even lenses come before those
+under odd ones, so that either half of them can be taken alone. The adjoint gathers per voxel. The projection
 scatters: on the CPU every part of the voxels adds to rays of its own, which each pixel sums in a fixed order; on CUDA
 it adds atomically. The innermost loops are C++, see ``projector.h``. Twin: ``reference.dense``.
 """
@@ -24,12 +25,17 @@ from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 wp.set_module_options(native.options("projector.h"))
 
 
+EVEN, ODD, ALL = 0, 1, 2
+"""Lenses whose rays take part: i + j is even, odd, or either. Neighbours in a row or column of lenses differ."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
     """Weights of all voxels for one camera: a sparse matrix with 8-bit values and a scale per column.
 
     A block is `width` rays wide and `height` rows high. In the form "pixels" it has one value per ray, row by row. In
     the form "profiles" it has `width` values A, then `height` values B; the value of column c and row k is A[c] B[k].
+    There `width` is `BLOCK_WIDTH` and `height` a multiple of `ROW_GROUP`, and blocks are sorted by it.
     """
 
     form: str
@@ -50,14 +56,16 @@ class Blocks:
     """Weight of one level, shape (voxel,), float32."""
     microimages: Microimages
     """Where the rays lie in memory."""
+    even_blocks: np.ndarray | None = None
+    """Number of each voxel's blocks under even lenses, which come first, shape (voxel,), int32; None for all."""
+    even_values: np.ndarray | None = None
+    """Number of their values, shape (voxel,), int32."""
 
     @property
     def nbytes(self) -> int:
         """Memory of all arrays [byte]."""
-        return sum(
-            getattr(self, name).nbytes
-            for name in ("first_block", "first_value", "ray", "height", "width", "value", "scale")
-        )
+        names = ("first_block", "first_value", "ray", "height", "width", "value", "scale", "even_blocks", "even_values")
+        return sum(array.nbytes for array in (getattr(self, name) for name in names) if array is not None)
 
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur twice."""
@@ -88,16 +96,24 @@ class Matrix:
     width: wp.array(dtype=wp.uint8)
     level: wp.array(dtype=wp.uint8)
     scale: wp.array(dtype=float)
+    even_blocks: wp.array(dtype=int)
+    even_values: wp.array(dtype=int)
     stride: int
     profiles: bool
 
 
-@wp.func_native("return lfpiv::gather(lfpiv::blocks_of(matrix, voxel), rays.data);")
-def _gather(matrix: Matrix, voxel: int, rays: wp.array(dtype=float)) -> float: ...
+@wp.func_native("""
+    lfpiv::prefetch_next(matrix, voxel, lenses);
+    return lfpiv::gather(lfpiv::blocks_of(matrix, voxel, lenses), rays.data);
+""")
+def _gather(matrix: Matrix, voxel: int, lenses: int, rays: wp.array(dtype=float)) -> float: ...
 
 
-@wp.func_native("lfpiv::scatter(lfpiv::blocks_of(matrix, voxel), intensity, rays_out.data);")
-def _scatter(matrix: Matrix, voxel: int, intensity: float, rays_out: wp.array(dtype=float)): ...
+@wp.func_native("""
+    lfpiv::prefetch_next(matrix, voxel, lenses);
+    lfpiv::scatter(lfpiv::blocks_of(matrix, voxel, lenses), intensity, rays_out.data);
+""")
+def _scatter(matrix: Matrix, voxel: int, lenses: int, intensity: float, rays_out: wp.array(dtype=float)): ...
 
 
 @wp.kernel
@@ -106,6 +122,7 @@ def _back_project(
     matrix: Matrix,
     rays: wp.array(dtype=float),
     active: wp.array(dtype=float),
+    lenses: int,
     first_voxel: int,
     # out
     volume_out: wp.array(dtype=float),
@@ -113,7 +130,7 @@ def _back_project(
     voxel = first_voxel + wp.tid()
     if active[voxel] == 0.0:
         return
-    volume_out[voxel] = volume_out[voxel] + matrix.scale[voxel] * _gather(matrix, voxel, rays)
+    volume_out[voxel] = volume_out[voxel] + matrix.scale[voxel] * _gather(matrix, voxel, lenses, rays)
 
 
 @wp.kernel
@@ -121,6 +138,7 @@ def _project(
     # in
     matrix: Matrix,
     volume: wp.array(dtype=float),
+    lenses: int,
     first_voxel: int,
     # out
     rays_out: wp.array(dtype=float),
@@ -128,7 +146,7 @@ def _project(
     voxel = first_voxel + wp.tid()
     intensity = volume[voxel] * matrix.scale[voxel]
     if intensity != 0.0:
-        _scatter(matrix, voxel, intensity, rays_out)
+        _scatter(matrix, voxel, lenses, intensity, rays_out)
 
 
 @wp.func
@@ -152,6 +170,7 @@ def _project_atomic(
     # in
     matrix: Matrix,
     volume: wp.array(dtype=float),
+    lenses: int,
     first_voxel: int,
     # out
     rays_out: wp.array(dtype=float),
@@ -160,8 +179,14 @@ def _project_atomic(
     intensity = volume[voxel] * matrix.scale[voxel]
     if intensity == 0.0:
         return
-    value = matrix.first_value[voxel]
-    for block in range(matrix.first_block[voxel], matrix.first_block[voxel + 1]):
+    value = wp.int64(matrix.first_value[voxel])
+    first, last = int(matrix.first_block[voxel]), int(matrix.first_block[voxel + 1])
+    if lenses == wp.static(EVEN):
+        last = first + matrix.even_blocks[voxel]
+    if lenses == wp.static(ODD):
+        first += matrix.even_blocks[voxel]
+        value += wp.int64(matrix.even_values[voxel])
+    for block in range(first, last):
         width, height = int(matrix.width[block]), int(matrix.height[block])
         for row in range(height):
             for column in range(width):
@@ -214,6 +239,11 @@ class Projector:
         for name in ("first_block", "first_value", "ray", "height", "width", "scale"):
             setattr(self._matrix, name, to_device(getattr(blocks, name)))
         self._matrix.level = to_device(blocks.value)
+        self.lens_sets = 1 if blocks.even_blocks is None else 2
+        """Sets of lenses that can be taken alone."""
+        for name, ends in (("even_blocks", blocks.first_block), ("even_values", blocks.first_value)):
+            array = getattr(blocks, name)
+            setattr(self._matrix, name, to_device(np.diff(ends).astype(np.int32) if array is None else array))
         self._matrix.stride = blocks.microimages.edge
         self._matrix.profiles = blocks.form == "profiles"
         wp.load_module(_project.module, device=runtime.device().warp)  # before threads start
@@ -245,7 +275,8 @@ class Projector:
     def _map_rays(self) -> RayMap:
         """Return the map between pixels and the rays that voxels light."""
         self.scatter(np.ones(len(self.blocks.scale), np.float32))
-        return RayMap(self.blocks.microimages, self.rays.numpy(), self._places, [start for start, _ in self._spans])
+        starts, two = [start for start, _ in self._spans], self.lens_sets == 2
+        return RayMap(self.blocks.microimages, self.rays.numpy(), self._places, starts, two_sets=two)
 
     @contextlib.contextmanager
     def reserved(self) -> Iterator[None]:
@@ -268,24 +299,24 @@ class Projector:
             finally:
                 self._reserved = False
 
-    def scatter(self, volume: np.ndarray) -> None:
-        """Send the light of `volume`, shape (voxel,), to the rays."""
+    def scatter(self, volume: np.ndarray, lenses: int = ALL) -> None:
+        """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
         voxels = to_device(volume, float)
         if not self._on_cpu:
             self.rays.zero_()
-            launch(Call(_project_atomic, len(volume), [self._matrix, voxels], [self.rays]))
+            launch(Call(_project_atomic, len(volume), [self._matrix, voxels, lenses], [self.rays]))
             return
         rays = self.rays.numpy()
 
         def scatter_part(part, first, last):
             rays[self._places[part] : self._places[part + 1]] = 0.0
-            inputs, outputs = [self._matrix, voxels, first], [self._parts[part]]
+            inputs, outputs = [self._matrix, voxels, lenses, first], [self._parts[part]]
             wp.launch(_project, dim=last - first, inputs=inputs, outputs=outputs, device="cpu")
 
         runtime.run_chunks(len(volume), scatter_part)
 
-    def gather(self, out: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-        """Add the weighted sum of the light on each voxel's rays to `out`, shape (voxel,), and return it.
+    def gather(self, out: np.ndarray, active: np.ndarray | None = None, lenses: int = ALL) -> np.ndarray:
+        """Add the weighted sum of the light on each voxel's rays of some lenses to `out`, shape (voxel,). Return `out`.
 
         Voxels whose `active`, shape (voxel,), float32, is zero do not change.
         """
@@ -293,7 +324,7 @@ class Projector:
         mask = to_device(np.ones_like(out) if active is None else active, float)
 
         def gather_part(part, first, last):
-            inputs = [self._matrix, self._parts[part], mask, first]
+            inputs = [self._matrix, self._parts[part], mask, lenses, first]
             wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume], device=device)
 
         runtime.run_chunks(len(out), gather_part)
@@ -301,10 +332,10 @@ class Projector:
             out[:] = volume.numpy()
         return out
 
-    def project(self, volume: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Write the image of `volume`, shape (voxel,), into `out`, shape (pixel,), and return it."""
+    def project(self, volume: np.ndarray, out: np.ndarray, lenses: int = ALL) -> np.ndarray:
+        """Write the image of `volume`, shape (voxel,), through some lenses into `out`, shape (pixel,). Return `out`."""
         with self.reserved():
-            self.scatter(volume)
+            self.scatter(volume, lenses)
             out.fill(0.0)  # pixels that no voxel lights
             image = to_device(out, float)
             self.map.collect(self.rays, image)
@@ -312,14 +343,19 @@ class Projector:
             out[:] = image.numpy()
         return out
 
-    def back_project(self, image: np.ndarray, out: np.ndarray) -> np.ndarray:
+    def back_project(self, image: np.ndarray, out: np.ndarray, lenses: int = ALL) -> np.ndarray:
         """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
 
-        Return `out`.
+        Rays of other lenses than `lenses` do not count. Return `out`.
         """
         with self.reserved():
             self.map.spread(to_device(image, float), self.rays)
-            return self.gather(out)
+            return self.gather(out, lenses=lenses)
+
+    def see_only(self, lenses: int) -> np.ndarray:
+        """Return the sensor pixels that see light through some lenses and through no others, shape (pixel,), int32."""
+        rays = self.map.rays if lenses == ALL else self.map.of_lenses[lenses]
+        return self.map.pixel[rays.start : rays.end]
 
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32."""

@@ -6,7 +6,7 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch, to_device
 from lfpiv_kernels.reconstruction.pixel_rays import PixelRays
-from lfpiv_kernels.reconstruction.projector import Projector
+from lfpiv_kernels.reconstruction.projector import ALL, Projector
 
 wp.set_module_options(native.options("update.h"))
 
@@ -65,6 +65,22 @@ def _update(
 
 
 @wp.kernel
+def _sharpen(
+    # in
+    logarithm: wp.array(dtype=float),
+    blurred: wp.array(dtype=float),
+    share: float,
+    largest: float,
+    first_voxel: int,
+    # out
+    volume_out: wp.array(dtype=float),
+):
+    voxel = first_voxel + wp.tid()
+    step = logarithm[voxel] + share * (logarithm[voxel] - blurred[voxel])
+    volume_out[voxel] = volume_out[voxel] * wp.exp(wp.clamp(step, -largest, largest))
+
+
+@wp.kernel
 def _extrapolate(
     # in
     exponent: float,
@@ -107,8 +123,10 @@ class Comparison:
         device = runtime.device().warp
         self._sums = [wp.zeros(projector.map.rays.runs, dtype=wp.float64, device=device) for _ in range(2)]
 
-    def compare(self, volume: np.ndarray) -> tuple[float, float]:
+    def compare(self, volume: np.ndarray, lenses: int = ALL) -> tuple[float, float]:
         """Project `volume`, shape (voxel,), and write gain * log((image + floor) / (projection + floor)) on the rays.
+
+        With `lenses` only the pixels that see no other lenses count. The other rays become dark.
 
         Returns
         -------
@@ -117,17 +135,29 @@ class Comparison:
         float
             Sum of P log(P / I) - P + I with P the projection and I the image, both plus floor [counts].
         """
-        self.projector.scatter(volume)
-        rays = self.projector.map.rays
+        self.projector.scatter(volume, lenses)
+        rays = self.projector.map.rays if lenses == ALL else self.projector.map.of_lenses[lenses]
         inputs, outputs = [rays, self._image, self._gain, self._floor], [self.projector.rays, *self._sums]
         launch(Call(_compare, rays.runs, inputs, outputs), parts=_parts(rays.runs, FEWEST_RUNS))
-        squares, divergence = (float(sums.numpy().sum()) for sums in self._sums)
+        squares, divergence = (float(sums.numpy()[: rays.runs].sum()) for sums in self._sums)
         return squares, divergence
 
 
 def update(volume: np.ndarray, exponent: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Multiply `volume` by exp(step * exponent) in place; float32, shape (voxel,). Return `volume`."""
     _sweep(_update, [to_device(exponent, float), to_device(step, float)], [volume])
+    return volume
+
+
+def sharpened(
+    volume: np.ndarray, logarithm: np.ndarray, blurred: np.ndarray, share: float, largest: float
+) -> np.ndarray:
+    """Multiply `volume` by exp(logarithm + share * (logarithm - blurred)) in place; float32, shape (voxel,).
+
+    The absolute exponent is at most `largest`. Return `volume`.
+    """
+    inputs = [to_device(logarithm, float), to_device(blurred, float), float(share), float(largest)]
+    _sweep(_sharpen, inputs, [volume])
     return volume
 
 

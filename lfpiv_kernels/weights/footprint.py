@@ -106,8 +106,22 @@ def _fill(
 ): ...
 
 
-@wp.func_native("lfpiv::pack(lfpiv::block_arrays(blocks), lfpiv::block_arrays(packed_out), voxel);")
-def _pack(blocks: BlockArrays, voxel: int, packed_out: BlockArrays): ...
+@wp.func_native("""
+    lfpiv::pack(
+        lfpiv::block_arrays(blocks), lfpiv::block_arrays(packed_out), voxel, profiles, edge, lenses,
+        even_blocks_out.data, even_values_out.data
+    );
+""")
+def _pack(
+    blocks: BlockArrays,
+    voxel: int,
+    profiles: bool,
+    edge: int,
+    lenses: int,
+    packed_out: BlockArrays,
+    even_blocks_out: wp.array(dtype=int),
+    even_values_out: wp.array(dtype=int),
+): ...
 
 
 @wp.kernel
@@ -141,11 +155,17 @@ def _fill_blocks(
 def _pack_blocks(
     # in
     blocks: BlockArrays,
+    profiles: bool,
+    edge: int,
+    lenses: int,  # along i
     first_voxel: int,
     # out
-    packed_out: BlockArrays,  # without gaps
+    packed_out: BlockArrays,  # without gaps, those of even lenses first
+    even_blocks_out: wp.array(dtype=int),  # blocks and values of each voxel under even lenses
+    even_values_out: wp.array(dtype=int),
 ):
-    _pack(blocks, first_voxel + wp.tid(), packed_out)
+    voxel = first_voxel + wp.tid()
+    _pack(blocks, voxel, profiles, edge, lenses, packed_out, even_blocks_out, even_values_out)
 
 
 class Footprints:
@@ -189,6 +209,7 @@ class Footprints:
         self._inputs.corners = to_device(microimages.corner.ravel())
         self._inputs.cuts = wp.vec3i(*cuts)
         self._inputs.profiles = form == "profiles"
+        self._order = [self._inputs.profiles, microimages.edge, columns]
         self._outline = Outline()
         self._outline.extent, self._outline.steps = to_device(np.ravel(outline)), len(outline)
         self._outline.square = len(outline) == 1
@@ -233,21 +254,25 @@ class Footprints:
         self._counts = [count.numpy() for count in counts]
         return self._counts
 
-    def write(self, ray, height, width, value, scale):
+    def write(self, ray, height, width, value, per_voxel):
         """Copy the blocks computed last, without gaps, into arrays of their length.
 
         Parameters
         ----------
-        ray, height, width, value, scale : ndarray
+        ray, height, width, value : ndarray
             As in ``projector.Blocks``, for these voxels only.
+        per_voxel : tuple of ndarray
+            `scale`, `even_blocks` and `even_values` of ``projector.Blocks``, for these voxels only.
         """
-        arrays = [to_device(array) for array in (ray, height, width, value)]
-        packed = _block_arrays(*(_starts(count) for count in self._counts), *arrays)
-        self._launch(_pack_blocks, len(scale), [self._blocks], [packed])
+        scale, *even = per_voxel
+        filled = (ray, height, width, value, *even)
+        arrays = [to_device(array) for array in filled]
+        packed = _block_arrays(*(_starts(count) for count in self._counts), *arrays[:4])
+        self._launch(_pack_blocks, len(scale), [self._blocks, *self._order], [packed, *arrays[4:]])
         scale[:] = self._scale.numpy()[: len(scale)]
         if self._device.kind == "cuda":
-            for array, filled in zip((ray, height, width, value), arrays, strict=True):
-                array[:] = filled.numpy()
+            for array, on_device in zip(filled, arrays, strict=True):
+                array[:] = on_device.numpy()
 
     def _counts_of(self, voxels):
         """Return room for each voxel's number of blocks and of values."""

@@ -11,7 +11,7 @@ import warp as wp
 
 from lfpiv_kernels import native
 from lfpiv_kernels.launch import Call, launch, to_device
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, ROW_GROUP
 
 wp.set_module_options(native.options("microimages.h", contract="off"))  # rounds as NumPy does
 
@@ -38,6 +38,11 @@ class Microimages:
     """Fraction of the pixel's cell inside the pupil, shape (ray,), float32."""
     sensor_shape: tuple[int, int]
     """Rows and columns of the sensor [pixel]."""
+
+    @property
+    def lenses(self) -> int:
+        """Number of lenses along i."""
+        return int(self.corner.shape[1])
 
     @property
     def size(self) -> int:
@@ -102,7 +107,8 @@ def lens_rays(first_lens, centre, radius, edge, sensor_shape):
     """
     corner = np.floor(centre - radius).astype(np.int32)
     count = LAYERS * centre[..., 0].size * edge**2
-    pixel, share = np.empty(count + BLOCK_WIDTH, np.int32), np.empty(count + BLOCK_WIDTH, np.float32)
+    beyond = (ROW_GROUP - 1) * edge + BLOCK_WIDTH  # what a filled-up block may reach
+    pixel, share = np.empty(count + beyond, np.int32), np.empty(count + beyond, np.float32)
     pixel[count:], share[count:] = -1, 0.0
     layout = Layout()
     layout.centre, layout.corner = (to_device(np.ravel(array), device="cpu") for array in (centre, corner))

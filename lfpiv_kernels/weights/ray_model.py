@@ -4,6 +4,8 @@ import taichi as ti
 
 from lfpiv_kernels import native
 
+ROW_GROUP: int = native.constant("projector.h", "ROW_GROUP")
+"""Rows of a block of profiles are a multiple of it."""
 BLOCK_WIDTH: int = native.constant("projector.h", "BLOCK_WIDTH")
 """Largest width of a block of weights [pixel]: one vector load."""
 MODEL_SIZE: int = native.constant("ray_model.h", "MODEL_SIZE")

@@ -175,7 +175,7 @@ def test_pivpy_computes_with_the_planes(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"to": "xlsx"}, "to: expected one of vti, netcdf, zarr, csv, pivpy, found 'xlsx'"),
+        ({"to": "xlsx"}, "to: expected one of vti, netcdf, zarr, csv, vtp, pivpy, found 'xlsx'"),
         ({"to": "csv", "depth_mm": 0.0}, "depth: expected with pivpy only"),
         ({"to": "pivpy", "depth_mm": 9.0}, "depth: expected a z among the vectors, -1 to 0.8 mm, found 9 mm"),
         ({"to": "pivpy", "depth_mm": float("nan")}, "depth: .*found nan"),

@@ -68,7 +68,7 @@ def whole(out):
     """Whether nothing is in a folder but finished results."""
     left = {path.name for path in out.rglob("*") if path.is_file() and path.suffix != ".nc"}
     return (
-        left <= {"background.h5", "calibration.h5", "guard.json", "summary.json", "report.html"}
+        left <= {"background.h5", "calibration.h5", "guard.json", "refinement.json", "summary.json", "report.html"}
         and not (out / ".shared").exists()
     )
 

@@ -152,13 +152,13 @@ def test_a_forged_calibration_is_refused_where_it_is_not_made(small_run, out, fo
 
 @pytest.mark.slow
 def test_a_run_mends_a_folder_with_equal_numbers(small_run, out, caplog):
-    """Calibration, background, guard layers, a volume and vectors at once."""
-    for name in ("calibration.h5", "background.h5", "guard.json"):
+    """Calibration, background, guard layers, refinement, a volume and vectors at once."""
+    for name in ("calibration.h5", "background.h5", "guard.json", "refinement.json"):
         flip(out / name)
     flip(out / "volumes" / "pair_0001_b.nc")
     doubled(out / "vectors" / "pair_0001.nc")
     summary = pipeline.run(small_run.experiment, out, keep_volumes=True)
-    wanted = {"calibration.h5", "background.h5", "guard.json", "pair_0001.nc"}
+    wanted = {"calibration.h5", "background.h5", "guard.json", "refinement.json", "pair_0001.nc"}
     assert wanted <= set(rejected(caplog)) and not summary["failed"]
     assert same_vectors(out, small_run.out) == PAIRS
     caplog.clear()

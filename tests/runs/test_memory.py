@@ -1,7 +1,12 @@
 """Memory that control groups leave, by trees of files in the forms that the kernel gives them."""
 
+import dataclasses
+import math
+
 import pytest
 
+from lfpiv.experiment.opening import read_experiment
+from lfpiv.experiment.settings import Series
 from lfpiv.runs import memory
 from lfpiv.runs.memory import GIB
 
@@ -56,3 +61,17 @@ def test_without_control_groups_the_machine_alone_counts(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "none either")
     monkeypatch.setattr(memory, "meminfo", lambda key: 64 * GIB)
     assert memory.available_bytes() == 64 * GIB
+
+
+def test_a_sequence_holds_the_instants_between_those_of_a_pair(small_run):
+    experiment = read_experiment(small_run.experiment)
+    predicting = experiment.smart.model_copy(update={"predict": True})
+
+    def needed(step, smart):
+        series = None if step is None else Series(instants=40, step=step)
+        return memory.worker_bytes(dataclasses.replace(experiment, series=series, smart=smart))
+
+    assert needed(None, predicting) == needed(None, experiment.smart) == needed(8, experiment.smart)
+    pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
+    assert needed(8, predicting) - needed(1, predicting) == 7 * 4 * (experiment.grid.size + pixels)
+    assert needed(1, predicting) > needed(1, experiment.smart)

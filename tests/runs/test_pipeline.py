@@ -17,7 +17,7 @@ from lfpiv.experiment.opening import read_experiment
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import Folder
 from lfpiv.results.provenance import Marks
-from lfpiv.runs import guard, pair_figures, pipeline, rig
+from lfpiv.runs import guard, pair_figures, pipeline, refinement, rig
 from lfpiv.runs.invocation import Invocation
 from lfpiv.runs.run import open_run
 
@@ -55,6 +55,7 @@ def test_every_file_of_the_contract_is_there_and_whole(finished):
         "background.h5",
         "calibration.h5",
         "guard.json",
+        "refinement.json",
         "report.html",
         "summary.json",
         *(f"vectors/pair_000{pair}.nc" for pair in range(PAIRS)),
@@ -161,8 +162,15 @@ def test_each_setting_concerns_what_depends_on_it(small_run, tmp_path, case):
     old, new, concerned = EDITS[case]
     experiment = read_experiment(changed(small_run.experiment, tmp_path, old, new))
     wanted = provenance.of_calibration(experiment)
-    measured, _ = guard.read(Folder(small_run.out))
-    of_pair = provenance.of_pair(experiment, wanted.hash, 1, guard=measured.layers)
+    folder = Folder(small_run.out)
+    (measured, _), (sized, _) = guard.read(folder), refinement.read(folder)
+    of_pair = provenance.of_pair(
+        experiment,
+        wanted.hash,
+        1,
+        guard=guard.layers(experiment, measured),
+        refinement=refinement.factor(experiment, sized),
+    )
     marks = {
         "calibration": (small_run.out / "calibration.h5", wanted),
         "volumes": (small_run.out / "volumes" / "pair_0001_b.nc", of_pair.volumes[1]),

@@ -26,7 +26,7 @@ from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.results import netcdf, provenance
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume
-from lfpiv.runs import background, dispatch, guard, pipeline
+from lfpiv.runs import background, dispatch, guard, pipeline, refinement
 from lfpiv.runs.run import open_run
 from lfpiv.runs.stretches import MOST_INSTANTS, cut
 from lfpiv.warn import Code, from_text
@@ -156,7 +156,8 @@ def test_a_stretch_that_kills_two_workers_has_failed_but_for_its_finished_pairs(
     assert [pair for pair, outcome in outcomes.items() if outcome.died] == list(died) and len(died) == 2
     shutil.copy2(small_run.out / "calibration.h5", tmp_path / "out")
     with open_run(made[0], tmp_path / "out", None, None) as run:
-        run = dataclasses.replace(run, guard=guard.read(Folder(small_run.out))[0])
+        folder = Folder(small_run.out)
+        run = dataclasses.replace(run, guard=guard.read(folder)[0], refinement=refinement.read(folder)[0])
         run.folder.vectors(died[1]).unlink()  # it died before it wrote this one
         tried = set()
         for pair in died:

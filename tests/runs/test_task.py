@@ -33,6 +33,7 @@ def work(request, tiny_experiment, tmp_path, monkeypatch):
         folder=Folder(tmp_path / "out", experiment.series),
         calibration_hash="a1",
         guard=((1, 2), (0, 0), (3, 4)),
+        refinement=1.25,
         weights=None,
         cameras={},
         darks={},
@@ -64,7 +65,7 @@ def test_a_worker_reads_the_work_that_the_run_wrote(work, tmp_path, monkeypatch)
     )
     assert same == work.experiment
     np.testing.assert_array_equal(same.solid, work.experiment.solid)
-    for name in ("folder", "calibration_hash", "guard", "keep_volumes", "background", "vectors"):
+    for name in ("folder", "calibration_hash", "guard", "refinement", "keep_volumes", "background", "vectors"):
         assert getattr(found, name) == getattr(work, name), name
     assert (found.scratch is None) == (work.experiment.series is None)
     for path in (shared, shared.parent, work.folder.shared):

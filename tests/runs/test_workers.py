@@ -272,7 +272,7 @@ def test_workers_that_cannot_be_had_are_refused(small_run, tmp_path, capfd, opti
     assert commands.call(["run", str(small_run.experiment), "--out", str(out), *options]) == 2
     said = capfd.readouterr().err.splitlines()[-1]
     assert said.startswith("lfpiv: ") and all(word in said for word in words), said
-    assert {path.name for path in out.iterdir()} <= {"background.h5", "calibration.h5", "guard.json"}
+    assert {path.name for path in out.iterdir()} <= {"background.h5", "calibration.h5", "guard.json", "refinement.json"}
 
 
 def test_without_dask_its_extra_is_named(small_run, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from distributed import KilledWorker
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.experiment.settings import Series
 from lfpiv.results.folder import Folder
-from lfpiv.runs import dispatch, guard
+from lfpiv.runs import dispatch, guard, refinement
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.stretches import cut
 from lfpiv.runs.worker import Result
@@ -42,13 +42,14 @@ def write_series(small_run, folder: Path) -> Path:
 
 
 def make_work(small_run, file: Path, out: Path) -> PairWork:
-    """Return the work on all pairs of a series, with the calibration and the guard layers of the small run."""
+    """Return the work on all pairs of a series, with the calibration, guard layers and refinement of the small run."""
     from lfpiv.calibration.camera import load_calibration
 
     out.mkdir()
     shutil.copy2(small_run.out / "calibration.h5", out)
     experiment = read_experiment(file)
-    measured, _ = guard.read(Folder(small_run.out))
+    (measured, _), (sized, _) = guard.read(Folder(small_run.out)), refinement.read(Folder(small_run.out))
+    layers, finer = guard.layers(experiment, measured), refinement.factor(experiment, sized)
     calibration = load_calibration(out / "calibration.h5")
     with h5py.File(out / "calibration.h5") as stored:
         stamp = stored.attrs["settings_hash"]
@@ -56,8 +57,9 @@ def make_work(small_run, file: Path, out: Path) -> PairWork:
         experiment=experiment,
         folder=Folder(out, experiment.series),
         calibration_hash=stamp,
-        guard=measured.layers,
-        weights=build_weights(calibration, guard.with_guard(experiment, measured.layers).grid),
+        guard=layers,
+        refinement=finer,
+        weights=build_weights(calibration, experiment.grid.padded(layers).refined(finer)),
         cameras=calibration.cameras,
         darks={camera.name: None for camera in experiment.cameras},
         keep_volumes=False,

@@ -55,6 +55,7 @@ def test_fine_voxels_validate_as_well_as_larger_ones(factor, reach):
         fields.append(np.stack([vectors[f"displacement_{axis}"] for axis in "zyx"], -1) / scale)
     reaches = [peak_reach(*(volume**0.5 for volume in pair_at(scale)), WINDOW) for scale in (1, factor)]
     assert reaches[0] == 2 and reaches[1] >= reach
-    assert valid[1] >= valid[0] - 0.02 and valid[0] > 0.95
+    one_vector = 1 / fields[0][..., 0].size
+    assert valid[1] >= valid[0] - 1.01 * one_vector and valid[0] > 0.95
     assert fields[0].shape == fields[1].shape
     assert np.linalg.norm(fields[1] - fields[0], axis=-1).mean() < TOLERANCE_FIELD

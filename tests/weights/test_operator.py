@@ -24,6 +24,7 @@ from lfpiv_kernels.rays.lattice import cell_frame, cell_rectangles, pack_lattice
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.weights import footprint, microimages
 from lfpiv_kernels.weights import ray_model as raymodel
+from lfpiv_kernels.weights.microimages import LAYERS
 
 VOXEL_MM = 0.1
 LEVEL = 0.5 / raymodel.LEVELS * 1.1  # rounding to 8 bits, in units of the largest weight; the bound is 4-10 % above it
@@ -205,14 +206,15 @@ def test_rays_lie_where_their_lenses_put_them(layout, f_number):
     assert (covered[(row * 130 + column)[seen & lit]] > 0).all()
 
 
-def test_a_pixel_knows_its_rays(small):
+@pytest.mark.parametrize("two_sets", [False, True])
+def test_a_pixel_knows_its_rays(small, two_sets):
     """Light of the camera's rays in three parts of memory, of which neighbours overlap."""
     rays = small.cameras["cam1"].microimages
     third = rays.size // 3
     starts, ends = np.array([0, third - 900, 2 * third - 900]), np.array([third, 2 * third, rays.size])
     parts = np.concatenate([[0], np.cumsum(ends - starts)])
     light = (np.random.default_rng(9).random(parts[-1]) < 0.2).astype(np.float32)
-    ray_map = RayMap(rays, light, parts, starts)
+    ray_map = RayMap(rays, light, parts, starts, two_sets=two_sets)
     found, place = ray_map.rays, np.flatnonzero(light)
     part = np.searchsorted(parts, place, side="right") - 1
     ray = place - parts[part] + starts[part]
@@ -220,7 +222,16 @@ def test_a_pixel_knows_its_rays(small):
     lit = rays.share[ray] > 0
     np.testing.assert_array_equal(found.dark.numpy(), place[~lit])
     pixel, first = np.unique(rays.pixel[ray[lit]], return_index=True)
-    np.testing.assert_array_equal(ray_map.pixel, pixel[np.argsort(first)])
+    odd = two_sets * (np.indices(rays.corner.shape[:2]).sum(0) % 2)  # (lens along j, lens along i)
+    row, column = np.divmod(ray[lit] // rays.edge**2, rays.lenses)
+    sees_odd = np.isin(pixel, rays.pixel[ray[lit]][odd[row // LAYERS % len(odd), column] == 1])
+    sees_even = np.isin(pixel, rays.pixel[ray[lit]][odd[row // LAYERS % len(odd), column] == 0])
+    np.testing.assert_array_equal(
+        ray_map.pixel, pixel[np.lexsort((first, sees_odd.astype(int) + (sees_odd & sees_even)))]
+    )
+    ends = [(one.start, one.end) for one in ray_map.of_lenses]
+    even, both = int((~sees_odd).sum()), int((sees_odd & sees_even).sum())
+    assert ends == [(0, even), (even, len(pixel) - both)]
     counts = np.diff(found.first.numpy())
     assert found.first.numpy()[0] == 0 and counts.min() > 0
     order = np.lexsort((found.place.numpy(), np.repeat(ray_map.pixel, counts)))
@@ -238,8 +249,9 @@ def test_microimages_may_be_higher_than_a_block(form):
     )
     blocks = weights.projector("fine").blocks
     assert blocks.height.max() == footprint.TALLEST and blocks.microimages.edge > footprint.TALLEST
-    rays, _ = blocks.entries(0)
-    assert len(np.unique(rays)) == len(rays)  # blocks do not overlap
+    rays, weight = blocks.entries(0)
+    rays = rays[weight > 0]
+    assert len(np.unique(rays)) == len(rays)  # blocks do not overlap but where zeros fill them up
     assert weights.image("fine", (0, 0, 0)).sum() == pytest.approx(1.0, rel=0.01)
     assert np.max(compare_with_count(weights)["fine"]) <= FOOTPRINT_WORST
 

@@ -1,0 +1,134 @@
+"""Damping by ghosts of a run: measured once in simulated pairs, after recorded ones are finished.
+
+The outcome is one file for all pairs (`lfpiv.results.stored_damping`). It depends on finished vectors, their images and
+fixed seeds only, so that it is the same for any number of workers.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from threadpoolctl import threadpool_limits
+
+from lfpiv.errors import InputError
+from lfpiv.files import writing
+from lfpiv.geometry.grid import AXES
+from lfpiv.progress import StepProgress
+from lfpiv.reconstruction.bootstrap import measure_damping
+from lfpiv.results import netcdf, stored_damping
+from lfpiv.results.provenance import Stamp
+from lfpiv.results.stored_damping import StoredDamping
+from lfpiv.runs.frame_light import FrameLight
+from lfpiv.runs.pair import PairWork
+from lfpiv.velocity.damping import Damping
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.results.folder import Folder
+
+log = logging.getLogger(__name__)
+
+IMITATED = 4
+"""Largest number of recorded pairs whose images show how many particles there are."""
+
+
+StampOf = Callable[[Sequence[int]], Stamp]
+"""Returns the stamp of the damping measured with some pairs."""
+
+
+def stored(experiment: Experiment, folder: Folder, stamp_of: StampOf) -> StoredDamping | None:
+    """Return the stored damping if it fits the run; None if it is off, missing, or of other settings or images."""
+    if not experiment.simulated_pairs or (found := stored_damping.read(folder.bootstrap)) is None:
+        return None
+    known, marks = found
+    return known if stamp_of(known.pairs).fits(marks) else None
+
+
+def decide(
+    experiment: Experiment,
+    folder: Folder,
+    stamp_of: StampOf,
+    finished: Callable[[], Sequence[int]],
+    make_work: Callable[[], PairWork],
+    progress: StepProgress,
+) -> StoredDamping | None:
+    """Return the stored damping, or measure and store it; None if it is off or no pair can be imitated.
+
+    `finished` returns the pairs whose vectors are in the folder, `make_work` the work on pairs with its weights. Both
+    are called only if pairs must be simulated.
+    """
+    if not experiment.simulated_pairs:
+        if experiment.bootstrap.pairs:
+            log.info("damping by ghosts: not measured in so short a run; set bootstrap.pairs")
+        with writing(folder.bootstrap):
+            folder.bootstrap.unlink(missing_ok=True)
+        return None
+    if experiment.in_sequence:
+        log.info("damping by ghosts: not measured in a series whose instants follow from those before (smart.predict)")
+        return None
+    if (known := stored(experiment, folder, stamp_of)) is not None:
+        log.info("damping by ghosts: measured before, kept")
+        return known
+    pairs = _spread(finished(), experiment.simulated_pairs)
+    if not pairs or stamp_of(pairs).parts["images"] is None:
+        log.info("damping by ghosts: not measured, no finished %s has its images", experiment.noun)
+        return None
+    start, damping, reason = time.perf_counter(), None, ""
+    try:
+        with threadpool_limits(1):  # sums of BLAS depend on its number of threads
+            damping = _measure(make_work(), pairs, progress)
+    except InputError as error:
+        log.warning("damping by ghosts: not measured: %s", error)
+        return None
+    except ValueError as error:
+        reason = str(error)
+        log.warning("damping by ghosts: not measured: %s", reason)
+    seconds = time.perf_counter() - start
+    found = StoredDamping(damping=damping, pairs=tuple(pairs), seconds=seconds, reason=reason)
+    stored_damping.write(found, stamp_of(pairs), folder.bootstrap)
+    if damping is not None:
+        for axis in AXES[::-1]:
+            log.info("%s", sentence(damping, axis))
+    return found
+
+
+def sentence(damping: Damping, axis: str) -> str:
+    """Return the damping along an axis as a sentence."""
+    found = damping.axes[axis]
+    used = "taken off" if found.applied else "not significant" if found.fluctuation else "no fluctuations"
+    return (
+        f"damping by ghosts along {axis}: slope of measured on true fluctuations {found.slope:.3f} +- "
+        f"{found.slope_error:.3f}, offset {found.offset:+.3f} +- {found.offset_error:.3f} voxel; {used}"
+    )
+
+
+def _spread(finished: Sequence[int], count: int) -> list[int]:
+    """Return evenly spread pairs: as many as are simulated, or all finished ones if these are fewer."""
+    count = min(count, len(finished))
+    return [finished[(2 * number + 1) * len(finished) // (2 * count)] for number in range(count)]
+
+
+def _measure(work: PairWork, pairs: list[int], progress: StepProgress) -> Damping:
+    """Measure the damping with the vectors and the images of some finished pairs."""
+    assert work.weights is not None
+    vectors: list[xr.Dataset] = [netcdf.read_vectors(work.folder.vectors(pair)) for pair in pairs]
+    frames: list[FrameLight] = []
+    for pair in pairs[:IMITATED]:
+        frames += [work.light_again(frame) for frame in work.experiment.pair_frames(pair)]
+    noise = {name: sum(frame.noise[name] for frame in frames) / len(frames) for name in frames[0].noise}
+    first = work.solver.smart.solve(frames[0].images, floor=frames[0].noise)
+    return measure_damping(
+        work.weights,
+        vectors,
+        [frame.images for frame in frames],
+        work.measure,
+        pairs=work.experiment.simulated_pairs,
+        noise=noise,
+        volume=first.volume,
+        progress=progress,
+    )

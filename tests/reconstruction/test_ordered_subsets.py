@@ -1,0 +1,215 @@
+"""Ordered subsets: the rays' halves, an epoch against its twin, the limit, the last passes, and what is refused."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from support.ideal_rig import optics, two_cameras
+
+import lfpiv
+from lfpiv.reconstruction import momentum, ordered_subsets
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.sieve import Sieve
+from lfpiv.reconstruction.smart import CameraEquation, ImageEquations, State
+from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.reconstruction.steps import SmartStep
+from lfpiv.weights.operator import Weights
+from lfpiv_kernels import reference, runtime
+from lfpiv_kernels.reconstruction import update as kernels
+from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
+
+TOLERANCE_SUM = 1e-6  # float32 sums of the same terms in another order, of the brightest pixel
+TOLERANCE_ADJOINT = 1e-6  # float32 sums of terms with random signs, of the norms' product
+TOLERANCE_TWIN = 2e-4  # three epochs of float32 sums against float64, of the brightest voxel
+TOLERANCE_FIXED = 1e-4  # logarithms of float32 quotients near 1, relative
+FORMS = ["profiles", "pixels"]
+
+
+@pytest.fixture(scope="module", params=FORMS)
+def weights(request):
+    """A 3 x 4 x 5 grid seen by two cameras."""
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0.3), size_mm=(0.5, 0.4, 0.3), voxel_mm=0.1)
+    return lfpiv.build_weights(two_cameras(optics=optics(rows=200, columns=240)), grid, form=request.param)
+
+
+@pytest.fixture(scope="module")
+def volume_of_blobs():
+    """Weights of a volume of 10 x 16 x 16 voxels, blobs in it, and their noisy images."""
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.6, 1.6, 1.0), voxel_mm=0.1)
+    weights = lfpiv.build_weights(two_cameras(optics=optics(rows=400, columns=440)), grid, form="profiles")
+    rng = np.random.default_rng(3)
+    coefficients = np.zeros(grid.size, np.float32)
+    coefficients[rng.choice(grid.size, 120, replace=False)] = 4e5
+    truth = Sieve(0.6, grid.shape)(coefficients).reshape(grid.shape)
+    images = weights(truth)
+    noisy = {name: (image + rng.normal(0, 8, image.shape)).astype(np.float32) for name, image in images.items()}
+    return weights, truth, noisy
+
+
+def test_subsets_partition_the_pixels_that_see_one_half(weights):
+    for name in weights.cameras:
+        even, odd, every = (set(weights.projector(name).see_only(lenses)) for lenses in (EVEN, ODD, ALL))
+        assert not even & odd and even | odd <= every
+        assert len(even | odd) > 0.9 * len(every)
+
+
+def test_neighbouring_lenses_are_of_different_halves(weights):
+    """Pixels near the centres of microimages, whose lens the lattice tells without any layout of rays."""
+    for name, camera in weights.cameras.items():
+        projector, geometry, lenses = weights.projector(name), camera.optics, camera.lattice
+        halves = []
+        for half in (EVEN, ODD):
+            row, column = np.divmod(projector.see_only(half), geometry.sensor_shape[1])
+            at = (np.stack([column, row], 1) + 0.5 - np.array(geometry.sensor_shape[::-1]) / 2) * geometry.pixel_mm
+            lens = at / (1 + geometry.sensor_per_pupil)
+            nearest = lenses.nearest(lens)
+            central = np.linalg.norm(lens - lenses.centres_mm(nearest), axis=1) < 0.3 * lenses.pitch_mm
+            halves.append(np.unique(nearest[central].sum(1) % 2))
+        assert [len(half) for half in halves] == [1, 1] and halves[0] != halves[1]
+
+
+def test_halves_add_up_to_the_projection_and_to_the_back_projection(weights):
+    rng = np.random.default_rng(1)
+    volume = rng.random(weights.grid.size, np.float32)
+    for name, camera in weights.cameras.items():
+        projector, size = weights.projector(name), camera.gain.size
+        whole, even, odd = (projector.project(volume, np.zeros(size, np.float32), part) for part in (ALL, EVEN, ODD))
+        np.testing.assert_allclose(even + odd, whole, atol=TOLERANCE_SUM * whole.max())
+        assert min(even.max(), odd.max()) > 0.1 * whole.max()
+        image = rng.random(size, np.float32)
+        back = [projector.back_project(image, np.zeros_like(volume), part) for part in (ALL, EVEN, ODD)]
+        np.testing.assert_allclose(back[1] + back[2], back[0], atol=TOLERANCE_SUM * back[0].max())
+
+
+@pytest.mark.parametrize("lenses", [EVEN, ODD])
+def test_each_half_is_adjoint_to_its_back_projection(weights, lenses):
+    rng = np.random.default_rng(2)
+    for name, camera in weights.cameras.items():
+        volume = rng.normal(size=weights.grid.size).astype(np.float32)
+        image = rng.normal(size=camera.gain.size).astype(np.float32)
+        projector = weights.projector(name)
+        forth = projector.project(volume, np.zeros_like(image), lenses)
+        back = projector.back_project(image, np.zeros_like(volume), lenses)
+        products = np.vdot(forth.astype(float), image), np.vdot(back.astype(float), volume)
+        norms = float(np.linalg.norm(forth) * np.linalg.norm(image))
+        assert abs(products[0] - products[1]) < TOLERANCE_ADJOINT * norms
+
+
+def test_epochs_equal_their_dense_twin(weights):
+    rng, floor = np.random.default_rng(4), 0.5
+    first = rng.uniform(50, 200, weights.grid.size).astype(np.float32)
+    names, subsets = list(weights.cameras), ordered_subsets.subsets_of(2, True)
+    images = {name: rng.uniform(0, 20, camera.gain.size).astype(np.float32) for name, camera in weights.cameras.items()}
+    dense = [reference.dense(weights.projector(name).blocks) for name in names]
+    pixels = [weights.projector(names[one.camera]).see_only(one.lenses) for one in subsets]
+    twin = reference.ordered_subsets(
+        [dense[one.camera][seen] for one, seen in zip(subsets, pixels, strict=True)],
+        [images[names[one.camera]][seen] for one, seen in zip(subsets, pixels, strict=True)],
+        first.astype(float),
+        column_sum=sum(matrix.sum(0) for matrix in dense),
+        epochs=3,
+        floor=floor,
+        shortening=ordered_subsets.SHORTENING,
+        momentum=ordered_subsets.SUBSET_MOMENTUM,
+        leap=kernels.LARGEST_LEAP,
+    )
+    even_gain = {name: np.ones(camera.gain.size, np.float32) for name, camera in weights.cameras.items()}
+    equations = ImageEquations(
+        [
+            CameraEquation(image=images[name], gain=even_gain[name], floor=floor, projector=weights.projector(name))
+            for name in names
+        ]
+    )
+    sieve, column_sum = Sieve(0.0, weights.stored.shape), sum(matrix.sum(0) for matrix in dense).astype(np.float32)
+    sums = [dense[one.camera][seen].sum(0).astype(np.float32) for one, seen in zip(subsets, pixels, strict=True)]
+    sizes = ordered_subsets.step_sizes(column_sum, sums, np.ones(len(first), bool))
+    state = State(first.copy(), momentum.Momentum(first.copy()), ())
+    steps = [SmartStep(size, sieve) for size in sizes]
+    with equations.locked():
+        epochs = ordered_subsets.iterate_epochs(equations, state, sieve, subsets=subsets, steps=steps, epochs=3)
+        found = [after.coefficients for after, _ in epochs][-1]
+    np.testing.assert_allclose(found, twin, atol=TOLERANCE_TWIN * twin.max())
+
+
+def test_sums_of_lenses_are_those_of_the_dense_weights(weights):
+    for name, camera in weights.cameras.items():
+        for lenses in (EVEN, ODD):
+            pixels = weights.projector(name).see_only(lenses)
+            expected = camera.gain.ravel()[pixels] @ reference.dense(weights.projector(name).blocks)[pixels]
+            np.testing.assert_allclose(weights.sums_of_lenses(name, lenses), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_truth_is_a_fixed_point_of_subsets(weights):
+    truth = np.random.default_rng(5).uniform(1e3, 2e3, weights.grid.shape).astype(np.float32)
+    keywords = {"first": truth, "floor": 1.0, "floor_share": 0.0, "subsets": 4}
+    volume = lfpiv.reconstruct(weights, weights(truth), 8, **keywords)
+    np.testing.assert_allclose(volume.values, truth, rtol=TOLERANCE_FIXED)
+
+
+def test_fourteen_passes_over_subsets_reach_the_misfit_and_truth_of_forty_iterations(volume_of_blobs):
+    weights, truth, images = volume_of_blobs
+    plain = lfpiv.reconstruct(weights, images, 40, sieve_voxel=0.6)
+    fast = lfpiv.reconstruct(weights, images, 14, sieve_voxel=0.6, subsets="auto")
+    assert fast.attrs["misfit"][-1] <= plain.attrs["misfit"][-1]
+    assert (
+        lfpiv.metrics.reconstruction_quality(fast, truth) >= lfpiv.metrics.reconstruction_quality(plain, truth) - 2e-3
+    )
+
+
+def test_the_last_passes_take_all_rays_and_lower_the_misfit(volume_of_blobs):
+    weights, _, images = volume_of_blobs
+    misfit = lfpiv.reconstruct(weights, images, 9, sieve_voxel=0.6, subsets=4).attrs["misfit"]
+    whole = misfit[-1 - ordered_subsets.WHOLE_PASSES :]
+    assert len(misfit) == 10 and (np.diff(whole) < 0).all()
+
+
+@pytest.mark.parametrize("iterations", [0, 1, 2, 5])
+def test_the_first_misfit_is_that_of_the_first_guess(volume_of_blobs, iterations):
+    weights, _, images = volume_of_blobs
+    guess = lfpiv.reconstruct(weights, images, 0, sieve_voxel=0.6)
+    volume = lfpiv.reconstruct(weights, images, iterations, sieve_voxel=0.6, subsets=4)
+    assert volume.attrs["misfit"][0] == pytest.approx(guess.attrs["misfit"][0], rel=1e-9)
+    assert volume.attrs["iterations"] == iterations and len(volume.attrs["residual"]) == iterations + 1
+
+
+def test_a_stop_by_tolerance_is_one_of_whole_passes(volume_of_blobs):
+    weights, _, images = volume_of_blobs
+    volume = lfpiv.reconstruct(weights, images, 60, sieve_voxel=0.6, subsets=4, tolerance=3e-3)
+    misfit = volume.attrs["misfit"]
+    assert volume.attrs["iterations"] < 60 and volume.attrs["stop"].startswith("misfit no longer falls")
+    assert 0 <= misfit[-2] - misfit[-1] < 3e-3 * misfit[-2]
+
+
+def test_subsets_do_not_depend_on_the_threads(volume_of_blobs, monkeypatch):
+    weights, _, images = volume_of_blobs
+    device, keywords = runtime.device(), {"sieve_voxel": 0.6, "subsets": 4}
+    before = lfpiv.reconstruct(weights, images, 4, **keywords)
+    monkeypatch.setattr(runtime, "device", lambda: dataclasses.replace(device, threads=1))
+    np.testing.assert_array_equal(lfpiv.reconstruct(weights, images, 4, **keywords).values, before.values)
+
+
+@pytest.mark.parametrize(
+    ("settings", "cameras", "expected"),
+    [
+        ({"subsets": "auto"}, 2, 4),
+        ({"subsets": "auto"}, 1, 2),
+        ({"subsets": 2}, 2, 2),
+        ({"subsets": 1}, 2, 1),
+        ({"subsets": "auto", "accelerate": False}, 2, 1),
+        ({"subsets": "auto", "smoothing_voxel": 1.0}, 2, 1),
+        ({"subsets": "auto", "normalisation": "paper"}, 2, 1),
+    ],
+)
+def test_the_number_of_subsets(weights, settings, cameras, expected):
+    some = weights if cameras == 2 else weights.of_camera(next(iter(weights.cameras)))
+    assert isinstance(some, Weights) and len(SmartSolver(some, SmartSettings(**settings)).subsets) == expected
+
+
+def test_subsets_that_cannot_be_made_are_refused(weights):
+    with pytest.raises(ValueError, match="subsets: with these cameras expected one of 1, 2, 4, got 3"):
+        lfpiv.reconstruct(weights, weights(np.ones(weights.grid.shape)), 2, subsets=3)
+    for wrong in (0, -1, 2.5, "many", True):
+        with pytest.raises(ValueError, match="subsets: expected"):
+            SmartSettings(subsets=wrong)
+    with pytest.raises(ValueError, match="subsets: ordered subsets need momentum"):
+        SmartSettings(subsets=4, accelerate=False)

@@ -1,0 +1,38 @@
+"""A run with the table [tracking]: particles beside the vectors, kept, and made anew when their settings change."""
+
+import logging
+
+import numpy as np
+import pytest
+
+import lfpiv
+from lfpiv.runs import pipeline
+
+
+def with_tracking(small_run, folder, keys=""):
+    experiment = small_run.images(folder)
+    text = experiment.read_text("utf-8")
+    experiment.write_text(f"{text}\n[tracking]\n{keys}", "utf-8")
+    return experiment
+
+
+@pytest.mark.slow
+def test_particles_stand_beside_the_vectors_and_follow_their_settings(small_run, tmp_path, caplog):
+    experiment, out = with_tracking(small_run, tmp_path / "data", "rounds = 2\n"), small_run.results(tmp_path / "out")
+    summary = pipeline.run(experiment, out, pairs=(0, 1))
+    file = out / "particles" / "pair_0000.nc"
+    table = lfpiv.open_particles(out)
+    figures = next(entry for entry in summary["pairs"] if entry["pair"] == 0)["particles"]
+    assert figures["linked"] == table.sizes["particle"] > 20
+    valid = table["valid"].values
+    moved = np.stack([table[f"displacement_{axis}"].values for axis in "xyz"], axis=1)[valid]
+    assert np.abs(np.median(moved, axis=0) - (0.8, -0.6, 0.4)).max() < 0.1
+
+    made = file.stat().st_mtime_ns
+    assert "vectors of pair 0" in " ".join(pipeline.run(experiment, out, pairs=(0, 1))["reused"])
+    assert file.stat().st_mtime_ns == made
+
+    experiment.write_text(experiment.read_text("utf-8").replace("rounds = 2", "rounds = 1"), "utf-8")
+    caplog.set_level(logging.INFO)
+    pipeline.run(experiment, out, pairs=(0, 1))
+    assert file.stat().st_mtime_ns > made and "tracking.rounds" in caplog.text
