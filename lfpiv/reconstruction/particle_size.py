@@ -41,8 +41,8 @@ PUPIL_SHARE = 0.6
 """Largest coordinate of a sub-aperture along an axis of the pupil, as a share of the pupil's radius."""
 MEAN_LENSES = 3.0
 """Standard deviation of the Gaussian over which the mean light is taken [lens]."""
-FAR_LENSES = 4
-"""Distance at which products show no particles any more, only light that varies slowly [lens]."""
+FAR_LENSES = (4, 5, 6)
+"""Distances at which products show no particles any more, only light that varies slowly [lens]."""
 LIT_SHARE = 0.1
 """Least light of a lens that counts, as a share of the brightest lens's light of an evenly lit volume."""
 LEAST_RANGE = 0.1
@@ -86,7 +86,7 @@ class SubApertures:
     def covariances(self, image: np.ndarray) -> np.ndarray:
         """Return sums of products of neighbours in the pupil, shape (2, sub-aperture): at the same lens, one away.
 
-        The product `FAR_LENSES` away is subtracted: light that varies slowly and was not removed with the mean.
+        The mean product `FAR_LENSES` away is subtracted: light that varies slowly and was not removed with the mean.
         """
         pixels = np.asarray(image, np.float32).reshape(-1)
         here, right, below = (
@@ -94,7 +94,8 @@ class SubApertures:
             for step, even in zip(self._steps, self._even, strict=True)
         )
         same = (here * (right + below)).sum((1, 2))
-        near, far = (self._apart(here, right, below, lenses) for lenses in (1, FAR_LENSES))
+        near = self._apart(here, right, below, 1)
+        far = np.mean([self._apart(here, right, below, lenses) for lenses in FAR_LENSES], axis=0)
         return np.stack([same - far, near - far])
 
     @staticmethod

@@ -236,7 +236,7 @@ def timings(summary: Summary, noun: str = "pair") -> str:
         "weights": "weights",
         "reconstruction": "reconstruction, all volumes",
         "correlation": f"correlation, all {noun}s",
-        "bootstrap": "damping by ghosts, simulated pairs",
+        "bootstrap": "damping by ghosts",
         "total": "this run, until the report",
     }
     rows = [[text, number(summary.timings_s.get(key), 1)] for key, text in names.items()]

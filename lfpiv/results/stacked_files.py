@@ -16,9 +16,9 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import hdf5
-from lfpiv.errors import InputError
+from lfpiv.errors import DamagedFile, InputError
 from lfpiv.geometry.grid import AXES
-from lfpiv.records import read_object
+from lfpiv.records import RecordError, read_object
 from lfpiv.results import datasets, finished, netcdf, provenance, stored_damping
 from lfpiv.velocity.damping import ATTRIBUTE
 
@@ -63,7 +63,10 @@ class StackedFiles:
         first = netcdf.read_vectors(self.path(0))
         self.stored_names = {str(name) for name in first.data_vars}
         """Variables that the files hold. The others follow from them and the damping by ghosts."""
-        depends_on = read_object(first.attrs.get("depends_on", "{}"))
+        try:
+            depends_on = read_object(first.attrs.get("depends_on", "{}"))
+        except RecordError as error:
+            raise DamagedFile(self.path(0), f"depends_on: {error}") from None
         self.damping = stored_damping.of_vectors(folder / stored_damping.FILE, depends_on)
         """Damping by ghosts of these vectors; None if it was not measured."""
         self.first = first if self.damping is None else self.damping.unbiased(first)

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.fft
 from scipy.ndimage import convolve, gaussian_filter
 
+from lfpiv.geometry.resampling import volume_on
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
@@ -120,7 +121,7 @@ class CameraVolumes:
     Parameters
     ----------
     weights : Weights
-        The operator of two or more cameras.
+        The operator of two or more cameras. Volumes are correlated on the voxels of its `volume`.
     """
 
     def __init__(self, weights: Weights):
@@ -134,7 +135,8 @@ class CameraVolumes:
         for number, (name, solver) in enumerate(self._solvers.items()):
             if progress is not None:
                 progress(number / len(self._solvers))
-            self._volumes[name].append(_flattened(solver.solve({name: images[name]}).volume))
+            found = volume_on(solver.solve({name: images[name]}).to_dataarray(), self.weights.volume)
+            self._volumes[name].append(_flattened(found.values))
 
     def each(self, instants: int) -> list[CameraVolumes]:
         """Return the volumes of each run of so many instants alone."""
@@ -154,7 +156,7 @@ class CameraVolumes:
         tuple of Disparity
             Empty if no two cameras show the same particles in any part of the volume.
         """
-        grid, found = self.weights.grid, list[Disparity]()
+        grid, found = self.weights.volume, list[Disparity]()
         middle = tuple(slice((n - m) // 2, (n + m) // 2) for n in grid.shape for m in [min(n, MIDDLE_VOXEL)])
         for pair in combinations(self.weights.cameras, 2):
             volumes = self._volumes[pair[0]], self._volumes[pair[1]]
