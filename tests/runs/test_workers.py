@@ -23,8 +23,7 @@ from lfpiv.errors import ClusterError, InputError, StorageError
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.results import datasets, netcdf, provenance, stamps
-from lfpiv.results.folder import Folder
-from lfpiv.runs import cluster_workers, dispatch, guard, local_workers, memory, pipeline, refinement, worker_plan
+from lfpiv.runs import cluster_workers, dispatch, guard, local_workers, memory, pipeline, worker_plan
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.stretches import cut
 from lfpiv.runs.worker import Result
@@ -290,13 +289,13 @@ def test_finishing_thousands_of_pairs_opens_each_file_at_most_twice(small_run, t
     out, experiment = small_run.calibrated(tmp_path / "out"), read_experiment(file)
     (out / "vectors").mkdir()
     calibration = stamps.of_calibration(experiment).hash
-    content, measured = (small_run.out / "vectors" / "pair_0000.nc").read_bytes(), Folder(small_run.out)
-    layers = guard.layers(experiment, guard.read(measured)[0])
-    grid = {"guard": layers, "refinement": refinement.read(measured)[0].factor}
+    content = (small_run.out / "vectors" / "pair_0000.nc").read_bytes()
+    least = guard.layers(experiment, None)  # nothing is measured: most of the images are missing
     for pair in range(pairs):
         path = out / "vectors" / f"pair_{pair:04d}.nc"
         path.write_bytes(content)
-        stamp = stamps.of_pair(experiment, calibration, pair, **grid).vectors.attributes | {datasets.FILE: path.name}
+        marks = stamps.of_pair(experiment, calibration, pair, guard=least, refinement=1.0).vectors.attributes
+        stamp = marks | {datasets.FILE: path.name}
         rewrite(path, lambda file, stamp=stamp: file.attrs.update(stamp), sealed=True)
     opened, read_marks = [], provenance.read_marks
     monkeypatch.setattr(provenance, "read_marks", lambda path: opened.append(path) or read_marks(path))
