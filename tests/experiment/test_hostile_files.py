@@ -140,7 +140,7 @@ CHANGES = {
     "plane behind the lens": ("planes_mm = [-0.2, 0.2]", "planes_mm = [-0.2, 900]", "behind the lens"),
     "far search": ("pairs = 2", "pairs = 2\n[correlation]\nmax_displacement_voxel = 16", "less than the volume's 16"),
     "huge network": ("pairs = 2", "pairs = 2\n[network]\nhidden = [200, 200]", "at most 10000 weights"),
-    "many cameras": ("[board]", "[[camera]]\n" * 5000 + "[board]", "more."),
+    "many cameras": ("[board]", "[[camera]]\n" * 5000 + "[board]", "more: these keys are missing"),
     "many planes": ("[-0.2, 0.2]", str(list(range(3000))), "planes_mm: expected at most 1000 value(s)"),
 }
 
