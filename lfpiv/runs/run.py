@@ -334,6 +334,7 @@ class Run:
         light, warnings = provenance.background_figures(self.folder.background)
         return Contents(
             vectors=self.finished,
+            selected=self.numbers,
             volumes=volumes,
             background=light,
             background_warnings=warnings,

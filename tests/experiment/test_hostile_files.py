@@ -120,7 +120,7 @@ CHANGES = {
     "tiny magnification": ("magnification = -1.0", "magnification = 1e-300", "magnitude 0.0001 to 1000"),
     "tiny f-number": ("f_number = 4.0", "f_number = 0.1", "f_number: expected microimages from 1 pixel to 4 times"),
     "large f-number": ("f_number = 4.0", "f_number = 10000", "f_number: expected microimages from 1 pixel"),
-    "huge volume": ("size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e4, 1e4, 1e4]", "at most 1e+11 voxels"),
+    "huge volume": ("size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e4, 1e4, 1e4]", "Lengths are in millimetres"),
     "huge guard layers": ("voxel_mm = 0.05", "voxel_mm = 0.05\nguard_mm = 1e6", "at most 1e+11 voxels"),
     "solids beyond memory": (
         "voxel_mm = 0.05",
