@@ -233,6 +233,14 @@ class Experiment:
         """Number of pairs that are simulated to measure the damping by ghosts; 0 for none."""
         return self.bootstrap.count(self.pairs)
 
+    def frame_images(self, frame: Frame) -> list[ImagePath]:
+        """Return the images of one frame, in the order of the cameras."""
+        return [split(self.particle_path(camera.name, *frame), camera.raw) for camera in self.cameras]
+
+    def pair_images(self, pair: int) -> list[ImagePath]:
+        """Return all images of one pair, in a fixed order."""
+        return [image for frame in self.pair_frames(pair) for image in self.frame_images(frame)]
+
     def pair_paths(self, pair: int) -> list[Path]:
         """Return the paths of all images of one pair, in a fixed order."""
         return [path for frame in self.pair_frames(pair) for path in self.frame_paths(frame)]

@@ -1,12 +1,15 @@
 """The same command again: what is kept, what is noticed, and what the exit status says."""
 
 import json
+import os
+import shutil
 
 import h5py
 import pytest
 
 from lfpiv import hdf5
 from lfpiv.cli import commands
+from lfpiv.runs.run import open_run
 
 
 def run(experiment, out, *more):
@@ -32,3 +35,55 @@ def test_a_pair_without_a_valid_vector_is_not_done(finished, capfd):
     assert run(experiment, out) == 3
     assert "no vector is valid in pair 2: see" in capfd.readouterr().err
     assert json.loads((out / "summary.json").read_text())["without_vectors"] == [2]
+
+
+def unfinished(experiment, out):
+    """Return the pairs that a run would do."""
+    with open_run(experiment, out, None, None) as current:
+        return current.unfinished(volumes=True).ahead()
+
+
+def test_copied_and_touched_images_are_the_same_images(small_run, tmp_path):
+    out = small_run.results(tmp_path / "out")
+    data = tmp_path / "copied"
+    shutil.copytree(small_run.experiment.parent, data, copy_function=shutil.copy)  # cp -r: new times
+    experiment = data / small_run.experiment.name
+    assert unfinished(experiment, out) == []
+    image = data / "particles" / "left" / "pair_0001_a.tif"
+    image.touch()
+    assert unfinished(experiment, out) == []
+
+
+def test_a_changed_byte_is_noticed_whatever_the_times_say(finished):
+    experiment, out = finished
+    image = experiment.parent / "particles" / "right" / "pair_0002_b.tif"
+    times = image.stat()
+    content = bytearray(image.read_bytes())
+    content[len(content) // 2] ^= 1
+    image.write_bytes(content)
+    os.utime(image, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert image.stat().st_size == times.st_size
+    assert unfinished(experiment, out) == [2]
+
+
+def test_exchanged_images_of_one_size_are_noticed(finished):
+    experiment, out = finished
+    one, other = (experiment.parent / "particles" / "left" / f"pair_000{pair}_a.tif" for pair in (0, 3))
+    first, second = one.read_bytes(), other.read_bytes()
+    one.write_bytes(second)
+    other.write_bytes(first)
+    assert unfinished(experiment, out) == [0, 3]
+
+
+def test_stamps_of_earlier_versions_are_read(finished):
+    """They state path, size and one time of each image."""
+    experiment, out = finished
+    path = out / "vectors" / "pair_0001.nc"
+    with h5py.File(path, "r+") as file:
+        parts = json.loads(file.attrs["depends_on"])
+        parts["images"] = [entry[:3] for entry in parts["images"]]
+        file.attrs["depends_on"] = json.dumps(parts)
+    hdf5.seal(path)
+    assert unfinished(experiment, out) == []
+    (experiment.parent / "particles" / "left" / "pair_0001_a.tif").touch()
+    assert unfinished(experiment, out) == [1]
