@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -208,11 +208,12 @@ class Experiment:
         """Return the paths of all images that the calibration reads, in a fixed order."""
         return [image.path for image in self.calibration_images()]
 
-    def calibration_images(self) -> list[ImagePath]:
-        """Return all images that the calibration reads, in a fixed order."""
-        found = [split(path, c.raw) for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
+    def calibration_images(self, cameras: Sequence[CameraSetup] | None = None) -> list[ImagePath]:
+        """Return all images that the calibration reads, in a fixed order; `cameras` are all unless some are given."""
+        cameras = self.cameras if cameras is None else cameras
+        found = [split(path, c.raw) for c in cameras for path in (c.white_path, c.dark_path) if path is not None]
         planes = range(len(self.board.planes_mm))
-        return found + [split(self.board_path(c.name, plane), c.raw) for c in self.cameras for plane in planes]
+        return found + [split(self.board_path(c.name, plane), c.raw) for c in cameras for plane in planes]
 
     @property
     def self_calibration_pairs(self) -> list[int]:

@@ -44,18 +44,27 @@ def _orientation(camera: CameraSetup) -> float | list[float] | None:
 
 def of_calibration(experiment: Experiment) -> Stamp:
     """Return the stamp of the calibration."""
-    cameras = {
+    return _of_cameras(experiment, experiment.cameras)
+
+
+def of_camera(experiment: Experiment, name: str) -> Stamp:
+    """Return the stamp of what the calibration measures of one camera alone."""
+    return _of_cameras(experiment, (experiment.camera(name),))
+
+
+def _of_cameras(experiment: Experiment, cameras: Sequence[CameraSetup]) -> Stamp:
+    stated = {
         camera.name: [dataclasses.asdict(camera.optics), _orientation(camera), camera.image_flip]
         + ([camera.raw.model_dump()] if camera.raw else [])
-        for camera in experiment.cameras
+        for camera in cameras
     }
     return Stamp(
         {
             "version": __version__,
-            "camera": cameras,
+            "camera": stated,
             "board": experiment.board.model_dump(exclude=None if experiment.board.mark else {"mark"}),
             "network": experiment.network.model_dump(),
-            "images": content_hash(experiment.calibration_images()),
+            "images": content_hash(experiment.calibration_images(cameras)),
         }
     )
 
