@@ -120,20 +120,18 @@ def _run(
     """
     selected = _parse_pairs(pairs)
     with _output.progress() as progress:
-        from lfpiv.runs import pipeline
+        from lfpiv.runs import unchanged
 
-        summary = pipeline.run(
-            experiment,
-            out,
-            pairs=selected,
-            device=device,
-            keep_volumes=keep_volumes,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-        )
-    _output.show(summary, lambda: terminal.print_run(summary, out))
-    _end(summary)
+        options: dict[str, Any] = {"pairs": selected, "device": device, "keep_volumes": keep_volumes}
+        options |= {"workers": workers, "scheduler": scheduler}
+        summary = unchanged.repeat(unchanged.Command(experiment=str(experiment), **options), out)
+        if summary is None:
+            from lfpiv.runs import pipeline
+
+            summary = pipeline.run(experiment, out, **options, progress=progress)
+    finished = summary
+    _output.show(finished, lambda: terminal.print_run(finished, out))
+    _end(finished)
 
 
 @_command(

@@ -92,6 +92,8 @@ class Experiment:
     """Path pattern of the particle images, relative to the experiment file."""
     solid: np.ndarray | None = field(default=None, compare=False, repr=False)
     """True for voxels without fluid, shape (z, y, x); None without a mask."""
+    mask_path: Path | None = field(default=None, compare=False)
+    """File of a mask, or None."""
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
     """How many pairs are simulated to measure the damping by ghosts."""
     background: str = "none"

@@ -118,7 +118,8 @@ def read_experiment(path: str | Path) -> Experiment:
             nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
             nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
-    return replace(experiment, solid=solid_voxels(path, table.volume, grid))
+    mask_path = None if table.volume.mask is None else path.parent / table.volume.mask
+    return replace(experiment, solid=solid_voxels(path, table.volume, grid), mask_path=mask_path)
 
 
 def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:

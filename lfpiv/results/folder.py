@@ -96,6 +96,11 @@ class Folder:
         return self.path / "report.html"
 
     @property
+    def record(self) -> Path:
+        """Files that the last run read and wrote, with their sizes and times."""
+        return self.path / ".record.json"
+
+    @property
     def lock(self) -> Path:
         """Lock file of the run that writes here. It names the process."""
         return self.path / ".lock"

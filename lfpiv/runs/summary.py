@@ -19,7 +19,6 @@ import numpy as np
 from lfpiv import files, version
 from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.files import writing
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
@@ -145,14 +144,6 @@ def read(path: Path) -> EarlierSummary:
         failed={failure.pair: failure.reason for failure in known.failed},
         peak_memory_mib=known.peak_memory_mib,
     )
-
-
-def write(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Write ``summary.json`` with a digest of its entries; return its content."""
-    written = {**content, "digest": digest(files.plain(content))}
-    with writing(path):
-        files.write_json(written, path)
-    return written
 
 
 def build(
