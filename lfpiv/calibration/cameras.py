@@ -13,6 +13,7 @@ import logging
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -44,6 +45,16 @@ MODEL_ERROR_PITCH = 0.002
 """Error that all labels of a dot share, beside their standard errors [microlens pitch]."""
 
 
+class KeptCameras(Protocol):
+    """Keeps what the images of each camera show, so that an interrupted calibration goes on from there."""
+
+    def load(self, name: str) -> CalibratedCamera | None:
+        """Return a camera that was kept; None if there is none that fits the experiment."""
+
+    def keep(self, camera: CalibratedCamera) -> None:
+        """Keep a camera: its decoder, the labels of its dots and the thin lens fitted to them."""
+
+
 def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> Calibration:
     """Calibrate every camera of an experiment from its white and board images (section 3.1 of the paper).
 
@@ -65,14 +76,18 @@ def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> C
     InputError
         If a white image shows no microlens array or the board's dots cannot be found. Names camera and file.
     """
+    return calibrate_or_continue(experiment, None, progress)
+
+
+def calibrate_or_continue(
+    experiment: Experiment, kept: KeptCameras | None, progress: StepProgress | None = None
+) -> Calibration:
+    """Calibrate every camera as `calibrate` does, without measuring again the dots of cameras in `kept`."""
     whole, count = progress or (lambda fraction: None), len(experiment.cameras)
     measured = {}
     for number, setup in enumerate(experiment.cameras):
-        with collected() as warnings:
-            seen = _measure_camera(
-                experiment, setup, part_of(whole, 0.75 * number / count, 0.75 * (number + 1) / count)
-            )
-        measured[setup.name] = replace(seen, warnings=tuple(warnings))
+        step = part_of(whole, 0.75 * number / count, 0.75 * (number + 1) / count)
+        measured[setup.name] = _measure_or_load(experiment, setup, kept, step)
     errors = _fit_board(experiment, measured)
     cameras = {}
     for number, setup in enumerate(experiment.cameras):
@@ -152,6 +167,28 @@ class _Measured:
     """Thin lens fitted to them."""
     warnings: tuple[Warning, ...] = ()
 
+    def as_camera(self, setup: CameraSetup) -> CalibratedCamera:
+        """Return the camera with the thin lens as its mapping, to be stored."""
+        return CalibratedCamera(
+            name=setup.name,
+            optics=setup.optics,
+            lattice=self.sensor.lattice,
+            decoder=self.sensor.decoder,
+            baseline=self.lens,
+            report=self.sensor.quality,
+            warnings=self.warnings,
+            dots=self.dots,
+        )
+
+    @classmethod
+    def of_camera(cls, camera: CalibratedCamera) -> _Measured | None:
+        """Return what `as_camera` made a camera of; None for another one."""
+        lens, dots, quality = camera.baseline, camera.dots, camera.report
+        if lens is None or dots is None or quality is None or camera.network is not None:
+            return None
+        sensor = _Sensor(lattice=camera.lattice, decoder=camera.decoder, quality=quality)
+        return cls(sensor=sensor, dots=dots, lens=lens, warnings=camera.warnings)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Mapping:
@@ -167,6 +204,23 @@ class _Mapping:
     """Difference from the stated pose and magnification."""
     sigma_nor_stated: float
     """Mean error on the held-out dots at their stated places [microlens pitch]."""
+
+
+def _measure_or_load(
+    experiment: Experiment, setup: CameraSetup, kept: KeptCameras | None, step: StepProgress
+) -> _Measured:
+    """Return what the images of a camera show, from an interrupted calibration if it kept that."""
+    camera = None if kept is None else kept.load(setup.name)
+    if camera is not None and (known := _Measured.of_camera(camera)) is not None:
+        log.info("%s: dots measured before, kept", setup.name)
+        step(1.0)
+        return known
+    with collected() as warnings:
+        found = _measure_camera(experiment, setup, step)
+    found = replace(found, warnings=tuple(warnings))
+    if kept is not None:
+        kept.keep(found.as_camera(setup))
+    return found
 
 
 def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> _Measured:

@@ -116,24 +116,22 @@ def _run(
 ) -> None:
     """Do all steps: calibrate, reconstruct, correlate, report. Finished parts in DIR are not repeated.
 
-    A pair or instant that fails is left out and named; then the exit status is 3.
+    A pair or instant that fails is left out and named; then the exit status is 3, as where no vector is valid.
     """
     selected = _parse_pairs(pairs)
     with _output.progress() as progress:
-        from lfpiv.runs import pipeline
+        from lfpiv.runs import unchanged
 
-        summary = pipeline.run(
-            experiment,
-            out,
-            pairs=selected,
-            device=device,
-            keep_volumes=keep_volumes,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-        )
-    _output.show(summary, lambda: terminal.print_run(summary, out))
-    _end(summary)
+        options: dict[str, Any] = {"pairs": selected, "device": device, "keep_volumes": keep_volumes}
+        options |= {"workers": workers, "scheduler": scheduler}
+        summary = unchanged.repeat(unchanged.Command(experiment=str(experiment), **options), out)
+        if summary is None:
+            from lfpiv.runs import pipeline
+
+            summary = pipeline.run(experiment, out, **options, progress=progress)
+    finished = summary
+    _output.show(finished, lambda: terminal.print_run(finished, out))
+    _end(finished)
 
 
 @_command(
@@ -296,7 +294,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def call(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status.
 
-    0: done, 1: any other error, 2: bad input or usage, 3: done except for some pairs.
+    0: done, 1: any other error, 2: bad input or usage, 3: done except for some pairs, which failed or have no vectors.
     """
     _output.debug = _output.quiet = _output.json = False
     try:
@@ -340,8 +338,11 @@ def _parse_pairs(text: str) -> tuple[int, int | None]:
 
 
 def _end(summary: dict[str, Any]) -> None:
-    """List the pairs that failed. End with exit status 3 if any failed in this run."""
+    """List the pairs that failed. End with exit status 3 if any failed in this run, or has no valid vector."""
+    where = sys.stdout if _output.is_text else sys.stderr
     if summary["failed"]:
-        terminal.print_failed(summary, sys.stdout if _output.is_text else sys.stderr)
-    if terminal.failed_now(summary):
+        terminal.print_failed(summary, where)
+    if summary.get("without_vectors"):
+        terminal.print_without_vectors(summary, where)
+    if terminal.failed_now(summary) or summary.get("without_vectors"):
         raise typer.Exit(3)

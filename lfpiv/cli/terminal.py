@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from lfpiv.errors import printable
 from lfpiv.progress import Progress
+from lfpiv.warn import name_pairs
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -221,6 +222,16 @@ def print_failed(summary: dict[str, Any], where: TextIO) -> None:
         say(f"{count} of {total} {_noun(summary)}s failed; the same command tries them again", file=where)
     if earlier:
         say(f"{earlier} of {total} {_noun(summary)}s failed in earlier runs and were not tried in this one", file=where)
+
+
+def print_without_vectors(summary: dict[str, Any], where: TextIO) -> None:
+    """Name the pairs of this run that have no valid vector."""
+    noun, pairs = _noun(summary), summary["without_vectors"]
+    say(
+        f"no vector is valid in {name_pairs(pairs[:LISTED_PAIRS], noun, len(pairs))}: see the warnings, and light and "
+        "volumes in the report",
+        file=where,
+    )
 
 
 def _noun(summary: dict[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -92,6 +92,8 @@ class Experiment:
     """Path pattern of the particle images, relative to the experiment file."""
     solid: np.ndarray | None = field(default=None, compare=False, repr=False)
     """True for voxels without fluid, shape (z, y, x); None without a mask."""
+    mask_path: Path | None = field(default=None, compare=False)
+    """File of a mask, or None."""
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
     """How many pairs are simulated to measure the damping by ghosts."""
     background: str = "none"
@@ -208,11 +210,12 @@ class Experiment:
         """Return the paths of all images that the calibration reads, in a fixed order."""
         return [image.path for image in self.calibration_images()]
 
-    def calibration_images(self) -> list[ImagePath]:
-        """Return all images that the calibration reads, in a fixed order."""
-        found = [split(path, c.raw) for c in self.cameras for path in (c.white_path, c.dark_path) if path is not None]
+    def calibration_images(self, cameras: Sequence[CameraSetup] | None = None) -> list[ImagePath]:
+        """Return all images that the calibration reads, in a fixed order; `cameras` are all unless some are given."""
+        cameras = self.cameras if cameras is None else cameras
+        found = [split(path, c.raw) for c in cameras for path in (c.white_path, c.dark_path) if path is not None]
         planes = range(len(self.board.planes_mm))
-        return found + [split(self.board_path(c.name, plane), c.raw) for c in self.cameras for plane in planes]
+        return found + [split(self.board_path(c.name, plane), c.raw) for c in cameras for plane in planes]
 
     @property
     def self_calibration_pairs(self) -> list[int]:
@@ -232,6 +235,14 @@ class Experiment:
     def simulated_pairs(self) -> int:
         """Number of pairs that are simulated to measure the damping by ghosts; 0 for none."""
         return self.bootstrap.count(self.pairs)
+
+    def frame_images(self, frame: Frame) -> list[ImagePath]:
+        """Return the images of one frame, in the order of the cameras."""
+        return [split(self.particle_path(camera.name, *frame), camera.raw) for camera in self.cameras]
+
+    def pair_images(self, pair: int) -> list[ImagePath]:
+        """Return all images of one pair, in a fixed order."""
+        return [image for frame in self.pair_frames(pair) for image in self.frame_images(frame)]
 
     def pair_paths(self, pair: int) -> list[Path]:
         """Return the paths of all images of one pair, in a fixed order."""

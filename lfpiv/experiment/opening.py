@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import bounds, images, nominal_checks
+from lfpiv.experiment import bounds, images, nominal_checks, scale_checks
 from lfpiv.experiment.experiment import CameraSetup, Experiment, board_label, check_shape
 from lfpiv.experiment.mask import solid_voxels
 from lfpiv.experiment.patterns import check_length, check_pattern
@@ -88,13 +88,15 @@ def read_experiment(path: str | Path) -> Experiment:
             f"{path}: smart.motion_passes: expected 0 for a time series, where each instant is reconstructed once and "
             f"used in two pairs, found {table.smart.motion_passes}. Set it to 0."
         )
+    cameras = tuple(_camera(path, camera) for camera in table.camera)
+    scale_checks.require_scale(path, table.volume, board, cameras)
     grid = _grid(path, table.volume, len(names))
     _check_windows(path, table.correlation, grid)
     experiment = Experiment(
         path=path,
         name=table.name,
         dt_s=table.dt_s,
-        cameras=tuple(_camera(path, camera) for camera in table.camera),
+        cameras=cameras,
         board=board,
         grid=grid,
         guard_mm=table.volume.guard_mm,
@@ -116,7 +118,8 @@ def read_experiment(path: str | Path) -> Experiment:
             nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
             nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
-    return replace(experiment, solid=solid_voxels(path, table.volume, grid))
+    mask_path = None if table.volume.mask is None else path.parent / table.volume.mask
+    return replace(experiment, solid=solid_voxels(path, table.volume, grid), mask_path=mask_path)
 
 
 def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:

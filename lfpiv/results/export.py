@@ -25,7 +25,7 @@ from lfpiv.files import replacing, writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.records import read_object
-from lfpiv.results import datasets, netcdf, particles, provenance, stores
+from lfpiv.results import datasets, image_identity, netcdf, particles, provenance, stores
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.reader import open_results
 from lfpiv.results.stacked_files import INSTANT, PAIR, TIME_ATTRIBUTES, StackedFiles
@@ -254,7 +254,7 @@ def _same_origin(volume: Path, vectors: Path) -> bool:
     """Return whether a volume and vectors were made from equal settings and images, as far as both files state them."""
     one, other = (read_object(provenance.require_marks(path).depends_on or "{}") for path in (volume, vectors))
     known = (name for name in one.keys() & other.keys() if name != "images" or None not in (one[name], other[name]))
-    return all(one[name] == other[name] for name in known)
+    return all(image_identity.same(one[name], other[name]) for name in known)
 
 
 def _vector_arrays(vectors: xr.Dataset) -> dict[str, Any]:

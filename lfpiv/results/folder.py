@@ -56,6 +56,10 @@ class Folder:
         """Calibration corrected for movements of the cameras."""
         return self.path / "self_calibration.h5"
 
+    def camera(self, name: str) -> Path:
+        """Return the path of what the calibration has measured of one camera, until it is finished."""
+        return self.path / f"calibration_{name}.h5"
+
     @property
     def background(self) -> Path:
         """Light that stands still in the particle images."""
@@ -90,6 +94,11 @@ class Folder:
     def report(self) -> Path:
         """Report of the run as HTML."""
         return self.path / "report.html"
+
+    @property
+    def record(self) -> Path:
+        """Files that the last run read and wrote, with their sizes and times."""
+        return self.path / ".record.json"
 
     @property
     def lock(self) -> Path:

@@ -20,6 +20,7 @@ import numpy as np
 from lfpiv import files, hdf5, warn
 from lfpiv.errors import DamagedFile
 from lfpiv.records import RecordError, read_json, read_object, validate
+from lfpiv.results.image_identity import Images
 from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
@@ -53,33 +54,40 @@ class Stamp:
     """The parts that a result depends on."""
 
     parts: Mapping[str, Any]
-    """Name -> settings, a hash, or the identity of images; None for missing images."""
+    """Name -> settings, a hash, or images; None for missing images."""
 
     @cached_property
     def hash(self) -> str:
-        """Short hash of all parts."""
-        return files.settings_hash(**self.parts)
+        """Short hash of all parts; of images, of their paths."""
+        return files.settings_hash(
+            **{name: part.names if isinstance(part, Images) else part for name, part in self.parts.items()}
+        )
 
     @property
     def attributes(self) -> dict[str, str]:
-        """Attributes that a file stores."""
-        return {"settings_hash": self.hash, "depends_on": json.dumps(files.plain(self.parts))}
+        """Attributes that a file stores; reads the images for their digests."""
+        parts = {name: part.stored() if isinstance(part, Images) else part for name, part in self.parts.items()}
+        return {"settings_hash": self.hash, "depends_on": json.dumps(files.plain(parts))}
 
     def changes(self, marks: Marks) -> list[str]:
         """Return the names of the parts that changed since a file was made; empty if the file still fits.
 
         Missing images count as unchanged, because raw data may be deleted.
         """
-        if marks.settings_hash == self.hash:
+        has_images = any(isinstance(part, Images) for part in self.parts.values())
+        if marks.settings_hash == self.hash and not has_images:
             return []
         try:
             before = read_object(marks.depends_on)
         except RecordError:
             return ["settings or images"]
-        now = files.plain(self.parts)
         found = []
-        for name in {**before, **now}:
-            old, new = before.get(name), now.get(name)
+        for name in {**before, **self.parts}:
+            old, new = before.get(name), self.parts.get(name)
+            if isinstance(new, Images):
+                found += [] if new.agree(old) else [name]
+                continue
+            new = files.plain(new)
             if old == new or (name in (IMAGES, IMAGES_BEFORE) and new is None):
                 continue
             if isinstance(old, dict) and isinstance(new, dict):

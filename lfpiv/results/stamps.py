@@ -7,20 +7,18 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lfpiv import files
-from lfpiv.experiment import images
 from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
-from lfpiv.experiment.readers.source import ImagePath, split
+from lfpiv.experiment.readers.source import split
 from lfpiv.experiment.segments import followed
 from lfpiv.geometry.grid import NO_LAYERS, Layers
+from lfpiv.results.image_identity import CondensedImages, Images, content_hash, look_at
 from lfpiv.results.provenance import IMAGES_BEFORE, OF_PAIR, Stamp
 from lfpiv.version import __version__
 
@@ -46,18 +44,27 @@ def _orientation(camera: CameraSetup) -> float | list[float] | None:
 
 def of_calibration(experiment: Experiment) -> Stamp:
     """Return the stamp of the calibration."""
-    cameras = {
+    return _of_cameras(experiment, experiment.cameras)
+
+
+def of_camera(experiment: Experiment, name: str) -> Stamp:
+    """Return the stamp of what the calibration measures of one camera alone."""
+    return _of_cameras(experiment, (experiment.camera(name),))
+
+
+def _of_cameras(experiment: Experiment, cameras: Sequence[CameraSetup]) -> Stamp:
+    stated = {
         camera.name: [dataclasses.asdict(camera.optics), _orientation(camera), camera.image_flip]
         + ([camera.raw.model_dump()] if camera.raw else [])
-        for camera in experiment.cameras
+        for camera in cameras
     }
     return Stamp(
         {
             "version": __version__,
-            "camera": cameras,
+            "camera": stated,
             "board": experiment.board.model_dump(exclude=None if experiment.board.mark else {"mark"}),
             "network": experiment.network.model_dump(),
-            "images": content_hash(experiment.calibration_images()),
+            "images": content_hash(experiment.calibration_images(cameras)),
         }
     )
 
@@ -74,25 +81,27 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
         Pairs from which the light is estimated.
     """
     recorded = {camera.name: camera.background for camera in experiment.cameras}
-    paths = [
-        path
+    start = experiment.path.parent
+    seen = [
+        image
         for pair in pairs
         for frame in background_frames(experiment, pair)
-        for path in experiment.frame_paths(frame)
+        for image in experiment.frame_images(frame)
+        if image.file.is_file()
     ]
     images = [
-        path
-        for name in recorded
+        split(path, camera.raw)
+        for camera in experiment.cameras
         for frame in lit_frames(experiment)
-        if (path := experiment.background_path(name, frame)) is not None
+        if (path := experiment.background_path(camera.name, frame)) is not None
     ]
     return Stamp(
         {
             "calibration": calibration,
             "background": experiment.background,
             "background_image": recorded if images else None,
-            "recorded": _identity(images, experiment.path.parent),
-            "images": _identity(_existing(paths), experiment.path.parent) if None in recorded.values() else None,
+            "recorded": look_at(images, start),
+            "images": look_at(seen, start) if None in recorded.values() else None,
         }
     )
 
@@ -105,10 +114,6 @@ def lit_frames(experiment: Experiment) -> tuple[str, ...]:
 def background_frames(experiment: Experiment, pair: int) -> tuple[Frame, ...]:
     """Return the frames of a pair from which standing light is estimated: both, or the first instant of a series."""
     return experiment.pair_frames(pair)[: len(lit_frames(experiment))]
-
-
-def _existing(paths: Iterable[Path]) -> list[Path]:
-    return [path for path in paths if split(path).file.is_file()]
 
 
 def of_self_calibration(experiment: Experiment, calibration: str, background: str | None = None) -> Stamp | None:
@@ -128,14 +133,14 @@ def of_guard(experiment: Experiment, calibration: str, pairs: Sequence[int], bac
 
     `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light.
     """
-    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    images = [image for pair in pairs for image in experiment.pair_images(pair)]
     return Stamp(
         {
             "calibration": calibration,
             "self_calibration": _self_calibration(experiment),
             "volume": dataclasses.asdict(experiment.grid),
             "background": background,
-            "images": _identity(paths, experiment.path.parent),
+            "images": look_at(images, experiment.path.parent),
         }
     )
 
@@ -159,7 +164,7 @@ def of_pair(
         "guard": guard if guard != NO_LAYERS else None,
         "refinement": refinement if refinement != 1 else None,
     }
-    of_pair = parts | {"images": _identity(experiment.pair_paths(pair), start)}
+    of_pair = parts | {"images": look_at(experiment.pair_images(pair), start)}
     of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
     if experiment.series is None:
         volumes = Stamp(of_pair)
@@ -169,16 +174,17 @@ def of_pair(
             particles=_of_particles(experiment, of_pair | of_vectors),
         )
     first, second = (
-        Stamp(parts | {"images": _identity(experiment.frame_paths(instant), start)})
+        Stamp(parts | {"images": look_at(experiment.frame_images(instant), start)})
         for instant in experiment.pair_frames(pair)
     )
     of_vectors["step"] = experiment.series.step
     if experiment.in_sequence:
         before = [_images_before(experiment, instant.number) for instant in experiment.pair_frames(pair)]
         first, second = (
-            Stamp({**stamp.parts, IMAGES_BEFORE: hashed}) for stamp, hashed in zip((first, second), before, strict=True)
+            Stamp({**stamp.parts, IMAGES_BEFORE: images}) for stamp, images in zip((first, second), before, strict=True)
         )
-        of_vectors[IMAGES_BEFORE] = None if None in before else before
+        both = [state for images in before if images is not None for state in images.states]
+        of_vectors[IMAGES_BEFORE] = None if None in before else CondensedImages(tuple(both))
     return PairStamps(
         volumes=(first, second),
         vectors=Stamp(of_pair | of_vectors),
@@ -192,9 +198,9 @@ def of_bootstrap(experiment: Experiment, vectors: Stamp, pairs: Sequence[int]) -
     It has the parts of `vectors`, the stamp of a pair's vectors, so that readers can compare the two; but the images
     are those of the pairs.
     """
-    paths = [path for pair in pairs for path in experiment.pair_paths(pair)]
+    sources = [image for pair in pairs for image in experiment.pair_images(pair)]
     parts = {name: part for name, part in vectors.parts.items() if name not in OF_PAIR}
-    images = _identity(paths, experiment.path.parent)
+    images = look_at(sources, experiment.path.parent)
     return Stamp(parts | {"images": images, "bootstrap": experiment.simulated_pairs})
 
 
@@ -204,13 +210,13 @@ def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp |
     return None if tracking is None else Stamp(of_vectors | {"tracking": tracking.model_dump()})
 
 
-def _images_before(experiment: Experiment, instant: int) -> str | None:
-    """Hash the identity of the images from which an instant of a sequence follows; None if one is missing."""
+def _images_before(experiment: Experiment, instant: int) -> Images | None:
+    """Return the images from which an instant of a sequence follows; None if one is missing."""
     assert experiment.series is not None
     name = experiment.frames[0]
     frames = (Frame(number, name) for number in followed(experiment.series, instant)[:-1])
-    found = _identity([path for frame in frames for path in experiment.frame_paths(frame)], experiment.path.parent)
-    return None if found is None else files.settings_hash(images=found)
+    sources = [image for frame in frames for image in experiment.frame_images(frame)]
+    return look_at(sources, experiment.path.parent, condensed=True)
 
 
 def _of_light(experiment: Experiment, calibration: str, background: str | None) -> dict[str, Any]:
@@ -238,36 +244,10 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
     """Return settings and images of the self-calibration; None if the experiment has none."""
     if not experiment.self_calibration.pairs:
         return None
-    images = [
-        experiment.particle_path(camera.name, pair, experiment.frames[0])
-        for pair in experiment.self_calibration_pairs
-        for camera in experiment.cameras
-    ]
-    return {**experiment.self_calibration.model_dump(), "images": _identity(images, experiment.path.parent)}
-
-
-def _identity(paths: Sequence[Path], start: Path) -> list[list[Any]] | None:
-    """Return path from `start`, size and time of the last change of images; None if one is missing."""
-    try:
-        found = [(path, split(path).file.stat()) for path in paths]
-    except OSError:
-        return None
-    return [[os.path.relpath(path, start), status.st_size, status.st_mtime_ns] for path, status in found]
-
-
-def content_hash(sources: Iterable[ImagePath]) -> str:
-    """Hash several images, in order: the bytes of whole files, the grey values of parts of files."""
-    digest = hashlib.blake2b(digest_size=16)
-    for source in sources:
-        if source.part:
-            grey = images.read_image(source.path, "part of a file", raw=source.raw)
-            digest.update(repr(grey.shape).encode() + grey.tobytes())
-        else:
-            with source.file.open("rb") as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-        digest.update(b"end of file" + source.part.encode())
-    return digest.hexdigest()
+    frames = [Frame(pair, experiment.frames[0]) for pair in experiment.self_calibration_pairs]
+    seen = look_at([image for frame in frames for image in experiment.frame_images(frame)], experiment.path.parent)
+    content = None if seen is None else files.settings_hash(images=[[s.place, s.digest] for s in seen.states])
+    return {**experiment.self_calibration.model_dump(), "images": content}
 
 
 def _mask_hash(solid: np.ndarray | None) -> str | None:

@@ -96,7 +96,8 @@ def _images_lost(stamp: Stamp, marks: Marks) -> bool:
     if stamp.changes(marks) != ["images"]:
         return False
     before = read_object(marks.depends_on).get("images") or []
-    return all(image in before for image in files.plain(stamp.parts)["images"] or [])
+    now = stamp.parts["images"]
+    return now is None or now.all_in(before)
 
 
 def series(experiment: Experiment) -> list[int]:

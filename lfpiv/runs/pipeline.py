@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import bootstrap, dispatch, local_workers, memory, rig, task, worker_plan
+from lfpiv.runs import bootstrap, dispatch, local_workers, memory, rig, task, unchanged, worker_plan
 from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import PairWork
@@ -23,6 +23,7 @@ from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.rig import Prepared
 from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.todo import Todo
+from lfpiv.runs.unchanged import Command
 from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def run(
     if scheduler is not None and workers is not None:
         raise InputError("--workers, --scheduler: expected one of them: a cluster has workers of its own.")
     with open_run(experiment, out, device, progress, pairs) as current:
+        read = unchanged.look_at(current.experiment)
         checked = _check(current, current.unfinished(volumes=keep_volumes), workers, scheduler)
         calibrated = rig.calibrate(current)
         before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
@@ -98,7 +100,18 @@ def run(
         calibrated = replace(calibrated, calibration=prepared.board)
         done, weights = _process(current, prepared, checked, keep_volumes)
         done = _bootstrap(current, prepared, done, weights)
-        return current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
+        summary = current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
+        if not isinstance(experiment, Experiment):
+            command = Command(
+                experiment=str(experiment),
+                pairs=pairs,
+                device=device,
+                keep_volumes=keep_volumes,
+                workers=workers,
+                scheduler=scheduler,
+            )
+            unchanged.record(command, current.folder, current.experiment, read, summary)
+        return summary
 
 
 def calibrate(

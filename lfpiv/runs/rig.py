@@ -29,7 +29,7 @@ from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.warn import Code, Warning, collected, warn
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.camera import Calibration
+    from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.experiment.experiment import Experiment
     from lfpiv.runs.run import Run
     from lfpiv.weights.operator import Weights
@@ -97,8 +97,11 @@ def with_standing_light(run: Run, calibration: Calibration) -> Calibration:
 
 
 def calibrate(run: Run) -> Calibrated:
-    """Calibrate the cameras and write the calibration, unless the folder holds one that fits the experiment."""
-    from lfpiv.calibration.cameras import calibrate
+    """Calibrate the cameras and write the calibration, unless the folder holds one that fits the experiment.
+
+    What was measured of each camera is kept until the calibration is written, in case it is interrupted.
+    """
+    from lfpiv.calibration.cameras import calibrate_or_continue
 
     marks = provenance.read_marks(run.folder.calibration)
     if run.calibration_stamp.fits(marks):
@@ -109,10 +112,47 @@ def calibrate(run: Run) -> Calibrated:
     elif marks is not None:
         log.info("%s changed: calibration made again", ", ".join(run.calibration_stamp.changes(marks)))
     start = time.perf_counter()
-    calibration = calibrate(run.experiment, progress=run.step("calibration"))
+    kept = _Kept(run)
+    calibration = calibrate_or_continue(run.experiment, kept, run.step("calibration"))
     seconds = time.perf_counter() - start
     _write(calibration, run.folder.calibration, {**run.calibration_stamp.attributes, "seconds": seconds})
+    kept.remove()
     return Calibrated(calibration=calibration, seconds=seconds, reused=False)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """What a calibration measured of each camera, in files of its own until all are calibrated."""
+
+    run: Run
+
+    def load(self, name: str) -> CalibratedCamera | None:
+        """Return a camera that was kept; None if there is none that fits the experiment."""
+        from lfpiv.calibration.camera import load_calibration
+
+        path = self.run.folder.camera(name)
+        marks = provenance.read_marks(path)
+        if marks is None or not stamps.of_camera(self.run.experiment, name).fits(marks):
+            return None
+        try:
+            camera = load_calibration(path).cameras.get(name)
+        except DamagedFile as error:
+            provenance.reject(path, error.reason)
+            return None
+        return camera if camera is not None and camera.optics == self.run.experiment.camera(name).optics else None
+
+    def keep(self, camera: CalibratedCamera) -> None:
+        """Write a camera."""
+        from lfpiv.calibration.camera import Calibration
+
+        stamp = stamps.of_camera(self.run.experiment, camera.name)
+        _write(Calibration({camera.name: camera}), self.run.folder.camera(camera.name), stamp.attributes)
+
+    def remove(self) -> None:
+        """Remove the files."""
+        for camera in self.run.experiment.cameras:
+            with writing(path := self.run.folder.camera(camera.name)):
+                path.unlink(missing_ok=True)
 
 
 def self_calibrate(run: Run, calibration: Calibration) -> tuple[Calibration, SelfCalibrationFigures | None]:

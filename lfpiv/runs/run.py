@@ -23,7 +23,7 @@ from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import finished, provenance, stamps
+from lfpiv.results import finished, provenance, stamps, summary_file
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
@@ -317,7 +317,7 @@ class Run:
             with writing(self.folder.report):
                 write_report(self.experiment, calibrated.calibration, result, vectors, self.folder.report)
             result |= self._usage(done, result["timings_s"] | {"report": time.perf_counter() - start})
-        return summary.write(result, self.folder.summary)
+        return summary_file.write(result, self.folder.summary)
 
     def _contents(self) -> Contents:
         """Read the figures of all finished pairs of the experiment, from the attributes of their files."""
@@ -334,6 +334,7 @@ class Run:
         light, warnings = provenance.background_figures(self.folder.background)
         return Contents(
             vectors=self.finished,
+            selected=self.numbers,
             volumes=volumes,
             background=light,
             background_warnings=warnings,

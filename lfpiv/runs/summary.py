@@ -19,7 +19,6 @@ import numpy as np
 from lfpiv import files, version
 from lfpiv.calibration.coverage import outside_warnings, sight_warnings
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.files import writing
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.reconstruction.result import SmartStop
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
@@ -60,6 +59,8 @@ class Contents:
 
     vectors: Mapping[int, PairFigures]
     """Pair -> figures of its vectors."""
+    selected: range
+    """Pairs selected for this invocation."""
     volumes: Gathering
     """Warnings about the images of pairs that have volumes and no vectors."""
     background: Mapping[str, Any] = field(default_factory=dict)
@@ -145,14 +146,6 @@ def read(path: Path) -> EarlierSummary:
     )
 
 
-def write(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Write ``summary.json`` with a digest of its entries; return its content."""
-    written = {**content, "digest": digest(files.plain(content))}
-    with writing(path):
-        files.write_json(written, path)
-    return written
-
-
 def build(
     experiment: Experiment,
     device: Device,
@@ -200,6 +193,7 @@ def build(
         "pairs": pairs.listed,
         "pairs_failed": len(failed) + max(done.tried.failures - len(done.tried.failed), 0),
         "failed": failed,
+        "without_vectors": list(pairs.empty),
         "valid_fraction": pairs.mean("valid_fraction"),
         "finite_fraction": pairs.mean("finite_fraction"),
         "warnings": list(warnings),
@@ -217,6 +211,8 @@ class _Survey:
     """Entries of the pairs, of at most `MOST_LISTED`."""
     totals: Mapping[str, float]
     """Figure -> its sum over all pairs."""
+    empty: Sequence[int]
+    """Selected pairs without a single valid vector, at most `MOST_LISTED`."""
     warnings: Sequence[Warning]
 
     def mean(self, name: str) -> float | None:
@@ -228,7 +224,7 @@ def _survey(contents: Contents, folder: Folder) -> _Survey:
     """Go through the figures of all finished pairs once. If they are too many for the summary, write them to a file."""
     total, images, vectors = len(contents.vectors), Gathering(), Gathering()
     tracked = folder.particles(0).parent.is_dir()
-    totals, listed = dict.fromkeys(_SUMMED, 0.0), []
+    totals, listed, empty = dict.fromkeys(_SUMMED, 0.0), [], []
     with _lines(folder.pairs if total > MOST_LISTED else None) as write:
         for place, (pair, figures) in enumerate(contents.vectors.items()):
             entry = {"pair": pair, "file": folder.vectors(pair).name, **figures.to_json()}
@@ -236,6 +232,8 @@ def _survey(contents: Contents, folder: Folder) -> _Survey:
             write(entry)
             if total <= MOST_LISTED or place in (0, total - 1) or _is_sampled(place, total):
                 listed.append(entry)
+            if pair in contents.selected and not figures.valid_fraction > 0 and len(empty) < MOST_LISTED:
+                empty.append(pair)
             images.add(warning.of_pair(pair) for warning in figures.warnings)
             vectors.add(_of_pair(pair, figures))
             for name in totals:
@@ -243,7 +241,8 @@ def _survey(contents: Contents, folder: Folder) -> _Survey:
     if total <= MOST_LISTED:
         folder.pairs.unlink(missing_ok=True)
     images.join(contents.volumes)
-    return _Survey(count=total, listed=listed, totals=totals, warnings=[*images.merged(), *vectors.merged()])
+    warnings = [*images.merged(), *vectors.merged()]
+    return _Survey(count=total, listed=listed, totals=totals, empty=empty, warnings=warnings)
 
 
 def _is_sampled(place: int, total: int) -> bool:

@@ -282,8 +282,6 @@ class Tracers(Table):
 
 
 Flow = Uniform | Shear | Ring | Swirl | SwirlingJet | Tracers
-KINDS = {model.model_fields["kind"].default: model for model in (Uniform, Shear, Ring, Swirl, SwirlingJet, Tracers)}
-"""Flows by their ``kind`` in a scene file."""
 
 
 def _window(window_mm: float | tuple[float, float, float]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +26,7 @@ from lfpiv.experiment.bounds import (
 from lfpiv.experiment.settings import Compute, Correlation, Network, NominalBoard, Smart, Table, Volume
 from lfpiv.experiment.toml import read_toml
 from lfpiv.simulation.board_errors import BoardErrors
-from lfpiv.simulation.flows import KINDS, Flow, Tracers
+from lfpiv.simulation.flows import Flow, Tracers
 from lfpiv.simulation.image_files import check_pattern
 from lfpiv.simulation.light import Brightness, Sheet, StrayLight
 from lfpiv.simulation.scene_camera import (
@@ -266,19 +266,6 @@ class Scene(Table):
         cameras = tuple(camera.with_shared(shared) for camera in self.camera)
         object.__setattr__(self, "camera", cameras)
         return self
-
-    @field_validator("flow", mode="before")
-    @classmethod
-    def _known_flow(cls, table: Any) -> Any:
-        if isinstance(table, Mapping):
-            kind = table.get("kind")
-            if not isinstance(kind, str) or kind not in KINDS:
-                raise ValueError(f"a flow with kind = {' or '.join(map(repr, KINDS))}")
-            known = KINDS[kind].model_fields
-            unknown = [key for key in table if key not in known]
-            if unknown:
-                raise ValueError(f"for kind {kind!r} only the keys {', '.join(known)} (not {unknown[0]!r})")
-        return table
 
     def solid(self, points_mm: np.ndarray) -> np.ndarray:
         """Return which points (n, 3) [mm] are in a wall, shape (n,)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -71,22 +70,11 @@ class Surface(Table):
         return sheet if self.power is None else np.asarray(self.power, float)
 
 
-KINDS = ("half_space", "box")
-"""Kinds of walls."""
-
-
 def _as_list(value: Any) -> Any:
     return value if isinstance(value, (list, tuple)) else (value,)
 
 
-def _known_walls(value: Any) -> Any:
-    walls = _as_list(value)
-    if any(isinstance(wall, Mapping) and wall.get("kind") not in KINDS for wall in walls):
-        raise ValueError(f"a wall with kind = {' or '.join(map(repr, KINDS))}")
-    return walls
-
-
-Walls = Annotated[tuple[Solid, ...], Field(max_length=bounds.MOST_SOLIDS), BeforeValidator(_known_walls)]
+Walls = Annotated[tuple[Solid, ...], Field(max_length=bounds.MOST_SOLIDS), BeforeValidator(_as_list)]
 """Solid regions without particles. They hide nothing behind them."""
 Surfaces = Annotated[tuple[Surface, ...], Field(max_length=bounds.MOST_SOLIDS), BeforeValidator(_as_list)]
 

@@ -120,7 +120,7 @@ CHANGES = {
     "tiny magnification": ("magnification = -1.0", "magnification = 1e-300", "magnitude 0.0001 to 1000"),
     "tiny f-number": ("f_number = 4.0", "f_number = 0.1", "f_number: expected microimages from 1 pixel to 4 times"),
     "large f-number": ("f_number = 4.0", "f_number = 10000", "f_number: expected microimages from 1 pixel"),
-    "huge volume": ("size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e4, 1e4, 1e4]", "at most 1e+11 voxels"),
+    "huge volume": ("size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e4, 1e4, 1e4]", "Lengths are in millimetres"),
     "huge guard layers": ("voxel_mm = 0.05", "voxel_mm = 0.05\nguard_mm = 1e6", "at most 1e+11 voxels"),
     "solids beyond memory": (
         "voxel_mm = 0.05",
@@ -140,7 +140,7 @@ CHANGES = {
     "plane behind the lens": ("planes_mm = [-0.2, 0.2]", "planes_mm = [-0.2, 900]", "behind the lens"),
     "far search": ("pairs = 2", "pairs = 2\n[correlation]\nmax_displacement_voxel = 16", "less than the volume's 16"),
     "huge network": ("pairs = 2", "pairs = 2\n[network]\nhidden = [200, 200]", "at most 10000 weights"),
-    "many cameras": ("[board]", "[[camera]]\n" * 5000 + "[board]", "more."),
+    "many cameras": ("[board]", "[[camera]]\n" * 5000 + "[board]", "more: these keys are missing"),
     "many planes": ("[-0.2, 0.2]", str(list(range(3000))), "planes_mm: expected at most 1000 value(s)"),
 }
 

@@ -175,25 +175,22 @@ def test_a_new_image_concerns_the_rest_of_its_segment_and_what_it_leads_into(mad
     file = write_series(small_run, tmp_path / "data")
     work = at(changed(made[1], tmp_path / "out", instants=INSTANTS, keep_volumes=True), file)
 
-    def hashes():
-        return {
-            frame.frame.number: frame.stamp.hash
-            for pair in work.experiment.numbers
-            for frame in work.files(pair).frames
-        }
+    def frames():
+        return {one.frame.number: one.stamp for pair in work.experiment.numbers for one in work.files(pair).frames}
 
-    before = hashes()
+    made_of = {number: provenance.Marks(**stamp.attributes) for number, stamp in frames().items()}
+
+    def changed_since():
+        return [number for number, stamp in frames().items() if not stamp.fits(made_of[number])]
+
     path = file.parent / f"run/left/{FIRST + 2:05d}.tif"  # the last one of its segment
-    shutil.copy(path, tmp_path / "copy")
+    content = path.read_bytes()
     path.unlink()
-    assert work.files(FIRST + 5).frames[0].stamp.parts[provenance.IMAGES_BEFORE] == hash_of(work, FIRST + 5)
-    (tmp_path / "copy").rename(path)
-    after = hashes()
-    assert [number for number in before if before[number] != after[number]] == [5, 6, 7, 8]
-
-
-def hash_of(work, instant):
-    return work.files(instant).frames[0].stamp.parts[provenance.IMAGES_BEFORE]
+    assert frames()[FIRST + 5].parts[provenance.IMAGES_BEFORE] is None and not changed_since()
+    path.write_bytes(content)  # as a copy
+    assert not changed_since()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert changed_since() == [5, 6, 7, 8]
 
 
 def test_after_a_bad_or_repeated_image_the_sequence_begins_anew(made, small_run, tmp_path):

@@ -76,7 +76,10 @@ def test_equal_seeds_give_equal_imperfections(device, tmp_path):
             "[[surface]]\ncentre_mm = [0, 0, 0]\nlength_mm = 1\nwidth_mm = 1\ncounts = 1\nalong = [0, 0, 2]",
             "a direction in the plane",
         ),
-        ("[[wall]]\npoint_mm = [0, 0, 0]\nnormal = [0, 0, 1]", "a wall with kind = 'half_space' or 'box'"),
+        (
+            "[[wall]]\npoint_mm = [0, 0, 0]\nnormal = [0, 0, 1]",
+            "wall[0]: expected kind = 'half_space' or 'box', found a table without kind",
+        ),
         (
             '[[wall]]\nkind = "box"\ncentre_mm = [0, 0, 0]\nsize_mm = [1, 1, 0]',
             "wall[0].size_mm[2]: expected a number above",

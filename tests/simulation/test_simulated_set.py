@@ -103,7 +103,7 @@ def test_equal_seeds_give_equal_files_and_a_flip_mirrors(small, tmp_path):
     [
         ("f_number = 4.0", "f_numer = 4.0", "f_numer"),
         ('kind = "swirl"', 'kind = "whirl"', "'uniform' or 'shear' or 'ring' or 'swirl' or 'swirling_jet'"),
-        ("core_mm = 0.2", "core = 0.2", "not 'core'"),
+        ("core_mm = 0.2", "core = 0.2", "flow.core: unknown key. Did you mean 'core_mm'?"),
         ("per_microlens = 0.5", "per_microlens = 0.5\ncount = 3", "either per_microlens or count"),
         ("per_microlens = 0.5", "per_microlens = 1e-9", "at least one particle"),
         ("seed = 5", 'seed = "5"', "seed"),
