@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.calibration.coverage import SEEN_SHARE, warn_seen_by_one
+from lfpiv.experiment.settings import Compute
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.progress import StepProgress, part_of
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+DEFAULTS = Compute()
+"""Computation and form of the weights where none are stated."""
 METHODS = ("footprint", "count")
 FORMS = ("auto", *footprint.FORMS)
 COUNT_SAMPLES_ONE = 144
@@ -348,9 +351,9 @@ class Adjoint:
 def build_weights(
     calibration: Calibration,
     grid: Grid,
-    method: str = "footprint",
+    method: str = DEFAULTS.weights,
     *,
-    form: str = "auto",
+    form: str = DEFAULTS.weights_form,
     limit_bytes: float = math.inf,
     progress: StepProgress | None = None,
 ) -> Weights:
