@@ -6,7 +6,7 @@ The steps are those of `lfpiv.runs.rig` and `lfpiv.runs.pair`. What a run keeps 
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress, part_of
+from lfpiv.prompt import Card, Shown, count, times
 from lfpiv.results.pair_files import PairVolumes
 from lfpiv.runs import memory, rig, worker_plan
 from lfpiv.runs.frame_light import FrameLight, pair_light, read_darks
@@ -33,8 +34,8 @@ PAIR = "image pair"
 """Name of the step that measures a pair, for progress."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Rig:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Rig(Shown):
     """What all pairs of an experiment share. Made by `prepare`."""
 
     experiment: Experiment
@@ -46,8 +47,23 @@ class Rig:
     """Layers of voxels, in those of the experiment, beyond each face of its grid (z, y, x)."""
     refinement: float
     """Edge of a voxel of the experiment over that of the reconstructed ones."""
-    work: PairWork = field(repr=False)
+    work: PairWork
     """The work on pairs, as a run does it."""
+
+    def card(self) -> Card:
+        """Return what matters of the rig, for people."""
+        layers = ", ".join(f"{axis} {low} and {high}" for axis, (low, high) in zip("zyx", self.guard, strict=True))
+        grid = self.weights.grid
+        standing = [name for name, camera in self.calibration.cameras.items() if camera.standing is not None]
+        facts = (
+            ("experiment", str(self.experiment.path)),
+            ("guard layers", layers),
+            ("reconstructed voxels", f"{times(grid.shape)} (z, y, x) of {grid.voxel_mm:.4g} mm"),
+            ("light that stands", f"subtracted from {', '.join(standing)}" if standing else "none"),
+            ("use", "vectors = lfpiv.measure_pair(rig, pair)"),
+        )
+        cameras = count(len(self.weights.cameras), "camera")
+        return Card(f"Rig of {cameras}, for {count(self.experiment.pairs, self.experiment.noun)}", facts)
 
     def light(self, pair: int) -> tuple[FrameLight, FrameLight]:
         """Read the images of both frames of a pair.

@@ -20,6 +20,7 @@ from lfpiv.experiment.settings import Compute
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.progress import StepProgress, part_of
+from lfpiv.prompt import Card, Shown, count, times
 from lfpiv.weights.blocks import (
     BLOCK_BYTES,
     CHUNK_VOXELS,
@@ -54,7 +55,7 @@ COUNT_SAMPLES_ONE = 144
 Images = dict[str, np.ndarray]
 
 
-class Weights:
+class Weights(Shown):
     """Weights of a grid's voxels on every camera's pixels: a linear operator.
 
     `build_weights` makes it from a calibration. ``weights(volume)`` returns a dict camera -> image,
@@ -99,6 +100,23 @@ class Weights:
         self._lens_sums: dict[tuple[str, int], np.ndarray] = {}
         self.volume = stored.grid
         """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
+
+    def card(self) -> Card:
+        """Return what matters of the weights, for people."""
+        grid, forms = self.stored.grid, self.forms
+        facts = [
+            ("voxels", f"{times(grid.shape)} (z, y, x) of {grid.voxel_mm:.4g} mm"),
+            *((axis, f"{low:.4g} to {high:.4g} mm") for axis, (low, high) in zip("xyz", _extent(grid), strict=True)),
+            ("method", self.method),
+            ("memory", f"{self.memory_bytes / 2**20:,.0f} MiB"),
+            ("use", "images = weights(volume), volume = weights.T(images)"),
+        ]
+        rows = [
+            (name, times(camera.optics.sensor_shape), forms.get(name, "counted when first needed"))
+            for name, camera in self.cameras.items()
+        ]
+        title = f"Weights of {count(grid.size, 'voxel')} on {count(len(rows), 'camera')}"
+        return Card(title, tuple(facts), (("camera", "pixels (rows, columns)", "stored as"), *rows))
 
     def of_camera(self, name: str) -> Weights:
         """Return the weights of one of the cameras. They share memory with these."""
@@ -307,6 +325,12 @@ class Weights:
         if name not in self._counted:
             self._counted[name] = CountedVoxels(self.stored, self.cameras[name])
         return self._counted[name]
+
+
+def _extent(grid: Grid) -> list[tuple[float, float]]:
+    """Return the faces of a grid along x, y, z [mm]."""
+    half = grid.voxel_mm / 2
+    return [(float(axis[0]) - half, float(axis[-1]) + half) for axis in map(grid.axis_mm, (2, 1, 0))]
 
 
 class Adjoint:
