@@ -28,6 +28,7 @@ from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.microimage_layout import microimages_of
 from lfpiv.lightfield.standing_light import StandingLight
 from lfpiv.prompt import Card, Shown, count, number, times
+from lfpiv.version import SOURCE, history
 from lfpiv.warn import Warning
 from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.weights.microimages import Microimages
@@ -207,6 +208,7 @@ class Calibration(Shown):
         """Write the calibration to an HDF5 file, and seal it. Overwrite an older file."""
         with h5py.File(path, "w") as file:
             file.attrs["schema_version"] = SCHEMA_VERSION
+            file.attrs.update({"source": SOURCE, "history": history()})
             file.attrs["cameras"] = list(self.cameras)
             for name, camera in self.cameras.items():
                 _write_camera(file.create_group(f"camera/{name}"), camera)
