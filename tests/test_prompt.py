@@ -14,11 +14,13 @@ from lfpiv.lightfield.lens_array import LensArray
 
 LINES, COLUMNS = 24, 200
 """One screen."""
+NOTEBOOK = "_repr_html_"
+"""Name under which notebooks look for the HTML of a value."""
 
 
 def shown(value):
     """Text of a value after the checks that hold for all."""
-    text, page = repr(value), value._repr_html_()
+    text, page = repr(value), getattr(value, NOTEBOOK)()
     assert len(text.splitlines()) <= LINES and max(map(len, text.splitlines())) <= COLUMNS
     words = " ".join(ElementTree.fromstring(page).itertext())
     for word in re.findall(r"\S+", text):

@@ -113,7 +113,7 @@ class PairSolver:
         weights: Weights,
         settings: SmartSettings,
         *,
-        motion_passes: int = 0,
+        motion_passes: int = DEFAULTS.motion_passes,
         correlation: Mapping[str, Any] | None = None,
         mask: np.ndarray | xr.DataArray | None = None,
     ):
