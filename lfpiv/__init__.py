@@ -34,6 +34,9 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.results.export import export_results as export_results
     from lfpiv.results.particles import open_particles as open_particles
     from lfpiv.results.reader import open_results as open_results
+    from lfpiv.runs.measurement import Rig as Rig
+    from lfpiv.runs.measurement import measure_pair as measure_pair
+    from lfpiv.runs.measurement import prepare as prepare
     from lfpiv.runs.pipeline import run as run
     from lfpiv.selfcalibration.movements import self_calibrate as self_calibrate
     from lfpiv.tracking.finding import find_particles as find_particles
@@ -50,6 +53,7 @@ _MODULES = {
     "LensArray": "lfpiv.lightfield.lens_array",
     "LensLattice": "lfpiv.geometry.optics",
     "Optics": "lfpiv.geometry.optics",
+    "Rig": "lfpiv.runs.measurement",
     "build_weights": "lfpiv.weights.operator",
     "calibrate": "lfpiv.calibration.cameras",
     "correlate": "lfpiv.velocity.cross_correlation",
@@ -59,10 +63,12 @@ _MODULES = {
     "link_particles": "lfpiv.tracking.linking",
     "load_calibration": "lfpiv.calibration.camera",
     "measure_damping": "lfpiv.reconstruction.bootstrap",
+    "measure_pair": "lfpiv.runs.measurement",
     "open_experiment": "lfpiv.experiment.opening",
     "open_results": "lfpiv.results.reader",
     "open_particles": "lfpiv.results.particles",
     "particle_tracks": "lfpiv.tracking.tracks",
+    "prepare": "lfpiv.runs.measurement",
     "reconstruct": "lfpiv.reconstruction.volume",
     "reconstruct_pair": "lfpiv.reconstruction.motion",
     "run": "lfpiv.runs.pipeline",
@@ -90,4 +96,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_SUBMODULES, *__all__])
+    return sorted(["__version__", *_SUBMODULES, *__all__])

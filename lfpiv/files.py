@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv.errors import StorageError
+from lfpiv.version import history
 
 MIB = 1 << 20
 
@@ -66,6 +67,13 @@ def write_text(text: str, path: Path) -> None:
 def write_json(value: Any, path: Path) -> None:
     """Write a JSON file atomically; NaN and infinity become null."""
     write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n", path)
+
+
+def state_origin(path: Path) -> None:
+    """Insert a comment with program and time after the declaration of an XML file, also one with binary data."""
+    head, end, rest = path.read_bytes().partition(b"?>")
+    if end:
+        path.write_bytes(head + end + f"\n<!-- {history()} -->".encode() + rest)
 
 
 def plain(value: Any) -> Any:

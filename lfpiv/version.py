@@ -5,8 +5,21 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import platform
+from datetime import UTC, datetime
 
 __version__ = "0.1.0"
+
+
+SOURCE = f"lfpiv {__version__}"
+"""Program that a file comes from, for its attribute ``source``."""
+
+
+def history(earlier: str = "") -> str:
+    """Return the attribute ``history`` of a file that is written now: a line with time and program after earlier ones.
+
+    The line has no arguments of the command: they name folders of the machine.
+    """
+    return "\n".join([*earlier.splitlines(), f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {SOURCE}"])
 
 
 def versions() -> dict[str, str]:

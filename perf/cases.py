@@ -51,6 +51,11 @@ LABEL_NOISE = 0.04
 DEMO_VOXEL = 0.5
 """Largest mean displacement error of the demo [voxel]."""
 
+BARE_SMART = {"intensity_cap": 0.0, "sieve_voxel": 0.0, "subsets": 1, "tolerance": 0.0}
+"""SMART as the peers do it, in a given number of iterations, whatever the defaults are."""
+BARE_CORRELATION = {"smoothing_voxel": 0.0, "intensity_power": 1.0}
+"""The same of the correlation."""
+
 
 class WrongResult(Exception):
     """The result is wrong, so its time means nothing."""
@@ -180,7 +185,7 @@ def _smart(scale, iterations, form="profiles") -> Work:
     truth = 1e4 * particles(weights.grid.shape)
     images = weights(truth)
     first = np.full(weights.grid.shape, float(truth.mean()), np.float32)
-    plain = {"accelerate": False, "floor_share": 0.0}  # as the peer; momentum costs the same per iteration
+    bare = {"accelerate": False, "floor_share": 0.0, **BARE_SMART}  # as the peer; momentum costs the same per iteration
     require(bool((weights.column_sum > 0).all()), "a voxel is seen by no camera")  # all voxels active
 
     def check(volume):
@@ -189,7 +194,7 @@ def _smart(scale, iterations, form="profiles") -> Work:
         return {"residual": volume.attrs["residual"][-1], "stored_bytes": weights.memory_bytes}
 
     work = Work(
-        lambda: lfpiv.reconstruct(weights, images, iterations, first=first, floor=1.0, **plain),
+        lambda: lfpiv.reconstruct(weights, images, iterations, first=first, floor=1.0, **bare),
         check,
         {"iterations": iterations, "voxel_camera": 2 * weights.grid.size * iterations},
         read_bytes=(2 * iterations + 1) * weights.memory_bytes,
@@ -217,7 +222,7 @@ def _smart_subsets(scale, passes, plain) -> Work:
     weights = lfpiv.build_weights(rig(scale["sensor"]), grid(scale), form="profiles")
     images, rng = weights(2e4 * particles(weights.grid.shape)), np.random.default_rng(2)
     noisy = {name: (image + rng.normal(0, 3, image.shape)).astype(np.float32) for name, image in images.items()}
-    keywords = {"sieve_voxel": 0.6}
+    keywords = {**BARE_SMART, "sieve_voxel": 0.6}
 
     def check(volume):
         before = lfpiv.reconstruct(weights, noisy, plain, **keywords).attrs["misfit"][-1]
@@ -226,7 +231,7 @@ def _smart_subsets(scale, passes, plain) -> Work:
         return {"misfit_ratio": ratio, "stored_bytes": weights.memory_bytes}
 
     return Work(
-        lambda: lfpiv.reconstruct(weights, noisy, passes, subsets="auto", **keywords),
+        lambda: lfpiv.reconstruct(weights, noisy, passes, **{**keywords, "subsets": "auto"}),
         check,
         {"passes": passes},
         read_bytes=2 * passes * weights.memory_bytes,
@@ -241,7 +246,7 @@ def _correlate(scale, window, search=None) -> Work:
 
     def run():
         if search is None:
-            vectors = lfpiv.correlate(first, second, dt_s=1.0, voxel_mm=0.1, windows=(window,))
+            vectors = lfpiv.correlate(first, second, dt_s=1.0, voxel_mm=0.1, windows=(window,), **BARE_CORRELATION)
             return np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], -1)
         peaks = correlate.correlate_windows(first, second, window=cube, step=(window // 2,) * 3, search=(search,) * 3)
         return peaks.displacement
@@ -322,7 +327,7 @@ def _vectors(scale) -> Work:
         require(error < 0.1, f"mean displacement error of {error:.3f} voxel")
         return {"mean_error_voxel": error, "vectors": int(vectors["valid"].size)}
 
-    return Work(lambda: lfpiv.correlate(*volumes, dt_s=1.0, voxel_mm=0.1), check, {"pairs": 1})
+    return Work(lambda: lfpiv.correlate(*volumes, dt_s=1.0, voxel_mm=0.1, **BARE_CORRELATION), check, {"pairs": 1})
 
 
 def _train(scale, epochs) -> Work:

@@ -19,7 +19,7 @@ KERNEL_FILES = sorted((ROOT / "lfpiv_kernels").rglob("*.py"))
 PACKAGE_FILES = sorted((ROOT / "lfpiv").rglob("*.py"))
 ALL_FILES = KERNEL_FILES + PACKAGE_FILES
 
-GROUND = {"geometry", "files", "errors", "hdf5", "records", "warn", "version", "progress"}
+GROUND = {"geometry", "files", "errors", "hdf5", "records", "warn", "version", "progress", "prompt"}
 """Rooms that every room may import, beside `lfpiv_kernels`."""
 FACES = {"__init__", "__main__", "derived", "statistics"}
 """Files that hand public names on: they may import every room, and no room imports them."""
@@ -28,6 +28,7 @@ MAY_IMPORT = {
     "errors": set(),
     "version": set(),
     "progress": set(),
+    "prompt": set(),
     "hdf5": {"errors", "records"},
     "records": set(),
     "warn": {"errors", "records"},
@@ -35,14 +36,14 @@ MAY_IMPORT = {
     "geometry": {"errors"},
     "experiment": set(),
     "lightfield": set(),
-    "velocity": set(),
+    "velocity": {"experiment"},
     "metrics": set(),
     "calibration": {"lightfield", "experiment"},
     "simulation": {"experiment"},
     "results": {"experiment", "velocity"},
-    "weights": {"calibration", "lightfield"},
+    "weights": {"calibration", "lightfield", "experiment"},
     "reconstruction": {"weights", "calibration", "lightfield", "velocity", "experiment"},
-    "tracking": {"reconstruction", "weights", "calibration", "lightfield", "metrics"},
+    "tracking": {"reconstruction", "weights", "calibration", "lightfield", "metrics", "experiment"},
     "selfcalibration": {"reconstruction", "weights", "calibration"},
     "report": {"results", "calibration", "lightfield", "velocity", "experiment"},
 }

@@ -33,8 +33,9 @@ for name, camera in calibration.cameras.items():
     level, floor[name] = camera.decoder.background(image)
     images[name] = image - level
 
-volume = lfpiv.reconstruct(weights, images, iterations=20, floor=floor)
-diverging = lfpiv.reconstruct(weights, images, iterations=6, floor=floor, relaxation=3.0, accelerate=False)
+volume = lfpiv.reconstruct(weights, images, floor=floor)
+bare = {"accelerate": False, "sieve_voxel": 0.0, "tolerance": 0.0}
+diverging = lfpiv.reconstruct(weights, images, iterations=6, floor=floor, relaxation=3.0, **bare)
 print("relaxation 1:", volume.attrs["stop"])
 print("relaxation 3:", diverging.attrs["stop"])
 

@@ -20,13 +20,15 @@ from lfpiv.calibration import stored
 from lfpiv.calibration.board.dots import BoardDots
 from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.network import Network
-from lfpiv.calibration.quality import LensArrayQuality
+from lfpiv.calibration.quality import CalibrationQuality, LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.microimage_layout import microimages_of
 from lfpiv.lightfield.standing_light import StandingLight
+from lfpiv.prompt import Card, Shown, count, number, times
+from lfpiv.version import SOURCE, history
 from lfpiv.warn import Warning
 from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.weights.microimages import Microimages
@@ -38,8 +40,12 @@ SEALED_SINCE = 2
 """First version whose files are sealed."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CalibratedCamera:
+HEAD = ("camera", "pixels (rows, columns)", "microlenses", "mapping", "dots found", "error [pitch]", "warnings")
+"""Header of the cameras' rows at a prompt; the error is that of held-out dots, Eq. 8."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class CalibratedCamera(Shown):
     """One camera: its microlens array, its light-field decoder and its ray mapping."""
 
     name: str
@@ -63,6 +69,24 @@ class CalibratedCamera:
     """Error of each held-out label [microlens pitch], shape (n,)."""
     standing: StandingLight | None = None
     """Light that stands still in the particle images, or None. It belongs to a run and is not stored here."""
+
+    def card(self) -> Card:
+        """Return what matters of the camera, for people."""
+        return Card(f"Calibrated camera {self.name!r}", table=(HEAD, self.cells()))
+
+    def cells(self) -> tuple[str, ...]:
+        """Return the camera's row under `HEAD`."""
+        parts = [("thin lens", self.baseline), ("network", self.network)]
+        report, of_board = self.report, isinstance(self.report, CalibrationQuality)
+        return (
+            self.name,
+            times(self.optics.sensor_shape),
+            self.lattice.layout if report is None else f"{self.lattice.layout}, {report.lenses:,}",
+            " + ".join(name for name, part in parts if part is not None) or "own",
+            f"{report['dots_found']} of {report['dots_expected']}" if report is not None and of_board else "-",
+            number(report["sigma_nor_test"], ".4f") if report is not None and of_board else "-",
+            ", ".join(warning.code.name.lower() for warning in self.warnings) or "none",
+        )
 
     def with_standing(self, standing: StandingLight) -> CalibratedCamera:
         """Return the camera with light that stands still in its images, and without gain in unusable pixels."""
@@ -163,8 +187,8 @@ class CalibratedCamera:
         return replace(self, network=network, baseline=baseline)
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Shown):
     """The calibrated cameras of a rig. Made by `calibrate`, `load_calibration` or `thin_lens`."""
 
     cameras: dict[str, CalibratedCamera]
@@ -172,10 +196,19 @@ class Calibration:
     board: BoardErrors | None = None
     """Errors of the board that the calibration corrected. None without a board, and in older files."""
 
+    def card(self) -> Card:
+        """Return what matters of the calibration, for people."""
+        facts = []
+        if self.board is not None:
+            facts.append(("errors of the board", ", ".join(self.board.corrected) or "none found"))
+        table = (HEAD, *(camera.cells() for camera in self.cameras.values()))
+        return Card(f"Calibration of {count(len(self.cameras), 'camera')}", tuple(facts), table)
+
     def save(self, path: str | Path | io.BytesIO) -> None:
         """Write the calibration to an HDF5 file, and seal it. Overwrite an older file."""
         with h5py.File(path, "w") as file:
             file.attrs["schema_version"] = SCHEMA_VERSION
+            file.attrs.update({"source": SOURCE, "history": history()})
             file.attrs["cameras"] = list(self.cameras)
             for name, camera in self.cameras.items():
                 _write_camera(file.create_group(f"camera/{name}"), camera)

@@ -28,6 +28,7 @@ from lfpiv.experiment.settings import (
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
+from lfpiv.prompt import Card, Shown, count, seconds, times
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +50,19 @@ class CameraSetup:
     raw: RawImages | None = None
     """Layout of the camera's files without a header, or None."""
 
+    def cells(self) -> tuple[str, ...]:
+        """Return the camera's row in the card of its experiment."""
+        optics, angle = self.optics, self.nominal_angle_deg
+        return (
+            self.name,
+            times(optics.sensor_shape),
+            f"{optics.focal_length_mm:g}",
+            f"{optics.magnification:g}",
+            f"{optics.f_number:g}",
+            f"{optics.layout}, {1000 * optics.microlens_pitch_mm:.4g} um",
+            "-" if angle is None else f"{angle:.4g} deg",
+        )
+
     @property
     def nominal_angle_deg(self) -> float | None:
         """Nominal angle about y [degree], None where no orientation is stated."""
@@ -64,8 +78,8 @@ class Frame(NamedTuple):
     """Name of the frame in its pair; an instant of a series has that of the first frame."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Experiment:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Experiment(Shown):
     """An experiment with checked settings and images. Made by `open_experiment`."""
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True, extra="forbid")  # workers get it as JSON
@@ -102,6 +116,31 @@ class Experiment:
     """The time series; None for image pairs."""
     tracking: Tracking | None = None
     """Settings of the tracking of particles; None without it."""
+
+    def card(self) -> Card:
+        """Return what matters of the experiment, for people."""
+        grid, board = self.grid, self.board
+        what = count(self.pairs, "image pair") if self.series is None else count(self.series.instants, "instant")
+        size = [n * grid.voxel_mm for n in grid.shape[::-1]]
+        guard_mm = self.guard_mm if isinstance(self.guard_mm, str | tuple) else (self.guard_mm,)
+        planes = count(len(board.planes_mm), "plane")
+        facts = [
+            ("file", str(self.path)),
+            ("images", f"{what}, {seconds(self.dt_s)} between frames: {self.particle_images}"),
+            ("volume", f"{times(size)} mm (x, y, z) in {times(grid.shape)} voxels (z, y, x) of {grid.voxel_mm:g} mm"),
+            ("guard layers", guard_mm if isinstance(guard_mm, str) else f"{times(guard_mm)} mm (x, y, z)"),
+            ("board", f"{times(board.dots)} dots, {board.spacing_mm:g} mm apart, {planes}"),
+        ]
+        if self.solid is not None:
+            facts.append(("mask", f"{100 * float(self.solid.mean()):.1f} % of the volume holds no fluid"))
+        for name in ("smart", "correlation", "tracking", "network", "self_calibration", "bootstrap", "compute"):
+            table = getattr(self, name)
+            stated = {} if table is None else {key: getattr(table, key) for key in sorted(table.model_fields_set)}
+            if stated:
+                facts.append((f"[{name}]", ", ".join(f"{key} = {value!r}" for key, value in stated.items())))
+        head = ("camera", "pixels (rows, columns)", "f [mm]", "M", "f/", "microlenses", "angle")
+        title = f"Experiment {self.name!r}: {count(len(self.cameras), 'camera')}, {what}"
+        return Card(title, tuple(facts), (head, *(camera.cells() for camera in self.cameras)))
 
     @property
     def numbers(self) -> range:

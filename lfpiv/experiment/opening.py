@@ -230,14 +230,13 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
             f"found {farthest:g}."
         )
     for window in correlation.windows or ():
-        if not isinstance(window, tuple):
-            continue  # a single edge is cut to the volume
-        for axis, edge, n in zip(AXES, window, grid.shape, strict=True):
+        edges = window if isinstance(window, tuple) else (window, window, window)
+        for axis, edge, n in zip(AXES, edges, grid.shape, strict=True):
             if edge > n:
+                cut = [min(one, most) for one, most in zip(edges, grid.shape, strict=True)]
                 raise InputError(
                     f"{path}: correlation.windows: expected windows inside the volume, found {edge} voxels "
-                    f"along {axis} where the volume has {n}. Use a smaller window, or a single edge, which is cut to "
-                    "the volume."
+                    f"along {axis} where the volume has {n}. State {cut}, ordered (z, y, x), or a smaller window."
                 )
 
 

@@ -43,6 +43,9 @@ SMALLEST_WINDOW = 4
 Edge = Annotated[int, Field(strict=True, ge=SMALLEST_WINDOW, le=bounds.LARGEST_WINDOW)]
 Window = Edge | tuple[Edge, Edge, Edge]
 
+DEFAULT_WINDOWS = (32, 16, 12, 12)
+"""Window edge of each pass where none is stated [voxel], cut to the volume along each axis."""
+
 
 class Table(BaseModel):
     """Base of all tables: frozen, refuses unknown keys and infinite numbers."""
@@ -103,7 +106,7 @@ class Correlation(Table):
     """Table ``[correlation]``: settings of the cross-correlation."""
 
     windows: Annotated[tuple[Window, ...], Field(min_length=1, max_length=bounds.MOST_PASSES)] | None = None
-    """Window of each pass, one edge or (z, y, x) [voxel]; absent: 32, 16, 12, 12, cut to the volume."""
+    """Window of each pass within the volume, one edge or (z, y, x) [voxel]; absent: 32, 16, 12, 12, cut to it."""
     overlap: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.5
     """Fraction by which neighbouring windows overlap."""
     max_displacement_voxel: Displacement | None = None

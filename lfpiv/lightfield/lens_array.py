@@ -23,6 +23,7 @@ from lfpiv.lightfield.microimage_fit import (
     robust_fit,
     whole_microimages,
 )
+from lfpiv.prompt import Card, Shown, count, times
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
@@ -43,8 +44,8 @@ DISTORTION_PX = 0.05
 """Smooth distortion above which a warning is due [pixel, rms]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class LensArray:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class LensArray(Shown):
     """Microimage centres of one camera as a lattice on the sensor: centre = origin + i basis[0] + j basis[1].
 
     Positions are (column, row) in pixels, integer at a pixel's centre. Microimage (0, 0) is nearest to the sensor's
@@ -68,6 +69,17 @@ class LensArray:
     """Number of microimages that the lattice was fitted to."""
     sensor_shape: tuple[int, int]
     """Shape of the white image [pixel], order (rows, columns)."""
+
+    def card(self) -> Card:
+        """Return what matters of the lattice, for people."""
+        facts = (
+            ("sensor", f"{times(self.sensor_shape)} pixels (rows, columns)"),
+            ("pitch", f"{self.pitch_px:.4f} pixel"),
+            ("rotation", f"{self.rotation_deg:.4f} degree"),
+            ("middle", f"({self.origin_px[0]:.2f}, {self.origin_px[1]:.2f}) pixel (column, row)"),
+            ("fit", f"{self.rms_px:.4f} pixel rms over {count(self.measured, 'microimage')}"),
+        )
+        return Card(f"Lens array of {count(len(self.centres_px), 'microimage')}, {self.layout}", facts)
 
     @property
     def pitch_px(self) -> float:

@@ -28,7 +28,7 @@ import xarray as xr
 from lfpiv.experiment.settings import Correlation
 from lfpiv.geometry.volume import MASKED
 from lfpiv.reconstruction.result import Reconstruction
-from lfpiv.reconstruction.settings import SmartSettings, require_whole
+from lfpiv.reconstruction.settings import DEFAULTS, SmartSettings, require_whole
 from lfpiv.reconstruction.shared_light import MotionField, shared_guesses
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.velocity.cross_correlation import correlate
@@ -113,7 +113,7 @@ class PairSolver:
         weights: Weights,
         settings: SmartSettings,
         *,
-        motion_passes: int = 0,
+        motion_passes: int = DEFAULTS.motion_passes,
         correlation: Mapping[str, Any] | None = None,
         mask: np.ndarray | xr.DataArray | None = None,
     ):
@@ -184,15 +184,15 @@ def reconstruct_pair(
     weights: Weights,
     images: Sequence[Mapping[str, np.ndarray]],
     *,
-    motion_passes: int = 1,
+    motion_passes: int = DEFAULTS.motion_passes,
     floor: Sequence[float | Mapping[str, float] | None] = (None, None),
     correlation: Mapping[str, Any] | None = None,
-    iterations: int = 10,
+    iterations: int = DEFAULTS.iterations,
     mask: np.ndarray | xr.DataArray | None = None,
     progress: Callable[[float], None] | None = None,
     **smart: Any,
 ) -> list[xr.DataArray]:
-    """Reconstruct the two volumes of an image pair, and again from what they share along the motion between them.
+    """Reconstruct the two volumes of an image pair, and with motion passes again from what they share along the motion.
 
     The first guesses of a motion pass are those of `lfpiv.reconstruction.shared_light.shared_guesses`. For many pairs
     make one `PairSolver`.
@@ -204,7 +204,8 @@ def reconstruct_pair(
     images : sequence of two mappings of str to ndarray
         Images of the first and the second frame, each as `reconstruct` takes them.
     motion_passes : int
-        How often the motion is measured and followed, >= 0; 0 reconstructs each frame by itself.
+        How often the motion is measured and followed, >= 0; 0, as in an experiment file without this key, reconstructs
+        each frame by itself.
     floor : sequence of two
         Noise floor of each frame's images, as `reconstruct` takes it.
     correlation : mapping, optional
@@ -216,7 +217,8 @@ def reconstruct_pair(
     progress : callable, optional
         Called with the finished fraction.
     **smart
-        The other settings of `reconstruct`. With a sieve a pass starts from the volume in place of its coefficients.
+        The other settings of `reconstruct`, with its defaults. With a sieve a pass starts from the volume in place of
+        its coefficients.
 
     Returns
     -------

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.volume import is_finite
 
 NORMALISATIONS = ("column", "paper")
 AUTO = "auto"
 """Sieve and intensity cap that suit the size of the particles."""
-FLOOR_SHARE = 0.1
-"""Default of the least noise floor, as a share of an image's brightness."""
+DEFAULTS = Smart()
+"""Settings of SMART where none are stated."""
+PLAIN: dict[str, Any] = {"intensity_cap": 0.0, "sieve_voxel": 0.0, "subsets": 1, "tolerance": 0.0}
+"""Settings of SMART over all rays, without limit of the counts and sieve, in a given number of iterations."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmartSettings:
-    """Settings of SMART; `lfpiv.reconstruct` describes each.
+    """Settings of SMART; `lfpiv.reconstruct` describes each. The defaults are those of the table ``[smart]``.
 
     Raises
     ------
@@ -25,17 +29,17 @@ class SmartSettings:
         If a value is out of its range.
     """
 
-    iterations: int = 10
-    relaxation: float = 1.0
-    floor_share: float = FLOOR_SHARE
-    intensity_cap: float | str = 0.0
-    normalisation: str = "column"
-    accelerate: bool = True
-    smoothing_voxel: float = 0.0
-    sieve_voxel: float | str = 0.0
-    active_share: float = 0.0
-    tolerance: float = 0.0
-    subsets: int | str = 1
+    iterations: int = DEFAULTS.iterations
+    relaxation: float = DEFAULTS.relaxation
+    floor_share: float = DEFAULTS.floor_share
+    intensity_cap: float | str = DEFAULTS.intensity_cap
+    normalisation: str = DEFAULTS.normalisation
+    accelerate: bool = DEFAULTS.accelerate
+    smoothing_voxel: float = DEFAULTS.smoothing_voxel
+    sieve_voxel: float | str = DEFAULTS.sieve_voxel
+    active_share: float = DEFAULTS.active_share
+    tolerance: float = DEFAULTS.tolerance
+    subsets: int | str = DEFAULTS.subsets
 
     @property
     def allows_subsets(self) -> bool:

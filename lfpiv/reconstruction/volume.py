@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import xarray as xr
 
-from lfpiv.reconstruction.settings import FLOOR_SHARE, SmartSettings
+from lfpiv.reconstruction.settings import DEFAULTS, SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.weights.operator import Weights
 
@@ -15,19 +15,19 @@ from lfpiv.weights.operator import Weights
 def reconstruct(
     weights: Weights,
     images: Mapping[str, np.ndarray],
-    iterations: int = 10,
-    relaxation: float = 1.0,
+    iterations: int = DEFAULTS.iterations,
+    relaxation: float = DEFAULTS.relaxation,
     *,
     floor: float | Mapping[str, float] | None = None,
-    floor_share: float = FLOOR_SHARE,
-    intensity_cap: float | str = 0.0,
-    normalisation: str = "column",
-    accelerate: bool = True,
-    smoothing_voxel: float = 0.0,
-    sieve_voxel: float | str = 0.0,
-    active_share: float = 0.0,
-    tolerance: float = 0.0,
-    subsets: int | str = 1,
+    floor_share: float = DEFAULTS.floor_share,
+    intensity_cap: float | str = DEFAULTS.intensity_cap,
+    normalisation: str = DEFAULTS.normalisation,
+    accelerate: bool = DEFAULTS.accelerate,
+    smoothing_voxel: float = DEFAULTS.smoothing_voxel,
+    sieve_voxel: float | str = DEFAULTS.sieve_voxel,
+    active_share: float = DEFAULTS.active_share,
+    tolerance: float = DEFAULTS.tolerance,
+    subsets: int | str = DEFAULTS.subsets,
     first: np.ndarray | None = None,
     mask: np.ndarray | xr.DataArray | None = None,
     progress: Callable[[float], None] | None = None,
@@ -43,8 +43,10 @@ def reconstruct(
     same misfit in at most half the iterations; the misfit still falls in every one, and the limit is the same. The
     first guess is ``exp(sum_i w log(I + b) / sum_i w)``, less the floor's own share, scaled to the images' light.
 
-    The keywords are those of the table ``[smart]`` of an experiment file, one by one: hence more than eight. For many
-    instants make one `lfpiv.reconstruction.solver.SmartSolver`.
+    The keywords are those of the table ``[smart]`` of an experiment file, one by one: hence more than eight. Their
+    defaults are the table's (`lfpiv.experiment.settings.Smart`). For many instants make one
+    `lfpiv.reconstruction.solver.SmartSolver`. `lfpiv.measure_pair` adds what a run does besides: guard layers, finer
+    voxels, light that stands still.
 
     Parameters
     ----------
@@ -55,7 +57,7 @@ def reconstruct(
         Pixels that no voxel lights are left out. Differences of the cameras' brightness are measured and corrected
         (`lfpiv.reconstruction.recording`).
     iterations : int
-        Number of iterations, >= 0.
+        Largest number of iterations, >= 0.
     relaxation : float
         Relaxation parameter mu, > 0; 1 is safe, 3 diverges.
     floor : float or mapping of str to float, optional
@@ -74,8 +76,8 @@ def reconstruct(
     normalisation : {"column", "paper"}
         See above.
     accelerate : bool
-        False iterates without momentum, as in the formulas above. Then 5 iterations and 7 more with the first volume as
-        `first` equal 12 exactly. Momentum starts anew with every call.
+        False iterates without momentum, as in the formulas above. Then, without sieve and tolerance, 5 iterations and 7
+        more with the first volume as `first` equal 12 exactly. Momentum starts anew with every call.
     smoothing_voxel : float
         Standard deviation [voxel] of a Gaussian that smooths the volume after each iteration but the last; 0 for none.
         The misfit may rise by it.

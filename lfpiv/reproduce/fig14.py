@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from skimage.measure import marching_cubes
 
 from lfpiv import metrics
-from lfpiv.experiment.settings import Correlation, Smart
+from lfpiv.experiment.settings import DEFAULT_WINDOWS, Correlation, Smart
 from lfpiv.geometry.grid import AXES
 from lfpiv.metrics.vector_fields import BELOW_VOXEL
 from lfpiv.progress import Progress
@@ -22,7 +22,6 @@ from lfpiv.reproduce import angles, page, plots, rigs, store
 from lfpiv.simulation.flows import Ring
 from lfpiv.velocity import derived
 from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.velocity.settings import DEFAULT_WINDOWS
 from lfpiv.weights.operator import Weights
 
 TITLE = "Fig. 14: displacement of a ring vortex; Fig. 13: its vorticity at 0.5 particles per microlens"

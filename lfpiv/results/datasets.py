@@ -20,6 +20,7 @@ import xarray as xr
 from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import plain, replacing, write_bytes
+from lfpiv.version import SOURCE, history
 
 SCHEMA_VERSION = 4
 """Version of the files. 2: the group has its own dimensions. 3: adds ``profile_z``. 4: sealed, and states its name."""
@@ -29,6 +30,10 @@ SEALED_SINCE = 4
 
 FILE = "file"
 """Attribute with the name under which a file was written: a copy under another name is recognised by it."""
+
+CONVENTIONS = "CF-1.11"
+"""Conventions that names and attributes follow, as far as they know the quantities: they have no name for a velocity in
+a fluid other than air and sea water."""
 
 _DESCRIPTIONS: dict[str, dict[str, Any]] = {
     "z": {"axis": "Z"},
@@ -41,6 +46,11 @@ _DESCRIPTIONS: dict[str, dict[str, Any]] = {
     },
     "masked": {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "fluid masked"},
 }  # attributes of the CF conventions, for plotting and geometry tools
+
+_DOUBTS = {
+    **dict.fromkeys("uvw", ("valid",)),
+    **{f"displacement_{axis}": (f"uncertainty_{axis}", "valid") for axis in "xyz"},
+}  # variables that say how well others are known
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
@@ -74,15 +84,23 @@ def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, A
         hdf5.seal(scratch)
 
 
-def packed(dataset: xr.Dataset, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """Return a dataset with the attributes and the compression that it has in a file."""
+def packed(dataset: xr.Dataset, attributes: Mapping[str, Any], *, root: bool = True) -> xr.Dataset:
+    """Return a dataset with the attributes and the compression that it has in a file; `root` is the file's own group.
+
+    A file states the conventions that it follows, the program that wrote it, and when.
+    """
     dataset = dataset.copy()
     own = {"schema_version": SCHEMA_VERSION, **dataset.attrs, **attributes}
+    if root:
+        own |= {"Conventions": CONVENTIONS, "source": SOURCE, "history": history(str(own.get("history", "")))}
     dataset.attrs = {key: _attribute(value) for key, value in own.items()}
     summed = {"fletcher32": True}
     compressed = {**summed, "zlib": True, "complevel": 1, "shuffle": True}
     for name, item in dataset.variables.items():
         described = {**item.attrs, **_DESCRIPTIONS.get(str(name), {})}
+        doubts = [other for other in _DOUBTS.get(str(name), ()) if other in dataset]
+        if doubts:
+            described["ancillary_variables"] = " ".join(doubts)
         item.attrs = {key: _attribute(value) for key, value in described.items()}
         numbers = item.ndim and item.size and item.dtype.kind in "fiub"
         item.encoding = {} if not numbers else compressed if item.ndim >= 2 else summed

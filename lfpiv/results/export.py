@@ -21,11 +21,12 @@ from pyevtk.vtk import VtkGroup
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.settings import Series
-from lfpiv.files import replacing, writing
+from lfpiv.files import state_origin, writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.records import read_object
 from lfpiv.results import datasets, image_identity, netcdf, particles, provenance, stores
+from lfpiv.results import tables as csv_tables
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.reader import open_results
 from lfpiv.results.stacked_files import INSTANT, PAIR, TIME_ATTRIBUTES, StackedFiles
@@ -36,9 +37,6 @@ log = logging.getLogger(__name__)
 
 FOLDER = "export"
 """Default folder of exports inside the folder of the run."""
-
-CSV_DIGITS = 9
-"""Significant digits in text, enough for single precision."""
 
 _MM_PER_M = 1000.0
 
@@ -147,7 +145,11 @@ def export_results(
                 write(files, path, {"versions": versions()}, interval_s, step)
                 return [path]
             if form is Format.CSV:
-                return _write_csv(results, target, step) + _write_particle_csv(tables, target)
+                written, of_particles = _write_csv(results, target, step), _write_particle_csv(tables, target)
+                columns = {name: {"units": unit} for name, unit in particles.PARTICLE_UNITS.items()}
+                known = dict.fromkeys(written, csv_tables.columns_of(results)) | dict.fromkeys(of_particles, columns)
+                csv_tables.describe(known, target)
+                return written + of_particles
             if form is Format.VTP:
                 times = dict(
                     zip(results[files.dimension].values.tolist(), _times(results, interval_s).tolist(), strict=True)
@@ -290,6 +292,7 @@ def _write_image(arrays: dict[str, Any], places: xr.Dataset | xr.DataArray, path
     with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as scratch:
         origin = tuple(float(axis[0]) for axis in axes)
         written = imageToVTK(str(Path(scratch) / "image"), origin=origin, spacing=spacing, pointData=points)
+        state_origin(Path(written))
         os.replace(written, path)
 
 
@@ -300,6 +303,7 @@ def _write_collection(files: dict[Path, float], path: Path) -> None:
         for file, time in files.items():
             group.addFile(str(Path(scratch) / file.name), sim_time=time)
         group.save()
+        state_origin(Path(scratch) / "collection.pvd")
         os.replace(Path(scratch) / "collection.pvd", path)
 
 
@@ -309,17 +313,8 @@ def _write_collection(files: dict[Path, float], path: Path) -> None:
 def _write_csv(results: xr.Dataset, target: Path, progress: StepProgress) -> list[Path]:
     written = []
     for pair, vectors in _each_pair(results, progress):
-        units = {name: vectors[name].attrs.get("units", "1") for name in vectors.variables}
-        names = ["x", "y", "z", *vectors.data_vars]
-        titles = [str(name) if units[name] == "1" else f"{name} [{units[name]}]" for name in names]
-        flags = {name: vectors[name].astype(np.uint8) for name, item in vectors.data_vars.items() if item.dtype == bool}
-        table = vectors.assign(flags).to_dataframe(dim_order=list(AXES))
-        path = target / f"{_stem(results, pair)}.csv"
-        with replacing(path) as scratch:
-            table.reset_index().to_csv(
-                scratch, columns=names, header=titles, index=False, float_format=f"%.{CSV_DIGITS}g", encoding="utf-8"
-            )
-        written.append(path)
+        written.append(target / f"{_stem(results, pair)}.csv")
+        csv_tables.write_vectors(vectors, written[-1])
     return written
 
 
@@ -337,7 +332,7 @@ def _write_particle_csv(tables: dict[int, Path], target: Path) -> list[Path]:
     written = []
     for path in tables.values():
         written.append(target / f"particles_{path.stem}.csv")
-        particles.write_csv(particles.read_particles(path), written[-1], CSV_DIGITS)
+        particles.write_csv(particles.read_particles(path), written[-1], csv_tables.DIGITS)
     return written
 
 

@@ -211,7 +211,7 @@ def write_vectors(
     path.parent.mkdir(parents=True, exist_ok=True)
     groups = {"": datasets.packed(vectors, {**attributes, "versions": versions(), datasets.FILE: path.name})}
     if reconstruction is not None:
-        groups[RECONSTRUCTION] = datasets.packed(reconstruction.rename(_GROUP_AXES), {})
+        groups[RECONSTRUCTION] = datasets.packed(reconstruction.rename(_GROUP_AXES), {}, root=False)
     datasets.write_groups(groups, path)
 
 

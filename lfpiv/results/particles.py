@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.files import plain, replacing
+from lfpiv.files import plain, replacing, state_origin
 from lfpiv.results import datasets
 from lfpiv.results.stacked_files import NAME
 from lfpiv.version import versions
@@ -185,6 +185,7 @@ def write_vtp(table: xr.Dataset, path: Path) -> None:
     _array(vertices, "offsets", np.arange(1, count + 1, dtype=np.int64))
     with replacing(path) as scratch:
         ElementTree.ElementTree(root).write(scratch, encoding="utf-8", xml_declaration=True)
+        state_origin(scratch)
 
 
 def _array(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:

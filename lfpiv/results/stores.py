@@ -76,7 +76,7 @@ def open_store(path: Path, pairs: tuple[int, int | None] | None = None) -> xr.Da
         text = " ".join((error.reason if isinstance(error, DamagedFile) else str(error)).split())[:300]
         raise InputError(f"{path}: expected a store of `lfpiv export`, found {text}. Export again.") from None
     dimension = INSTANT if INSTANT in results.dims else PAIR
-    for name in (FORM, COMPLETE, SIGNATURE, hdf5.SEALED, store_seal.OUTLINE, store_seal.CONTENT):
+    for name in ("history", FORM, COMPLETE, SIGNATURE, hdf5.SEALED, store_seal.OUTLINE, store_seal.CONTENT):
         results.attrs.pop(name, None)
     if isinstance(edges := results.attrs.get("voxel_mm"), list):
         results.attrs["voxel_mm"] = np.asarray(edges)

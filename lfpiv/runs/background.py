@@ -28,6 +28,7 @@ from lfpiv.progress import StepProgress
 from lfpiv.records import RecordError, read_object, validate
 from lfpiv.results import datasets, provenance, stamps
 from lfpiv.results.provenance import Marks, Stamp
+from lfpiv.version import SOURCE, history
 from lfpiv.warn import Code, Warning, to_text, warn
 
 if TYPE_CHECKING:
@@ -355,7 +356,7 @@ def write(found: Background, path: Path, attributes: Mapping[str, Any]) -> None:
 
     content = io.BytesIO()  # see `files.write_bytes` for why not straight to disk
     with h5py.File(content, "w") as file:
-        file.attrs.update({**attributes, datasets.FILE: path.name})
+        file.attrs.update({**attributes, datasets.FILE: path.name, "source": SOURCE, "history": history()})
         file.attrs["figures"] = json.dumps({"content": found.content, "cameras": found.figures})
         file.attrs["warnings"] = to_text(found.warnings)
         for name, light in found.cameras.items():

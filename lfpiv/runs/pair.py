@@ -85,9 +85,7 @@ class PairWork:
         StorageError
             If a result cannot be written; then no other pair could be written either.
         """
-        instants: Instants | None = None
-        if self.experiment.series is not None:
-            instants = SequentialInstants(self, stored) if self.experiment.in_sequence else Instants(self, stored)
+        instants = self.instants(stored)
         computed: Computed | None = None
         try:
             for number, (pair, coming) in enumerate(_with_next(pairs)):
@@ -103,6 +101,12 @@ class PairWork:
             self.images.start(())
         if instants is not None:
             instants.clear()
+
+    def instants(self, stored: Collection[int] = ()) -> Instants | None:
+        """Return the instants of a series, of which none is known yet; None for image pairs."""
+        if self.experiment.series is None:
+            return None
+        return SequentialInstants(self, stored) if self.experiment.in_sequence else Instants(self, stored)
 
     def _compute(self, pair: int, instants: Instants | None, progress: StepProgress) -> Computed:
         """Compute the results of one pair and start to write them."""
@@ -181,19 +185,28 @@ class PairWork:
         if files.outdated(**wanted) is None:
             log.info("%s: was finished by a worker that died afterwards", self.experiment.name_of(pair))
             return
-        if instants is None:
-            volumes = self._pair_volumes(files, part_of(progress, 0.0, RECONSTRUCTED))
-        elif self.vectors:
-            volumes = instants.volumes(files, part_of(progress, 0.0, RECONSTRUCTED))
-        else:
+        if instants is not None and not self.vectors:
             instants.keep(files, progress)
             return
+        volumes = self.volumes(files, instants, part_of(progress, 0.0, RECONSTRUCTED))
         if self.vectors:
             progress(RECONSTRUCTED)
             self._correlate(files, volumes, progress)
 
-    def _pair_volumes(self, files: PairFiles, progress: StepProgress) -> PairVolumes:
-        """Read the volumes of an image pair, or reconstruct both together."""
+    def volumes(self, files: PairFiles, instants: Instants | None, progress: StepProgress) -> PairVolumes:
+        """Read the volumes of a pair, or reconstruct both together, those of a series each by itself.
+
+        Raises
+        ------
+        Failure
+            If an instant of a series failed.
+        InputError
+            If images cannot be used, or two of them are the same.
+        StorageError
+            If a volume cannot be written.
+        """
+        if instants is not None:
+            return instants.volumes(files, progress)
         frames = files.read_volumes()
         if frames is None:
             frames = self._reconstruct_pair(files, progress)
@@ -281,12 +294,17 @@ class PairWork:
         first, second = self.reconstructor.volumes(images, noise)
         return measure_vectors(first, second, self.experiment, self.between)
 
-    def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
-        experiment, start = self.experiment, time.perf_counter()
-        vectors = without_unmeasured(measure_vectors(*volumes.volumes, experiment, self.between), volumes)
+    def vectors_between(self, pair: int, volumes: PairVolumes) -> xr.Dataset:
+        """Return the vectors of a pair, with the warnings about its images and with times [s] as attributes."""
+        start = time.perf_counter()
+        vectors = without_unmeasured(measure_vectors(*volumes.volumes, self.experiment, self.between), volumes)
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
-        vectors.attrs["reconstruction_s"] = reconstruction_s(experiment, files.pair, volumes)
+        vectors.attrs["reconstruction_s"] = reconstruction_s(self.experiment, pair, volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start
+        return vectors
+
+    def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
+        experiment, vectors = self.experiment, self.vectors_between(files.pair, volumes)
         condensed, found = volumes.condensed(), volumes.warnings
         if files.particles is not None and self.weights is not None:
             found = (*found, *self._track(files, volumes, vectors))

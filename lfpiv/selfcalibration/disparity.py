@@ -21,7 +21,7 @@ from scipy.ndimage import convolve, gaussian_filter
 
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.settings import PLAIN, SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class CameraVolumes:
 
     def __init__(self, weights: Weights):
         self.weights = weights
-        settings = SmartSettings(iterations=ITERATIONS)
+        settings = SmartSettings(iterations=ITERATIONS, **PLAIN)
         self._solvers = {name: SmartSolver(weights.of_camera(name), settings) for name in weights.cameras}
         self._volumes: dict[str, list[np.ndarray]] = {name: [] for name in weights.cameras}
 

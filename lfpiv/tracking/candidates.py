@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from lfpiv.geometry.volume import voxel_place
 from lfpiv.metrics.particles import find_particles
+from lfpiv.reconstruction.settings import PLAIN
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.tracking.refinement import Cloud
 from lfpiv.weights.operator import Weights
@@ -58,7 +59,7 @@ def reconstructed(
 ) -> xr.DataArray | None:
     """Reconstruct a volume from images; None if they hold no light where the volume is seen."""
     try:
-        return reconstruct(weights, images, iterations, floor=dict(noise), floor_share=0.02, sieve_voxel=0.0)
+        return reconstruct(weights, images, iterations, floor=dict(noise), floor_share=0.02, **PLAIN)
     except ValueError:
         return None
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from lfpiv.experiment.settings import Tracking
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import is_finite
 from lfpiv.reconstruction.particle_size import ParticleSizer
@@ -26,10 +27,8 @@ from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Normal, Scene, diagonal_blocks, light_scatter, overlaps, refine, rendered
 from lfpiv.weights.operator import Weights
 
-ROUNDS = 5
-"""Default number of rounds of fitting, removing and adding."""
-WEAKEST = 0.1
-"""Default of the least light of a particle, as a share of the typical one."""
+DEFAULTS = Tracking()
+"""Settings of the search where none are stated."""
 SIGNIFICANCE = 5.0
 """Least light of a particle in each camera that sees it [standard error]."""
 MERGED_VOXEL = 0.8
@@ -70,8 +69,8 @@ def find_particles(
     *,
     noise: float | Mapping[str, float] | None = None,
     sigma_voxel: float | None = None,
-    rounds: int = ROUNDS,
-    weakest: float = WEAKEST,
+    rounds: int = DEFAULTS.rounds,
+    weakest: float = DEFAULTS.weakest,
 ) -> FoundParticles:
     """Find the particles of one instant: candidates from SMART, refined on the raw images.
 
@@ -140,8 +139,8 @@ class ParticleSearch:
     weights: Weights
     grid: Grid | None = None
     sigma_voxel: float | None = None
-    rounds: int = ROUNDS
-    weakest: float = WEAKEST
+    rounds: int = DEFAULTS.rounds
+    weakest: float = DEFAULTS.weakest
 
     def __post_init__(self) -> None:
         self.images = ParticleImages(

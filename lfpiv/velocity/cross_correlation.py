@@ -20,7 +20,7 @@ from lfpiv.geometry.volume import is_finite
 from lfpiv.velocity.coverage import Voxels
 from lfpiv.velocity.multi_pass import Pass, correlate_passes, peak_ratio
 from lfpiv.velocity.seeding import unseeded_voxels
-from lfpiv.velocity.settings import CorrelationSettings, triple, windows_of
+from lfpiv.velocity.settings import DEFAULTS, CorrelationSettings, triple, windows_of
 from lfpiv.velocity.standing_light import on_standing_light
 from lfpiv.velocity.systematic import image_residual, with_systematic
 from lfpiv.velocity.volume_pair import (
@@ -73,13 +73,13 @@ def correlate(
     volume_a: xr.DataArray | np.ndarray,
     volume_b: xr.DataArray | np.ndarray,
     *,
-    dt_s: float,
-    windows: Sequence[int | Sequence[int]] | None = None,
-    overlap: float = 0.5,
+    dt_s: float | None = None,
+    windows: int | Sequence[int | Sequence[int]] | None = DEFAULTS.windows,
+    overlap: float = DEFAULTS.overlap,
     voxel_mm: float | None = None,
-    max_displacement_voxel: float | None = None,
-    smoothing_voxel: float = 0.0,
-    intensity_power: float = 1.0,
+    max_displacement_voxel: float | None = DEFAULTS.max_displacement_voxel,
+    smoothing_voxel: float = DEFAULTS.smoothing_voxel,
+    intensity_power: float = DEFAULTS.intensity_power,
     mask: xr.DataArray | np.ndarray | None = None,
 ) -> xr.Dataset:
     """Measure the displacement of the particles between two volumes.
@@ -90,29 +90,30 @@ def correlate(
     taken if it passes, otherwise the prediction from the neighbours. With more than one pass, swapping the volumes
     negates the result. A single pass takes windows of the first volume only: it is twice as fast and less accurate.
 
-    It has more than 8 parameters because each setting of the experiment file is one keyword.
+    It has more than 8 parameters because each setting of the table ``[correlation]`` is one keyword. Their defaults are
+    the table's (`lfpiv.experiment.settings.Correlation`).
 
     Parameters
     ----------
     volume_a, volume_b : DataArray or ndarray, shape (z, y, x)
         Intensities at the first and the second instant, finite, of any sign. Either two DataArrays with coordinates z,
-        y, x [mm], or two arrays.
-    dt_s : float
-        Time between the two volumes [s].
-    windows : sequence, optional
-        Window of each pass [voxel]: (z, y, x), or one edge, which is cut to the volume. The last window sets the vector
-        grid. All others overlap by at least `multi_pass.COARSE_OVERLAP`. Repeat a window to iterate.
-        Default: `settings.DEFAULT_WINDOWS`, cut to the volume.
+        y, x [mm], or two arrays, of which nothing else need be known.
+    dt_s : float, optional
+        Time between the two volumes [s]. Without it there are no velocities.
+    windows : int or sequence, optional
+        Window of each pass [voxel]: (z, y, x) or one edge, within the volume; a number is the window of a single pass.
+        The last window sets the vector grid. All others overlap by at least `multi_pass.COARSE_OVERLAP`. Repeat a
+        window to iterate. Default: `lfpiv.experiment.settings.DEFAULT_WINDOWS`, cut to the volume.
     overlap : float
         Part of a window that its neighbour shares, 0 <= overlap < 1.
     voxel_mm : float, optional
-        Voxel edge [mm]. Required for arrays, whose first voxel is then centred at 0; not allowed for DataArrays.
+        Voxel edge [mm] of arrays, whose first voxel is centred at 0; not allowed for DataArrays. Without it the
+        coordinates are indices of voxels, and there are no velocities.
     max_displacement_voxel : float, optional
         Largest displacement along each axis that the first pass searches [voxel]. Default: a quarter of its window.
     smoothing_voxel : float
-        Standard deviation of a Gaussian that smooths both volumes first [voxel]; 0: none. About 0.5 suits particles
-        that are single bright voxels. Larger particles need none. The attribute ``sieve_voxel`` of a volume counts as
-        smoothing that it already has: only sqrt(smoothing_voxel^2 - sieve_voxel^2) is added.
+        Standard deviation of a Gaussian that smooths both volumes first [voxel]; 0: none. The attribute ``sieve_voxel``
+        of a volume counts as smoothing that it already has: only sqrt(smoothing_voxel^2 - sieve_voxel^2) is added.
     intensity_power : float
         Power of the smoothed intensities that is correlated, negative intensities as 0; 1: no change. Below 1, bright
         particles and their ghosts weigh less against the others.
@@ -123,11 +124,12 @@ def correlate(
     Returns
     -------
     Dataset
-        Dims z, y, x: window centres [mm]. All vectors are means over the window. Where part of a window is masked, its
-        fluid is correlated, and the field of the pass before continues the vector to the window's centre.
+        Dims z, y, x: window centres [mm], of arrays without `voxel_mm` [voxel]. All vectors are means over the window.
+        Where part of a window is masked, its fluid is correlated, and the field of the pass before continues the vector
+        to the window's centre.
 
-        ``u``, ``v``, ``w`` [m/s] and ``displacement_x``, ``_y``, ``_z`` [voxel]: finite unless no vector is valid; NaN
-        where masked.
+        ``u``, ``v``, ``w`` [m/s], where `dt_s` and the size of the voxels are known, and ``displacement_x``, ``_y``,
+        ``_z`` [voxel]: finite unless no vector is valid; NaN where masked.
         ``valid``: true where the vector was measured and passed validation, false where it was replaced. If the volumes
         have the coordinate ``views``, vectors are also replaced where two cameras see less than three quarters of the
         window. So are vectors of windows in which light brighter than moving particles stays in place
@@ -152,7 +154,16 @@ def correlate(
     Raises
     ------
     ValueError
-        If the volumes differ in kind, shape or coordinates, are not finite, or an argument is out of range.
+        If the volumes differ in kind, shape or coordinates, are not finite, an argument is out of range, a window does
+        not fit into the volume, or `dt_s` is given for arrays without `voxel_mm`.
+
+    Examples
+    --------
+    >>> import numpy as np, lfpiv
+    >>> volume = np.random.default_rng(0).random((24, 24, 24))
+    >>> moved = lfpiv.correlate(volume, np.roll(volume, 1, axis=2), windows=(12, 12))
+    >>> float(moved.displacement_x.median().round(1)), moved.x.values.tolist(), moved.x.units
+    (1.0, [5.5, 11.5, 17.5], 'voxel')
 
     References
     ----------
@@ -163,8 +174,10 @@ def correlate(
     axes = voxel_axes(volume_a, volume_b, voxel_mm)
     solid = solid_voxels(mask, volume_a, volume_b, axes)
     first, second = normalise(first, "volume_a", solid), normalise(second, "volume_b", solid)
-    if not (is_finite(dt_s) and dt_s > 0):
+    if dt_s is not None and not (is_finite(dt_s) and dt_s > 0):
         raise ValueError(f"dt_s: expected a positive time [s], got {dt_s!r}.")
+    if dt_s is not None and axes.spacing_mm is None:
+        raise ValueError("dt_s: velocities of arrays need the voxel edge too: state voxel_mm [mm], or leave dt_s out.")
     shape = triple(first.shape)
     settings = CorrelationSettings(
         windows=windows_of(windows, shape),
@@ -197,9 +210,9 @@ def correlate(
     if voxels.unseeded is not None:
         log.info("correlation: %.0f %% of the volume holds no particles", 100 * voxels.unseeded_fraction)
     attributes = {
-        "title": "displacement and velocity of particles between two volumes",
-        "dt_s": float(dt_s),
-        "voxel_mm": [float(spacing) for spacing in axes.spacing_mm],
+        "title": f"displacement {'' if dt_s is None else 'and velocity '}of particles between two volumes",
+        **({} if dt_s is None else {"dt_s": float(dt_s)}),
+        **({} if axes.spacing_mm is None else {"voxel_mm": [float(spacing) for spacing in axes.spacing_mm]}),
         "valid_fraction": last.valid_fraction,
         "seen_fraction": last.fraction(last.coverage.seen),
         "masked_fraction": float(last.coverage.masked.mean()),
@@ -213,19 +226,25 @@ def correlate(
     return xr.Dataset(_variables(last, deviation, axes, dt_s), _coordinates(last, axes), attributes)
 
 
-def _variables(result: Pass, deviation: np.ndarray, axes: VoxelAxes, dt_s: float) -> dict[str, Variable]:
-    """Return displacement, velocity, uncertainty and quality of the last pass as variables over (z, y, x)."""
+def _variables(result: Pass, deviation: np.ndarray, axes: VoxelAxes, dt_s: float | None) -> dict[str, Variable]:
+    """Return velocity, displacement, uncertainty and quality of the last pass as variables over (z, y, x)."""
     coverage = result.coverage
     known = np.where(coverage.masked, np.nan, 1.0)
+    displacements = {axis: result.field[..., k] * known for k, axis in enumerate(AXES)}
     fields: dict[str, tuple[np.ndarray, str, str]] = {}
-    for k, (name, axis) in enumerate(zip("wvu", AXES, strict=True)):
-        displacement, metres = result.field[..., k] * known, axes.spacing_mm[k] * 1e-3
-        fields[name] = (displacement * metres / dt_s, "m/s", f"velocity along {axis}")
-        fields[f"displacement_{axis}"] = (displacement, "voxel", f"displacement along {axis}, mean over the window")
-        text = f"standard deviation of the displacement along {axis}: {UNCERTAINTY_PARTS}"
-        fields[f"uncertainty_{axis}"] = (deviation[..., k], "voxel", text)
+    if dt_s is not None and axes.spacing_mm is not None:
+        edges_mm = dict(zip(AXES, axes.spacing_mm, strict=True))
+        for name, axis in zip("uvw", "xyz", strict=True):
+            metres = edges_mm[axis] * 1e-3
+            fields[name] = (displacements[axis] * metres / dt_s, "m/s", f"velocity along {axis}")
+    for axis in "xyz":
+        text = f"displacement along {axis}, mean over the window"
+        fields[f"displacement_{axis}"] = (displacements[axis], "voxel", text)
     text = f"standard deviation of the displacement vector: {UNCERTAINTY_PARTS}"
     fields["uncertainty"] = (np.sqrt((deviation**2).sum(-1)), "voxel", text)
+    for axis in "xyz":
+        text = f"standard deviation of the displacement along {axis}: {UNCERTAINTY_PARTS}"
+        fields[f"uncertainty_{axis}"] = (deviation[..., AXES.index(axis)], "voxel", text)
     text = f"highest correlation over the highest more than {result.given.reach} lags away"
     fields["peak_ratio"] = (peak_ratio(result.peaks) * known, "1", text)
     fields["correlation"] = (result.peaks.correlation * known, "1", "correlation coefficient at the peak")
@@ -242,11 +261,9 @@ def _variables(result: Pass, deviation: np.ndarray, axes: VoxelAxes, dt_s: float
 
 
 def _coordinates(result: Pass, axes: VoxelAxes) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
-    """Return the window centres along each axis [mm]."""
-    attributes = {"units": "mm", "long_name": "centre of the window"}
+    """Return the window centres along each axis."""
+    attributes = {"units": axes.unit, "long_name": "centre of the window"}
     return {
         axis: (axis, voxels[0] + spacing * centres, dict(attributes))
-        for axis, voxels, spacing, centres in zip(
-            AXES, axes.centres_mm, axes.spacing_mm, result.given.centres, strict=True
-        )
+        for axis, voxels, spacing, centres in zip(AXES, axes.centres, axes.spacing, result.given.centres, strict=True)
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -12,16 +11,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lfpiv.experiment.settings import DEFAULT_WINDOWS, Correlation
 from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import is_finite
-
-log = logging.getLogger(__name__)
 
 Triple = tuple[int, int, int]
 """Whole numbers along (z, y, x)."""
 
-DEFAULT_WINDOWS = (32, 16, 12, 12)
-"""Default window edge of each pass [voxel], cut to the volume along each axis."""
+DEFAULTS = Correlation()
+"""Settings of a correlation where none are stated."""
 FIRST_SEARCH = 0.25
 """Default search range of the first pass, as a part of its window: the one-quarter rule."""
 REFINE_SEARCH = 3
@@ -76,30 +74,37 @@ def triple(values: Iterable[int]) -> Triple:
     return z, y, x
 
 
-def windows_of(windows: Sequence[int | Sequence[int]] | None, shape: Triple) -> tuple[Triple, ...]:
-    """Check the windows of all passes against the shape of the volumes, and return each as (z, y, x)."""
+def windows_of(windows: int | Sequence[int | Sequence[int]] | None, shape: Triple) -> tuple[Triple, ...]:
+    """Check the windows of all passes against the shape of the volumes, and return each as (z, y, x).
+
+    A number is the window of a single pass. Default windows are cut to the volume; others raise ValueError.
+    """
     if windows is None:
-        return tuple(triple(min(edge, n) for n in shape) for edge in DEFAULT_WINDOWS)
-    if isinstance(windows, (int, float, str)):
-        raise ValueError(f"windows: expected a sequence, one window per pass, got {windows!r}.")
+        return tuple(largest_within((edge, edge, edge), shape) for edge in DEFAULT_WINDOWS)
+    if isinstance(windows, str):
+        raise ValueError(f"windows: expected a window or a sequence, one window per pass, got {windows!r}.")
+    if not isinstance(windows, Iterable):
+        return (_check_window(windows, shape),)
     if len(windows) == 0:
         raise ValueError("windows: expected at least one pass, got none.")
     return tuple(_check_window(window, shape) for window in windows)
 
 
 def _check_window(window: Any, shape: Triple) -> Triple:
-    """Return one window as (z, y, x): cut to the volume if it is a single edge."""
+    """Return one window as (z, y, x)."""
     given = tuple(window) if np.ndim(window) else (window,) * 3
     if len(given) != 3 or not all(is_finite(edge) and int(edge) == edge and edge >= 4 for edge in given):
         raise ValueError(f"windows: expected edges of whole voxels >= 4, one or (z, y, x) per pass, got {window}.")
     edges = triple(int(edge) for edge in given)
-    too_large = [(axis, edge, n) for axis, edge, n in zip(AXES, edges, shape, strict=True) if edge > n]
-    if too_large and np.ndim(window):
-        axis, edge, n = too_large[0]
-        raise ValueError(
-            f"windows: expected edges within the volume, got {edge} along {axis}, which has {n} voxels. "
-            "Use a smaller window, or a single edge, which is cut to the volume."
-        )
-    if too_large:
-        log.info("window %d is cut to the volume %s", edges[0], shape)
+    for axis, edge, n in zip(AXES, edges, shape, strict=True):
+        if edge > n:
+            raise ValueError(
+                f"windows: expected edges within the volume, got {edge} along {axis}, which has {n} voxels. "
+                f"The largest window of this kind is {largest_within(edges, shape)}, as (z, y, x)."
+            )
+    return edges
+
+
+def largest_within(edges: Triple, shape: Triple) -> Triple:
+    """Return a window (z, y, x) cut to a volume."""
     return triple(min(edge, n) for edge, n in zip(edges, shape, strict=True))

@@ -25,12 +25,19 @@ _BACKGROUND_SAMPLES = 100_000  # voxels whose median is the background
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelAxes:
-    """Voxel centres of a volume."""
+    """Voxel centres of a volume, in millimetres or as indices."""
 
-    centres_mm: tuple[np.ndarray, ...]
-    """Voxel centres along z, y, x [mm]."""
-    spacing_mm: tuple[float, float, float]
-    """Distance of voxels along z, y, x [mm]."""
+    centres: tuple[np.ndarray, ...]
+    """Voxel centres along z, y, x [`unit`]."""
+    spacing: tuple[float, float, float]
+    """Distance of voxels along z, y, x [`unit`]."""
+    unit: str = "mm"
+    """"mm", or "voxel" where the edge of a voxel is not known."""
+
+    @property
+    def spacing_mm(self) -> tuple[float, float, float] | None:
+        """Distance of voxels along z, y, x [mm]; None where it is not known."""
+        return self.spacing if self.unit == "mm" else None
 
 
 def numbers_of(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
@@ -100,20 +107,23 @@ def voxel_axes(
     if np.shape(volume_a) != np.shape(volume_b):
         raise ValueError(f"volume_b: expected the shape of volume_a, {np.shape(volume_a)}, got {np.shape(volume_b)}.")
     if not isinstance(volume_a, xr.DataArray) and not isinstance(volume_b, xr.DataArray):
+        if voxel_mm is None:
+            indices = tuple(np.arange(n, dtype=float) for n in np.shape(volume_a))
+            return VoxelAxes(centres=indices, spacing=(1.0, 1.0, 1.0), unit="voxel")
         if not (is_finite(voxel_mm) and voxel_mm > 0):
-            raise ValueError(f"voxel_mm: expected the voxel edge [mm] > 0, which arrays need, got {voxel_mm!r}.")
+            raise ValueError(f"voxel_mm: expected the voxel edge [mm] > 0, got {voxel_mm!r}.")
         centres = tuple(voxel_mm * np.arange(n) for n in np.shape(volume_a))
-        return VoxelAxes(centres_mm=centres, spacing_mm=(voxel_mm, voxel_mm, voxel_mm))
+        return VoxelAxes(centres=centres, spacing=(voxel_mm, voxel_mm, voxel_mm))
     if not isinstance(volume_a, xr.DataArray) or not isinstance(volume_b, xr.DataArray):
         one, other = ("volume_b", "volume_a") if isinstance(volume_b, xr.DataArray) else ("volume_a", "volume_b")
         raise ValueError(
             f"{other}: expected a DataArray, as {one} is, got an array without coordinates. Give it those of {one}, or "
-            "hand over both as arrays, with voxel_mm."
+            "hand over both as arrays."
         )
     if voxel_mm is not None:
         raise ValueError("voxel_mm: expected no value with DataArrays, whose coordinates state it. Leave it out.")
     z, y, x = (_common_axis(volume_a, volume_b, axis) for axis in AXES)
-    return VoxelAxes(centres_mm=(z[0], y[0], x[0]), spacing_mm=(z[1], y[1], x[1]))
+    return VoxelAxes(centres=(z[0], y[0], x[0]), spacing=(z[1], y[1], x[1]))
 
 
 def _common_axis(volume_a: xr.DataArray, volume_b: xr.DataArray, axis: str) -> tuple[np.ndarray, float]:
@@ -158,11 +168,11 @@ def solid_voxels(
     Without `mask`, the coordinate ``masked`` of the volumes is taken.
     """
     if mask is not None:
-        masks = [checked_mask(mask, axes.centres_mm)]
+        masks = [checked_mask(mask, axes.centres)]
     else:
         volumes = [volume for volume in (volume_a, volume_b) if isinstance(volume, xr.DataArray)]
         found = [volume[MASKED] for volume in volumes if MASKED in volume.coords]
-        masks = [checked_mask(one.drop_vars(MASKED), axes.centres_mm, MASKED) for one in found]
+        masks = [checked_mask(one.drop_vars(MASKED), axes.centres, MASKED) for one in found]
     solid = np.logical_or.reduce(masks) if masks else np.zeros(1, bool)
     return solid if solid.any() else None
 

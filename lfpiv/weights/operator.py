@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.calibration.coverage import SEEN_SHARE, warn_seen_by_one
+from lfpiv.experiment.settings import Compute
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.progress import StepProgress, part_of
+from lfpiv.prompt import Card, Shown, count, times
 from lfpiv.weights.blocks import (
     BLOCK_BYTES,
     CHUNK_VOXELS,
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+DEFAULTS = Compute()
+"""Computation and form of the weights where none are stated."""
 METHODS = ("footprint", "count")
 FORMS = ("auto", *footprint.FORMS)
 COUNT_SAMPLES_ONE = 144
@@ -51,7 +55,7 @@ COUNT_SAMPLES_ONE = 144
 Images = dict[str, np.ndarray]
 
 
-class Weights:
+class Weights(Shown):
     """Weights of a grid's voxels on every camera's pixels: a linear operator.
 
     `build_weights` makes it from a calibration. ``weights(volume)`` returns a dict camera -> image,
@@ -96,6 +100,23 @@ class Weights:
         self._lens_sums: dict[tuple[str, int], np.ndarray] = {}
         self.volume = stored.grid
         """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
+
+    def card(self) -> Card:
+        """Return what matters of the weights, for people."""
+        grid, forms = self.stored.grid, self.forms
+        facts = [
+            ("voxels", f"{times(grid.shape)} (z, y, x) of {grid.voxel_mm:.4g} mm"),
+            *((axis, f"{low:.4g} to {high:.4g} mm") for axis, (low, high) in zip("xyz", _extent(grid), strict=True)),
+            ("method", self.method),
+            ("memory", f"{self.memory_bytes / 2**20:,.0f} MiB"),
+            ("use", "images = weights(volume), volume = weights.T(images)"),
+        ]
+        rows = [
+            (name, times(camera.optics.sensor_shape), forms.get(name, "counted when first needed"))
+            for name, camera in self.cameras.items()
+        ]
+        title = f"Weights of {count(grid.size, 'voxel')} on {count(len(rows), 'camera')}"
+        return Card(title, tuple(facts), (("camera", "pixels (rows, columns)", "stored as"), *rows))
 
     def of_camera(self, name: str) -> Weights:
         """Return the weights of one of the cameras. They share memory with these."""
@@ -306,6 +327,12 @@ class Weights:
         return self._counted[name]
 
 
+def _extent(grid: Grid) -> list[tuple[float, float]]:
+    """Return the faces of a grid along x, y, z [mm]."""
+    half = grid.voxel_mm / 2
+    return [(float(axis[0]) - half, float(axis[-1]) + half) for axis in map(grid.axis_mm, (2, 1, 0))]
+
+
 class Adjoint:
     """The adjoint of `Weights`; ``adjoint.T`` is the operator itself."""
 
@@ -348,9 +375,9 @@ class Adjoint:
 def build_weights(
     calibration: Calibration,
     grid: Grid,
-    method: str = "footprint",
+    method: str = DEFAULTS.weights,
     *,
-    form: str = "auto",
+    form: str = DEFAULTS.weights_form,
     limit_bytes: float = math.inf,
     progress: StepProgress | None = None,
 ) -> Weights:

@@ -233,7 +233,7 @@ def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray
             levels = {camera: weights.cameras[camera].decoder.background(images[camera]) for camera in bench.TWO}
             light.append({camera: images[camera] - np.float32(level) for camera, (level, _) in levels.items()})
             noise.append({camera: deviation for camera, (_, deviation) in levels.items()})
-        found = reconstruct_pair(weights, light, floor=noise, **smart.model_dump())
+        found = reconstruct_pair(weights, light, floor=noise, motion_passes=smart.motion_passes, **smart.of_one_frame())
         return {
             "volumes": np.stack([volume.values for volume in found]),
             "iterations": np.mean([volume.attrs["iterations"] for volume in found]),

@@ -22,6 +22,7 @@ from lfpiv.geometry.grid import AXES, Grid, Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.reconstruction.beyond import light_beyond
 from lfpiv.reconstruction.refinement import measure_size, needed_refinement
+from lfpiv.reconstruction.settings import PLAIN
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import rigs
 from lfpiv.runs.guard import LEAST_LAYERS
@@ -112,7 +113,7 @@ def by_first_guess(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) ->
     weights = weights_of(rig, rig.grid)
     start = time.process_time()
     light = [{name: rig.light(name, image) for name, image in images.items()} for images in recorded.images]
-    found = [reconstruct(weights, images, 0, floor_share=0.0) for images in light]
+    found = [reconstruct(weights, images, 0, floor_share=0.0, **PLAIN) for images in light]
     return Measured(
         volumes=found,
         passes=1.0,

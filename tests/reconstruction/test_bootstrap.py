@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from support import plain_steps
 from support.ideal_rig import lattice, optics, two_cameras
 
 import lfpiv
@@ -124,8 +125,10 @@ def test_the_likely_flow_has_the_power_of_the_true_one():
 @pytest.mark.slow
 def test_the_damping_of_a_rig_is_measured_and_the_same_each_time(weights):
     def measure(frames, noise):
-        volumes = lfpiv.reconstruct_pair(weights, frames, floor=noise, iterations=12, motion_passes=0, sieve_voxel=0.6)
-        return lfpiv.correlate(*volumes, dt_s=1e-3, windows=(12, 8))
+        volumes = plain_steps.reconstruct_pair(
+            weights, frames, floor=noise, iterations=12, motion_passes=0, sieve_voxel=0.6
+        )
+        return plain_steps.correlate(*volumes, dt_s=1e-3, windows=(12, 8))
 
     particles = RecordedParticles(
         density=0.01, sigma_voxel=0.7, light={"cam1": 4e6, "cam2": 4e6}, noise=NOISE, full={"cam1": 1e9, "cam2": 1e9}

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import plain_steps
 from support.ideal_rig import two_cameras
 
 import lfpiv
@@ -61,7 +62,7 @@ def scene(weights, spread, seed, size=0.5):
 
 
 def quality(weights, images, truth, cap):
-    volume = lfpiv.reconstruct(weights, images, 20, intensity_cap=cap, tolerance=5e-4).values
+    volume = plain_steps.reconstruct(weights, images, 20, intensity_cap=cap, tolerance=5e-4).values
     return float((volume * truth).sum() / np.sqrt(np.square(volume).sum() * np.square(truth).sum()))
 
 
@@ -82,7 +83,7 @@ def test_images_of_another_brightness_give_the_same_volume_in_their_counts(weigh
     _, images = scene(weights, 1.0, 2)
     keywords = {"iterations": 5, "intensity_cap": CAP}
     plain, brighter = (
-        lfpiv.reconstruct(weights, {name: factor * image for name, image in images.items()}, **keywords).values
+        plain_steps.reconstruct(weights, {name: factor * image for name, image in images.items()}, **keywords).values
         for factor in (1.0, 4.0)
     )
     assert np.abs(brighter / 4 - plain).max() < TOLERANCE_F32 * plain.max()
@@ -102,12 +103,14 @@ def test_particles_of_unlike_brightness_are_found_better_and_equal_ones_as_well(
 @pytest.mark.parametrize(("size", "sieve", "expected"), [(0.0, "auto", POINT_CAP), (0.9, "auto", CAP), (0.0, 0.0, CAP)])
 def test_the_cap_suits_the_particles_size_where_it_is_measured(weights, size, sieve, expected):
     _, images = scene(weights, 0.0, 5, size)
-    assert lfpiv.reconstruct(weights, images, 0, intensity_cap="auto", sieve_voxel=sieve).intensity_cap == expected
-    assert lfpiv.reconstruct(weights, images, 0, sieve_voxel=sieve).intensity_cap == 0
+    assert (
+        plain_steps.reconstruct(weights, images, 0, intensity_cap="auto", sieve_voxel=sieve).intensity_cap == expected
+    )
+    assert plain_steps.reconstruct(weights, images, 0, sieve_voxel=sieve).intensity_cap == 0
 
 
 @pytest.mark.parametrize("cap", [-1.0, float("nan"), "2"])
 def test_a_cap_out_of_its_range_is_refused(weights, cap):
     _, images = scene(weights, 0.0, 5)
     with pytest.raises(ValueError, match="intensity_cap: expected a number >= 0"):
-        lfpiv.reconstruct(weights, images, 1, intensity_cap=cap)
+        plain_steps.reconstruct(weights, images, 1, intensity_cap=cap)

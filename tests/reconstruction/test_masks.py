@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from support import plain_steps
 from support.ideal_rig import two_cameras
 
 import lfpiv
@@ -33,44 +34,44 @@ def recorded():
 def test_voxels_without_fluid_stay_dark_and_the_rest_explains_the_images(recorded, sieve_voxel):
     weights, solid, (images, _) = recorded
     options = {"iterations": 12, "sieve_voxel": sieve_voxel}
-    volume = lfpiv.reconstruct(weights, images, mask=solid, **options)
+    volume = plain_steps.reconstruct(weights, images, mask=solid, **options)
     assert (volume.values[solid] == 0).all() and (volume.values[~solid] > 0).mean() > 0.99
     np.testing.assert_array_equal(volume["masked"].values, solid)
-    free = lfpiv.reconstruct(weights, images, **options)
+    free = plain_steps.reconstruct(weights, images, **options)
     assert "masked" not in free.coords and free.values[solid].sum() > 0.02 * free.values.sum()  # ghosts
     assert volume.attrs["residual"][-1] < 1.2 * free.attrs["residual"][-1]
 
 
 def test_a_mask_is_a_first_guess_without_light_there(recorded):
     weights, solid, (images, _) = recorded
-    first = lfpiv.reconstruct(weights, images, iterations=0, mask=solid)
-    zeros = lfpiv.reconstruct(weights, images, iterations=8, first=first.values)
-    masked = lfpiv.reconstruct(weights, images, iterations=8, first=first.values, mask=solid)
+    first = plain_steps.reconstruct(weights, images, iterations=0, mask=solid)
+    zeros = plain_steps.reconstruct(weights, images, iterations=8, first=first.values)
+    masked = plain_steps.reconstruct(weights, images, iterations=8, first=first.values, mask=solid)
     np.testing.assert_array_equal(masked.values, zeros.values)
 
 
 def test_a_mask_is_given_as_flags_numbers_or_with_coordinates(recorded):
     weights, solid, (images, _) = recorded
-    expected = lfpiv.reconstruct(weights, images, iterations=2, mask=solid)
+    expected = plain_steps.reconstruct(weights, images, iterations=2, mask=solid)
     array = xr.DataArray(solid, {axis: GRID.axis_mm(k) for k, axis in enumerate("zyx")}, ("z", "y", "x"))
     for mask in (solid.astype(np.uint8), array, array * 0.7):
-        xr.testing.assert_identical(lfpiv.reconstruct(weights, images, iterations=2, mask=mask), expected)
+        xr.testing.assert_identical(plain_steps.reconstruct(weights, images, iterations=2, mask=mask), expected)
     with pytest.raises(ValueError, match="mask: expected a voxel for each"):
-        lfpiv.reconstruct(weights, images, mask=solid[1:])
+        plain_steps.reconstruct(weights, images, mask=solid[1:])
     with pytest.raises(ValueError, match="inverted"):
-        lfpiv.reconstruct(weights, images, mask=np.ones(GRID.shape))
+        plain_steps.reconstruct(weights, images, mask=np.ones(GRID.shape))
 
 
 def test_correlation_reads_the_mask_from_stored_volumes(recorded, tmp_path):
     weights, solid, images = recorded
     options = {"dt_s": 1.0, "windows": (8, 6)}
-    volumes = lfpiv.reconstruct_pair(weights, images, iterations=6, mask=solid, motion_passes=1)
-    vectors = lfpiv.correlate(*volumes, **options)
+    volumes = plain_steps.reconstruct_pair(weights, images, iterations=6, mask=solid, motion_passes=1)
+    vectors = plain_steps.correlate(*volumes, **options)
     assert vectors["masked"].values.any() and not vectors["masked"].values.all()
     np.testing.assert_array_equal(vectors["masked"].values, vectors["fluid_share"].values < 0.5)
     for frame, volume in zip("ab", volumes, strict=True):
         netcdf.write_volume(volume, tmp_path / f"{frame}.nc", attributes={})
     read = [netcdf.read_volume(tmp_path / f"{frame}.nc") for frame in "ab"]
-    xr.testing.assert_equal(lfpiv.correlate(*read, **options), vectors)
+    xr.testing.assert_equal(plain_steps.correlate(*read, **options), vectors)
     honest = motion.unshared_quality(vectors, volumes)
     assert np.isfinite(honest["uncertainty"].values[honest["valid"].values]).mean() > 0.5

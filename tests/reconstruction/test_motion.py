@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy import ndimage
+from support import plain_steps
 from support.ideal_rig import optics, two_cameras
 
 import lfpiv
@@ -164,7 +165,7 @@ def pair(weights):
 
 
 def measured(volumes):
-    return lfpiv.correlate(*volumes, dt_s=1.0, windows=WINDOWS, smoothing_voxel=0.5, intensity_power=0.5)
+    return plain_steps.correlate(*volumes, dt_s=1.0, windows=WINDOWS, smoothing_voxel=0.5, intensity_power=0.5)
 
 
 def errors(vectors, flow):
@@ -186,8 +187,8 @@ def reconstructed(weights, pair):
     """Volumes of the frames by themselves, volumes that share their light, fractions told on the way."""
     settings = {"iterations": 15, "correlation": {"windows": WINDOWS, "smoothing_voxel": 0.5}, "tolerance": 5e-4}
     seen = []
-    alone = [lfpiv.reconstruct(weights, image, iterations=15, tolerance=5e-4) for image in pair[2]]
-    both = motion.reconstruct_pair(weights, pair[2], motion_passes=1, progress=seen.append, **settings)
+    alone = [plain_steps.reconstruct(weights, image, iterations=15, tolerance=5e-4) for image in pair[2]]
+    both = plain_steps.reconstruct_pair(weights, pair[2], motion_passes=1, progress=seen.append, **settings)
     return alone, both, seen
 
 
@@ -266,7 +267,7 @@ def test_it_is_what_correlate_states_where_nothing_is_shared(shear, windows):
         blobs(positions) + blobs(spread(180, ghosts)) + 7.0  # and some light everywhere
         for ghosts, positions in ((40, middle - half), (41, middle + half))
     ]
-    vectors = lfpiv.correlate(*both, dt_s=1.0, **settings)
+    vectors = plain_steps.correlate(*both, dt_s=1.0, **settings)
     again = motion.unshared_quality(
         vectors, [volume.assign_coords({motion.UNSHARED: (volume.dims, 3 * volume.values)}) for volume in both]
     )
@@ -282,7 +283,7 @@ def test_volumes_that_do_not_say_leave_the_vectors_as_they_are(reconstructed, ca
     assert motion.unshared_quality(vectors, alone) is vectors and not caplog.text
     assert motion.unshared_quality(vectors, [volume.drop_vars(motion.UNSHARED) for volume in both]) is vectors
     assert "the uncertainty is too small" in caplog.text
-    single = lfpiv.correlate(*both, dt_s=1.0, windows=(12,))  # nothing to deform by
+    single = plain_steps.correlate(*both, dt_s=1.0, windows=(12,))  # nothing to deform by
     assert np.isnan(motion.unshared_quality(single, both)["uncertainty"]).all()
 
 
@@ -291,7 +292,7 @@ def test_a_run_tells_which_pairs_followed_the_motion(small_run, tmp_path, monkey
     calls = []
 
     def lost_in_the_second_pair(*volumes, **settings):
-        calls.append(lfpiv.correlate(*volumes, **settings))
+        calls.append(plain_steps.correlate(*volumes, **settings))
         return calls[-1].assign_attrs(valid_fraction=0.1) if len(calls) == 2 else calls[-1]
 
     monkeypatch.setattr(motion, "correlate", lost_in_the_second_pair)
@@ -325,9 +326,9 @@ def test_frames_that_have_nothing_in_common_are_left_alone(weights, pair, monkey
     _, _, images = pair
     strangers = [images[0], images_of(weights, spread(360, 99, share=1.0), 9)]
     settings = {"iterations": 3, "correlation": {"windows": (12, 8)}}
-    alone = motion.reconstruct_pair(weights, strangers, motion_passes=0, **settings)
+    alone = plain_steps.reconstruct_pair(weights, strangers, motion_passes=0, **settings)
     monkeypatch.setattr(motion, "LEAST_VALID", 1.0)  # neighbours among few random vectors agree by chance
-    volumes = motion.reconstruct_pair(weights, strangers, motion_passes=2, **settings)
+    volumes = plain_steps.reconstruct_pair(weights, strangers, motion_passes=2, **settings)
     for before, after in zip(alone, volumes, strict=True):
         np.testing.assert_array_equal(before.values, after.values)
         assert before.attrs["motion"] == motion.Motion.OFF.value and before.attrs["motion_valid"] == []
@@ -340,10 +341,10 @@ def test_bad_arguments_are_named(weights, pair):
     _, _, images = pair
     for wrong in (-1, 1.5, True):
         with pytest.raises(ValueError, match="motion_passes: expected a whole number"):
-            motion.reconstruct_pair(weights, images, motion_passes=wrong)
+            plain_steps.reconstruct_pair(weights, images, motion_passes=wrong)
     with pytest.raises(ValueError, match="expected two frames, got 1"):
-        motion.reconstruct_pair(weights, images[:1])
+        plain_steps.reconstruct_pair(weights, images[:1])
     with pytest.raises(ValueError, match="first: expected no first guess"):
-        motion.reconstruct_pair(weights, images, first=np.ones(GRID.shape))
+        plain_steps.reconstruct_pair(weights, images, first=np.ones(GRID.shape))
     with pytest.raises(ValueError, match="frame 2 of the pair: images: camera 'cam1' is missing"):
-        motion.reconstruct_pair(weights, [images[0], {}], iterations=0)
+        plain_steps.reconstruct_pair(weights, [images[0], {}], iterations=0)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support import plain_steps
 from support.ideal_rig import optics, two_cameras
 
 import lfpiv
@@ -142,14 +143,14 @@ def test_sums_of_lenses_are_those_of_the_dense_weights(weights):
 def test_truth_is_a_fixed_point_of_subsets(weights):
     truth = np.random.default_rng(5).uniform(1e3, 2e3, weights.grid.shape).astype(np.float32)
     keywords = {"first": truth, "floor": 1.0, "floor_share": 0.0, "subsets": 4}
-    volume = lfpiv.reconstruct(weights, weights(truth), 8, **keywords)
+    volume = plain_steps.reconstruct(weights, weights(truth), 8, **keywords)
     np.testing.assert_allclose(volume.values, truth, rtol=TOLERANCE_FIXED)
 
 
 def test_fourteen_passes_over_subsets_reach_the_misfit_and_truth_of_forty_iterations(volume_of_blobs):
     weights, truth, images = volume_of_blobs
-    plain = lfpiv.reconstruct(weights, images, 40, sieve_voxel=0.6)
-    fast = lfpiv.reconstruct(weights, images, 14, sieve_voxel=0.6, subsets="auto")
+    plain = plain_steps.reconstruct(weights, images, 40, sieve_voxel=0.6)
+    fast = plain_steps.reconstruct(weights, images, 14, sieve_voxel=0.6, subsets="auto")
     assert fast.attrs["misfit"][-1] <= plain.attrs["misfit"][-1]
     assert (
         lfpiv.metrics.reconstruction_quality(fast, truth) >= lfpiv.metrics.reconstruction_quality(plain, truth) - 2e-3
@@ -158,7 +159,7 @@ def test_fourteen_passes_over_subsets_reach_the_misfit_and_truth_of_forty_iterat
 
 def test_the_last_passes_take_all_rays_and_lower_the_misfit(volume_of_blobs):
     weights, _, images = volume_of_blobs
-    misfit = lfpiv.reconstruct(weights, images, 9, sieve_voxel=0.6, subsets=4).attrs["misfit"]
+    misfit = plain_steps.reconstruct(weights, images, 9, sieve_voxel=0.6, subsets=4).attrs["misfit"]
     whole = misfit[-1 - ordered_subsets.WHOLE_PASSES :]
     assert len(misfit) == 10 and (np.diff(whole) < 0).all()
 
@@ -166,15 +167,15 @@ def test_the_last_passes_take_all_rays_and_lower_the_misfit(volume_of_blobs):
 @pytest.mark.parametrize("iterations", [0, 1, 2, 5])
 def test_the_first_misfit_is_that_of_the_first_guess(volume_of_blobs, iterations):
     weights, _, images = volume_of_blobs
-    guess = lfpiv.reconstruct(weights, images, 0, sieve_voxel=0.6)
-    volume = lfpiv.reconstruct(weights, images, iterations, sieve_voxel=0.6, subsets=4)
+    guess = plain_steps.reconstruct(weights, images, 0, sieve_voxel=0.6)
+    volume = plain_steps.reconstruct(weights, images, iterations, sieve_voxel=0.6, subsets=4)
     assert volume.attrs["misfit"][0] == pytest.approx(guess.attrs["misfit"][0], rel=1e-9)
     assert volume.attrs["iterations"] == iterations and len(volume.attrs["residual"]) == iterations + 1
 
 
 def test_a_stop_by_tolerance_is_one_of_whole_passes(volume_of_blobs):
     weights, _, images = volume_of_blobs
-    volume = lfpiv.reconstruct(weights, images, 60, sieve_voxel=0.6, subsets=4, tolerance=3e-3)
+    volume = plain_steps.reconstruct(weights, images, 60, sieve_voxel=0.6, subsets=4, tolerance=3e-3)
     misfit = volume.attrs["misfit"]
     assert volume.attrs["iterations"] < 60 and volume.attrs["stop"].startswith("misfit no longer falls")
     assert 0 <= misfit[-2] - misfit[-1] < 3e-3 * misfit[-2]
@@ -183,9 +184,9 @@ def test_a_stop_by_tolerance_is_one_of_whole_passes(volume_of_blobs):
 def test_subsets_do_not_depend_on_the_threads(volume_of_blobs, monkeypatch):
     weights, _, images = volume_of_blobs
     device, keywords = runtime.device(), {"sieve_voxel": 0.6, "subsets": 4}
-    before = lfpiv.reconstruct(weights, images, 4, **keywords)
+    before = plain_steps.reconstruct(weights, images, 4, **keywords)
     monkeypatch.setattr(runtime, "device", lambda: dataclasses.replace(device, threads=1))
-    np.testing.assert_array_equal(lfpiv.reconstruct(weights, images, 4, **keywords).values, before.values)
+    np.testing.assert_array_equal(plain_steps.reconstruct(weights, images, 4, **keywords).values, before.values)
 
 
 @pytest.mark.parametrize(
@@ -207,7 +208,7 @@ def test_the_number_of_subsets(weights, settings, cameras, expected):
 
 def test_subsets_that_cannot_be_made_are_refused(weights):
     with pytest.raises(ValueError, match="subsets: with these cameras expected one of 1, 2, 4, got 3"):
-        lfpiv.reconstruct(weights, weights(np.ones(weights.grid.shape)), 2, subsets=3)
+        plain_steps.reconstruct(weights, weights(np.ones(weights.grid.shape)), 2, subsets=3)
     for wrong in (0, -1, 2.5, "many", True):
         with pytest.raises(ValueError, match="subsets: expected"):
             SmartSettings(subsets=wrong)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import plain_steps
 from support.ideal_rig import IdealCamera, IdealRig, optics, rotation, two_cameras
 
 import lfpiv
@@ -64,7 +65,7 @@ def test_light_that_no_voxel_lights_changes_nothing_and_is_stated(weights):
         assert not everywhere[name][spot].any()
         image[spot & (image >= 0)] = 4095.0  # negative counts tell the noise
     keywords = {"iterations": 20, "tolerance": 5e-4}
-    plain, beside = (lfpiv.reconstruct(weights, seen, **keywords) for seen in (images, glare))
+    plain, beside = (plain_steps.reconstruct(weights, seen, **keywords) for seen in (images, glare))
     assert beside.values.tobytes() == plain.values.tobytes()
     assert beside.misfit == plain.misfit and beside.residual == plain.residual
     for name, share, before in zip(glare, beside.light_outside, plain.light_outside, strict=True):
@@ -81,14 +82,16 @@ def test_a_hot_pixel_raises_no_floor_and_no_particle_is_cut(weights, per_voxel):
     hot = {name: image.copy() for name, image in images.items()}
     for image in hot.values():
         image[200, 240] = 65535.0
-    plain, spoilt = (lfpiv.reconstruct(weights, seen, 0, floor=0.0, floor_share=1.0).floor for seen in (images, hot))
+    plain, spoilt = (
+        plain_steps.reconstruct(weights, seen, 0, floor=0.0, floor_share=1.0).floor for seen in (images, hot)
+    )
     assert spoilt == pytest.approx(plain, rel=TOLERANCE_FLOOR)
     everywhere = weights(np.ones_like(truth))
     for floor, name in zip(plain, images, strict=True):
         light = np.maximum(images[name][everywhere[name] > 0], 0).astype(float)
         assert floor == pytest.approx((light**2).sum() / light.sum(), rel=TOLERANCE_FLOOR)
         assert floor < clean[name].max()
-    default = lfpiv.reconstruct(weights, hot, 0, floor_share=0.0).floor
+    default = plain_steps.reconstruct(weights, hot, 0, floor_share=0.0).floor
     assert default == pytest.approx([NOISE] * 2, rel=2 * TOLERANCE_FLOOR)  # negative counts of the noise
 
 
@@ -96,17 +99,17 @@ def test_a_hot_pixel_raises_no_floor_and_no_particle_is_cut(weights, per_voxel):
 def test_a_camera_s_brightness_is_part_of_its_gain(weights):
     """Brightness and floor scale with it: the same as a camera of which the white image says so, in its own counts."""
     images = recorded(weights, particles(weights.grid, 2), 2)
-    assert lfpiv.reconstruct(weights, images, 0).camera_gain == [1.0, 1.0]
+    assert plain_steps.reconstruct(weights, images, 0).camera_gain == [1.0, 1.0]
     gain = np.float32(recording.GAIN_STEP**-6)
     for name in images:
         dim = images | {name: images[name] * gain}
-        found = lfpiv.reconstruct(weights, dim, 10)
+        found = plain_steps.reconstruct(weights, dim, 10)
         assert dict(zip(images, found.camera_gain, strict=True)) == pytest.approx(
             dict.fromkeys(images, 1.0) | {name: gain}
         )
         known = two_cameras()
         known.cameras[name].gain *= gain
-        known = lfpiv.reconstruct(lfpiv.build_weights(known, weights.grid), dim, 10)
+        known = plain_steps.reconstruct(lfpiv.build_weights(known, weights.grid), dim, 10)
         assert known.camera_gain == [1.0, 1.0]
         assert np.abs(found.values - known.values).max() <= TOLERANCE_F32 * known.values.max()
         assert np.diff(found.misfit).max() < 0
@@ -117,7 +120,7 @@ def test_cameras_of_unlike_brightness_are_nearly_as_good_as_like_ones(weights, g
     """With photon noise the dim one tells less; untold, its brightness would cost far more than its noise does."""
     truth = particles(weights.grid, 3)
     like, unlike = (
-        lfpiv.reconstruct(
+        plain_steps.reconstruct(
             weights, recorded(weights, truth, 3, light, noise=0.5), 40, tolerance=5e-4, sieve_voxel="auto"
         )
         for light in (1.0, gain)
@@ -133,8 +136,8 @@ def test_cameras_that_see_different_parts_are_not_taken_for_unlike_ones(half_see
     truth = particles(half_seen.grid, seed, per_voxel=[0.0005, 0.002, 0.01][seed])
     assert half_seen.views.min() < 2
     like, dim = (recorded(half_seen, truth, seed, light, noise=0.2) for light in (1.0, 0.2))
-    assert lfpiv.reconstruct(half_seen, like, 0).camera_gain == [1.0, 1.0]
-    found = lfpiv.reconstruct(half_seen, dim, 0).camera_gain
+    assert plain_steps.reconstruct(half_seen, like, 0).camera_gain == [1.0, 1.0]
+    found = plain_steps.reconstruct(half_seen, dim, 0).camera_gain
     assert found[0] == 1.0 and 0.1 < found[1] < 0.4
 
 
@@ -142,14 +145,14 @@ def test_a_reflection_is_not_taken_for_a_brighter_camera(weights):
     """In the middle of the volume, 14 times as bright as particles and with twenty times the light of them all."""
     images = recorded(weights, particles(weights.grid, 6), 6)
     images["cam2"][180:220, 220:260] = 4095.0
-    found = lfpiv.reconstruct(weights, images, 0).camera_gain
+    found = plain_steps.reconstruct(weights, images, 0).camera_gain
     assert found[1] == 1.0 and found[0] > 0.5  # by all its light it would be 0.055
 
 
 def test_an_image_of_noise_is_not_brightened(weights):
     images = recorded(weights, particles(weights.grid, 4), 4)
     images["cam2"] = np.random.default_rng(4).normal(0, NOISE, images["cam2"].shape).astype(np.float32)
-    assert lfpiv.reconstruct(weights, images, 0).camera_gain == [1.0, 1.0]
+    assert plain_steps.reconstruct(weights, images, 0).camera_gain == [1.0, 1.0]
 
 
 def test_an_image_that_is_dark_where_the_volume_is_seen_is_named(weights):
@@ -157,4 +160,4 @@ def test_an_image_that_is_dark_where_the_volume_is_seen_is_named(weights):
     images["cam2"] = np.where(images["cam2"] > 0, 0, 1).astype(np.float32)
     images["cam2"][weights(np.ones(weights.grid.shape))["cam2"] > 0] = 0
     with pytest.raises(ValueError, match=r"images\['cam2'\]: expected light where the volume is seen"):
-        lfpiv.reconstruct(weights, images)
+        plain_steps.reconstruct(weights, images)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import plain_steps
 from support.ideal_rig import optics, two_cameras
 
 import lfpiv
@@ -49,7 +50,7 @@ def test_finer_voxels_and_padding_show_small_particles_better(rig):
     for factor in (1.0, 1.3):
         fine = GRID.padded(((1, 1),) * 3 if factor > 1 else ((0, 0),) * 3).refined(factor)
         weights = lfpiv.build_weights(rig, fine)
-        volume = lfpiv.volume_on(lfpiv.reconstruct(weights, images, 30, sieve_voxel=0.6 * factor), GRID)
+        volume = lfpiv.volume_on(plain_steps.reconstruct(weights, images, 30, sieve_voxel=0.6 * factor), GRID)
         assert volume.attrs["sieve_voxel"] == pytest.approx(0.6) and volume.shape == GRID.shape
         quality[factor] = metrics.reconstruction_quality(volume, metrics.truth_volume(at, None, GRID, 0.7))
     assert quality[1.3] > quality[1.0] + 0.015

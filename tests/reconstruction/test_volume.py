@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 from scipy import ndimage
 from scipy.optimize import minimize
+from support import plain_steps
 from support.ideal_rig import IdealCamera, IdealRig, optics, two_cameras
 
 import lfpiv
@@ -116,7 +117,7 @@ def test_smart_reaches_the_solution_of_least_divergence(seed, accelerate, iterat
     best = minimize(dual, np.zeros(len(image)), jac=True, method="BFGS", options={"gtol": 1e-10, "maxiter": 5000}).x
     expected = first * np.exp(matrix.T @ best / column_sum)
     assert np.allclose(matrix @ expected, image, rtol=1e-5)
-    volume = lfpiv.reconstruct(
+    volume = plain_steps.reconstruct(
         weights,
         images_of(weights, image),
         iterations=iterations,
@@ -137,7 +138,7 @@ def test_smart_equals_its_dense_twin(normalisation, floor):
     rng = np.random.default_rng(6)
     image = rng.uniform(0.1, 3.0, len(matrix))
     first = rng.uniform(0.5, 2.0, weights.grid.size).astype(np.float32)
-    volume = lfpiv.reconstruct(
+    volume = plain_steps.reconstruct(
         weights,
         images_of(weights, image),
         iterations=50,
@@ -164,7 +165,7 @@ def test_momentum_equals_its_dense_twin(seed, iterations):
     first = np.exp(rng.normal(0, 1, weights.grid.size)).astype(np.float32)
     twin, restarts = accelerated_twin(matrix, image, first, iterations=iterations, floor=0.1)
     assert restarts > 0
-    volume = lfpiv.reconstruct(
+    volume = plain_steps.reconstruct(
         weights,
         images_of(weights, image),
         iterations=iterations,
@@ -184,9 +185,9 @@ def test_momentum_that_only_harms_leaves_plain_smart(monkeypatch):
     def spoil(volume, last, exponent):
         last[:] = volume * (1.0 if exponent == 0 else 1e3)
 
-    plain = lfpiv.reconstruct(weights, images, iterations=12, accelerate=False)
+    plain = plain_steps.reconstruct(weights, images, iterations=12, accelerate=False)
     monkeypatch.setattr(momentum, "extrapolate", spoil)
-    spoilt = lfpiv.reconstruct(weights, images, iterations=12)
+    spoilt = plain_steps.reconstruct(weights, images, iterations=12)
     assert spoilt.values.tobytes() == plain.values.tobytes()
     assert spoilt.misfit == plain.misfit
 
@@ -237,23 +238,28 @@ def test_threads_that_share_weights_take_turns():
     with ThreadPoolExecutor(4) as threads:
         together = list(threads.map(weights, volumes))
     assert all((a[name] == b[name]).all() for a, b in zip(alone, together, strict=True) for name in a)
-    one, other = (lfpiv.reconstruct(weights, images, 5).values for images in alone[:2])
+    one, other = (plain_steps.reconstruct(weights, images, 5).values for images in alone[:2])
     with ThreadPoolExecutor(2) as threads:
-        both = list(threads.map(lambda images: lfpiv.reconstruct(weights, images, 5).values, alone[:2]))
+        both = list(threads.map(lambda images: plain_steps.reconstruct(weights, images, 5).values, alone[:2]))
     assert both[0].tobytes() == one.tobytes() and both[1].tobytes() == other.tobytes()
-    for meddle in (lambda _: weights(volumes[0]), lambda _: lfpiv.reconstruct(weights, alone[0], 1, first=volumes[0])):
+    for meddle in (
+        lambda _: weights(volumes[0]),
+        lambda _: plain_steps.reconstruct(weights, alone[0], 1, first=volumes[0]),
+    ):
         with pytest.raises(RuntimeError, match="in use by a reconstruction of the same thread"):
-            lfpiv.reconstruct(weights, alone[0], 5, progress=meddle)
-    assert lfpiv.reconstruct(weights, alone[0], 5).values.tobytes() == one.tobytes()  # the refusal left nothing behind
+            plain_steps.reconstruct(weights, alone[0], 5, progress=meddle)
+    assert (
+        plain_steps.reconstruct(weights, alone[0], 5).values.tobytes() == one.tobytes()
+    )  # the refusal left nothing behind
 
 
 def test_threads_change_nothing(monkeypatch):
     weights = random_system(8, rows=40)
     images, _ = noisy_images(weights, 8)
-    many = lfpiv.reconstruct(weights, images, iterations=12)
+    many = plain_steps.reconstruct(weights, images, iterations=12)
     single = dataclasses.replace(runtime.device(), threads=1)
     monkeypatch.setattr(runtime, "device", lambda: single)
-    alone = lfpiv.reconstruct(weights, images, iterations=12)
+    alone = plain_steps.reconstruct(weights, images, iterations=12)
     assert alone.values.tobytes() == many.values.tobytes()
     assert alone.misfit == many.misfit
 
@@ -265,7 +271,7 @@ def test_threads_change_nothing(monkeypatch):
 def test_misfit_never_rises_and_the_volume_stays_positive(seed, keywords):
     weights = random_system(seed)
     images, image = noisy_images(weights, seed)
-    volume = lfpiv.reconstruct(weights, images, iterations=60, floor=0.05, floor_share=0.0, **keywords)
+    volume = plain_steps.reconstruct(weights, images, iterations=60, floor=0.05, floor_share=0.0, **keywords)
     misfit = np.array(volume.misfit)
     assert (np.diff(misfit) <= TOLERANCE_MISFIT * image.sum()).all()
     assert misfit[-1] < misfit[0]
@@ -280,7 +286,9 @@ def test_momentum_needs_at_most_half_the_iterations(seed):
     weights = random_system(seed)
     images, _ = noisy_images(weights, seed)
     plain, fast = (
-        lfpiv.reconstruct(weights, images, iterations=40, floor=0.05, floor_share=0.0, accelerate=accelerate).misfit
+        plain_steps.reconstruct(
+            weights, images, iterations=40, floor=0.05, floor_share=0.0, accelerate=accelerate
+        ).misfit
         for accelerate in (False, True)
     )
     assert fast[20] < plain[40]
@@ -290,12 +298,12 @@ def test_momentum_needs_at_most_half_the_iterations(seed):
 def test_twelve_iterations_are_five_and_seven():
     weights = random_system(3)
     image = images_of(weights, matrix_of(weights) @ np.random.default_rng(3).random(weights.grid.size))
-    twelve = lfpiv.reconstruct(weights, image, iterations=12, accelerate=False)
-    five = lfpiv.reconstruct(weights, image, iterations=5, accelerate=False)
-    seven = lfpiv.reconstruct(weights, image, iterations=7, first=five.values, accelerate=False)
+    twelve = plain_steps.reconstruct(weights, image, iterations=12, accelerate=False)
+    five = plain_steps.reconstruct(weights, image, iterations=5, accelerate=False)
+    seven = plain_steps.reconstruct(weights, image, iterations=7, first=five.values, accelerate=False)
     assert seven.values.tobytes() == twelve.values.tobytes()
-    five = lfpiv.reconstruct(weights, image, iterations=5)
-    seven = lfpiv.reconstruct(weights, image, iterations=7, first=five.values)
+    five = plain_steps.reconstruct(weights, image, iterations=5)
+    seven = plain_steps.reconstruct(weights, image, iterations=7, first=five.values)
     assert (
         seven.misfit[0] == five.misfit[-1] > seven.misfit[-1]
     )  # momentum starts anew, from where the first ones ended
@@ -310,7 +318,7 @@ def test_zeros_of_the_first_guess_stay_and_change_nothing_else(accelerate):
     first = np.random.default_rng(9).uniform(0.5, 2.0, weights.grid.shape).astype(np.float32)
     first[np.random.default_rng(10).random(first.shape) < 0.5] = 0.0
     lit = first.ravel() > 0
-    volume = lfpiv.reconstruct(
+    volume = plain_steps.reconstruct(
         weights, images, iterations=20, floor=0.2, floor_share=0.0, first=first, accelerate=accelerate
     )
     assert (volume.values[first == 0] == 0).all()
@@ -325,11 +333,13 @@ def test_zeros_of_the_first_guess_stay_and_change_nothing_else(accelerate):
 def test_active_share_starts_without_the_dim_voxels():
     weights = random_system(11)
     images, _ = noisy_images(weights, 11)
-    guess = lfpiv.reconstruct(weights, images, iterations=0).values
+    guess = plain_steps.reconstruct(weights, images, iterations=0).values
     share = float(np.median(guess) / guess.max())
-    pruned = lfpiv.reconstruct(weights, images, iterations=10, active_share=share)
+    pruned = plain_steps.reconstruct(weights, images, iterations=10, active_share=share)
     assert ((pruned.values == 0) == (guess < share * guess.max())).all()
-    same = lfpiv.reconstruct(weights, images, iterations=10, first=np.where(guess < share * guess.max(), 0, guess))
+    same = plain_steps.reconstruct(
+        weights, images, iterations=10, first=np.where(guess < share * guess.max(), 0, guess)
+    )
     assert same.values.tobytes() == pruned.values.tobytes()
 
 
@@ -347,7 +357,7 @@ def test_a_sieve_is_smart_on_blurred_voxels():
     )
     assert np.allclose(blur, blur.T)
     twin = reference.smart(matrix_of(weights) @ blur, image, first.ravel(), iterations=30, floor=0.2)
-    volume = lfpiv.reconstruct(
+    volume = plain_steps.reconstruct(
         weights,
         images_of(weights, image),
         iterations=30,
@@ -369,7 +379,7 @@ def test_sharp_steps_reach_the_images_in_half_the_iterations(seed):
     order = weights.stored.store(truth.reshape(shape).astype(np.float32))
     volume = weights.stored.restore(blur(order))
     keywords = {"floor": 1e-3, "floor_share": 0.0, "sieve_voxel": 0.6}
-    stays = lfpiv.reconstruct(weights, weights(volume), iterations=20, first=truth.reshape(shape), **keywords)
+    stays = plain_steps.reconstruct(weights, weights(volume), iterations=20, first=truth.reshape(shape), **keywords)
     assert np.abs(stays.values / volume - 1).max() <= TOLERANCE_F32
     sharp, plain = (_misfits(weights, weights(volume), start.reshape(shape), sharp) for sharp in (True, False))
     assert sharp[30] < plain[60] < plain[0]
@@ -457,12 +467,12 @@ def test_images_tell_how_large_particles_are(small_volume, sigma_voxel, ppm, cou
     images = traced_images(rig, positions, sigma_voxel * 0.1, 1, counts=counts)
     size = particle_size.ParticleSizer(weights).size(images)
     assert size == pytest.approx(np.sqrt(max(sigma_voxel**2 - 1 / 12, 0)), abs=TOLERANCE_SIZE)
-    volume = lfpiv.reconstruct(weights, images, iterations=1, sieve_voxel="auto")
+    volume = plain_steps.reconstruct(weights, images, iterations=1, sieve_voxel="auto")
     if sigma_voxel:
         assert volume.sieve_voxel == pytest.approx(np.sqrt(size**2 - 1 / 12), abs=particle_size.SIEVE_STEP_VOXEL / 2)
     else:  # points: plain SMART, bit for bit
         assert volume.sieve_voxel == 0.0
-        assert volume.values.tobytes() == lfpiv.reconstruct(weights, images, iterations=1).values.tobytes()
+        assert volume.values.tobytes() == plain_steps.reconstruct(weights, images, iterations=1).values.tobytes()
 
 
 def test_images_of_noise_ask_for_no_sieve(small_volume):
@@ -480,7 +490,7 @@ def test_volumes_made_of_gaussians_are_smoothed_less_before_they_are_correlated(
     pair = [lfpiv.metrics.truth_volume(positions + shift, None, grid) for shift in (0.0, 0.07)]
     made = [volume.assign_attrs(sieve_voxel=sieve) for volume, sieve in zip(pair, (0.4, 0.3), strict=True)]
     less, same = (
-        lfpiv.correlate(*volumes, dt_s=1.0, windows=(16, 8), smoothing_voxel=smoothing)
+        plain_steps.correlate(*volumes, dt_s=1.0, windows=(16, 8), smoothing_voxel=smoothing)
         for volumes, smoothing in ((made, 0.5), (pair, 0.4))
     )
     assert less["valid"].any() and "0.5" in less.attrs["settings"]  # what was asked for, the same for all pairs
@@ -491,7 +501,7 @@ def test_volumes_made_of_gaussians_are_smoothed_less_before_they_are_correlated(
 def test_truth_is_a_fixed_point():
     weights = random_system(4)
     truth = np.random.default_rng(4).uniform(0.5, 2, weights.grid.shape).astype(np.float32)
-    volume = lfpiv.reconstruct(weights, weights(truth), iterations=20, first=truth)
+    volume = plain_steps.reconstruct(weights, weights(truth), iterations=20, first=truth)
     assert np.abs(volume.values / truth - 1).max() <= TOLERANCE_F32
     assert volume.residual[-1] <= TOLERANCE_F32
 
@@ -503,8 +513,8 @@ def test_the_floor_is_the_noise_of_the_background_by_default():
     image = images_of(weights, matrix_of(weights) @ rng.random(weights.grid.size) ** 8)
     image = {name: np.where(np.arange(8) < 3, 0, image[name]) + noise[name] for name in image}  # three dark columns
     floor = {name: float(np.sqrt((image[name][image[name] < 0] ** 2).mean())) for name in image}
-    given = lfpiv.reconstruct(weights, image, floor=floor, floor_share=0.0)
-    measured = lfpiv.reconstruct(weights, image, floor_share=0.0)
+    given = plain_steps.reconstruct(weights, image, floor=floor, floor_share=0.0)
+    measured = plain_steps.reconstruct(weights, image, floor_share=0.0)
     assert np.allclose(measured.values, given.values, rtol=TOLERANCE_F32)
 
 
@@ -512,21 +522,21 @@ def test_the_floor_is_at_least_a_share_of_the_brightness():
     weights = random_system(8)
     images, _ = noisy_images(weights, 8)
     brightness = {name: (image**2).sum() / image.sum() for name, image in images.items()}
-    given = lfpiv.reconstruct(weights, images, floor={name: 0.2 * value for name, value in brightness.items()})
-    shared = lfpiv.reconstruct(weights, images, floor=0.0, floor_share=0.2)
+    given = plain_steps.reconstruct(weights, images, floor={name: 0.2 * value for name, value in brightness.items()})
+    shared = plain_steps.reconstruct(weights, images, floor=0.0, floor_share=0.2)
     assert np.allclose(shared.values, given.values, rtol=TOLERANCE_F32)
     assert np.allclose(shared.floor, [0.2 * value for value in brightness.values()])
-    doubled = lfpiv.reconstruct(weights, {name: 2 * image for name, image in images.items()}, floor=0.0)
-    once = lfpiv.reconstruct(weights, images, floor=0.0)
+    doubled = plain_steps.reconstruct(weights, {name: 2 * image for name, image in images.items()}, floor=0.0)
+    once = plain_steps.reconstruct(weights, images, floor=0.0)
     assert np.allclose(doubled.values, 2 * once.values, rtol=TOLERANCE_F32)  # no count is special
 
 
 def test_verdicts():
     weights = random_system(7)
     image = images_of(weights, matrix_of(weights) @ np.random.default_rng(7).random(weights.grid.size))
-    assert lfpiv.reconstruct(weights, image, iterations=3).stop == "all iterations asked for were done"
-    assert "iteration limit" in lfpiv.reconstruct(weights, image, iterations=3, tolerance=1e-6).stop
-    early = lfpiv.reconstruct(weights, image, iterations=500, tolerance=0.05)
+    assert plain_steps.reconstruct(weights, image, iterations=3).stop == "all iterations asked for were done"
+    assert "iteration limit" in plain_steps.reconstruct(weights, image, iterations=3, tolerance=1e-6).stop
+    early = plain_steps.reconstruct(weights, image, iterations=500, tolerance=0.05)
     assert "no longer falls" in early.stop
     assert early.iterations < 500
 
@@ -536,14 +546,14 @@ def test_a_misfit_beyond_all_numbers_is_divergence(iterations):
     weights = random_system(7)
     images, _ = noisy_images(weights, 7)
     keywords = {"relaxation": 1e4, "accelerate": False}
-    assert "misfit rises" in lfpiv.reconstruct(weights, images, iterations, **keywords).stop
+    assert "misfit rises" in plain_steps.reconstruct(weights, images, iterations, **keywords).stop
 
 
 def test_dark_pixels_without_a_floor_do_not_end_it():
     """One dark pixel among many that shine has an infinite misfit without a floor: the least one keeps it finite."""
     weights = random_system(10)
     images, _ = noisy_images(weights, 10)
-    volume = lfpiv.reconstruct(weights, images, 40, floor=0.0, floor_share=0.0)
+    volume = plain_steps.reconstruct(weights, images, 40, floor=0.0, floor_share=0.0)
     assert np.isfinite(volume.misfit).all() and volume.misfit[-1] < 0.5 * volume.misfit[0]
     assert np.isfinite(volume.values).all() and (volume.values > 0).any()
 
@@ -556,8 +566,8 @@ def test_particles_come_back_in_their_places():
     for place in places:
         truth[place] = 1000.0
     images = weights(truth)
-    plain = lfpiv.reconstruct(weights, images, iterations=20, floor=1e-3, floor_share=0.0)
-    smooth = lfpiv.reconstruct(weights, images, iterations=20, floor=1e-3, floor_share=0.0, smoothing_voxel=0.5)
+    plain = plain_steps.reconstruct(weights, images, iterations=20, floor=1e-3, floor_share=0.0)
+    smooth = plain_steps.reconstruct(weights, images, iterations=20, floor=1e-3, floor_share=0.0, smoothing_voxel=0.5)
     for volume in (plain, smooth):
         brightest = np.argsort(volume.values.ravel())[::-1]
         found = np.array(np.unravel_index(brightest[:3], grid.shape)).T
@@ -574,7 +584,7 @@ def test_light_outside_the_volume_and_dead_pixels_do_not_break_it():
     truth = np.full(grid.shape, 0.01, np.float32)
     truth[4, 4, 4] = 1e5  # about 70 counts in its brightest pixels
     images = {name: image + 3.0 for name, image in weights(truth).items()}
-    volume = lfpiv.reconstruct(weights, images, iterations=10, floor=1.0, floor_share=0.0)
+    volume = plain_steps.reconstruct(weights, images, iterations=10, floor=1.0, floor_share=0.0)
     assert np.isfinite(volume.values).all()
     assert np.unravel_index(volume.values.argmax(), grid.shape) == (4, 4, 4)
 
@@ -608,7 +618,7 @@ def test_wrong_arguments_are_named(keywords, message):
     weights = random_system(0)
     image = images_of(weights, matrix_of(weights) @ np.ones(weights.grid.size))
     with pytest.raises(ValueError, match=message):
-        lfpiv.reconstruct(weights, image, **keywords)
+        plain_steps.reconstruct(weights, image, **keywords)
 
 
 @pytest.mark.parametrize(
@@ -626,7 +636,7 @@ def test_wrong_images_are_named(change, message):
     images = images_of(weights, matrix_of(weights) @ np.ones(weights.grid.size))
     change(images)
     with pytest.raises(ValueError, match=message):
-        lfpiv.reconstruct(weights, images)
+        plain_steps.reconstruct(weights, images)
 
 
 FEW_RAYS, MANY_RAYS = 0.05, 0.2
@@ -671,15 +681,15 @@ def test_a_volume_tells_what_fewer_than_two_cameras_see(tmp_path, caplog):
 
     positions = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)) * (0.8, 1.8, 0.8)
     images = weights(lfpiv.metrics.truth_volume(positions, None, grid, 0.07))
-    volume = lfpiv.reconstruct(weights, images, iterations=2)
+    volume = plain_steps.reconstruct(weights, images, iterations=2)
     np.testing.assert_array_equal(volume["views"], views)
     netcdf.write_volume(volume, tmp_path / "volume.nc", attributes={})
     read = netcdf.read_volume(tmp_path / "volume.nc")
-    vectors = lfpiv.correlate(read, read, dt_s=1.0, windows=((8, 8, 8), (8, 6, 8)))
+    vectors = plain_steps.correlate(read, read, dt_s=1.0, windows=((8, 8, 8), (8, 6, 8)))
     assert 0 < vectors.attrs["seen_fraction"] < 1
     middle = np.abs(vectors["y"].values)
     assert vectors["valid"].values[:, middle < 0.2].all() and not vectors["valid"].values[:, middle > 0.5].any()
-    pair = lfpiv.reconstruct_pair(weights, [images, images], iterations=2, correlation={"windows": ((8, 8, 8),)})
+    pair = plain_steps.reconstruct_pair(weights, [images, images], iterations=2, correlation={"windows": ((8, 8, 8),)})
     assert all("views" in frame.coords for frame in pair)
 
 
@@ -689,7 +699,7 @@ def test_a_volume_that_all_see_tells_nothing_and_neither_does_one_camera(caplog)
         grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.4, height, 0.4), voxel_mm=0.1)
         weights = lfpiv.build_weights(IdealRig(cameras), grid)
         with caplog.at_level(logging.WARNING):
-            volume = lfpiv.reconstruct(weights, weights(np.ones(grid.shape, np.float32)), iterations=0)
+            volume = plain_steps.reconstruct(weights, weights(np.ones(grid.shape, np.float32)), iterations=0)
         assert "views" not in volume.coords and "fewer than two" not in caplog.text
 
 

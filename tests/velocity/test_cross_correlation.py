@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import scipy.ndimage
 import xarray as xr
+from support import plain_steps
 from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, shear, uniform
 
 import lfpiv
+from lfpiv.experiment.settings import DEFAULT_WINDOWS
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.velocity.settings import CorrelationSettings
 from lfpiv.velocity.validation import LEAST_SEEN
@@ -32,7 +34,7 @@ def error_of(result, flow, window):
 
 
 def correlate(pair, **options):
-    return lfpiv.correlate(*pair, dt_s=1e-3, voxel_mm=1.0, **options)
+    return plain_steps.correlate(*pair, dt_s=1e-3, voxel_mm=1.0, **options)
 
 
 # --- known displacements -----------------------------------------------------------------------------------------
@@ -135,7 +137,7 @@ def volumes(shape=(20, 24, 28), voxel=0.1, first=(-1.0, 2.0, 3.0), seed=40, **op
 
 
 def test_the_dataset_has_units_and_positions():
-    result = lfpiv.correlate(*volumes(), windows=((16, 16, 20), (8, 12, 8)), overlap=0.5, dt_s=2e-4)
+    result = plain_steps.correlate(*volumes(), windows=((16, 16, 20), (8, 12, 8)), overlap=0.5, dt_s=2e-4)
     assert result["u"].dims == ("z", "y", "x") and dict(result.sizes) == {"z": 4, "y": 3, "x": 6}
     for name, axis in (("u", "x"), ("v", "y"), ("w", "z")):
         expected = result[f"displacement_{axis}"] * 0.1e-3 / 2e-4
@@ -153,17 +155,17 @@ def test_the_dataset_has_units_and_positions():
 
 def test_intensity_scale_and_background_do_not_matter():
     pair = volumes(noise=0.02)
-    plain, scaled = (lfpiv.correlate(*p, dt_s=1.0) for p in (pair, [1e6 * (v + 3) for v in pair]))
+    plain, scaled = (plain_steps.correlate(*p, dt_s=1.0) for p in (pair, [1e6 * (v + 3) for v in pair]))
     # float32 holds the larger numbers to 0.25, 1e-7 of the largest: hardly visible at the peak
     np.testing.assert_allclose(scaled["u"], plain["u"], atol=1e-4 * TOLERANCE_PEAK)
 
 
 def test_unrelated_and_empty_volumes_fail():
     first, second = volumes()[0], volumes(seed=41)[1]
-    result = lfpiv.correlate(first, second, dt_s=1.0, windows=(12, 8, 8))
+    result = plain_steps.correlate(first, second, dt_s=1.0, windows=(12, 8, 8))
     # chance: three components within half the search range of their neighbours, (1/2)^3 of them, some more by consensus
     assert float(result["valid"].mean()) < 0.3 and result.attrs["verdict"] == Verdict.FAILED.value
-    empty = lfpiv.correlate(0 * first, 0 * second, dt_s=1.0, windows=(12, 8))
+    empty = plain_steps.correlate(0 * first, 0 * second, dt_s=1.0, windows=(12, 8))
     assert not empty["valid"].any() and np.isnan(empty["u"]).all()
     assert empty.attrs["verdict"] == Verdict.FAILED.value
 
@@ -174,10 +176,10 @@ def test_windows_that_one_camera_sees_are_replaced():
     views = np.full(shape, 2, np.uint8)
     views[:, :12], views[3:9, 20:, :5] = 1, 0
     options = {"windows": (16, window), "overlap": 0.75, "dt_s": 1.0}
-    anything = lfpiv.correlate(first, second, **options)
+    anything = plain_steps.correlate(first, second, **options)
     assert anything["valid"].mean() > 0.95 and anything.attrs["seen_fraction"] == 1
     counted = [volume.assign_coords(views=(("z", "y", "x"), views)) for volume in (first, second)]
-    result = lfpiv.correlate(*counted, **options)
+    result = plain_steps.correlate(*counted, **options)
     origin, count = kernel.window_grid(shape, window, (2, 3, 2))
     share = np.zeros(count)
     for cell in np.ndindex(*count):
@@ -192,12 +194,12 @@ def test_windows_that_one_camera_sees_are_replaced():
     assert result.attrs["verdict"] == Verdict.GOOD.value  # of what can be measured nearly all is valid
     assert np.isfinite(measured(result)).all() and np.isnan(result["uncertainty"].values[~enough]).all()
     np.testing.assert_array_equal(measured(result)[both], measured(anything)[both])
-    one = lfpiv.correlate(first, counted[1], **options)
+    one = plain_steps.correlate(first, counted[1], **options)
     np.testing.assert_array_equal(one["valid"], good)
     nowhere = [volume.assign_coords(views=(("z", "y", "x"), 0 * views)) for volume in (first, second)]
-    assert lfpiv.correlate(*nowhere, **options).attrs["verdict"] == Verdict.FAILED.value
+    assert plain_steps.correlate(*nowhere, **options).attrs["verdict"] == Verdict.FAILED.value
     with pytest.raises(ValueError, match=r"views: expected a coordinate over \(z, y, x\)"):
-        lfpiv.correlate(first.assign_coords(views=("z", [2] * 20)), second, **options)
+        plain_steps.correlate(first.assign_coords(views=("z", [2] * 20)), second, **options)
 
 
 def test_displacements_beyond_the_search_are_recognised():
@@ -219,12 +221,49 @@ def test_displacements_beyond_the_search_are_recognised():
         assert lost in (Verdict.FAILED.value, Verdict.POOR.value)
 
 
-def test_a_single_edge_is_cut_to_the_volume():
+def test_default_windows_are_cut_to_the_volume_and_others_refused():
     first, second = volumes()
-    whole, given = max(first.shape), tuple(first.shape)
-    cut = lfpiv.correlate(first, second, dt_s=1.0, windows=(whole, 12))
-    same = lfpiv.correlate(first, second, dt_s=1.0, windows=(given, 12))
+    edges = [tuple(min(edge, n) for n in first.shape) for edge in DEFAULT_WINDOWS]
+    cut, same = lfpiv.correlate(first, second), lfpiv.correlate(first, second, windows=edges)
     assert cut["displacement_x"].values.tobytes() == same["displacement_x"].values.tobytes()
+    whole = max(first.shape)  # the error names the largest window that fits
+    with pytest.raises(ValueError, match=rf"got {whole} along z, which has {len(first)} voxels.*{len(first)}, "):
+        lfpiv.correlate(first, second, windows=(whole, 12))
+
+
+def test_a_number_is_the_window_of_a_single_pass():
+    pair = volumes()
+    one, same = lfpiv.correlate(*pair, windows=12), lfpiv.correlate(*pair, windows=(12,))
+    xr.testing.assert_identical(one, same)
+    with pytest.raises(ValueError, match="got 64 along z"):
+        lfpiv.correlate(*pair, windows=64)
+
+
+def test_arrays_without_any_size_give_displacements_at_indices():
+    pair = volumes()
+    bare = [volume.values for volume in pair]
+    found, scaled = lfpiv.correlate(*bare, windows=(12, 8)), lfpiv.correlate(*pair, dt_s=1e-3, windows=(12, 8))
+    assert not {"u", "v", "w"} & set(found) and not {"dt_s", "voxel_mm"} & set(found.attrs)
+    np.testing.assert_array_equal(found["displacement_y"], scaled["displacement_y"])
+    voxel_mm = float(pair[0].x[1] - pair[0].x[0])
+    for axis in "zyx":
+        assert found[axis].attrs["units"] == "voxel"
+        np.testing.assert_allclose(found[axis], (scaled[axis] - pair[0][axis][0]) / voxel_mm, atol=1e-9)
+    in_mm = lfpiv.correlate(*bare, voxel_mm=voxel_mm, windows=(12, 8))
+    assert "u" not in in_mm and in_mm["x"].attrs["units"] == "mm" and in_mm.attrs["voxel_mm"] == [voxel_mm] * 3
+    whole = lfpiv.correlate(*bare, voxel_mm=voxel_mm, dt_s=1e-3, windows=(12, 8))
+    np.testing.assert_array_equal(whole["u"], scaled["u"])
+    assert list(whole)[:6] == ["u", "v", "w", "displacement_x", "displacement_y", "displacement_z"]
+
+
+def test_a_mask_of_an_array_has_its_indices():
+    first, second = (volume.values for volume in volumes())
+    solid = np.zeros(first.shape, bool)
+    solid[:, :, :12] = True
+    found = lfpiv.correlate(first, second, windows=(12, 8), mask=solid)
+    assert found["masked"].sel(x=slice(None, 6)).all() and not found["masked"].sel(x=slice(18, None)).any()
+    spoilt = np.where(solid, 1e6, first)
+    xr.testing.assert_identical(lfpiv.correlate(spoilt, second, windows=(12, 8), mask=solid), found)
 
 
 def test_intensity_power_keeps_bright_spots_from_outweighing_particles():
@@ -234,7 +273,7 @@ def test_intensity_power_keeps_bright_spots_from_outweighing_particles():
     spot = scipy.ndimage.gaussian_filter(spot, 0.7)  # does not move
 
     def error(**options):
-        result = lfpiv.correlate(*(volume + spot for volume in pair), dt_s=1.0, windows=(12, 12), **options)
+        result = plain_steps.correlate(*(volume + spot for volume in pair), dt_s=1.0, windows=(12, 12), **options)
         fields = [result[f"displacement_{axis}"] - d for axis, d in zip("zyx", (0.5, 1.0, -1.5), strict=True)]
         return float(np.sqrt(sum(field**2 for field in fields)).mean())
 
@@ -253,16 +292,16 @@ def test_intensity_power_keeps_bright_spots_from_outweighing_particles():
             "windows: expected edges within the volume, got 32 along z, which has 20 voxels",
         ),
         ({"windows": ()}, "windows: expected at least one pass"),
-        ({"windows": 16}, "windows: expected a sequence"),
+        ({"windows": "16"}, "windows: expected a window or a sequence"),
+        ({"windows": 2}, "windows: expected edges of whole voxels >= 4"),
         ({"windows": (16, 2)}, "windows: expected edges of whole voxels >= 4"),
         ({"windows": ((16, 16),)}, "windows: expected edges of whole voxels >= 4"),
         ({"overlap": 1.0}, "overlap: expected 0 <= overlap < 1, got 1.0"),
         ({"dt_s": 0.0}, "dt_s: expected a positive time"),
-        ({"dt_s": None}, "dt_s: expected a positive time"),
         ({"windows": (None,)}, "windows: expected edges of whole voxels >= 4"),
         ({"volume_a": [[1, 2], [3]]}, "volume_a: expected a volume of numbers"),
         ({"volume_b": np.ma.masked_equal(np.zeros((20, 24, 28)), 0)}, "volume_b: expected finite intensities"),
-        ({"voxel_mm": None}, "voxel_mm: expected the voxel edge"),
+        ({"voxel_mm": None}, "dt_s: velocities of arrays need the voxel edge too"),
         ({"voxel_mm": -0.1}, "voxel_mm: expected the voxel edge"),
         ({"smoothing_voxel": -1.0}, "smoothing_voxel: expected a value >= 0"),
         ({"intensity_power": 0.0}, "intensity_power: expected a value > 0"),
@@ -272,19 +311,19 @@ def test_intensity_power_keeps_bright_spots_from_outweighing_particles():
 def test_bad_input_is_refused(change, message):
     good = {"volume_a": np.zeros((20, 24, 28)), "volume_b": np.zeros((20, 24, 28)), "dt_s": 1e-3, "voxel_mm": 0.1}
     with pytest.raises(ValueError, match=message):
-        lfpiv.correlate(**{**good, **change})
+        plain_steps.correlate(**{**good, **change})
 
 
 def test_coordinates_must_agree():
     first, second = volumes()
     with pytest.raises(ValueError, match="volume_b: expected the coordinates x of volume_a"):
-        lfpiv.correlate(first, second.assign_coords(x=second["x"] + 0.05), dt_s=1.0)
+        plain_steps.correlate(first, second.assign_coords(x=second["x"] + 0.05), dt_s=1.0)
     with pytest.raises(ValueError, match="evenly spaced coordinates y"):
-        lfpiv.correlate(*(v.assign_coords(y=v["y"].values ** 2) for v in (first, second)), dt_s=1.0)
+        plain_steps.correlate(*(v.assign_coords(y=v["y"].values ** 2) for v in (first, second)), dt_s=1.0)
     with pytest.raises(ValueError, match="volume_a: expected dims"):
-        lfpiv.correlate(*(v.transpose("x", "y", "z").transpose("x", "z", "y") for v in (first, second)), dt_s=1.0)
+        plain_steps.correlate(*(v.transpose("x", "y", "z").transpose("x", "z", "y") for v in (first, second)), dt_s=1.0)
     with pytest.raises(ValueError, match="voxel_mm: expected no value with DataArrays"):
-        lfpiv.correlate(first, second, dt_s=1.0, voxel_mm=0.1)
+        plain_steps.correlate(first, second, dt_s=1.0, voxel_mm=0.1)
     for pair, other in (((first, second.values), "volume_b"), ((first.values, second), "volume_a")):
         with pytest.raises(ValueError, match=f"{other}: expected a DataArray, as volume_. is"):
-            lfpiv.correlate(*pair, dt_s=1.0, voxel_mm=0.2)
+            plain_steps.correlate(*pair, dt_s=1.0, voxel_mm=0.2)

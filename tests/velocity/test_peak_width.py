@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from support import plain_steps
 from support.particle_volumes import blobs, ring
 
-import lfpiv
 from lfpiv.velocity.peak_width import peak_reach, refine_search
 
 WINDOW = (12, 12, 12)
@@ -50,7 +50,9 @@ def test_fine_voxels_validate_as_well_as_larger_ones(factor, reach):
     for scale in (1, factor):
         windows = tuple(round(edge * scale) for edge in (24, 16, 12, 12))
         first, second = pair_at(scale)
-        vectors = lfpiv.correlate(first, second, dt_s=1.0, voxel_mm=1 / scale, windows=windows, intensity_power=0.5)
+        vectors = plain_steps.correlate(
+            first, second, dt_s=1.0, voxel_mm=1 / scale, windows=windows, intensity_power=0.5
+        )
         valid.append(vectors.attrs["valid_fraction"])
         fields.append(np.stack([vectors[f"displacement_{axis}"] for axis in "zyx"], -1) / scale)
     reaches = [peak_reach(*(volume**0.5 for volume in pair_at(scale)), WINDOW) for scale in (1, factor)]

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from support import plain_steps
 from support.particle_volumes import blobs
 
-import lfpiv
 from lfpiv.velocity.coverage import LEAST_SEEDED
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.velocity.seeding import unseeded_voxels
@@ -78,7 +78,7 @@ def test_no_light_is_no_statement(shape):
 
 def test_vectors_without_particles_are_not_valid_and_the_verdict_leaves_them_out():
     pair = pair_of(lambda position: position[:, 2] < 30, ghosts=0.02)
-    result = lfpiv.correlate(*pair, dt_s=1e-3, voxel_mm=1.0, windows=(16, 12, 12))
+    result = plain_steps.correlate(*pair, dt_s=1e-3, voxel_mm=1.0, windows=(16, 12, 12))
     valid, share = result["valid"].values, result["seeded_share"].values
     assert not valid[share < LEAST_SEEDED].any() and valid[share >= LEAST_SEEDED].mean() > 0.9
     assert (
@@ -88,5 +88,5 @@ def test_vectors_without_particles_are_not_valid_and_the_verdict_leaves_them_out
     assert result.attrs["verdict"] == Verdict.GOOD.value and result.attrs["valid_fraction"] < 0.8
     assert abs(result.attrs["unseeded_fraction"] - 22 / 52) < EDGE / 52
     np.testing.assert_allclose(result.attrs["measurable_fraction"], (share >= LEAST_SEEDED).mean())
-    full = lfpiv.correlate(*pair_of(everywhere), dt_s=1e-3, voxel_mm=1.0, windows=(16, 12, 12))
+    full = plain_steps.correlate(*pair_of(everywhere), dt_s=1e-3, voxel_mm=1.0, windows=(16, 12, 12))
     assert full.attrs["unseeded_fraction"] == 0 and full.attrs["measurable_fraction"] == 1
