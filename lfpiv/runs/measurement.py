@@ -68,8 +68,8 @@ class Rig(Shown):
     def light(self, pair: int) -> tuple[FrameLight, FrameLight]:
         """Read the images of both frames of a pair.
 
-        ``light.images`` has those of each camera, less dark image and background, shape (rows, columns) [counts];
-        ``light.noise`` the noise of their background [counts], the floor of `lfpiv.reconstruct`.
+        The ``images`` of a frame are those of each camera, less dark image and background, shape (rows, columns)
+        [counts]; ``noise`` is that of their background [counts], the floor of `lfpiv.reconstruct`.
 
         Raises
         ------
@@ -149,7 +149,7 @@ def prepare(
     Returns
     -------
     Rig
-        For `measure_pair`. ``rig.weights``, ``rig.light(pair)`` and ``rig.volumes(pair)`` give the steps between.
+        For `measure_pair`. Its ``weights``, ``light`` and ``volumes`` give the steps between.
 
     Raises
     ------

@@ -162,8 +162,8 @@ def correlate(
     >>> import numpy as np, lfpiv
     >>> volume = np.random.default_rng(0).random((24, 24, 24))
     >>> moved = lfpiv.correlate(volume, np.roll(volume, 1, axis=2), windows=(12, 12))
-    >>> float(moved.displacement_x.median().round(1)), moved.x.values.tolist(), moved.x.units
-    (1.0, [5.5, 11.5, 17.5], 'voxel')
+    >>> float(moved.displacement_x.median().round(1)), moved.x.values.round().tolist(), moved.x.units
+    (1.0, [6.0, 12.0, 18.0], 'voxel')
 
     References
     ----------
