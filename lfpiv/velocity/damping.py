@@ -26,6 +26,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.records import RecordError, validate
 from lfpiv.velocity.coverage import LEAST_SEEDED
 from lfpiv.velocity.systematic import DAMPING
+from lfpiv.velocity.validation import fill
 
 SIGNIFICANT = 2.0
 """Least distance of a slope from 1, and of an offset from 0, that is corrected [standard error]."""
@@ -219,6 +220,12 @@ class Simulated:
         seeded: np.ndarray = self.vectors["seeded_share"].values >= LEAST_SEEDED
         used: np.ndarray = whole & seeded & np.isfinite(self.vectors["displacement_x"].values)
         return used
+
+
+def displacement(vectors: xr.Dataset) -> np.ndarray:
+    """Return the displacement along (z, y, x) [voxel], filled where it is masked, shape (z, y, x, 3)."""
+    found = np.stack([vectors[f"displacement_{axis}"].values for axis in AXES], axis=-1).astype(float)
+    return fill(found, np.isfinite(found).all(-1))
 
 
 def without_ghosts(stated: np.ndarray, distance: np.ndarray) -> np.ndarray:
