@@ -4,9 +4,9 @@ A parametric bootstrap: random particles as many, as large and as bright as the 
 field, imaged through the calibrated mappings with noise, and measured with the same settings. What the measurement
 leaves of the imposed displacement is the damping (`lfpiv.velocity.damping`).
 
-A measured field has errors, and its fluctuations are damped already. So the simulated flow has the amplitudes with which
-simulated vectors have the power of the recorded ones (`LikelyFlow`). A pilot pair, moved by the measured field, makes
-the start.
+A measured field has errors, and its fluctuations are damped already. So the simulated flow has the amplitudes with
+which simulated vectors have the power of the recorded ones (`LikelyFlow`). A pilot pair, moved by the measured field,
+makes the start.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ SEED = 20_260
 PILOTED = 2
 """Number of simulated pairs whose flow is made with the pilot, whose flow is the least alike."""
 
+
 def measure_damping(
     weights: Weights,
     vectors: Sequence[xr.Dataset],
@@ -54,8 +55,8 @@ def measure_damping(
     weights : Weights
         The operator of the reconstruction.
     vectors : sequence of Datasets
-        Vectors of recorded pairs, from `measure` or a run. Simulated pair k has the flow of the k-th one, and so on
-        from the first.
+        Vectors of recorded pairs of one flow, from `measure` or a run; the more, the better is the flow told from
+        errors. The flows of as many as are simulated are imitated, evenly spread.
     images : sequence of mappings of str to ndarray
         Images of some recorded instants, background subtracted: their particles are imitated.
     measure : callable
@@ -117,21 +118,27 @@ class _Bootstrap:
     def run(self, pairs: int, progress: StepProgress) -> Damping:
         """Simulate the pilot and the pairs; return the damping of the pairs."""
         progress(0.0)
-        simulated = [self._simulate(0, self._flow(0, []))]
+        imitated = evenly_spread(range(len(self._fields)), pairs)
+        simulated = [self._simulate(0, imitated[0], [])]
         for number in range(1, pairs + 1):
             progress(number / (pairs + 1))
             alike = simulated[1:] if number > PILOTED else simulated
-            simulated.append(self._simulate(number, self._flow((number - 1) % len(self._fields), alike)))
+            simulated.append(self._simulate(number, imitated[(number - 1) % len(imitated)], alike))
         progress(1.0)
-        return estimate_damping(simulated[1:])
+        return estimate_damping(simulated[1:], self._vectors)
 
-    def _simulate(self, number: int, means: np.ndarray) -> Simulated:
-        """Simulate and measure one pair of a flow whose means over the windows are given, (z, y, x, 3) [voxel]."""
-        like = self._vectors[max(number - 1, 0) % len(self._vectors)]
-        flow = ImposedField(like, means)
+    def _simulate(self, number: int, imitated: int, alike: Sequence[Simulated]) -> Simulated:
+        """Simulate and measure one pair with the flow of a recorded one, made with simulated pairs so far."""
+        flow = ImposedField(self._vectors[imitated], self._flow(imitated, alike))
         frames = self._pair.images(flow, np.random.default_rng([SEED, number]))
         found = self._measure(frames, (self._noise, self._noise))
         return Simulated(vectors=found, imposed=flow.window_means)
+
+
+def evenly_spread(pairs: Sequence[int], count: int) -> list[int]:
+    """Return evenly spread pairs, or all if there are no more."""
+    count = min(count, len(pairs))
+    return [pairs[(2 * number + 1) * len(pairs) // (2 * count)] for number in range(count)]
 
 
 def _noise(images: Sequence[Images]) -> dict[str, float]:

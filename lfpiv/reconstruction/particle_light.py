@@ -14,9 +14,9 @@ REACH = 1 / 6
 class LightField:
     """Relative light of a particle at any place: a smoothed volume of some instant, or the same everywhere.
 
-    Particles may end within the grid, whose outer layers pad the volume. So the volume is smoothed where it is lit only,
-    and its dark rim stays dark: along each axis a layer is lit as far as the layers from the face to it have reached the
-    median layer.
+    Particles may end within the grid, whose outer layers pad the volume. So the volume is smoothed only where it is
+    lit, and its dark rim stays dark. Along each axis a layer is lit by the share of the median layer that the layers
+    from the face to it have reached.
 
     Parameters
     ----------
