@@ -216,14 +216,18 @@ def _damping(damping: DampingFigures | None) -> str:
     if damping is None or not damping.axes:
         return "not measured" + (f": {damping.reason}" if damping is not None else "")
     slopes = ", ".join(
-        f"{axis} {found.slope:.3f} ± {found.slope_error:.3f}{'' if found.applied else ' (not significant)'}"
+        f"{axis} {found.slope:.3f} ± {found.slope_error:.3f}"
+        f"{'' if found.applied or not found.alike else ' (not significant)'}"
         for axis, found in sorted(damping.axes.items())
     )
     offsets = ", ".join(
         f"{axis} {found.offset:.3f} ± {found.offset_error:.3f}" for axis, found in sorted(damping.axes.items())
     )
+    alike = all(found.alike for found in damping.axes.values())
+    harder = "" if alike else "not taken off, since simulated pairs are harder to measure than recorded ones; "
     return (
-        f"slope of measured on true fluctuations, from {markup.count(damping.simulated, 'simulated pair')}: {slopes}; "
+        f"{harder}slope of measured on true fluctuations, from "
+        f"{markup.count(damping.simulated, 'simulated pair')}: {slopes}; "
         f"offset [voxel]: {offsets}. This report shows the raw vectors; open_results has both"
     ).replace("-", "−")
 

@@ -110,6 +110,8 @@ class AxisDamping(_Figures):
     offset: float
     offset_error: float
     applied: bool
+    alike: bool = True
+    """False if simulated pairs are harder to measure than recorded ones."""
 
 
 class DampingFigures(_Figures):

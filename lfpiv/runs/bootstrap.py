@@ -17,7 +17,7 @@ from lfpiv.errors import InputError
 from lfpiv.files import writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import StepProgress
-from lfpiv.reconstruction.bootstrap import measure_damping
+from lfpiv.reconstruction.bootstrap import evenly_spread, measure_damping
 from lfpiv.results import netcdf, stored_damping
 from lfpiv.results.provenance import Stamp
 from lfpiv.results.stored_damping import StoredDamping
@@ -35,7 +35,8 @@ log = logging.getLogger(__name__)
 
 IMITATED = 4
 """Largest number of recorded pairs whose images show how many particles there are."""
-
+FLOWS = 32
+"""Number of recorded pairs whose vectors show the flow, unless more are simulated."""
 
 StampOf = Callable[[Sequence[int]], Stamp]
 """Returns the stamp of the damping measured with some pairs."""
@@ -74,7 +75,7 @@ def decide(
     if (known := stored(experiment, folder, stamp_of)) is not None:
         log.info("damping by ghosts: measured before, kept")
         return known
-    pairs = _spread(finished(), experiment.simulated_pairs)
+    pairs = evenly_spread(finished(), max(experiment.simulated_pairs, FLOWS))
     if not pairs or stamp_of(pairs).parts["images"] is None:
         log.info("damping by ghosts: not measured, no finished %s has its images", experiment.noun)
         return None
@@ -94,6 +95,7 @@ def decide(
     if damping is not None:
         for axis in AXES[::-1]:
             log.info("%s", sentence(damping, axis))
+        log.info("simulated pairs: %s", damping.likeness)
     return found
 
 
@@ -101,16 +103,12 @@ def sentence(damping: Damping, axis: str) -> str:
     """Return the damping along an axis as a sentence."""
     found = damping.axes[axis]
     used = "taken off" if found.applied else "not significant" if found.fluctuation else "no fluctuations"
+    if not found.alike:
+        used = "not taken off, since simulated pairs are harder to measure than recorded ones"
     return (
         f"damping by ghosts along {axis}: slope of measured on true fluctuations {found.slope:.3f} +- "
         f"{found.slope_error:.3f}, offset {found.offset:+.3f} +- {found.offset_error:.3f} voxel; {used}"
     )
-
-
-def _spread(finished: Sequence[int], count: int) -> list[int]:
-    """Return evenly spread pairs: as many as are simulated, or all finished ones if these are fewer."""
-    count = min(count, len(finished))
-    return [finished[(2 * number + 1) * len(finished) // (2 * count)] for number in range(count)]
 
 
 def _measure(work: PairWork, pairs: list[int], progress: StepProgress) -> Damping:
@@ -118,7 +116,7 @@ def _measure(work: PairWork, pairs: list[int], progress: StepProgress) -> Dampin
     assert work.weights is not None
     vectors: list[xr.Dataset] = [netcdf.read_vectors(work.folder.vectors(pair)) for pair in pairs]
     frames: list[FrameLight] = []
-    for pair in pairs[:IMITATED]:
+    for pair in evenly_spread(pairs, IMITATED):
         frames += [work.light_again(frame) for frame in work.experiment.pair_frames(pair)]
     noise = {name: sum(frame.noise[name] for frame in frames) / len(frames) for name in frames[0].noise}
     first = work.reconstructor.solver.smart.solve(frames[0].images, floor=frames[0].noise)

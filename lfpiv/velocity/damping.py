@@ -13,7 +13,6 @@ References
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -24,8 +23,9 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.records import RecordError, validate
-from lfpiv.velocity.coverage import LEAST_SEEDED
-from lfpiv.velocity.systematic import DAMPING
+from lfpiv.velocity.likeness import UNKNOWN, Likeness, compare, octants, usable
+from lfpiv.velocity.systematic import DAMPING, without_ghosts
+from lfpiv.velocity.validation import fill
 
 SIGNIFICANT = 2.0
 """Least distance of a slope from 1, and of an offset from 0, that is corrected [standard error]."""
@@ -38,10 +38,6 @@ LARGEST_ERROR = 0.1
 """Largest standard error of a slope that is corrected, as a share of the slope."""
 LEAST_WINDOWS = 8
 """Least number of valid windows of all simulated pairs."""
-WHOLE_FLUID = 0.99
-"""Least share of fluid of a window that enters the regression."""
-UNKNOWN = 1e6
-"""Standard error of what cannot be known."""
 COVERED = 0.95
 """Share of the errors that two standard deviations should cover."""
 
@@ -59,7 +55,7 @@ class AxisDamping:
     slope: float
     """Slope of measured on true fluctuations."""
     slope_error: float
-    """Its standard error."""
+    """Its standard error, with the doubt that simulated pairs unlike the recorded ones raise."""
     offset: float
     """Mean of measured minus true displacement [voxel]."""
     offset_error: float
@@ -68,11 +64,13 @@ class AxisDamping:
     """Root mean square of the simulated fluctuations [voxel]."""
     uncertainty_factor: float
     """Factor by which the standard deviations of the correlation statistics are too small."""
+    alike: bool = True
+    """Whether simulated pairs are not harder to measure than recorded ones; else nothing is corrected."""
 
     @property
     def applied(self) -> bool:
         """Whether the slope differs from 1 significantly, so that vectors are corrected."""
-        known = self.slope_error <= LARGEST_ERROR * self.slope
+        known = self.alike and self.slope_error <= LARGEST_ERROR * self.slope
         significant = known and abs(self.slope - 1) > SIGNIFICANT * self.slope_error
         return significant and self.fluctuation >= LEAST_FLUCTUATION and SLOPES[0] <= self.slope <= SLOPES[1]
 
@@ -83,8 +81,8 @@ class AxisDamping:
 
     @property
     def used_offset(self) -> float:
-        """Offset of the correction [voxel]; 0 if it is not significant."""
-        return self.offset if abs(self.offset) > SIGNIFICANT * self.offset_error else 0.0
+        """Offset of the correction [voxel]; 0 if none is applied."""
+        return self.offset if self.alike and abs(self.offset) > SIGNIFICANT * self.offset_error else 0.0
 
     @property
     def pull(self) -> float:
@@ -107,6 +105,8 @@ class Damping:
     """x, y, z -> damping of that component."""
     simulated: int
     """Number of simulated pairs."""
+    likeness: Likeness | None = None
+    """What tells simulated from recorded pairs; None if they were not compared."""
 
     derived = frozenset(["uncertainty", *UNBIASED.values()] + [f"{name}_{axis}" for name in _DERIVED for axis in AXES])
     """Variables that `unbiased` adds or changes."""
@@ -118,7 +118,8 @@ class Damping:
     def to_json(self) -> dict[str, Any]:
         """Return the form that files and summaries store."""
         axes = {name: {**asdict(axis), "applied": axis.applied} for name, axis in self.axes.items()}
-        return {"axes": axes, "simulated": self.simulated}
+        likeness = None if self.likeness is None else asdict(self.likeness)
+        return {"axes": axes, "simulated": self.simulated, "likeness": likeness}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Damping:
@@ -132,7 +133,7 @@ class Damping:
         found = validate(_Stored, stored)
         if set(found.axes) != set(AXES):
             raise RecordError(f"expected the axes x, y, z, found {', '.join(found.axes)}")
-        return cls(axes=found.axes, simulated=found.simulated)
+        return cls(axes=found.axes, simulated=found.simulated, likeness=found.likeness)
 
     def unbiased(self, vectors: xr.Dataset) -> xr.Dataset:
         """Return vectors with displacements and velocities without damping beside the raw ones.
@@ -198,6 +199,7 @@ class Damping:
 class _Stored:
     axes: dict[str, AxisDamping]
     simulated: int
+    likeness: Likeness | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,20 +217,17 @@ class Simulated:
 
         Vectors that validation replaced count: the correction of all vectors is one.
         """
-        whole: np.ndarray = self.vectors["fluid_share"].values >= WHOLE_FLUID
-        seeded: np.ndarray = self.vectors["seeded_share"].values >= LEAST_SEEDED
-        used: np.ndarray = whole & seeded & np.isfinite(self.vectors["displacement_x"].values)
-        return used
+        return usable(self.vectors)
 
 
-def without_ghosts(stated: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Return the variances of stated standard deviations without the assumed share of ghosts [voxel^2]."""
-    own: np.ndarray = np.maximum(np.square(stated, dtype=float) - (DAMPING * distance) ** 2, 0)
-    return own
+def displacement(vectors: xr.Dataset) -> np.ndarray:
+    """Return the displacement along (z, y, x) [voxel], filled where it is masked, shape (z, y, x, 3)."""
+    found = np.stack([vectors[f"displacement_{axis}"].values for axis in AXES], axis=-1).astype(float)
+    return fill(found, np.isfinite(found).all(-1))
 
 
-def estimate_damping(pairs: Sequence[Simulated]) -> Damping:
-    """Estimate the damping from simulated pairs.
+def estimate_damping(pairs: Sequence[Simulated], recorded: Sequence[xr.Dataset] = ()) -> Damping:
+    """Estimate the damping from simulated pairs, and compare them with vectors of recorded ones.
 
     Standard errors are those of a jackknife over octants of all pairs. Neighbouring vectors share half of their windows
     and are not independent, octants nearly are.
@@ -240,10 +239,12 @@ def estimate_damping(pairs: Sequence[Simulated]) -> Damping:
     """
     if sum(int((pair.used & pair.vectors["valid"].values).sum()) for pair in pairs) < LEAST_WINDOWS:
         raise ValueError("simulated pairs: hardly any vector is valid, so that the damping cannot be measured.")
-    return Damping(axes={axis: _of_axis(pairs, axis) for axis in AXES[::-1]}, simulated=len(pairs))
+    likeness = compare(recorded, [pair.vectors for pair in pairs])
+    axes = {axis: _of_axis(pairs, axis, likeness) for axis in AXES[::-1]}
+    return Damping(axes=axes, simulated=len(pairs), likeness=likeness)
 
 
-def _of_axis(pairs: Sequence[Simulated], axis: str) -> AxisDamping:
+def _of_axis(pairs: Sequence[Simulated], axis: str, likeness: Likeness | None) -> AxisDamping:
     """Regress measured on imposed displacements of one axis."""
     pairs = [pair for pair in pairs if pair.used.any()]
     parts = [part for pair in pairs for part in _parts(pair, axis)]
@@ -253,13 +254,15 @@ def _of_axis(pairs: Sequence[Simulated], axis: str) -> AxisDamping:
     offset, offset_error = _jackknife(np.array(rests, float), empty=0.0)
     errors = np.concatenate([_scaled_errors(pair, axis, slope, offset) for pair in pairs])
     fluctuation = np.sqrt(sums[:, 0].sum() / sum(len(away) for away, _, _ in parts))
+    doubt = 0.0 if likeness is None else likeness.doubt * abs(slope - 1)
     return AxisDamping(
         slope=slope,
-        slope_error=slope_error,
+        slope_error=float(np.hypot(slope_error, doubt)),
         offset=offset,
         offset_error=offset_error,
         fluctuation=float(fluctuation),
         uncertainty_factor=max(float(np.quantile(errors, COVERED)) / 2, 1.0),
+        alike=likeness is None or not likeness.harder,
     )
 
 
@@ -268,7 +271,7 @@ def _parts(pair: Simulated, axis: str) -> Iterator[tuple[np.ndarray, np.ndarray,
     used, exact = pair.used, pair.imposed[..., AXES.index(axis)]
     found = pair.vectors[f"displacement_{axis}"].values.astype(float)
     away, moved = exact - exact[used].mean(), found - found[used].mean()
-    for octant in _octants(used.shape):
+    for octant in octants(used.shape):
         if (some := used & octant).any():
             yield away[some], moved[some], (found - exact)[some]
 
@@ -304,13 +307,6 @@ def _scaled_errors(pair: Simulated, axis: str, slope: float, offset: float) -> n
     variance = without_ghosts(pair.vectors[f"uncertainty_{axis}"].values, distance)
     known = used & (variance > 0)  # none after a single pass
     return np.abs(rest[known]) / np.sqrt(variance[known]) if known.any() else np.full(1, 2.0)
-
-
-def _octants(shape: tuple[int, ...]) -> list[np.ndarray]:
-    """Return flags of the octants of a grid of windows."""
-    halves = [np.arange(count) >= count / 2 for count in shape]
-    z, y, x = np.meshgrid(*halves, indexing="ij")
-    return [(z == a) & (y == b) & (x == c) for a, b, c in itertools.product((False, True), repeat=3)]
 
 
 def _from_mean(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, float]:

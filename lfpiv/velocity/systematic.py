@@ -61,3 +61,17 @@ def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, re
     systematic = (residual * RANDOM_SHARE * typical) ** 2 + (DAMPING * (field - mean)) ** 2
     whole: np.ndarray = np.sqrt(random**2 + systematic)
     return whole
+
+
+def without_ghosts(stated: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Return the variances of stated standard deviations without the assumed share of ghosts [voxel^2].
+
+    Parameters
+    ----------
+    stated : ndarray
+        From `with_systematic`, of one component [voxel].
+    distance : ndarray
+        Displacement minus its mean over the valid vectors [voxel].
+    """
+    own: np.ndarray = np.maximum(np.square(stated, dtype=float) - (DAMPING * distance) ** 2, 0)
+    return own
