@@ -22,6 +22,7 @@ from lfpiv.reproduce import angles, page, plots, rigs, store
 from lfpiv.simulation.flows import Ring
 from lfpiv.velocity import derived
 from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.settings import cut_windows
 from lfpiv.weights.operator import Weights
 
 TITLE = "Fig. 14: displacement of a ring vortex; Fig. 13: its vorticity at 0.5 particles per microlens"
@@ -95,7 +96,8 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
     def correlated(volumes: Sequence[xr.DataArray]) -> dict[str, np.ndarray]:
         fields: dict[str, np.ndarray] = {}
         for name, windows in SCHEDULES.items():
-            vectors = correlate(*volumes, dt_s=rigs.DT_S, windows=windows, **correlation)
+            cut = cut_windows(windows, volumes[0].shape)
+            vectors = correlate(*volumes, dt_s=rigs.DT_S, windows=cut, **correlation)
             fields |= _pack(vectors, name)
         return fields
 

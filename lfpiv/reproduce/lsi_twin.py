@@ -22,6 +22,7 @@ from lfpiv.simulation.scene import Noise
 from lfpiv.simulation.simulator import LEAST_INTENSITY
 from lfpiv.simulation.turbulence import Turbulence, TurbulentFlow
 from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.settings import cut_windows
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.rendering import render
 
@@ -220,7 +221,7 @@ def window_mm(twin: Twin) -> tuple[float, float, float]:
 
 
 def _measure(volumes: Sequence[xr.DataArray], twin: Twin, grid: Grid, pair: int) -> dict[str, np.ndarray]:
-    settings = Correlation(windows=WINDOWS).model_dump()
+    settings = Correlation(windows=cut_windows(WINDOWS, volumes[0].shape)).model_dump()
     vectors = correlate(*volumes, dt_s=twin.dt_s, **settings)
     displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "xyz"], axis=-1)
     return {

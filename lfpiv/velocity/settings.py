@@ -80,7 +80,7 @@ def windows_of(windows: int | Sequence[int | Sequence[int]] | None, shape: Tripl
     A number is the window of a single pass. Default windows are cut to the volume; others raise ValueError.
     """
     if windows is None:
-        return tuple(largest_within((edge, edge, edge), shape) for edge in DEFAULT_WINDOWS)
+        return cut_windows(DEFAULT_WINDOWS, shape)
     if isinstance(windows, str):
         raise ValueError(f"windows: expected a window or a sequence, one window per pass, got {windows!r}.")
     if not isinstance(windows, Iterable):
@@ -103,6 +103,12 @@ def _check_window(window: Any, shape: Triple) -> Triple:
                 f"The largest window of this kind is {largest_within(edges, shape)}, as (z, y, x)."
             )
     return edges
+
+
+def cut_windows(windows: Iterable[int | Sequence[int]], shape: Sequence[int]) -> tuple[Triple, ...]:
+    """Return windows of whole voxels, one edge or (z, y, x) each, cut to a volume of a shape."""
+    given = (triple(window) if isinstance(window, Iterable) else (window,) * 3 for window in windows)
+    return tuple(largest_within(edges, triple(shape)) for edges in given)
 
 
 def largest_within(edges: Triple, shape: Triple) -> Triple:

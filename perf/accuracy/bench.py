@@ -25,6 +25,7 @@ from lfpiv.reproduce import rigs, store
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import FULL_SCALE, render_camera
 from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.settings import cut_windows
 from lfpiv.weights.operator import Weights, build_weights
 from lfpiv_kernels.rendering import render
 
@@ -244,7 +245,10 @@ class Bench:
         correlation: Correlation | None = None,
     ) -> Judged:
         """Correlate a pair of volumes, and compare volumes and vectors with the truth."""
-        vectors = correlate(*volumes, dt_s=rigs.DT_S, **(correlation or Correlation()).model_dump())
+        settings = (correlation or Correlation()).model_dump()
+        if settings["windows"] is not None:
+            settings["windows"] = cut_windows(settings["windows"], volumes[0].shape)
+        vectors = correlate(*volumes, dt_s=rigs.DT_S, **settings)
         field = np.stack([vectors[f"displacement_{axis}"].values for axis in "xyz"], axis=-1)
         edge = json.loads(vectors.attrs["settings"])["windows"][-1]
         axes = [vectors[axis].values for axis in "zyx"]

@@ -42,6 +42,7 @@ from lfpiv import metrics
 from lfpiv.experiment.settings import Correlation
 from lfpiv.reproduce import rigs, store
 from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.settings import cut_windows
 
 CACHE = Path(tempfile.gettempdir()) / "lfpiv-reconstruction-bench"
 BLOBS = {"points": 0.0, "blobs": rigs.BLOB_VOXEL}
@@ -95,6 +96,8 @@ def vectors_of(case: Case, volumes: Sequence[xr.DataArray], settings: Mapping[st
     """Correlate each volume with the next one."""
     keys = ({"windows": case.windows} if case.windows else {}) | table_of(settings, "correlation")
     options = Correlation(**keys).model_dump()
+    if options["windows"] is not None:
+        options["windows"] = cut_windows(options["windows"], volumes[0].shape)
     return [correlate(first, second, dt_s=rigs.DT_S, **options) for first, second in pairwise(volumes)]
 
 
