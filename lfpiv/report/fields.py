@@ -181,8 +181,10 @@ def _encode(vectors: xr.Dataset, kind: str, step: int, block: bytearray) -> dict
     thin = vectors.isel(cut)
     values = flow.stored(vectors) if kind == "velocity" else {name: vectors[name] for name in "uvw"}
     entry: dict[str, Any] = {"values": {}}
-    for name, field in values.items():
-        stored, scale = quantise(field.isel(cut).values)
+    fine = {name: field.isel(cut).values for name, field in values.items()}
+    curl = [part for name, part in fine.items() if name.startswith("vorticity_")]
+    for name, part in fine.items():
+        stored, scale = quantise(part, largest(*curl) if name.startswith("vorticity_") else largest(part))
         entry["values"][name] = {"offset": len(block), "scale": scale}
         block += stored.tobytes()
     entry["valid"] = len(block)
@@ -196,12 +198,16 @@ def _encode(vectors: xr.Dataset, kind: str, step: int, block: bytearray) -> dict
 _COLOUR_MAPS = {"signed": "RdBu_r", "positive": "viridis"}
 
 
-def quantise(values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return 16-bit integers and the scale that converts them back to values."""
+def largest(*parts: np.ndarray) -> float:
+    """Return the largest finite magnitude of arrays; 0 without any."""
+    return max(float(np.abs(part[np.isfinite(part)]).max(initial=0.0)) for part in parts)
+
+
+def quantise(values: np.ndarray, top: float) -> tuple[np.ndarray, float]:
+    """Return 16-bit integers for values up to `top` in magnitude, and the scale that converts them back."""
     values = np.asarray(values, float)
     finite = np.isfinite(values)
-    largest = float(np.abs(values[finite]).max(initial=0.0))
-    scale = largest / STEPS if largest > 0 else 1.0
+    scale = top / STEPS if top > 0 else 1.0
     stored = np.full(values.shape, NO_NUMBER, "<i2")
     stored[finite] = np.rint(values[finite] / scale)
     return stored, scale

@@ -19,7 +19,7 @@ from lfpiv.quantities import significant
 from lfpiv.report.flow import COMPONENTS, IN_SLICE, Quantity
 from lfpiv.report.svg import arrows, cell_edges, colour_bar, new_panel, spread_ticks, style, to_svg
 
-MOST_SLICES = 6
+MOST_SLICES = 5
 """Largest number of slices of a vector field."""
 MOST_ARROWS = 20
 """Largest number of arrows along an axis of a slice; more are thinned out."""
@@ -27,8 +27,8 @@ ARROW_TINTS = (("#0b0f14", "#ffffff"), ("#ffffff", "#0b0f14"))
 """Colours of measured and of replaced vectors: the line and its outline, which shows on dark and on light cells."""
 MASKED_FILL, MASKED_LINE = "#d5d8db", "#9aa0a6"
 """Colours of masked cells in a slice and of their hatching."""
-SAMPLES = 6
-"""Number of samples across a cell, between which colours are interpolated."""
+SAMPLES = 160
+"""Number of samples along the longer edge of a slice, to which colours are interpolated."""
 SHARE = 99.0
 """Percentile of a quantity's magnitude at which its colours end."""
 
@@ -102,9 +102,10 @@ def slice_panel(
 
 def _smooth(values: np.ndarray) -> np.ndarray:
     """Return values interpolated linearly between the vectors, as they are beside unknown ones."""
+    fine = int(np.clip(SAMPLES // max(values.shape), 1, 16))
     if not np.isfinite(values).all():
-        return np.ma.masked_invalid(np.repeat(np.repeat(values, SAMPLES, 0), SAMPLES, 1))
-    places = np.meshgrid(*((np.arange(n * SAMPLES) + 0.5) / SAMPLES - 0.5 for n in values.shape), indexing="ij")
+        return np.ma.masked_invalid(np.repeat(np.repeat(values, fine, 0), fine, 1))
+    places = np.meshgrid(*((np.arange(n * fine) + 0.5) / fine - 0.5 for n in values.shape), indexing="ij")
     return np.asarray(ndimage.map_coordinates(values, places, order=1, mode="nearest"))
 
 
@@ -146,6 +147,8 @@ def _draw_streamlines(axes: Axes, slab: xr.Dataset, names: tuple[str, str]) -> N
     places = [np.linspace(float(slab[axis][0]), float(slab[axis][-1]), slab.sizes[axis]) for axis in names]
     density = 1.1 * np.clip([1.0, slab.sizes[up] / slab.sizes[across]], 0.35, 1.0)
     drawn = axes.streamplot(*places, *velocity, density=density, color="#0b0f14", linewidth=0.9, arrowsize=0.8)
+    for patch in axes.patches:
+        patch.set_in_layout(False)  # the heads of the arrows lie inside; measuring them takes long
     drawn.lines.set_path_effects([patheffects.withStroke(linewidth=2.2, foreground="#ffffff")])
 
 

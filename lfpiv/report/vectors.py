@@ -56,7 +56,7 @@ def section(vectors: Mapping[int, pathlib.Path], naming: Naming = PAIRS, damping
         _vorticity(name, fields, kinds, view),
         _uncertainty(name, first, fields, kinds, view),
         _displacements(name, first),
-        _damping(damping),
+        damping_table(damping),
         data,
     ]
     return "\n".join(part for part in parts if part)
@@ -235,7 +235,7 @@ def _displacements(name: str, first: xr.Dataset) -> str:
     )
 
 
-def _damping(damping: DampingFigures | None) -> str:
+def damping_table(damping: DampingFigures | None) -> str:
     """Tabulate the damping by ghosts; nothing where it was not measured."""
     if damping is None or not damping.axes:
         return ""

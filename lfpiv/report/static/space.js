@@ -4,7 +4,7 @@
 /** Largest number of arrows; more are thinned out. */
 const MOST_ARROWS = 700;
 /** Largest number of streamlines. */
-const MOST_LINES = 160;
+const MOST_LINES = 300;
 /** Largest number of values of a surface. */
 const MOST_IN_SURFACE = 60000;
 /** Buttons above the view, without plotly's own one that uploads the data. */
@@ -31,7 +31,7 @@ class SpaceView {
     this.elements.scene.addEventListener("pointerdown", () => this.elements.scene.focus({ preventScroll: true }));
     this.elements.scene.addEventListener("wheel", (event) => this.keepPageScrolling(event), { capture: true });
     for (const query of ["(prefers-color-scheme: dark)", "(max-width: 700px)"]) {
-      window.matchMedia(query).addEventListener("change", () => this.draw());
+      window.matchMedia(query).addEventListener("change", () => this.redraw());
     }
   }
 
@@ -161,7 +161,7 @@ class SpaceView {
     return {
       type: "isosurface", ...fine, surface: { count: 1 }, isomin: this.level(), isomax: this.level(),
       caps: { x: none, y: none, z: none }, opacity: 0.6, flatshading: false, showscale: false, hoverinfo: "skip",
-      colorscale: [[0, "#d9822b"], [1, "#d9822b"]], lighting: { ambient: 0.55, diffuse: 0.8, specular: 0.15 },
+      colorscale: [[0, "#d9822b"], [1, "#d9822b"]], lighting: { ambient: 0.65, diffuse: 0.7, specular: 0.15 },
     };
   }
 
@@ -199,6 +199,12 @@ class SpaceView {
     };
     const settings = { responsive: true, displaylogo: false, displayModeBar: true, modeBarButtons: BUTTONS };
     await Plotly.react(this.elements.scene, traces, layout, settings);
+  }
+
+  /** Draw from the beginning for another width or scheme: plotly would keep the margins that it drew first. */
+  async redraw() {
+    Plotly.purge(this.elements.scene);
+    await this.draw();
   }
 
   moveSurface() {

@@ -2,7 +2,7 @@
 // Follow streamlines through a field, in a slice or in space.
 
 /** Step of the integration, and longest streamline to either side [cells]. */
-const STREAM_STEP = 0.2, STREAM_LENGTH = 60;
+const STREAM_STEP = 0.1, STREAM_LENGTH = 60;
 /** Speed below which a streamline ends, as a share of the largest. */
 const STREAM_STILL = 0.003;
 
@@ -34,33 +34,34 @@ function follow(sample, seed, sign, still, stop) {
 /** Return streamlines that keep apart: lists of places [cells].
  *
  * `sample` returns the velocity at a place [cells of any axes], or null outside; `counts` is the number of cells along
- * each axis, `apart` the distance between streamlines [cells].
+ * each axis, `apart` the distance between streamlines [cells]. A streamline ends where it comes near another one or
+ * itself, and where it circles within the distance; it has to be longer than the distance.
  */
 function streamlines(sample, counts, apart, largest, most) {
-  const taken = new Map();
+  const taken = new Set();
   const key = (place) => place.map((value) => Math.floor((value + 0.5) / apart)).join(",");
-  const seeds = seedPlaces(counts, apart);
   const found = [];
-  for (const seed of seeds) {
+  for (const seed of seedPlaces(counts, apart)) {
     if (found.length >= most) break;
     if (taken.has(key(seed)) || sample(seed) === null) continue;
-    const own = found.length;
-    let here = null;
-    const stop = (place) => {
-      const cell = key(place);
-      if (cell === here) return false;
-      if (taken.has(cell)) return true; // its own path closes, or another streamline is near
-      taken.set(cell, own);
-      here = cell;
-      return false;
+    const own = new Set([key(seed)]);
+    const oneWay = (sign) => {
+      let here = key(seed), stay = 0;
+      return follow(sample, seed, sign, STREAM_STILL * largest, (place) => {
+        const cell = key(place);
+        stay = cell === here ? stay + 1 : 0;
+        if (cell === here) return stay * STREAM_STEP > 2 * apart;
+        if (taken.has(cell) || own.has(cell)) return true;
+        own.add(cell);
+        here = cell;
+        return false;
+      });
     };
-    here = key(seed);
-    taken.set(here, own);
-    const ahead = follow(sample, seed, 1, STREAM_STILL * largest, stop);
-    here = key(seed);
-    const behind = follow(sample, seed, -1, STREAM_STILL * largest, stop);
-    const places = [...behind.reverse(), seed, ...ahead];
-    if (places.length * STREAM_STEP > 1.5 * apart) found.push(places);
+    const ahead = oneWay(1);
+    const places = [...oneWay(-1).reverse(), seed, ...ahead];
+    if (own.size < 3) continue;
+    for (const cell of own) taken.add(cell);
+    found.push(places);
   }
   return found;
 }
