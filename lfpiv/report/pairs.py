@@ -103,9 +103,9 @@ def section(
         f'<h2 id="pairs">All {noun}s</h2>',
         markup.paragraph(_overview(pairs, failed, finished or len(pairs), noun)),
     ]
-    table = _table(groups, single, noun)
+    table, tracked = _table(groups, single, noun), particle_table(pairs, noun)
     if len(pairs) == 1:
-        return "\n".join([*parts, table])
+        return "\n".join([*parts, table, tracked])
     shown = [_line(groups, ("valid",), "valid vectors [%]", failed, noun, factor=100.0, bottom=0)]
     shown.append(_line(groups, ("uncertainty",), "median uncertainty [voxel]", failed, noun, bottom=0))
     scale = _velocity_scale(groups)
@@ -119,7 +119,7 @@ def section(
     if failed:
         caption += f" Marks on the lower edge: failed {noun}s."
     parts.append(markup.figure(shown, caption, table + (_worst(pairs, noun) if not single else "")))
-    return "\n".join(parts)
+    return "\n".join([*parts, tracked])
 
 
 def _overview(pairs: Sequence[PairFigures], failed: Sequence[int], finished: int, noun: str) -> str:
@@ -189,6 +189,33 @@ def _table(groups: Groups, single: bool, noun: str) -> str:
         rows.append([name, valid, *spread, number(groups.mean["uncertainty"][k], 3), ratio])
     caption = "Mean ± standard deviation over the valid vectors, medians of uncertainty and peak ratio"
     return markup.table(titles, rows, caption=caption) + markup.paragraph(f"{caption}.", "quiet")
+
+
+def particle_table(pairs: Sequence[PairFigures], noun: str) -> str:
+    """Tabulate the tracked particles, of many pairs those of an even choice; nothing without tracking."""
+    tracked = [pair.number for pair in pairs if pair.particles is not None]
+    chosen = set(evenly(tracked, WORST))
+    rows = [
+        [
+            str(pair.number),
+            " and ".join(f"{count:,}" for count in found.found),
+            f"{found.linked:,}",
+            f"{found.valid_links:,}",
+            number(float(np.mean(found.per_microlens)), 3),
+            number(float(np.mean(found.sigma_voxel)), 2),
+        ]
+        for pair in pairs
+        if pair.number in chosen and (found := pair.particles) is not None
+    ]
+    if not rows:
+        return ""
+    titles = [noun, "found", "linked", "valid", "per microlens", "size, σ [voxel]"]
+    text = "Particles found in each frame, and those followed from one to the next. The folder particles has them."
+    return (
+        "<h3>Tracked particles</h3>"
+        + markup.paragraph(text)
+        + markup.table(titles, rows, caption=f"Tracked particles by {noun}")
+    )
 
 
 def _velocity_scale(groups: Groups) -> Scale:

@@ -432,6 +432,17 @@ def test_damping_is_tabulated(reported):
     assert vectors.damping_table(None) == ""
 
 
+def test_tracked_particles_are_tabulated(reported):
+    tracked = {"found": [1115, 116], "linked": 102, "valid_links": 99, "per_microlens": [0.04, 0.06]}
+    tracked |= {"sigma_voxel": [0.2, 0.3]}
+    pairs = [pair | {"particles": tracked} for pair in reported.summary["pairs"][:2]]
+    table = pairs_section.particle_table(figures(reported.summary | {"pairs": pairs}).pairs, "pair")
+    rows = re.findall(r"<tr>(.*?)</tr>", table)
+    cells = [re.findall(r">([^<]+)<", row) for row in rows]
+    assert cells[1:] == [[str(pair), "1,115 and 116", "102", "99", "0.050", "0.25"] for pair in (0, 1)]
+    assert pairs_section.particle_table(figures(reported.summary).pairs, "pair") == ""
+
+
 def test_the_brightness_outside_the_light_sheet_tells_the_level_of_ghosts(reported, text):
     low, high, ratio = re.search(
         r"lies between z = (\S+) and (\S+) mm; .* is (\S+) times as bright inside as outside", text
