@@ -19,7 +19,7 @@ KERNEL_FILES = sorted((ROOT / "lfpiv_kernels").rglob("*.py"))
 PACKAGE_FILES = sorted((ROOT / "lfpiv").rglob("*.py"))
 ALL_FILES = KERNEL_FILES + PACKAGE_FILES
 
-GROUND = {"geometry", "files", "errors", "hdf5", "records", "warn", "version", "progress", "prompt"}
+GROUND = {"geometry", "files", "errors", "hdf5", "records", "warn", "version", "progress", "prompt", "quantities"}
 """Rooms that every room may import, beside `lfpiv_kernels`."""
 FACES = {"__init__", "__main__", "derived", "statistics"}
 """Files that hand public names on: they may import every room, and no room imports them."""
@@ -29,6 +29,7 @@ MAY_IMPORT = {
     "version": set(),
     "progress": set(),
     "prompt": set(),
+    "quantities": set(),
     "hdf5": {"errors", "records"},
     "records": set(),
     "warn": {"errors", "records"},

@@ -27,7 +27,16 @@ if TYPE_CHECKING:
 
 __all__ = ["write_report"]
 
-_SCRIPTS = ("fields.js", "slices.js", "space.js", "page.js")
+_SCRIPTS = (
+    "fields.js",
+    "drawing.js",
+    "streamlines.js",
+    "profile.js",
+    "slices.js",
+    "meshes.js",
+    "space.js",
+    "page.js",
+)
 
 
 def write_report(
@@ -62,18 +71,19 @@ def write_report(
     figures = Summary.model_validate(summary)
     naming = Naming.of(experiment)
     sections = {
+        "vectors": vector_section.section(vectors, naming, figures.damping),
+        "volumes": volumes.section(figures.pairs, vectors, naming) if vectors else "",
+        "pairs": pairs.section(figures.pairs, figures.failed, figures.finished_count, naming) if figures.pairs else "",
         "run": overview.run_facts(experiment, figures),
         "calibration": calibration_section.section(experiment, calibration, figures.calibration),
         "background": background.section(experiment, calibration),
-        "volumes": volumes.section(figures.pairs, vectors, naming) if vectors else "",
-        "vectors": vector_section.section(vectors, naming),
-        "pairs": pairs.section(figures.pairs, figures.failed, figures.finished_count, naming) if figures.pairs else "",
         "time": overview.timings(figures, naming.noun),
         "settings": overview.settings_and_versions(figures),
     }
     body = [
-        overview.head(experiment, figures),
+        overview.head(experiment),
         overview.warnings(figures, naming.noun),
+        overview.verdict(experiment, figures),
         overview.contents(sections, naming.noun),
         *sections.values(),
     ]

@@ -19,7 +19,7 @@ from lfpiv.report import markup
 from lfpiv.report.board_errors import board_part
 from lfpiv.report.dot_map import DotMap, dot_map, dot_outlines_px, rms_by
 from lfpiv.report.lens_map import LensMap, lattice_px, lens_map
-from lfpiv.report.markup import number
+from lfpiv.report.markup import number, significant
 from lfpiv.report.summary import CameraFigures
 from lfpiv.report.svg import INK, SERIES, arrows, colour_bar, new_panel, spread_ticks, style, to_svg
 
@@ -67,22 +67,36 @@ def section(experiment: Experiment, calibration: Calibration, figures: Mapping[s
         for title, key, digits in _ROWS
         if any(value is not None for value in values[key])
     ]
-    parts = [
-        '<h2 id="calibration">Calibration</h2>',
+    folded = [
         markup.table(["camera", *figures], rows, caption="Figures of the calibration by camera"),
         markup.paragraph("A pitch is the distance between microlenses; errors in pitches lie on the microlens array."),
     ]
     if calibration.board is not None:
-        parts.append(board_part(calibration.board))
+        folded.append(board_part(calibration.board))
     for setup in experiment.cameras:
         camera = calibration.cameras[setup.name]
-        parts.append(f"<h3>{markup.escape(setup.name)}</h3>")
-        parts.append(_lens_figure(experiment, setup, camera))
+        folded.append(f"<h3>{markup.escape(setup.name)}</h3>")
+        folded.append(_lens_figure(experiment, setup, camera))
         found = dot_map(camera)
-        parts.append(_board_figure(experiment, setup, camera, found, calibration.board))
+        folded.append(_board_figure(experiment, setup, camera, found, calibration.board))
         if found is not None:
-            parts.append(_mapping_figure(experiment, camera, found))
-    return "\n".join(parts)
+            folded.append(_mapping_figure(experiment, camera, found))
+    heading = '<h2 id="calibration">Calibration</h2>' + markup.paragraph(_overview(figures))
+    title = "Microlens arrays, board and mapping of each camera"
+    return heading + markup.details(title, "\n".join(folded), name="calibration-fold")
+
+
+def _overview(figures: Mapping[str, CameraFigures]) -> str:
+    """State the error of the mapping and the dots of each camera."""
+    texts = [
+        f"{name}: {significant(camera.sigma_nor_test, 2)} pitch"
+        + (f", {camera.dots_found:,} of {camera.dots_expected:,} dots" if camera.dots_expected else "")
+        for name, camera in figures.items()
+        if camera.sigma_nor_test is not None
+    ]
+    if not texts:
+        return "Rays by the nominal geometry, without a board."
+    return f"Error on held-out dots: {'; '.join(texts)}. A pitch is the distance between microlenses."
 
 
 def _lens_figure(experiment: Experiment, setup: CameraSetup, camera: CalibratedCamera) -> str:

@@ -7,6 +7,7 @@ two bytes, gzipped and written in base64; ``static/fields.js`` unpacks them.
 from __future__ import annotations
 
 import base64
+import dataclasses
 import gzip
 import json
 import logging
@@ -23,9 +24,9 @@ import xarray as xr
 
 from lfpiv import hdf5
 from lfpiv.geometry.grid import AXES
+from lfpiv.report import flow
 from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.results import netcdf
-from lfpiv.velocity import derived
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +34,7 @@ MOST_READ = 500
 """Largest number of files read for mean and fluctuation."""
 MOST_SHOWN = 6
 """Largest number of pairs that can be selected on the page."""
-MOST_VECTORS = 240_000
+MOST_VECTORS = 180_000
 """Largest number of vectors of all fields together."""
 MOST_IN_FIELD = 40_000
 """Largest number of vectors of one field. Larger fields are thinned out along x and y."""
@@ -123,7 +124,7 @@ def _like(first: xr.Dataset, velocity: np.ndarray, valid: np.ndarray) -> xr.Data
     return xr.Dataset({**variables, "valid": (AXES, valid), **masked}, coordinates)
 
 
-def embed(found: Survey, naming: Naming = PAIRS) -> tuple[str, int]:
+def embed(found: Survey, view: flow.View, naming: Naming = PAIRS) -> tuple[str, int]:
     """Encode the fields of a survey for the scripts.
 
     All fields share one block of little-endian 16-bit integers, which is gzipped and written in base64. A JSON text
@@ -133,6 +134,8 @@ def embed(found: Survey, naming: Naming = PAIRS) -> tuple[str, int]:
     ----------
     found : Survey
         From `survey`.
+    view : flow.View
+        What the first field is shown by at the start.
     naming : Naming
         Names of results.
 
@@ -144,31 +147,25 @@ def embed(found: Survey, naming: Naming = PAIRS) -> tuple[str, int]:
         Largest step along x and y at which vectors are in the page.
     """
     fields = [(naming.result(pair), vectors, "velocity") for pair, vectors in found.shown.items()]
+    first = fields[0][1]
+    kinds = flow.describe(first)
     if found.mean is not None and found.fluctuation is not None:
         count = f"{found.read:,} {naming.noun}s"
         fields += [(f"mean of {count}", found.mean, "velocity")]
         fields += [(f"fluctuation (standard deviation), {count}", found.fluctuation, "fluctuation")]
     block, described, thinning = bytearray(), [], 1
     for label, vectors, kind in fields:
-        derivatives = _derivatives(vectors) if kind == "velocity" else {}
         step = max(math.ceil(math.sqrt(vectors["u"].size / MOST_IN_FIELD)), 1)
         thinning = max(thinning, step)
-        cut = {"x": slice(None, None, step), "y": slice(None, None, step)}
-        entry: dict[str, Any] = {"label": label, "kind": kind, "values": {}}
-        thin = vectors.isel(cut)
-        for name, values in {**{name: thin[name] for name in "uvw"}, **derivatives}.items():
-            values = values.isel(cut) if name in derivatives else values
-            stored, scale = quantise(values.values)
-            entry["values"][name] = {"offset": len(block), "scale": scale}
-            block += stored.tobytes()
-        entry["valid"] = len(block)
-        block += thin["valid"].values.astype("<i2").tobytes()
-        if "masked" in thin and thin["masked"].values.any():
-            entry["masked"] = len(block)
-            block += thin["masked"].values.astype("<i2").tobytes()
-        entry |= {axis: [round(float(value), 6) for value in thin[axis].values] for axis in "xyz"}
-        described.append(entry)
-    meta = {"fields": described, "colours": {name: colour_stops(map_) for name, map_ in _COLOUR_MAPS.items()}}
+        described.append({"label": label, "kind": kind, **_encode(vectors, kind, step, block)})
+    place = {axis: int(k) // (1 if axis == "z" else thinning) for axis, k in view.place.items()}
+    meta = {
+        "fields": described,
+        "colours": {name: colour_stops(map_) for name, map_ in _COLOUR_MAPS.items()},
+        "quantities": {name: dataclasses.asdict(kind) for name, kind in kinds.items()},
+        "voxel": flow.voxel_velocity(first) * kinds["speed"].factor,
+        "start": dataclasses.asdict(view) | {"place": place},
+    }
     text = json.dumps(meta, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     data = base64.b64encode(gzip.compress(bytes(block), 9, mtime=0)).decode()
     return (
@@ -178,15 +175,39 @@ def embed(found: Survey, naming: Naming = PAIRS) -> tuple[str, int]:
     )
 
 
+def _encode(vectors: xr.Dataset, kind: str, step: int, block: bytearray) -> dict[str, Any]:
+    """Append a field to the block, every `step`-th vector along x and y; return offsets, scales and axes."""
+    cut = {"x": slice(None, None, step), "y": slice(None, None, step)}
+    thin = vectors.isel(cut)
+    values = flow.stored(vectors) if kind == "velocity" else {name: vectors[name] for name in "uvw"}
+    entry: dict[str, Any] = {"values": {}}
+    fine = {name: field.isel(cut).values for name, field in values.items()}
+    curl = [part for name, part in fine.items() if name.startswith("vorticity_")]
+    for name, part in fine.items():
+        stored, scale = quantise(part, largest(*curl) if name.startswith("vorticity_") else largest(part))
+        entry["values"][name] = {"offset": len(block), "scale": scale}
+        block += stored.tobytes()
+    entry["valid"] = len(block)
+    block += thin["valid"].values.astype("<i2").tobytes()
+    if "masked" in thin and thin["masked"].values.any():
+        entry["masked"] = len(block)
+        block += thin["masked"].values.astype("<i2").tobytes()
+    return entry | {axis: [round(float(value), 6) for value in thin[axis].values] for axis in "xyz"}
+
+
 _COLOUR_MAPS = {"signed": "RdBu_r", "positive": "viridis"}
 
 
-def quantise(values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return 16-bit integers and the scale that converts them back to values."""
+def largest(*parts: np.ndarray) -> float:
+    """Return the largest finite magnitude of arrays; 0 without any."""
+    return max(float(np.abs(part[np.isfinite(part)]).max(initial=0.0)) for part in parts)
+
+
+def quantise(values: np.ndarray, top: float) -> tuple[np.ndarray, float]:
+    """Return 16-bit integers for values up to `top` in magnitude, and the scale that converts them back."""
     values = np.asarray(values, float)
     finite = np.isfinite(values)
-    largest = float(np.abs(values[finite]).max(initial=0.0))
-    scale = largest / STEPS if largest > 0 else 1.0
+    scale = top / STEPS if top > 0 else 1.0
     stored = np.full(values.shape, NO_NUMBER, "<i2")
     stored[finite] = np.rint(values[finite] / scale)
     return stored, scale
@@ -196,10 +217,3 @@ def colour_stops(name: str) -> list[str]:
     """Return evenly spaced colours of a matplotlib colour map, as #rrggbb."""
     colours = matplotlib.colormaps[name](np.linspace(0, 1, COLOUR_STOPS))
     return [matplotlib.colors.to_hex(colour) for colour in colours]
-
-
-def _derivatives(vectors: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return the vorticity's magnitude [1/s] and Q [1/s^2]; nothing for fields of fewer than three layers."""
-    if min(vectors.sizes[axis] for axis in "zyx") < 3:
-        return {}
-    return {"vorticity": derived.vorticity(vectors)["vorticity_magnitude"], "q": derived.q_criterion(vectors)}

@@ -7,8 +7,23 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-NONE = "–"
-"""Text in place of an unknown number."""
+from lfpiv.quantities import UNKNOWN as NONE
+from lfpiv.quantities import significant
+
+__all__ = [
+    "NONE",
+    "count",
+    "details",
+    "escape",
+    "facts",
+    "figure",
+    "general",
+    "number",
+    "paragraph",
+    "percent",
+    "significant",
+    "table",
+]
 
 
 def figure(panels: Sequence[str], caption: str, numbers: str = "", *, title: str = "Numbers") -> str:
@@ -45,9 +60,10 @@ def facts(rows: Iterable[tuple[str, str]]) -> str:
     return f'<dl class="facts">{body}</dl>'
 
 
-def details(title: str, content: str) -> str:
-    """Return HTML `content` folded under a line of text."""
-    return f"<details><summary>{html.escape(title)}</summary>{content}</details>"
+def details(title: str, content: str, *, name: str = "") -> str:
+    """Return HTML `content` folded under a line of text, with `name` as its identifier."""
+    mark = f' id="{name}" class="fold"' if name else ""
+    return f"<details{mark}><summary>{html.escape(title)}</summary>{content}</details>"
 
 
 def paragraph(text: str, kind: str = "") -> str:
@@ -64,18 +80,6 @@ def escape(text: str) -> str:
 def number(value: float | None, digits: int) -> str:
     """Format a number with `digits` decimals."""
     return NONE if value is None or not np.isfinite(value) else f"{value:.{digits}f}".replace("-", "−")
-
-
-def significant(value: float | None, digits: int = 3) -> str:
-    """Format a number with `digits` significant digits."""
-    if value is None or not np.isfinite(value):
-        return NONE
-    rounded = float(f"{value:.{digits}g}")
-    if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
-        return np.format_float_positional(rounded, trim="-").replace("-", "−")
-    mantissa, _, power = f"{rounded:.{digits - 1}e}".partition("e")
-    mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
-    return f"{mantissa}e{int(power)}".replace("-", "−")
 
 
 def general(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Write the report's sections of text: the run, its warnings, time and memory, settings and versions."""
+"""Write the report's sections of text: the run, its verdicts and warnings, time and memory, settings and versions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lfpiv.experiment.experiment import CameraSetup, Experiment
-from lfpiv.report import markup
+from lfpiv.quantities import quantity
+from lfpiv.report import markup, verdicts
 from lfpiv.report.markup import number, percent
 from lfpiv.report.summary import DampingFigures, Summary, WeightFigures
 
@@ -15,40 +16,24 @@ WARNINGS_SHOWN, WARNINGS_MOST = 12, 300
 """Warnings shown openly, and shown in total with the folded ones. ``summary.json`` holds all."""
 
 
-def head(experiment: Experiment, summary: Summary) -> str:
-    """Return the title of the page and the main figures of the run."""
-    finished, failed = summary.finished_count, summary.failed_count
-    cards = [(f"{finished:,}", f"{_noun(experiment)}{'' if finished == 1 else 's'} finished")]
-    if failed:
-        cards.append((f"{failed:,}", f"{_noun(experiment)}{'' if failed == 1 else 's'} failed"))
-    if finished:
-        cards.append((percent(summary.valid_fraction), "valid vectors"))
-        uncertainty = [pair.uncertainty_voxel for pair in summary.pairs if pair.uncertainty_voxel is not None]
-        if uncertainty:
-            cards.append((number(float(np.mean(uncertainty)), 2), "voxel, median uncertainty"))
-    cameras = summary.calibration.values()
-    sigma = [camera.sigma_nor_test for camera in cameras if camera.sigma_nor_test is not None]
-    if sigma:
-        cards.append((number(max(sigma), 4), "pitch, error on held-out dots, worst camera"))
-    found, expected = sum(c.dots_found or 0 for c in cameras), sum(c.dots_expected or 0 for c in cameras)
-    if expected:
-        cards.append((f"{found:,} / {expected:,}", "board dots measured"))
-    boxes = "".join(
-        f"<div><dt>{markup.escape(label)}</dt><dd>{markup.escape(value)}</dd></div>" for value, label in cards
-    )
-    return (
-        f"<h1>{markup.escape(experiment.name)}</h1>"
-        + markup.paragraph(
-            f"Multi-camera light-field PIV, {markup.count(len(experiment.cameras), 'camera')}, "
-            f"lfpiv {summary.versions['lfpiv']}",
-            "quiet",
-        )
-        + f'<dl class="cards">{boxes}</dl>'
+def head(experiment: Experiment) -> str:
+    """Return the title of the page, and what was measured in two lines."""
+    nz, ny, nx = experiment.grid.shape
+    voxel = experiment.grid.voxel_mm
+    size = " × ".join(f"{n * voxel:g}" for n in (nx, ny, nz))
+    series = experiment.series
+    apart = "between frames" if series is None else f"between instants{_later(series.step)}"
+    return f'<h1 id="top">{markup.escape(experiment.name)}</h1>' + markup.paragraph(
+        f"Light-field PIV with {markup.count(len(experiment.cameras), 'camera')}, {size} mm (x, y, z), "
+        f"{quantity(experiment.dt_s, 's')} {apart}. One voxel of {voxel:g} mm is "
+        f"{quantity(voxel / 1000 / experiment.dt_s, 'm/s')}.",
+        "quiet",
     )
 
 
-def _noun(experiment: Experiment) -> str:
-    return "image pair" if experiment.series is None else experiment.noun
+def verdict(experiment: Experiment, summary: Summary) -> str:
+    """Return the main figures of the run, each judged."""
+    return verdicts.cards(verdicts.tiles(experiment, summary))
 
 
 def warnings(summary: Summary, noun: str = "pair") -> str:
@@ -75,17 +60,17 @@ def _list(texts: Sequence[str]) -> str:
 def contents(sections: Mapping[str, str], noun: str = "pair") -> str:
     """Return links to the sections that are not empty."""
     names = {
-        "run": "What was run",
-        "calibration": "Calibration",
-        "background": "Light that stands still",
+        "vectors": "Flow",
         "volumes": "Volumes",
-        "vectors": "Vectors",
-        "pairs": f"All {noun}s",
-        "time": "Time and memory",
+        "pairs": f"{noun.capitalize()}s",
+        "run": "Run",
+        "calibration": "Calibration",
+        "background": "Light",
+        "time": "Time",
         "settings": "Settings",
     }
     links = "".join(f'<a href="#{key}">{name}</a>' for key, name in names.items() if sections[key])
-    return f'<nav aria-label="Sections">{links}</nav>'
+    return f'<nav aria-label="Sections">{links}<a class="up" href="#top">↑ Top</a></nav>'
 
 
 def run_facts(experiment: Experiment, summary: Summary) -> str:
@@ -119,18 +104,22 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         ("Weights", _weights(summary.weights)),
         ("Cameras against each other", _agreement(summary.weights, experiment.noun)),
         ("Damping by ghosts", _damping(summary.damping)),
-        ("Computed on", f"{summary.device.kind}, {summary.device.threads} threads"),
+        ("Computed on", f"{summary.device.kind}, {markup.count(summary.device.threads, 'thread')}"),
     ]
     return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
 
 
 def _interval(experiment: Experiment) -> tuple[str, str]:
     """State the time between the two frames of a vector field and the velocity of one voxel."""
-    series, speed = experiment.series, f"1 voxel is {experiment.grid.voxel_mm / 1000 / experiment.dt_s:g} m/s"
+    series, interval = experiment.series, quantity(experiment.dt_s, "s", 6)
+    speed = f"1 voxel is {quantity(experiment.grid.voxel_mm / 1000 / experiment.dt_s, 'm/s')}"
     if series is None:
-        return "Time between frames", f"{experiment.dt_s:g} s: {speed}"
-    later = "" if series.step == 1 else f", from each to the one {series.step} later"
-    return "Time between instants", f"{experiment.dt_s:g} s{later}: {speed}"
+        return "Time between frames", f"{interval}: {speed}"
+    return "Time between instants", f"{interval}{_later(series.step)}: {speed}"
+
+
+def _later(step: int) -> str:
+    return "" if step == 1 else f", from each to the one {step} later"
 
 
 def _recorded(experiment: Experiment, finished: int) -> tuple[str, str]:
@@ -176,7 +165,7 @@ def _weights(weights: WeightFigures) -> str:
     """State the method and memory of the weights and their difference from counted rays."""
     if not weights.method:
         return ""
-    text = f"{weights.method}, {weights.memory_mib:.0f} MiB"
+    text = f"{weights.method}, {quantity(weights.memory_mib, 'MiB')}"
     forms = sorted(set(weights.form.values()))
     text += f", stored as {' and '.join(forms)}" if forms else ""
     errors = weights.count_check_l2
@@ -243,15 +232,15 @@ def timings(summary: Summary, noun: str = "pair") -> str:
         "bootstrap": "damping by ghosts",
         "total": "this run, until the report",
     }
-    rows = [[text, number(summary.timings_s.get(key), 1)] for key, text in names.items()]
+    rows = [[text, quantity(summary.timings_s.get(key), "s")] for key, text in names.items()]
     reused = ""
     if summary.reused:
         named = ", ".join(summary.reused[:WARNINGS_SHOWN])
         left = len(summary.reused) - WARNINGS_SHOWN
         more = f" and {left:,} more" if left > 0 else ""
         reused = markup.paragraph(f"Reused from an earlier run: {named}{more}.", "quiet")
-    memory = markup.paragraph(f"Peak memory: {number(summary.peak_memory_mib, 0)} MiB.")
-    table = markup.table(["stage", "time [s]"], rows, caption="Time of each stage")
+    memory = markup.paragraph(f"Peak memory: {quantity(summary.peak_memory_mib, 'MiB')}.")
+    table = markup.table(["stage", "time"], rows, caption="Time of each stage")
     return f'<h2 id="time">Time and memory</h2>{table}{memory}{reused}'
 
 

@@ -9,6 +9,7 @@ from typing import SupportsFloat
 
 import numpy as np
 
+from lfpiv.quantities import Scale, scale_of, significant
 from lfpiv.report import markup
 from lfpiv.report.fields import evenly
 from lfpiv.report.markup import number, percent
@@ -102,12 +103,13 @@ def section(
         f'<h2 id="pairs">All {noun}s</h2>',
         markup.paragraph(_overview(pairs, failed, finished or len(pairs), noun)),
     ]
-    table = _table(groups, single, noun)
+    table, tracked = _table(groups, single, noun), particle_table(pairs, noun)
     if len(pairs) == 1:
-        return "\n".join([*parts, table])
+        return "\n".join([*parts, table, tracked])
     shown = [_line(groups, ("valid",), "valid vectors [%]", failed, noun, factor=100.0, bottom=0)]
     shown.append(_line(groups, ("uncertainty",), "median uncertainty [voxel]", failed, noun, bottom=0))
-    shown.append(_line(groups, ("u", "v", "w"), "mean velocity [m/s]", failed, noun))
+    scale = _velocity_scale(groups)
+    shown.append(_line(groups, ("u", "v", "w"), f"mean velocity [{scale.unit}]", failed, noun, factor=scale.factor))
     caption = f"Each {noun}'s figures over its valid vectors."
     if not single:
         caption = (
@@ -117,7 +119,7 @@ def section(
     if failed:
         caption += f" Marks on the lower edge: failed {noun}s."
     parts.append(markup.figure(shown, caption, table + (_worst(pairs, noun) if not single else "")))
-    return "\n".join(parts)
+    return "\n".join([*parts, tracked])
 
 
 def _overview(pairs: Sequence[PairFigures], failed: Sequence[int], finished: int, noun: str) -> str:
@@ -156,7 +158,7 @@ def _line(
         name = key if len(keys) > 1 else None
         axes.plot(middle, factor * groups.mean[key], "o-" if few else "-", color=SERIES[k], lw=1.3, ms=3, label=name)
     if bottom is not None:
-        axes.set_ylim(bottom, 1.05 * axes.get_ylim()[1] if factor == 1 else 102)
+        axes.set_ylim(bottom, 1.05 * axes.get_ylim()[1] if keys != ("valid",) else 102)
     if failed:
         from_below = axes.get_xaxis_transform()
         marked = evenly(failed, MOST_ROWS)
@@ -173,7 +175,8 @@ def _empty(groups: Groups, key: str) -> bool:
 
 
 def _table(groups: Groups, single: bool, noun: str) -> str:
-    titles = [noun, "valid", "u [m/s]", "v [m/s]", "w [m/s]", "uncertainty [voxel]", "peak ratio"]
+    scale = _velocity_scale(groups)
+    titles = [noun, "valid", *(f"{name} [{scale.unit}]" for name in "uvw"), "uncertainty [voxel]", "peak ratio"]
     rows = []
     for k in range(len(groups.pairs)):
         first, last = groups.first[k], groups.last[k]
@@ -181,11 +184,52 @@ def _table(groups: Groups, single: bool, noun: str) -> str:
         valid = percent(groups.mean["valid"][k], 1)
         if not single:
             valid += f" (lowest {percent(groups.low['valid'][k], 1)})"
-        spread = [f"{number(groups.mean[c][k], 4)} ± {number(groups.mean[f'sd_{c}'][k], 4)}" for c in "uvw"]
+        spread = [_spread(scale.factor * groups.mean[c][k], scale.factor * groups.mean[f"sd_{c}"][k]) for c in "uvw"]
         ratio = number(groups.mean["peak_ratio"][k], 2)
         rows.append([name, valid, *spread, number(groups.mean["uncertainty"][k], 3), ratio])
     caption = "Mean ± standard deviation over the valid vectors, medians of uncertainty and peak ratio"
     return markup.table(titles, rows, caption=caption) + markup.paragraph(f"{caption}.", "quiet")
+
+
+def particle_table(pairs: Sequence[PairFigures], noun: str) -> str:
+    """Tabulate the tracked particles, of many pairs those of an even choice; nothing without tracking."""
+    tracked = [pair.number for pair in pairs if pair.particles is not None]
+    chosen = set(evenly(tracked, WORST))
+    rows = [
+        [
+            str(pair.number),
+            " and ".join(f"{count:,}" for count in found.found),
+            f"{found.linked:,}",
+            f"{found.valid_links:,}",
+            number(float(np.mean(found.per_microlens)), 3),
+            number(float(np.mean(found.sigma_voxel)), 2),
+        ]
+        for pair in pairs
+        if pair.number in chosen and (found := pair.particles) is not None
+    ]
+    if not rows:
+        return ""
+    titles = [noun, "found", "linked", "valid", "per microlens", "size, σ [voxel]"]
+    text = "Particles found in each frame, and those followed from one to the next. The folder particles has them."
+    return (
+        "<h3>Tracked particles</h3>"
+        + markup.paragraph(text)
+        + markup.table(titles, rows, caption=f"Tracked particles by {noun}")
+    )
+
+
+def _velocity_scale(groups: Groups) -> Scale:
+    """Return the unit in which the velocities of all groups are handy numbers."""
+    parts = [np.abs(groups.mean[name]) + groups.mean[f"sd_{name}"] for name in "uvw"]
+    return scale_of(_known(np.max, np.concatenate(parts)), "m/s")
+
+
+def _spread(mean: float, sd: float) -> str:
+    """Write a mean and a standard deviation, with as many decimals as show two digits of the latter."""
+    if not (np.isfinite(sd) and sd > 0):
+        return f"{significant(mean)} ± {significant(sd)}"
+    decimals = int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))
+    return f"{number(mean, decimals)} ± {number(sd, decimals)}"
 
 
 def _worst(pairs: Sequence[PairFigures], noun: str) -> str:

@@ -74,6 +74,19 @@ class MotionFigures(_Figures):
     followed: bool = False
 
 
+class ParticleFigures(_Figures):
+    """Figures of the tracked particles of a pair."""
+
+    found: tuple[int, ...]
+    """Number of particles of each frame."""
+    linked: int
+    valid_links: int
+    per_microlens: tuple[float, ...]
+    """Particles per microlens of each frame."""
+    sigma_voxel: tuple[float, ...]
+    """Standard deviation of their Gaussian shape [voxel] of each frame."""
+
+
 class PairFigures(_Figures):
     """Figures of a finished pair.
 
@@ -93,6 +106,8 @@ class PairFigures(_Figures):
     structure: dict[str, dict[str, float]] = {}
     camera_gain: dict[str, dict[str, float]] = {}
     light_outside: dict[str, dict[str, float]] = {}
+    particles: ParticleFigures | None = None
+    """None without tracking."""
 
 
 class Failure(_Figures):

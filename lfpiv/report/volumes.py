@@ -182,7 +182,7 @@ def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
         axes.plot(iteration, np.median(every, axis=0), color=SERIES[0], lw=1.4, label=f"median of {len(histories):,}")
         columns = {"median": np.median(every, axis=0), f"{BAND[0]} %": low, f"{BAND[1]} %": high}
     axes.set(ylim=(0, None))
-    style(axes, title="residual", xlabel="iteration", ylabel="||image − projection|| / ||image||", legend=True)
+    style(axes, title="residual", xlabel="iteration", ylabel="unexplained share", legend=True)
     spread_ticks(axes)
     ends = every[:, -1]
     svg = to_svg(

@@ -24,6 +24,7 @@ from lfpiv.reconstruction.result import SmartStop
 from lfpiv.records import RecordError, digest, read_object, read_text, validate
 from lfpiv.results import particles
 from lfpiv.results.folder import Folder
+from lfpiv.results.limits import LARGE_RESIDUAL
 from lfpiv.results.stored_damping import StoredDamping
 from lfpiv.runs import guard, refinement
 from lfpiv.runs.guard import Guard
@@ -48,9 +49,6 @@ CORRECTION_RAYS = 4000
 
 MOST_LISTED = 10_000
 """Largest number of pairs with an entry in the summary, and that a warning names. ``pairs.jsonl`` lists more."""
-
-LARGE_RESIDUAL = 0.75
-"""Residual of a volume above which its vectors are doubtful. Clear images have 0.3 to 0.5, dim ones up to 0.6."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import report_run
 
-from lfpiv.report import markup
+from lfpiv.report import flow, markup
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -149,7 +149,7 @@ def test_the_slider_moves_through_all_depths(tab):
     for k, depth in enumerate(truth["z"].values):
         slab = truth.isel(z=k)
         good = slab["valid"].values
-        means = [markup.significant(float(slab[name].values[good].mean())) for name in "uvw"]
+        means = [markup.significant(1000 * float(slab[name].values[good].mean())) for name in "uvw"]  # mm/s
         place = f"z = {markup.number(depth, 3)} mm"
         assert tab.of("slice-place") == place
         assert tab.of("slice-reading").startswith(
@@ -187,11 +187,92 @@ def test_a_vector_can_be_read_by_keys(tab):
     speed = float(np.sqrt(sum(float(vector[name]) ** 2 for name in "uvw")))
     said = tab.of("slice-reading")
     where = ", ".join(markup.number(float(vector[axis]), 3) for axis in "xyz")
-    assert said.startswith(f"(x, y, z) = ({where}) mm: u {markup.significant(float(vector['u']))} m/s")
-    assert f"speed {markup.significant(speed)} m/s, vorticity {markup.significant(2 * report_run.OMEGA)} 1/s" in said
+    assert said.startswith(f"(x, y, z) = ({where}) mm: u {markup.significant(1000 * float(vector['u']))} mm/s")
+    assert f"speed {markup.significant(1000 * speed)} mm/s, vorticity {2 * report_run.OMEGA:g} 1/s, " in said
+    assert f"vorticity x 0 1/s, vorticity y 0 1/s, vorticity z {2 * report_run.OMEGA:g} 1/s" in said
+    assert f"uncertainty {'0.1' if bool(vector['valid']) else '–'} voxel" in said
     assert said.endswith("; valid." if bool(vector["valid"]) else "; replaced after validation.")
     tab.js("document.getElementById('slice-slider').focus()")
     assert tab.of("slice-reading").startswith("z = ")
+
+
+PICTURE = "return document.getElementById('slice-canvas').toDataURL()"
+
+
+def test_the_slices_open_at_the_best_view_and_show_what_is_chosen(tab):
+    tab.open()
+    tab.wait("document.getElementById('slices').classList.contains('ready')")
+    view = flow.best_view(report_run.field(0))
+    value = "return document.getElementById(arguments[0]).value"
+    chosen = {name: tab.js(value, f"slice-{name}") for name in ("axis", "colour", "along", "slider")}
+    place = str(view.place[view.normal])
+    assert chosen == {"axis": view.normal, "colour": view.quantity, "along": view.along, "slider": place}
+    pictures = {tab.js(PICTURE)}
+    for name, label in (("overlay", "streamlines"), ("overlay", "nothing"), ("colour", "vorticity z"), ("axis", "x")):
+        tab.choose(f"slice-{name}", label)
+        pictures.add(tab.js(PICTURE))
+    tab.choose("slice-colour", "speed")
+    smooth = tab.js(PICTURE)
+    tab.js("document.getElementById('slice-smooth').click()")
+    assert len(pictures) == 5 and tab.js(PICTURE) != smooth and not tab.errors()
+
+
+def test_a_click_puts_the_profile_through_a_vector(tab):
+    tab.open()
+    tab.wait("document.getElementById('slices').classList.contains('ready')")
+    truth, profile = report_run.field(0), "return document.getElementById('profile-canvas').toDataURL()"
+    before = tab.js(profile)
+    tab.js(
+        """const frame = document.getElementById('slice-canvas').getBoundingClientRect();
+        const [x, y] = slices.centre(slices.box, 1, 4);
+        const where = { clientX: frame.left + x, clientY: frame.top + y, bubbles: true };
+        document.getElementById('slice-canvas').dispatchEvent(new MouseEvent('click', where));"""
+    )
+    middle = truth.sizes["z"] // 2
+    y, z = markup.number(float(truth["y"][4]), 3), markup.number(float(truth["z"][middle]), 3)
+    assert tab.of("profile-reading").startswith(f"u, v, w along x at y = {y} mm, z = {z} mm; bands are ± 2")
+    assert tab.js(profile) != before
+    points = tab.js("return slices.profile.values(slices.field, slices.place, 'x')")
+    line = truth.isel(y=4, z=middle)
+    for k, name in enumerate("uvw"):
+        found = [point["velocity"][k] for point in points]
+        np.testing.assert_allclose(found, 1000 * line[name].values, rtol=1e-3, atol=2e-3)
+    error = 2 * 0.1 * 1000 * flow.voxel_velocity(truth)  # two standard deviations of 0.1 voxel, in mm/s
+    assert [point["error"] for point in points if point["valid"]] == pytest.approx([error] * int(line["valid"].sum()))
+    tab.choose("slice-along", "y")
+    x = markup.number(float(truth["x"][1]), 3)
+    assert tab.of("profile-reading").startswith(f"u, v, w along y at x = {x} mm, z = {z} mm")
+    assert not tab.errors()
+
+
+def test_streamlines_of_a_rotation_are_circles(tab):
+    tab.open()
+    tab.wait("document.getElementById('slices').classList.contains('ready')")
+    found = tab.js(
+        """const sample = ([x, y]) => (Math.hypot(x - 10, y - 10) < 9 ? [10 - y, x - 10] : null);
+        return streamlines(sample, [21, 21], 2, 9, 100);"""
+    )
+    radii = [np.hypot(*(np.array(places) - 10).T) for places in found]
+    assert len(found) > 4 and max(np.ptp(radius) for radius in radii) < 0.02  # of the midpoint rule
+    assert all(len(places) > 20 for places in found)
+
+
+def test_the_contents_stay_in_view_and_lead_back(tab):
+    tab.open(PHONE)
+    tab.wait("document.getElementById('slices').classList.contains('ready')")
+    tab.js(
+        "document.documentElement.style.scrollBehavior = 'auto'; document.querySelector('nav a[href=\"#run\"]').click()"
+    )
+    tab.wait("window.scrollY > 500")
+    nav, head = "document.querySelector('nav').getBoundingClientRect()", "document.getElementById('run')"
+    assert tab.js(f"return {nav}.top") == 0
+    assert tab.js(f"return {head}.getBoundingClientRect().top >= {nav}.bottom")
+    tab.wait("document.querySelector('nav a[aria-current]')?.hash === '#run'")
+    assert not tab.js("return document.querySelector('#calibration-fold svg').checkVisibility()")
+    tab.js("document.querySelector('nav a[href=\"#calibration\"]').click()")
+    tab.wait("document.getElementById('calibration-fold').open")
+    tab.js("document.querySelector('nav .up').click()")
+    tab.wait("window.scrollY === 0")
 
 
 def test_numbers_read_as_in_the_tables(tab):
@@ -249,6 +330,9 @@ def test_the_view_in_space_draws_turns_and_fits_every_page(tab):
     for label in ("pair 2", "fluctuation", "mean of"):
         tab.choose("space-field", label)
     tab.choose("space-quantity", "none")
+    tab.choose("space-field", "pair 0")
+    tab.js("document.getElementById('space-lines').click()")
+    tab.wait("document.getElementById('space-scene').data.some((trace) => trace.name === 'streamlines')")
     time.sleep(0.5)  # drawing goes on after the event
     assert not tab.errors()
 
@@ -285,8 +369,9 @@ def test_every_control_is_reached_by_the_tab_key_and_shows_it(tab):
     open_for_keys(tab)
     controls = tab.js(CONTROLS)
     named = [
-        *("slice-field", "slice-colour", "slice-axis", "slice-slider", "slice-canvas"),
-        *("space-field", "space-quantity", "space-level", "space-arrows", "space-scene"),
+        *("slice-field", "slice-colour", "slice-axis", "slice-overlay", "slice-along", "slice-smooth"),
+        *("slice-slider", "slice-canvas"),
+        *("space-field", "space-quantity", "space-level", "space-arrows", "space-lines", "space-scene"),
     ]
     assert [name for name in controls if name in named] == named and {"A", "SUMMARY"} <= set(controls)
     focused = walk(tab)

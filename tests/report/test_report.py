@@ -16,8 +16,9 @@ from scipy import ndimage
 from support import report_run
 
 import lfpiv
+from lfpiv import quantities
 from lfpiv.experiment.settings import Series
-from lfpiv.report import calibration, markup, overview, vectors, volumes
+from lfpiv.report import calibration, flow, markup, overview, slice_panels, vectors, verdicts, volumes
 from lfpiv.report import pairs as pairs_section
 from lfpiv.report.dot_map import dot_map
 from lfpiv.report.fields import (
@@ -34,12 +35,15 @@ from lfpiv.report.fields import (
 from lfpiv.report.lens_map import lens_map
 from lfpiv.report.light_sheet import find_sheet
 from lfpiv.report.pairs import MOST_ROWS, group
+from lfpiv.report.slice_panels import slice_panel
 from lfpiv.report.summary import CameraFigures, Summary
+from lfpiv.report.svg import cell_edges
+from lfpiv.report.verdicts import Level
 from lfpiv.results import netcdf
 
-PLOTLY_BYTES, PAGE_BYTES, CAMERA_BYTES, VECTOR_BYTES = 2.4e6, 1.5e6, 0.7e6, 24
+PLOTLY_BYTES, PAGE_BYTES, CAMERA_BYTES, VECTOR_BYTES = 2.4e6, 1.5e6, 0.7e6, 32
 """Largest size of a report: plotly.js packed (1.9 MB in version 7), pictures and tables, pictures of each camera, and
-what one vector takes: six values of two bytes in base64, hardly smaller when packed, and half as much again."""
+what one vector takes: nine values of two bytes in base64, hardly smaller when packed, and a third as much again."""
 
 RMS_AGREEMENT = 0.15
 """Two estimates of the rms distance from the lattice over some hundred microimages, relative: 1/sqrt(2 n) each, and
@@ -117,8 +121,8 @@ def test_the_page_is_well_formed_and_whole(text):
     for _, attributes in page.elements:
         for key in ("src", "href"):
             assert re.match("data:|#", attributes.get(key, "#")), "the page refers to something outside itself"
-    # board; cameras; volumes; slices, space, histograms; pairs
-    assert len(page.all("svg")) == 1 + 2 * 9 + 3 + 2 + 6 + 1 + 3 + 3
+    # board; cameras; volumes; best slice, profile, depths, space, streams, vorticity, uncertainty, histograms; pairs
+    assert len(page.all("svg")) == 1 + 2 * 9 + 3 + 2 + 1 + 1 + 5 + 1 + 3 + 3 + 3 + 3 + 3
     assert "figure" not in page.open and len(page.all("figure")) == len(page.all("figcaption"))
 
 
@@ -153,7 +157,7 @@ def test_a_series_is_reported_by_instant(reported, tmp_path):
     assert not re.findall(r".{30}\b[Pp]airs?\b.{20}|.{30}\bframe [ab]\b", shown)
     assert "All instants" in page.text["h2"] and "Instant 7 failed" in text
     assert "instants 0 to 4; vectors of 3 of the 3 that have a partner 2 instants later" in text
-    assert "0.001 s, from each to the one 2 later" in text
+    assert "1 ms, from each to the one 2 later" in text
     listed = json.loads(re.search(r'id="field-list">([^<]*)</script>', text)[1])
     labels = [entry["label"] for entry in listed["fields"]]
     assert labels[0] == "instant 0" and labels[3] == "mean of 3 instants"
@@ -172,15 +176,17 @@ def test_fields_are_stored_to_a_65000th_of_their_range(text):
             *truth["valid"].values.ravel()
         ]
         expected = {name: truth[name].values for name in "uvw"}
-        expected["vorticity"] = np.full(truth["u"].shape, 2 * report_run.OMEGA * (1 + 0.1 * number))
+        expected["vorticity_z"] = np.full(truth["u"].shape, 2 * report_run.OMEGA * (1 + 0.1 * number))
+        expected |= {} if number == report_run.PAIRS - 1 else {"uncertainty": truth["uncertainty"].values}  # none valid
         for name, values in expected.items():
             stored = np.frombuffer(block, "<i2", values.size, entry["values"][name]["offset"])
             scale = entry["values"][name]["scale"]
-            assert (stored != NO_NUMBER).all()
+            known, largest = np.isfinite(values.ravel()), np.nanmax(np.abs(values))
+            assert ((stored != NO_NUMBER) == known).all()
             np.testing.assert_allclose(
-                stored * scale, values.ravel(), atol=0.51 * scale + 1e-6 * np.abs(values).max()
+                stored[known] * scale, values.ravel()[known], atol=0.51 * scale + 1e-6 * largest
             )  # half a step, and float32
-            assert scale * 65_000 < 2 * np.abs(values).max()
+            assert scale * 65_000 < 2 * largest
 
 
 def test_mean_and_fluctuation_are_those_of_the_valid_vectors(reported):
@@ -222,7 +228,8 @@ def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, mon
             [
                 overview.warnings(summary),
                 overview.timings(summary),
-                overview.head(reported.experiment, summary),
+                overview.head(reported.experiment),
+                overview.verdict(reported.experiment, summary),
                 vectors.section(paths),
                 volumes.section(summary.pairs, paths),
                 pairs_section.section(summary.pairs, summary.failed),
@@ -240,7 +247,7 @@ def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, mon
 
 def test_large_fields_are_thinned_out():
     large = report_run.field(0, (40, 120, 110))
-    html_text, step = embed(Survey(shown={0: large}, mean=None, fluctuation=None, read=1))
+    html_text, step = embed(Survey(shown={0: large}, mean=None, fluctuation=None, read=1), flow.best_view(large))
     (entry,) = json.loads(re.search(r'id="field-list">([^<]*)</script>', html_text)[1])["fields"]
     kept = len(entry["x"]) * len(entry["y"]) * len(entry["z"])
     assert len(entry["z"]) == 40 and step == math.ceil(math.sqrt(large["u"].size / MOST_IN_FIELD))
@@ -288,24 +295,152 @@ def test_a_dot_in_the_wrong_place_shows_where_it_is(reported):
     np.testing.assert_array_equal(after.position_mm[7], camera.dots.points_mm[camera.dots.dot == victim][0])
 
 
-def test_arrows_have_the_scale_that_is_stated(monkeypatch):
+def slice_of(field, quantity="w", normal="z", place=0, overlay="arrows"):
+    kinds = flow.describe(field)
+    return slice_panel(flow.shown(field, kinds), kinds, normal, place, quantity, overlay)
+
+
+def test_arrows_have_the_scale_that_is_stated_and_stay_inside(monkeypatch):
     """The longest arrow drawn is as long as the scale in the title says of its speed; a field at rest has no scale."""
     paths, titles = [], []
-    draw, style = vectors.arrows, vectors.style
-    monkeypatch.setattr(vectors, "arrows", lambda *parts: paths.append(draw(*parts)) or paths[-1])
-    monkeypatch.setattr(vectors, "style", lambda axes, **names: titles.append(names["title"]) or style(axes, **names))
+    draw, style = slice_panels.arrows, slice_panels.style
+    monkeypatch.setattr(slice_panels, "arrows", lambda *parts: paths.append(draw(*parts)) or paths[-1])
+    monkeypatch.setattr(slice_panels, "style", lambda axes, **kw: titles.append(kw["title"]) or style(axes, **kw))
     moving = report_run.field(0)
     moving["valid"][:] = True
-    assert len(vectors.slices(moving)) == 5
-    length, speed = map(float, re.search(r"an arrow of (\S+) mm is (\S+) m/s", titles[0]).groups())
+    slice_of(moving)
+    length, speed = map(float, re.search(r"an arrow of (\S+) mm is (\S+) mm/s", titles[0]).groups())
     shafts = paths[0].vertices.reshape(-1, 5, 2)
     longest = np.linalg.norm(shafts[:, 1] - shafts[:, 0], axis=1).max()
-    fastest = float(np.hypot(moving["u"], moving["v"]).max())
+    fastest = float(np.hypot(moving["u"], moving["v"]).max()) * 1000
     assert longest / fastest == pytest.approx(length / speed, rel=0.05)  # the title rounds to two digits
+    centres = np.stack(np.meshgrid(moving["x"], moving["y"]), axis=-1).reshape(-1, 2)
+    np.testing.assert_allclose((shafts[:, 0] + shafts[:, 1]) / 2, centres, atol=1e-9)
+    for k, axis in enumerate("xy"):
+        low, high = cell_edges(moving[axis].values)
+        assert low <= shafts[..., k].min() and shafts[..., k].max() <= high
     still = moving.assign({name: 0 * moving[name] for name in "uvw"})
     titles.clear()
-    assert vectors.slices(still, most=1) and "m/s" not in titles[0]
-    assert [vectors.round_below(value) for value in (0.0, 0.0199, 1.0, 7e3, np.nan)] == [0, 0.01, 1, 5000, 0]
+    assert slice_of(still) and "m/s" not in titles[0]
+    assert [slice_panels.round_below(value) for value in (0.0, 0.0199, 1.0, 7e3, np.nan)] == [0, 0.01, 1, 5000, 0]
+
+
+def vortex(normal, noise=0.0, seed=0, shape=(9, 11, 13)):
+    """Return a vortex along an axis, off the middle, with random errors [m/s] and their stated uncertainty."""
+    field = report_run.field(0, shape)
+    across, up = flow.IN_SLICE[normal]
+    places = np.meshgrid(*(field[axis].values for axis in "zyx"), indexing="ij")
+    z, y, x = (part - 0.2 for part in places)
+    from_axis = {"x": x, "y": y, "z": z}
+    speed = np.exp(-(from_axis[across] ** 2 + from_axis[up] ** 2 + (from_axis[normal] / 2) ** 2) / 0.2)
+    parts = {name: np.zeros(shape) for name in "uvw"}
+    parts[flow.COMPONENTS[across]] = -0.1 * from_axis[up] * speed
+    parts[flow.COMPONENTS[up]] = 0.1 * from_axis[across] * speed
+    rng = np.random.default_rng(seed)
+    for name, part in parts.items():
+        field[name] = field[name].dims, part + noise * rng.standard_normal(shape)
+    field["uncertainty"] = field["u"].dims, np.full(shape, max(noise, 1e-6) / flow.voxel_velocity(field))
+    return field.assign(valid=field["valid"] | True)
+
+
+@pytest.mark.parametrize("normal", ["x", "y", "z"])
+def test_the_best_slice_goes_through_the_vortex_across_its_axis(normal):
+    field = vortex(normal, noise=0.002)
+    view = flow.best_view(field)
+    assert (view.normal, view.quantity) == (normal, f"vorticity_{normal}")
+    assert {axis: field[axis].values[place] for axis, place in view.place.items()} == pytest.approx(
+        dict.fromkeys("xyz", 0.2), abs=0.21
+    )
+    assert view.along in flow.IN_SLICE[normal]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_is_not_shown_as_vorticity(seed):
+    field = vortex("z", seed=seed)
+    rng = np.random.default_rng(seed)
+    for name, mean in zip("uvw", (0.02, 0.01, 0.0), strict=True):
+        field[name] = field[name].dims, mean + 0.002 * rng.standard_normal(field[name].shape)
+    field["uncertainty"] = field["u"].dims, np.full(field["u"].shape, 0.002 / flow.voxel_velocity(field))
+    view = flow.best_view(field)
+    assert (view.normal, view.quantity) == ("z", "speed")
+
+
+def test_thin_fields_and_fields_without_valid_vectors_are_shown_by_speed():
+    thin = report_run.field(0, (2, 6, 7))
+    assert flow.best_view(thin).quantity == "speed" and "vorticity" not in flow.describe(thin)
+    nothing = report_run.field(report_run.PAIRS - 1)
+    assert flow.best_view(nothing).quantity == "speed"
+    for field in (thin, nothing):
+        for overlay in ("arrows", "streamlines", "none"):
+            assert "<svg" in slice_of(field, "speed", overlay=overlay)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (5e-05, "s", "50 µs"),
+        (9.999e-4, "s", "1 ms"),
+        (120.0, "s", "120 s"),
+        (0.02, "m/s", "20 mm/s"),
+        (0.5, "m/s", "0.5 m/s"),
+        (-2e-5, "m/s", "−20 µm/s"),
+        (2430.0, "1/s", "2430 1/s"),
+        (1.88e6, "1/s²", "1.88 1/ms²"),
+        (5939.2, "MiB", "5.8 GiB"),
+        (0.0, "s", "0 s"),
+        (None, "s", "–"),
+        (math.nan, "m/s", "–"),
+    ],
+)
+def test_quantities_in_the_units_of_people(value, unit, text):
+    assert quantities.quantity(value, unit) == text
+
+
+def tiles_of(run, **changed):
+    found = verdicts.tiles(run.experiment, figures(run.summary | changed))
+    return {tile.label.split(":")[0]: tile for tile in found}
+
+
+def test_tiles_judge_the_figures_of_the_run(reported):
+    good = tiles_of(reported, failed=[], valid_fraction=verdicts.GOOD_SHARE)
+    assert good["pairs finished"].level is good["valid vectors"].level is Level.GOOD
+    assert tiles_of(reported)["pairs finished"].level is Level.LOOK  # three finished, one failed
+    levels = [tiles_of(reported, valid_fraction=share)["valid vectors"].level for share in (0.79, 0.31, 0.29, None)]
+    assert levels == [Level.LOOK, Level.LOOK, Level.BAD, Level.BAD]
+    uncertainty = good["median uncertainty"]
+    assert (uncertainty.value, uncertainty.level) == ("0.10 voxel", Level.GOOD)
+    assert uncertainty.label == "median uncertainty: 10 mm/s"  # a tenth of 0.1 mm in 1 ms
+    pairs = [pair | {"residual": {"a": [0.9, 0.7]}} for pair in reported.summary["pairs"]]
+    residual = tiles_of(reported, pairs=pairs)["of the images unexplained, worst volume"]
+    assert (residual.value, residual.level) == ("70 %", Level.LOOK)
+    assert all(tile.limits.startswith("good: ") and "; bad: " in tile.limits for tile in good.values())
+
+
+def test_the_flow_comes_before_volumes_and_calibration_is_folded(text):
+    places = [text.index(f'<h2 id="{name}"') for name in ("warnings", "vectors", "volumes", "pairs", "calibration")]
+    assert places == sorted(places) and text.index('class="cards"') < places[1]
+    assert text.index('id="calibration-fold"') < text.index("Microlens array of left")
+    assert "<details open" not in text and 'href="#top"' in text and "1e-0" not in Page(text).text["p"]
+
+
+def test_damping_is_tabulated(reported):
+    axis = {"slope": 0.87, "slope_error": 0.01, "offset": 0.0, "offset_error": 0.02, "applied": True}
+    damping = {"axes": {"x": axis, "z": axis | {"applied": False}}, "simulated": 16}
+    text = vectors.damping_table(figures(reported.summary | {"damping": damping}).damping)
+    assert "Damping by ghosts" in text and text.count("0.870 ± 0.010") == 2
+    assert "taken off" in text and "not significant" in text
+    assert vectors.damping_table(None) == ""
+
+
+def test_tracked_particles_are_tabulated(reported):
+    tracked = {"found": [1115, 116], "linked": 102, "valid_links": 99, "per_microlens": [0.04, 0.06]}
+    tracked |= {"sigma_voxel": [0.2, 0.3]}
+    pairs = [pair | {"particles": tracked} for pair in reported.summary["pairs"][:2]]
+    table = pairs_section.particle_table(figures(reported.summary | {"pairs": pairs}).pairs, "pair")
+    rows = re.findall(r"<tr>(.*?)</tr>", table)
+    cells = [re.findall(r">([^<]+)<", row) for row in rows]
+    assert cells[1:] == [[str(pair), "1,115 and 116", "102", "99", "0.050", "0.25"] for pair in (0, 1)]
+    assert pairs_section.particle_table(figures(reported.summary).pairs, "pair") == ""
 
 
 def test_the_brightness_outside_the_light_sheet_tells_the_level_of_ghosts(reported, text):

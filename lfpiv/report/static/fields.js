@@ -3,14 +3,12 @@
 
 /** Stored integer that means not-a-number. */
 const NO_NUMBER = -32768;
-const QUANTITIES = {
-  u: { label: "u", unit: "m/s", signed: true },
-  v: { label: "v", unit: "m/s", signed: true },
-  w: { label: "w", unit: "m/s", signed: true },
-  speed: { label: "speed", unit: "m/s", signed: false },
-  vorticity: { label: "vorticity", unit: "1/s", signed: false },
-  q: { label: "Q", unit: "1/s²", signed: true },
-};
+/** How each quantity is written, from the page: label, unit, factor from SI, and whether it is signed. */
+let QUANTITIES = {};
+/** Velocity of one voxel, in the unit of the velocities. */
+let VOXEL = 0;
+/** Quantities that follow from stored ones: their parts. */
+const MAGNITUDES = { speed: ["u", "v", "w"], vorticity: ["vorticity_x", "vorticity_y", "vorticity_z"] };
 /** Velocity component along each axis. */
 const COMPONENT = { x: "u", y: "v", z: "w" };
 /** Axes in the order of the stored values. */
@@ -42,14 +40,15 @@ class Field {
 
   /** Return the names of the quantities that the field has. */
   quantities() {
-    return Object.keys(QUANTITIES).filter((name) => name === "speed" || name in this.entry.values);
+    const known = (name) => name in this.entry.values;
+    return Object.keys(QUANTITIES).filter((name) => (MAGNITUDES[name] || [name]).every(known));
   }
 
   /** Return the label of a quantity with its unit. */
   title(name) {
     const { label, unit } = QUANTITIES[name];
     if (this.isVector) return `${label} [${unit}]`;
-    return name === "speed" ? "all components [m/s]" : `${label}′ [m/s]`;
+    return name === "speed" ? `all components [${unit}]` : `${label}′ [${unit}]`;
   }
 
   isSigned(name) {
@@ -58,19 +57,27 @@ class Field {
 
   /** Return all values of a quantity, in the order (z, y, x). */
   values(name) {
-    if (!(name in this.cache)) this.cache[name] = name === "speed" ? this.speed() : this.decode(name);
+    if (!(name in this.cache)) this.cache[name] = name in MAGNITUDES ? this.magnitude(name) : this.decode(name);
     return this.cache[name];
   }
 
   decode(name) {
-    const { offset, scale } = this.entry.values[name];
+    const { offset } = this.entry.values[name];
+    const scale = this.entry.values[name].scale * QUANTITIES[name].factor;
     const stored = new Int16Array(this.block, offset, this.size);
     return Float32Array.from(stored, (value) => (value === NO_NUMBER ? NaN : value * scale));
   }
 
-  speed() {
-    const [u, v, w] = ["u", "v", "w"].map((name) => this.values(name));
-    return u.map((value, i) => Math.hypot(value, v[i], w[i]));
+  magnitude(name) {
+    const [x, y, z] = MAGNITUDES[name].map((part) => this.values(part));
+    return x.map((value, i) => Math.hypot(value, y[i], z[i]));
+  }
+
+  /** Return the standard deviation of a velocity component at an index; 0 where it is not known. */
+  velocityError(index) {
+    if (!("uncertainty" in this.entry.values)) return 0;
+    const error = this.values("uncertainty")[index] * VOXEL;
+    return Number.isFinite(error) ? error : 0;
   }
 
   /** Return the index of the value at (z, y, x) = (k, j, i). */
@@ -99,11 +106,24 @@ class Field {
     return this.cache[key];
   }
 
+  /** Return the quantile of the positive values of a quantity at the valid vectors, or of the magnitude without any. */
+  positiveQuantile(name, quantile) {
+    const known = this.values(name).filter((value, index) => value > 0 && this.isValid(index)).sort();
+    return known.length ? known[Math.round((known.length - 1) * quantile)] : this.magnitudeQuantile(name, quantile);
+  }
+
   /** Return the spacing of the vectors along an axis [mm]; that of another axis where it has a single layer. */
   spacing(name) {
     const spacing = (axis) => (axis.length > 1 ? (axis[axis.length - 1] - axis[0]) / (axis.length - 1) : NaN);
     const known = [this.axis[name], ...Object.values(this.axis)].map(spacing).filter(Number.isFinite);
     return known.length ? known[0] : 1;
+  }
+
+  /** Return the quantile of the speed in the plane of a slice over the valid vectors of the whole field. */
+  inPlaneQuantile(names, quantile) {
+    const [a, b] = names.map((name) => this.values(name));
+    const known = a.map((value, i) => Math.hypot(value, b[i])).filter((value, i) => this.isValid(i)).sort();
+    return known.length ? known[Math.round((known.length - 1) * quantile)] : 0;
   }
 
   /** Return counts, mean velocity, rms and largest speed of the valid vectors of a slice; masked ones do not count. */
@@ -143,13 +163,17 @@ function sliceAxes(normal) {
   return { z: ["x", "y"], y: ["x", "z"], x: ["y", "z"] }[normal];
 }
 
-/** Interpolate a colour map, given by stops #rrggbb, at a share from 0 to 1. */
-function colourAt(stops, share) {
+/** Interpolate a colour map, given by stops #rrggbb, at a share from 0 to 1; return red, green and blue. */
+function colourParts(stops, share) {
   const place = Math.min(Math.max(share, 0), 1) * (stops.length - 1);
   const low = Math.min(Math.floor(place), stops.length - 2);
   const part = (stop, k) => parseInt(stops[stop].slice(1 + 2 * k, 3 + 2 * k), 16);
-  const mix = [0, 1, 2].map((k) => Math.round(part(low, k) + (place - low) * (part(low + 1, k) - part(low, k))));
-  return `rgb(${mix.join(",")})`;
+  return [0, 1, 2].map((k) => Math.round(part(low, k) + (place - low) * (part(low + 1, k) - part(low, k))));
+}
+
+/** Return a colour of a colour map as CSS. */
+function colourAt(stops, share) {
+  return `rgb(${colourParts(stops, share).join(",")})`;
 }
 
 /** Format a number with significant digits, as `markup.significant` does for the tables. */

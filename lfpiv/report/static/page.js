@@ -33,11 +33,13 @@ async function startViews() {
     note.textContent = "This browser is too old for the moving views: still pictures.";
     return;
   }
-  const { fields: entries, colours } = JSON.parse(list.textContent);
+  const { fields: entries, colours, quantities, voxel, start } = JSON.parse(list.textContent);
+  QUANTITIES = quantities;
+  VOXEL = voxel;
   const block = await unpack("field-values");
   const fields = entries.map((entry) => new Field(entry, block));
   document.getElementById("slices").classList.add("ready");
-  window.slices = new SliceView(fields, colours);
+  window.slices = new SliceView(fields, colours, start, new ProfileView());
   const space = document.getElementById("space");
   const near = new IntersectionObserver((seen) => {
     if (!seen.some((entry) => entry.isIntersecting)) return;
@@ -47,7 +49,35 @@ async function startViews() {
   near.observe(space);
 }
 
+/** Mark the link to the section that is read. */
+function followSections() {
+  const links = [...document.querySelectorAll("nav a[href^='#']")];
+  const heads = links.map((link) => document.getElementById(link.hash.slice(1))).filter((head) => head?.tagName === "H2");
+  let waiting = false;
+  const mark = () => {
+    waiting = false;
+    const read = heads.filter((head) => head.getBoundingClientRect().top < 120).pop();
+    for (const link of links) {
+      if (read && link.hash === `#${read.id}`) link.setAttribute("aria-current", "true");
+      else link.removeAttribute("aria-current");
+    }
+  };
+  window.addEventListener("scroll", () => {
+    if (!waiting) requestAnimationFrame(mark);
+    waiting = true;
+  }, { passive: true });
+}
+
+/** Unfold the section that a link leads to. */
+function unfoldTarget() {
+  const folded = document.getElementById(`${window.location.hash.slice(1)}-fold`);
+  if (folded) folded.open = true;
+}
+
 markScrollers();
+followSections();
+window.addEventListener("hashchange", unfoldTarget);
+unfoldTarget();
 document.addEventListener("toggle", markScrollers, true);
 window.addEventListener("resize", markScrollers);
 startViews();

@@ -1,53 +1,73 @@
 "use strict";
-// Draw slices of a vector field on a canvas; a slider selects the layer.
+// Draw slices of a vector field on a canvas; a slider selects the layer, a click the line of the profiles.
+
+/** Smallest distance of arrows, and of streamlines [CSS pixel]. */
+const ARROWS_APART = 20, STREAMLINES_APART = 24;
+const MARGIN = { left: 58, right: 16, top: 30, bottom: 92 };
 
 class SliceView {
-  constructor(fields, colours) {
+  constructor(fields, colours, start, profile) {
     this.fields = fields;
     this.colours = colours;
+    this.profile = profile;
     this.selected = null;
+    /** Indices of the vector through which the slice and the line of the profiles go. */
+    this.place = { ...start.place };
     this.elements = Object.fromEntries(
-      ["field", "colour", "axis", "slider", "place", "canvas", "reading"].map((name) => [
+      ["field", "colour", "axis", "overlay", "smooth", "along", "slider", "place", "canvas", "reading"].map((name) => [
         name, document.getElementById(`slice-${name}`),
       ]),
     );
-    fillOptions(this.elements.field, fields.map((field, number) => [number, field.label]));
-    this.elements.field.addEventListener("change", () => this.selectField());
-    this.elements.axis.addEventListener("change", () => this.selectAxis());
-    this.elements.colour.addEventListener("change", () => this.draw());
-    this.elements.slider.addEventListener("input", () => this.draw());
-    const canvas = this.elements.canvas;
-    canvas.addEventListener("pointermove", (event) => this.selectPointed(event));
+    const { field, colour, axis, overlay, smooth, along, slider, canvas } = this.elements;
+    fillOptions(field, fields.map((entry, number) => [number, entry.label]));
+    field.addEventListener("change", () => this.selectField());
+    axis.addEventListener("change", () => this.selectAxis());
+    for (const choice of [colour, overlay, smooth, along]) choice.addEventListener("change", () => this.draw());
+    slider.addEventListener("input", () => this.selectLayer());
+    canvas.addEventListener("pointermove", (event) => this.select(this.pointed(event)));
+    canvas.addEventListener("click", (event) => this.pin(this.pointed(event)));
     canvas.addEventListener("pointerleave", () => this.select(null));
     canvas.addEventListener("keydown", (event) => this.moveSelection(event));
     canvas.addEventListener("blur", () => this.select(null));
     new ResizeObserver(() => this.draw()).observe(canvas.parentElement);
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
-    this.selectField();
+    axis.value = start.normal;
+    this.selectField(start.quantity, start.along);
   }
 
   get field() { return this.fields[Number(this.elements.field.value)]; }
   get normal() { return this.elements.axis.value; }
   get layer() { return Number(this.elements.slider.value); }
 
-  selectField() {
+  selectField(colour = null, along = null) {
     const names = this.field.quantities();
-    const first = this.elements.colour.options.length === 0;
     fillOptions(this.elements.colour, names.map((name) => [name, this.field.title(name)]));
-    if (first) this.elements.colour.value = "w";
-    this.selectAxis();
+    if (colour) this.elements.colour.value = colour;
+    this.selectAxis(along);
     this.writeTable();
   }
 
-  selectAxis() {
-    const slider = this.elements.slider;
-    const last = this.field.axis[this.normal].length - 1;
-    if (this.shownAxis !== this.normal || Number(slider.max) !== last) {
-      slider.max = last;
-      slider.value = Math.floor((last + 1) / 2);
-      this.shownAxis = this.normal;
-    }
+  selectAxis(along = null) {
+    const { slider } = this.elements;
+    for (const name of AXES) this.place[name] = Math.min(this.place[name], this.field.axis[name].length - 1);
+    slider.max = this.field.axis[this.normal].length - 1;
+    slider.value = this.place[this.normal];
+    fillOptions(this.elements.along, sliceAxes(this.normal).map((name) => [name, name]));
+    if (along) this.elements.along.value = along;
     this.selected = null;
+    this.draw();
+  }
+
+  selectLayer() {
+    this.place[this.normal] = this.layer;
+    this.draw();
+  }
+
+  /** Put the line of the profiles through a vector. */
+  pin(vector) {
+    if (!vector) return;
+    const [across, up] = sliceAxes(this.normal);
+    [this.place[across], this.place[up]] = vector;
     this.draw();
   }
 
@@ -61,34 +81,42 @@ class SliceView {
     });
     const span = edges.map(([low, high]) => high - low);
     const outerWidth = this.elements.canvas.parentElement.clientWidth;
-    const margin = { left: 54, right: 14, top: 26, bottom: 92 };
-    const most = Math.max(0.62 * window.innerHeight, 220);
-    const scale = Math.min((outerWidth - margin.left - margin.right) / span[0], most / span[1]);
+    const room = outerWidth - MARGIN.left - MARGIN.right;
+    const most = Math.max(0.6 * window.innerHeight, 220);
+    const scale = Math.min(room / span[0], most / span[1]);
     const [width, height] = span.map((value) => value * scale);
-    const left = margin.left + Math.max((outerWidth - margin.left - margin.right - width) / 2, 0);
-    const total = height + margin.top + margin.bottom;
-    return { across, up, edges, scale, outerWidth, width, height, left, top: margin.top, total };
+    const cell = [across, up].map((name) => this.field.spacing(name) * scale);
+    const left = MARGIN.left + Math.max((room - width) / 2, 0);
+    const total = height + MARGIN.top + MARGIN.bottom;
+    const counts = [across, up].map((name) => this.field.axis[name].length);
+    return { across, up, edges, cell, counts, outerWidth, width, height, left, top: MARGIN.top, total };
   }
 
   draw() {
-    const { canvas } = this.elements;
+    const { canvas, colour, overlay } = this.elements;
     const box = this.layout();
     if (!(box.outerWidth > 0)) return;
-    const pixelRatio = window.devicePixelRatio || 1;
-    canvas.width = Math.round(box.outerWidth * pixelRatio);
-    canvas.height = Math.round(box.total * pixelRatio);
-    canvas.style.height = `${box.total}px`;
-    const context = canvas.getContext("2d");
-    context.scale(pixelRatio, pixelRatio);
+    const context = prepare(canvas, box.outerWidth, box.total);
     this.ink = getComputedStyle(canvas).color;
-    context.font = "12px system-ui, sans-serif";
-    this.drawCells(context, box);
-    if (this.field.isVector) this.drawArrows(context, box);
-    this.drawFrame(context, box);
-    this.drawBar(context, box);
+    context.save();
+    context.beginPath();
+    context.rect(box.left, box.top, box.width, box.height);
+    context.clip();
+    this.drawColours(context, box);
+    this.drawLine(context, box);
+    if (this.field.isVector && overlay.value === "streamlines") this.drawStreamlines(context, box);
+    const arrows = this.field.isVector && overlay.value === "arrows" ? this.arrowScale(box) : null;
+    if (arrows) this.drawArrows(context, box, arrows);
     if (this.selected) this.drawSelected(context, box);
+    context.restore();
+    if (arrows) this.drawReference(context, box, arrows);
+    drawAxes(context, box, box.edges, [`${box.across} [mm]`, `${box.up} [mm]`], this.ink);
+    const width = Math.min(box.outerWidth - 40, 320);
+    const left = Math.min(Math.max(box.left + box.width / 2 - width / 2, 20), box.outerWidth - width - 20);
+    drawBar(context, [left, box.top + box.height + 44, width], this.scale(), this.field.title(colour.value), this.ink);
     this.box = box;
     this.describe();
+    this.profile.draw(this.field, this.place, this.elements.along.value, this.ink);
   }
 
   /** Return the colour map of the chosen quantity: its stops and ends, and a value's share of it. */
@@ -104,125 +132,125 @@ class SliceView {
     };
   }
 
-  drawCells(context, box) {
-    const values = this.field.values(this.elements.colour.value);
-    const scale = this.scale();
-    const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
+  drawColours(context, box) {
+    const { colour, smooth } = this.elements;
+    const values = this.field.values(colour.value);
+    const { share, stops } = this.scale();
+    const layer = new Float32Array(box.counts[0] * box.counts[1]);
     this.field.forSlice(this.normal, this.layer, (index, column, row) => {
-      const x = box.left + column * cell[0];
-      const y = box.top + box.height - (row + 1) * cell[1];
-      if (this.field.isMasked(index)) hatch(context, [x, y], cell);
-      if (!Number.isFinite(values[index])) return;
-      context.fillStyle = colourAt(scale.stops, scale.share(values[index]));
-      context.fillRect(Math.floor(x), Math.floor(y), Math.ceil(cell[0]) + 1, Math.ceil(cell[1]) + 1);
+      layer[row * box.counts[0] + column] = this.field.isMasked(index) ? NaN : values[index];
     });
-    context.clearRect(box.left + box.width, 0, box.outerWidth, box.total); // parts of cells beyond the frame
-    context.clearRect(0, box.top + box.height, box.outerWidth, box.total);
+    paintField(context, layer, box.counts, [box.left, box.top, box.width, box.height], share, stops, smooth.checked);
+    this.field.forSlice(this.normal, this.layer, (index, column, row) => {
+      const corner = [box.left + column * box.cell[0], box.top + box.height - (row + 1) * box.cell[1]];
+      if (this.field.isMasked(index)) hatch(context, corner, box.cell);
+    });
   }
 
-  drawArrows(context, box) {
-    const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
-    const step = Math.max(Math.ceil(13 / Math.min(...cell)), 1);
+  /** Mark the line of the profiles. */
+  drawLine(context, box) {
+    const [x, y] = this.centre(box, this.place[box.across], this.place[box.up]);
+    const path = new Path2D();
+    const level = this.elements.along.value === box.across;
+    path.moveTo(level ? box.left : x, level ? y : box.top);
+    path.lineTo(level ? box.left + box.width : x, level ? y : box.top + box.height);
+    context.setLineDash([7, 5]);
+    outlined(context, path, ["#0b0f14", "#ffffff"], 1);
+    context.setLineDash([]);
+  }
+
+  /** Return names, spacing and scale of the arrows; null for a field at rest. Arrows are as long as they are apart. */
+  arrowScale(box) {
+    const step = Math.max(Math.ceil(ARROWS_APART / Math.min(...box.cell)), 1);
     const names = [box.across, box.up].map((axis) => COMPONENT[axis]);
-    const longest = Math.max(...names.map((name) => this.field.magnitudeQuantile(name, 0.99)));
-    if (!(longest > 0)) return;
-    const scale = (1.3 * step * Math.min(...cell)) / longest;
+    const longest = this.field.inPlaneQuantile(names, 0.995);
+    const apart = step * Math.min(...box.cell);
+    return longest > 0 ? { step, names, longest, apart, scale: Math.min(apart, 60) / longest } : null;
+  }
+
+  drawArrows(context, box, { step, names, apart, scale }) {
     const [u, v] = names.map((name) => this.field.values(name));
-    const head = 0.35 * step * Math.min(...cell);
     this.field.forSlice(this.normal, this.layer, (index, column, row) => {
-      const offset = Math.floor(step / 2);
-      if (column % step !== offset || row % step !== offset) return;
-      const from = this.centre(box, column, row);
-      const colour = this.field.isValid(index) ? "#101418" : "#8b9198";
-      arrow(context, from, [u[index] * scale, -v[index] * scale], head, colour);
+      const offset = Math.floor((step - 1) / 2);
+      if (column % step !== offset || row % step !== offset || this.field.isMasked(index)) return;
+      const colours = this.field.isValid(index) ? ARROW.measured : ARROW.replaced;
+      arrow(context, this.centre(box, column, row), [u[index] * scale, -v[index] * scale], 0.32 * apart, colours);
     });
+  }
+
+  /** Draw an arrow of a round length above the slice. */
+  drawReference(context, box, { names, longest, apart, scale }) {
     const speed = roundBelow(longest);
-    const from = [box.left, box.top - 12];
-    arrow(context, from, [speed * scale, 0], head, this.ink);
+    const length = speed * scale;
+    arrow(context, [box.left + length / 2, box.top - 14], [length, 0], 0.32 * apart, [this.ink, "transparent"]);
     context.fillStyle = this.ink;
     context.textAlign = "left";
     context.textBaseline = "middle";
-    context.fillText(`${significant(speed)} m/s (${names.join(", ")})`, box.left + speed * scale + 8, box.top - 12);
+    const unit = QUANTITIES.speed.unit;
+    context.fillText(`${significant(speed)} ${unit} (${names.join(", ")})`, box.left + length + 8, box.top - 14);
+  }
+
+  drawStreamlines(context, box) {
+    const names = [box.across, box.up].map((axis) => COMPONENT[axis]);
+    const [u, v] = names.map((name) => this.field.values(name));
+    const [columns, rows] = box.counts;
+    const layers = [u, v].map((values, axis) => {
+      const layer = new Float32Array(columns * rows);
+      this.field.forSlice(this.normal, this.layer, (index, column, row) => {
+        layer[row * columns + column] = this.field.isMasked(index) ? NaN : values[index] / box.cell[1 - axis];
+      });
+      return layer;
+    });
+    const sample = ([x, y]) => {
+      if (x < -0.5 || y < -0.5 || x > columns - 0.5 || y > rows - 0.5) return null;
+      const velocity = layers.map((layer) => between(layer, columns, rows, x, y));
+      return velocity.every(Number.isFinite) ? velocity : null;
+    };
+    const largest = this.field.inPlaneQuantile(names, 0.995) / Math.max(...box.cell);
+    const found = streamlines(sample, box.counts, STREAMLINES_APART / Math.min(...box.cell), largest, 400);
+    for (const places of found) {
+      const points = places.map(([x, y]) => this.centre(box, x, y));
+      const path = new Path2D();
+      points.forEach((point, k) => (k ? path.lineTo(...point) : path.moveTo(...point)));
+      const middle = Math.max(Math.floor(points.length / 2), 1);
+      const [from, tip] = [points[middle - 1], points[middle]];
+      const length = Math.hypot(tip[0] - from[0], tip[1] - from[1]);
+      const along = [tip[0] - from[0], tip[1] - from[1]].map((value) => value / length);
+      for (const side of [0.6, -0.6]) {
+        path.moveTo(...tip);
+        path.lineTo(tip[0] - 6 * (along[0] + side * along[1]), tip[1] - 6 * (along[1] - side * along[0]));
+      }
+      outlined(context, path, ARROW.measured, 1.1);
+    }
   }
 
   centre(box, column, row) {
-    const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
-    return [box.left + (column + 0.5) * cell[0], box.top + box.height - (row + 0.5) * cell[1]];
-  }
-
-  drawFrame(context, box) {
-    context.strokeStyle = this.ink;
-    context.fillStyle = this.ink;
-    context.lineWidth = 1;
-    context.strokeRect(box.left, box.top, box.width, box.height);
-    const axisTicks = (axis, length) => ticks(...box.edges[axis], Math.max(Math.min(Math.floor(length / 55), 8), 2));
-    context.textAlign = "center";
-    context.textBaseline = "top";
-    for (const value of axisTicks(0, box.width)) {
-      const x = box.left + (value - box.edges[0][0]) * box.scale;
-      line(context, [x, box.top + box.height], [x, box.top + box.height + 4]);
-      context.fillText(significant(value, 6), x, box.top + box.height + 6);
-    }
-    context.fillText(`${box.across} [mm]`, box.left + box.width / 2, box.top + box.height + 22);
-    context.textAlign = "right";
-    context.textBaseline = "middle";
-    for (const value of axisTicks(1, box.height)) {
-      const y = box.top + box.height - (value - box.edges[1][0]) * box.scale;
-      line(context, [box.left - 4, y], [box.left, y]);
-      context.fillText(significant(value, 6), box.left - 6, y);
-    }
-    context.save();
-    context.translate(box.left - 44, box.top + box.height / 2);
-    context.rotate(-Math.PI / 2);
-    context.textAlign = "center";
-    context.fillText(`${box.up} [mm]`, 0, 0);
-    context.restore();
-  }
-
-  drawBar(context, box) {
-    const scale = this.scale();
-    const width = Math.min(box.outerWidth - 40, 320);
-    const left = Math.min(Math.max(box.left + box.width / 2 - width / 2, 20), box.outerWidth - width - 20);
-    const top = box.top + box.height + 44;
-    const steps = 160;
-    for (let k = 0; k < steps; k += 1) {
-      context.fillStyle = colourAt(scale.stops, (k + 0.5) / steps);
-      context.fillRect(left + (k * width) / steps, top, width / steps + 0.6, 10);
-    }
-    context.strokeStyle = this.ink;
-    context.strokeRect(left, top, width, 10);
-    context.fillStyle = this.ink;
-    context.textAlign = "center";
-    context.textBaseline = "top";
-    for (const value of ticks(scale.low, scale.high, 4)) {
-      const x = left + ((value - scale.low) / (scale.high - scale.low)) * width;
-      line(context, [x, top + 10], [x, top + 13]);
-      context.fillText(significant(value, 6), x, top + 14);
-    }
-    context.fillText(this.field.title(this.elements.colour.value), left + width / 2, top + 30);
+    return [box.left + (column + 0.5) * box.cell[0], box.top + box.height - (row + 0.5) * box.cell[1]];
   }
 
   drawSelected(context, box) {
-    const cell = [box.across, box.up].map((name) => this.field.spacing(name) * box.scale);
     const [x, y] = this.centre(box, ...this.selected);
-    context.lineWidth = 3;
-    context.strokeStyle = "#ffffff";
-    context.strokeRect(x - cell[0] / 2, y - cell[1] / 2, cell[0], cell[1]);
-    context.lineWidth = 1.5;
-    context.strokeStyle = "#000000";
-    context.strokeRect(x - cell[0] / 2, y - cell[1] / 2, cell[0], cell[1]);
+    for (const [width, colour] of [[3, "#ffffff"], [1.5, "#000000"]]) {
+      context.lineWidth = width;
+      context.strokeStyle = colour;
+      context.strokeRect(x - box.cell[0] / 2, y - box.cell[1] / 2, ...box.cell);
+    }
   }
 
-  selectPointed(event) {
-    const canvas = this.elements.canvas.getBoundingClientRect();
-    const { box, field } = this;
-    const column = Math.floor((event.clientX - canvas.left - box.left) / (field.spacing(box.across) * box.scale));
-    const row = Math.floor((box.top + box.height - event.clientY + canvas.top) / (field.spacing(box.up) * box.scale));
-    const inside = column >= 0 && row >= 0 && column < field.axis[box.across].length && row < field.axis[box.up].length;
-    this.select(inside ? [column, row] : null);
+  /** Return the [column, row] of the vector under the pointer, or null. */
+  pointed(event) {
+    const { box } = this;
+    const frame = this.elements.canvas.getBoundingClientRect();
+    const column = Math.floor((event.clientX - frame.left - box.left) / box.cell[0]);
+    const row = Math.floor((box.top + box.height - (event.clientY - frame.top)) / box.cell[1]);
+    return column >= 0 && row >= 0 && column < box.counts[0] && row < box.counts[1] ? [column, row] : null;
   }
 
   moveSelection(event) {
+    if (event.key === "Enter" && this.selected) {
+      this.pin(this.selected);
+      return;
+    }
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (!step) return;
     event.preventDefault();
@@ -252,10 +280,11 @@ class SliceView {
 
   describeSlice(where) {
     const statistics = this.field.sliceStatistics(this.normal, this.layer);
+    const { unit } = QUANTITIES.speed;
     const mark = this.field.isVector ? "" : "′";
     const parts = ["u", "v", "w"].map((name) => `${name}${mark} ${significant(statistics[name])}`).join(", ");
-    return `${where}: ${statistics.good} of ${statistics.count} vectors valid; mean ${parts} m/s; `
-      + `rms ${significant(statistics.rms)}, largest ${significant(statistics.largest)} m/s.`;
+    return `${where}: ${statistics.good} of ${statistics.count} vectors valid; mean ${parts} ${unit}; `
+      + `rms ${significant(statistics.rms)}, largest ${significant(statistics.largest)} ${unit}.`;
   }
 
   describeVector() {
@@ -291,55 +320,4 @@ class SliceView {
     });
     document.querySelector("#depth-table tbody").replaceChildren(...rows);
   }
-}
-
-/** Hatch a masked cell. */
-function hatch(context, [x, y], [width, height]) {
-  context.fillStyle = "#d5d8db";
-  context.fillRect(x, y, width, height);
-  context.strokeStyle = "#9aa0a6";
-  context.lineWidth = 1;
-  line(context, [x, y + height], [x + width, y]);
-  line(context, [x, y + height / 2], [x + width / 2, y]);
-  line(context, [x + width / 2, y + height], [x + width, y + height / 2]);
-}
-
-/** Draw an arrow with its tail at `from`; arrows shorter than half a pixel are left out. */
-function arrow(context, from, step, head, colour) {
-  const length = Math.hypot(...step);
-  if (!(length > 0.5)) return;
-  const along = step.map((value) => value / length);
-  const tip = [from[0] + step[0], from[1] + step[1]];
-  const barb = Math.min(head, length / 2.5, 9);
-  context.strokeStyle = colour;
-  context.lineWidth = 1.2;
-  line(context, from, tip);
-  for (const side of [0.45, -0.45]) {
-    line(context, tip, [tip[0] - barb * (along[0] + side * along[1]), tip[1] - barb * (along[1] - side * along[0])]);
-  }
-}
-
-function line(context, from, to) {
-  context.beginPath();
-  context.moveTo(...from);
-  context.lineTo(...to);
-  context.stroke();
-}
-
-/** Return the largest 1, 2 or 5 times a power of ten that does not exceed a value. */
-function roundBelow(value) {
-  const power = 10 ** Math.floor(Math.log10(value));
-  return [5, 2, 1].find((step) => step * power <= value * (1 + 1e-9)) * power;
-}
-
-/** Return about `count` round values between two ends. */
-function ticks(low, high, count) {
-  const rough = (high - low) / count;
-  const power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].find((factor) => factor * power >= rough * (1 - 1e-9)) * power;
-  const found = [];
-  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k += 1) {
-    found.push(Number((k * step).toPrecision(12)));
-  }
-  return found;
 }

@@ -1,19 +1,23 @@
 "use strict";
-// Draw a vector field in space with plotly.js: cones and a surface of equal value.
+// Draw a vector field in space with plotly.js: arrows, streamlines and a surface of equal value.
 
-/** Largest number of cones; more are thinned out. */
-const MOST_CONES = 1500;
+/** Largest number of arrows; more are thinned out. */
+const MOST_ARROWS = 700;
+/** Largest number of streamlines. */
+const MOST_LINES = 300;
+/** Largest number of values of a surface. */
+const MOST_IN_SURFACE = 60000;
 /** Buttons above the view, without plotly's own one that uploads the data. */
 const BUTTONS = [["toImage"], ["zoom3d", "pan3d", "orbitRotation", "tableRotation", "resetCameraDefault3d"]];
-/** Position of the eye at the start, in units of the scene. */
-const START_EYE = { x: 1.4, y: -1.6, z: 0.9 };
+/** Direction of the eye at the start, and its distance over the diagonal of the volume. */
+const START_EYE = { x: 0.62, y: -0.68, z: 0.4 }, START_DISTANCE = 1.08;
 
 class SpaceView {
   constructor(fields, colours) {
     this.fields = fields;
     this.colours = colours;
     this.elements = Object.fromEntries(
-      ["field", "quantity", "level", "value", "arrows", "scene"].map((name) => [
+      ["field", "quantity", "level", "value", "arrows", "lines", "scene"].map((name) => [
         name, document.getElementById(`space-${name}`),
       ]),
     );
@@ -21,11 +25,14 @@ class SpaceView {
     this.elements.field.addEventListener("change", () => this.selectField());
     this.elements.quantity.addEventListener("change", () => this.draw());
     this.elements.arrows.addEventListener("change", () => this.draw());
+    this.elements.lines.addEventListener("change", () => this.draw());
     this.elements.level.addEventListener("input", () => this.moveSurface());
     this.elements.scene.addEventListener("keydown", (event) => this.turn(event));
     this.elements.scene.addEventListener("pointerdown", () => this.elements.scene.focus({ preventScroll: true }));
     this.elements.scene.addEventListener("wheel", (event) => this.keepPageScrolling(event), { capture: true });
-    window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+    for (const query of ["(prefers-color-scheme: dark)", "(max-width: 700px)"]) {
+      window.matchMedia(query).addEventListener("change", () => this.redraw());
+    }
   }
 
   get field() { return this.fields[Number(this.elements.field.value)]; }
@@ -43,22 +50,25 @@ class SpaceView {
 
   fillQuantities() {
     const first = this.elements.quantity.options.length === 0;
-    const names = this.field.quantities().filter((name) => !["u", "v", "w"].includes(name));
+    const names = this.field.quantities().filter((name) => !["u", "v", "w", "uncertainty"].includes(name));
     fillOptions(this.elements.quantity, [...names.map((name) => [name, this.field.title(name)]), ["", "none"]]);
-    if (first && names.includes("vorticity")) this.elements.quantity.value = "vorticity";
+    if (first && names.includes("q")) this.elements.quantity.value = "q"; // positive inside vortices
   }
 
-  /** Return the camera at the start, farther away for narrow views. */
+  /** Return the camera at the start: so far that the volume fills the view, farther for narrow views. */
   startCamera() {
     const { clientWidth, clientHeight } = this.elements.scene;
-    const distance = Math.min(Math.max((1.25 * clientHeight) / clientWidth, 1), 1.7);
+    const spans = ["x", "y", "z"].map((name) => this.field.spacing(name) * this.field.axis[name].length);
+    const unit = Math.cbrt(spans[0] * spans[1] * spans[2]); // plotly's unit of length for aspectmode "data"
+    const narrow = Math.min(Math.max((1.5 * clientHeight) / clientWidth, 1), 1.5);
+    const distance = (START_DISTANCE * narrow * Math.hypot(...spans)) / unit;
     const eye = Object.fromEntries(Object.entries(START_EYE).map(([name, value]) => [name, distance * value]));
-    return { eye, up: { x: 0, y: 0, z: 1 }, center: { x: 0, y: 0, z: 0 } };
+    return { eye, up: { x: 0, y: 0, z: 1 }, center: { x: 0, y: 0, z: -0.06 } };
   }
 
-  /** Return the value of the surface: a share of the 99.5 % quantile. */
+  /** Return the value of the surface: a share of the 99.5 % quantile of the positive values. */
   level() {
-    return (Number(this.elements.level.value) / 100) * this.field.magnitudeQuantile(this.quantity, 0.995);
+    return (Number(this.elements.level.value) / 100) * this.field.positiveQuantile(this.quantity, 0.995);
   }
 
   showLevel() {
@@ -70,54 +80,88 @@ class SpaceView {
     this.elements.level.setAttribute("aria-valuetext", text);
   }
 
-  /** Return the positions of all vectors, in the order (z, y, x). */
-  positions() {
-    const { x, y, z } = this.field.axis;
-    const all = Object.fromEntries(["x", "y", "z"].map((name) => [name, new Float32Array(this.field.size)]));
-    let index = 0;
-    for (const depth of z) for (const up of y) for (const across of x) {
-      all.x[index] = across;
-      all.y[index] = up;
-      all.z[index] = depth;
-      index += 1;
-    }
-    return all;
-  }
+  /** Return whether the view is as narrow as a phone's. */
+  get isNarrow() { return this.elements.scene.clientWidth < 600; }
 
-  cones(colour) {
-    const { field } = this;
-    const positions = this.positions();
-    let step = 1;
-    while (field.shape.reduce((product, n) => product * Math.ceil(n / step), 1) > MOST_CONES) step += 1;
-    const chosen = { x: [], y: [], z: [], u: [], v: [], w: [] };
-    for (let k = 0; k < field.shape[0]; k += step) for (let j = 0; j < field.shape[1]; j += step)
-      for (let i = 0; i < field.shape[2]; i += step) {
-        const index = field.index(k, j, i);
-        if (!field.isValid(index) || !(field.values("speed")[index] > 0)) continue;
-        for (const name of ["x", "y", "z"]) chosen[name].push(positions[name][index]);
-        for (const name of ["u", "v", "w"]) chosen[name].push(field.values(name)[index]);
-      }
-    const longest = field.magnitudeQuantile("speed", 1);
-    const spacing = step * Math.min(...["x", "y", "z"].map((name) => field.spacing(name)));
+  /** Return how colours show the speed, with the colour bar, which lies below a narrow view. */
+  colouring(colour) {
+    const stops = this.colours.positive;
+    const place = this.isNarrow
+      ? { orientation: "h", x: 0.5, xanchor: "center", y: 0, yanchor: "bottom", len: 0.8 }
+      : { x: 1, xpad: 4, len: 0.7 };
     return {
-      type: "cone", ...chosen, name: "velocity", anchor: "tail", sizemode: "raw", sizeref: (1.2 * spacing) / longest,
-      cmin: 0, cmax: longest, colorscale: this.colours.positive.map((stop, k, all) => [k / (all.length - 1), stop]),
+      cmin: 0, cmax: this.field.magnitudeQuantile("speed", 0.995),
+      colorscale: stops.map((stop, k) => [k / (stops.length - 1), stop]),
       colorbar: {
-        title: { text: "speed [m/s]", side: "right", font: { color: colour } }, thickness: 12, len: 0.7,
-        tickfont: { color: colour }, x: 1, xpad: 4,
+        title: { text: this.field.title("speed"), side: this.isNarrow ? "bottom" : "right", font: { color: colour } },
+        thickness: 12, tickfont: { color: colour }, nticks: 6, ...place,
       },
-      hovertemplate: "x %{x:.3f}, y %{y:.3f}, z %{z:.3f} mm<br>u %{u:.4g}, v %{v:.4g}, w %{w:.4g} m/s<extra></extra>",
     };
   }
 
+  arrows(colour) {
+    const { field } = this;
+    let step = 1;
+    while (field.shape.reduce((product, n) => product * Math.ceil(n / step), 1) > MOST_ARROWS) step += 1;
+    const starts = field.shape.map((n) => Math.min(Math.floor((step - 1) / 2), n - 1));
+    const unit = QUANTITIES.speed.unit;
+    const chosen = [];
+    for (let k = starts[0]; k < field.shape[0]; k += step) for (let j = starts[1]; j < field.shape[1]; j += step)
+      for (let i = starts[2]; i < field.shape[2]; i += step) {
+        const index = field.index(k, j, i);
+        if (!field.isValid(index) || !(field.values("speed")[index] > 0)) continue;
+        const place = [field.axis.x[i], field.axis.y[j], field.axis.z[k]];
+        const velocity = ["u", "v", "w"].map((name) => field.values(name)[index]);
+        const where = ["x", "y", "z"].map((name, axis) => `${name} ${fixed(place[axis], 3)}`).join(", ");
+        const parts = ["u", "v", "w"].map((name, axis) => `${name} ${significant(velocity[axis])}`).join(", ");
+        chosen.push({ place, velocity, text: `${where} mm<br>${parts} ${unit}` });
+      }
+    const spacing = step * Math.min(...["x", "y", "z"].map((name) => field.spacing(name)));
+    const mesh = arrowMesh(chosen, spacing, field.magnitudeQuantile("speed", 0.995));
+    return {
+      type: "mesh3d", ...mesh, name: "velocity", ...this.colouring(colour), flatshading: false,
+      hovertemplate: "%{text}<extra></extra>", lighting: { ambient: 0.85, diffuse: 0.35, specular: 0.05 },
+    };
+  }
+
+  /** Return the streamlines as one trace, broken by gaps. */
+  streamlines(colour) {
+    const { field } = this;
+    const { axis } = field;
+    const names = ["x", "y", "z"];
+    const counts = names.map((name) => axis[name].length);
+    const sample = fieldSample(field, counts);
+    const spacing = names.map((name) => field.spacing(name));
+    const apart = Math.max(Math.cbrt((counts[0] * counts[1] * counts[2]) / MOST_LINES), 1);
+    const largest = field.magnitudeQuantile("speed", 0.995) / Math.min(...spacing);
+    const found = streamlines(sample, counts, apart, largest, MOST_LINES);
+    const trace = { x: [], y: [], z: [], speed: [] };
+    for (const places of found) {
+      places.forEach((place, k) => {
+        if (k % 2) return;
+        names.forEach((name, n) => trace[name].push(axis[name][0] + place[n] * spacing[n]));
+        trace.speed.push(Math.hypot(...sample(place).map((value, n) => value * spacing[n])));
+      });
+      for (const name of names) trace[name].push(null);
+      trace.speed.push(0);
+    }
+    const { x, y, z, speed } = trace;
+    return {
+      type: "scatter3d", mode: "lines", x, y, z, name: "streamlines", hoverinfo: "skip",
+      line: { width: 5, color: speed, ...this.colouring(colour), showscale: !this.elements.arrows.checked },
+    };
+  }
+
+  /** Return a surface of equal value, through values interpolated to a finer grid, which make it smooth. */
   surface() {
     const known = this.field.values(this.quantity).map((value) => (Number.isFinite(value) ? value : 0));
+    const factor = Math.min(Math.max(Math.floor(Math.cbrt(MOST_IN_SURFACE / known.length)), 1), 4);
+    const fine = refine(known, AXES.map((name) => this.field.axis[name]), factor);
     const none = { show: false };
     return {
-      type: "isosurface", ...this.positions(), value: known, surface: { count: 1 },
-      isomin: this.level(), isomax: this.level(), caps: { x: none, y: none, z: none }, opacity: 0.55,
-      showscale: false, hoverinfo: "skip",
-      colorscale: [[0, "#d9822b"], [1, "#d9822b"]], lighting: { ambient: 0.6, diffuse: 0.7, specular: 0.1 },
+      type: "isosurface", ...fine, surface: { count: 1 }, isomin: this.level(), isomax: this.level(),
+      caps: { x: none, y: none, z: none }, opacity: 0.6, flatshading: false, showscale: false, hoverinfo: "skip",
+      colorscale: [[0, "#d9822b"], [1, "#d9822b"]], lighting: { ambient: 0.65, diffuse: 0.7, specular: 0.15 },
     };
   }
 
@@ -128,7 +172,8 @@ class SpaceView {
     const [grid, quiet] = ["--line", "--quiet"].map((name) => style.getPropertyValue(name).trim());
     const traces = [];
     const moves = this.field.isVector && this.field.magnitudeQuantile("speed", 1) > 0;
-    if (moves && this.elements.arrows.checked) traces.push(this.cones(colour));
+    if (moves && this.elements.arrows.checked) traces.push(this.arrows(colour));
+    if (moves && this.elements.lines.checked) traces.push(this.streamlines(colour));
     if (this.quantity !== "" && this.field.shape.every((n) => n > 1)) traces.push(this.surface());
     this.surfaceNumber = traces.findIndex((trace) => trace.type === "isosurface");
     if (!traces.length) traces.push({ type: "scatter3d", x: [], y: [], z: [], mode: "markers" });
@@ -148,12 +193,18 @@ class SpaceView {
       margin: { l: 0, r: 0, t: 0, b: 0 }, showlegend: false, uirevision: "same",
       modebar: { bgcolor: "rgba(0,0,0,0)", color: quiet, activecolor: colour },
       scene: {
-        xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "data",
+        domain: { y: [this.isNarrow ? 0.14 : 0, 1] }, xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "data",
         camera: this.startCamera(), bgcolor: "rgba(0,0,0,0)",
       },
     };
     const settings = { responsive: true, displaylogo: false, displayModeBar: true, modeBarButtons: BUTTONS };
     await Plotly.react(this.elements.scene, traces, layout, settings);
+  }
+
+  /** Draw from the beginning for another width or scheme: plotly would keep the margins that it drew first. */
+  async redraw() {
+    Plotly.purge(this.elements.scene);
+    await this.draw();
   }
 
   moveSurface() {
