@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import Grid
-from lfpiv.geometry.volume import is_finite
+from lfpiv.geometry.volume import is_finite, lies_in
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import checked_images
 from lfpiv.tracking import candidates
@@ -38,10 +38,13 @@ MERGED_OVERLAP = 0.75
 """Overlap of their images in all cameras above which two candidates are one particle."""
 MERGED_SIGMA = 3.0
 """The same [standard error of their distance]."""
-MARGIN_VOXEL = 0.5
-"""How far particles may lie outside the grid of the weights [voxel]."""
+MARGIN_VOXEL = 12.0
+"""How far outside the grid of the weights particles may lie that only explain light [voxel]."""
+FOUND_MARGIN_VOXEL = 0.5
+"""How far outside the grid of the weights found particles may lie [voxel]."""
 SEEN = 0.3
-"""Least share of a particle's image on a camera's sensor for the camera to see it, relative to the largest share."""
+"""Least root of a camera's information about a particle's light, relative to the largest one, for the camera to see
+it."""
 FIRST_STEPS, STEPS, LAST_STEPS = 4, 4, 4
 """Iterations of the first round, of the later rounds, and after the last one."""
 EARLY = 0.5
@@ -152,6 +155,10 @@ class ParticleSearch:
         self._sizer: ParticleSizer | None = None
 
     @property
+    def _nothing(self) -> Cloud:
+        return Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, len(self.weights.cameras))))
+
+    @property
     def _grid(self) -> Grid:
         return self.weights.grid if self.grid is None else self.grid
 
@@ -169,9 +176,7 @@ class ParticleSearch:
         model = self.images if self.sigma_voxel is not None else self.images.of_size(self._first_size(images))
         if volume is None:
             volume = candidates.reconstructed(self.weights, images, deviation, candidates.FIRST_ITERATIONS)
-        count = len(self.weights.cameras)
-        nothing = Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, count)))
-        cloud = nothing if volume is None else candidates.volume_peaks(volume, count)
+        cloud = self._nothing if volume is None else candidates.volume_peaks(self.weights, volume)
         state = _State(model, scene, cloud, START_SCATTER)
         for number in range(self.rounds):
             before = len(state.cloud)
@@ -189,18 +194,23 @@ class ParticleSearch:
                 state.cloud = self._pruned(state)
             if not len(state.cloud):
                 break
-            state.scatter = light_scatter(state.cloud.light)
+            state.refine(1)
+            assert state.normal is not None
+            state.scatter = light_scatter(state.normal, state.cloud.light, state.scatter)
             if self.sigma_voxel is None and number < SIZED_ROUNDS:
                 _fit_size(state)
             state.refine(1)
             if number and len(state.cloud) == before:
                 break
         if len(state.cloud):
+            if self.sigma_voxel is None:
+                _fit_size(state)
             state.refine(LAST_STEPS)
             state.cloud = self._pruned(state)
         if len(state.cloud):
             state.refine(2)
-        return FoundParticles.of(self.weights.cameras, self._grid, state.model, state.scene, state.cloud, state.normal)
+        every = FoundParticles.of(self.weights.cameras, self._grid, state.model, state.scene, state.cloud, state.normal)
+        return every[lies_in(every.positions_mm, self.weights.grid, FOUND_MARGIN_VOXEL)]
 
     def _first_size(self, images: Mapping[str, np.ndarray]) -> float:
         self._sizer = self._sizer or ParticleSizer(self.weights)
@@ -216,25 +226,25 @@ class ParticleSearch:
             for number, (name, camera) in enumerate(self.weights.cameras.items())
         }
         volume = candidates.reconstructed(self.weights, images, noise, candidates.RESIDUAL_ITERATIONS)
-        count = cloud.light.shape[1]
         if volume is None:
-            return Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, count)))
-        return candidates.volume_peaks(volume, count, LEFT_SHARE * candidates.typical(cloud.light.mean(1)))
+            return self._nothing
+        return candidates.volume_peaks(self.weights, volume, LEFT_SHARE * candidates.typical(cloud.light.mean(1)))
 
     def _pruned(self, state: _State, part: float = 1.0) -> Cloud:
-        """Return the particles that all cameras confirm, those closer than one particle's size merged.
+        """Return the particles that all cameras which see them confirm, those closer than one particle's size merged.
 
         `part` is the part of the limits that applies.
         """
         cloud, normal = state.cloud, state.normal
         assert normal is not None
-        good = candidates.inside(self.weights, cloud.positions_mm, MARGIN_VOXEL)
+        good = lies_in(cloud.positions_mm, self.weights.grid, MARGIN_VOXEL)
         own = diagonal_blocks(normal.matrix, normal.right.shape)
         size = np.sqrt(np.maximum(np.einsum("pii->pi", own), 1e-30))
         inverse = np.linalg.pinv(own / size[:, :, None] / size[:, None, :], hermitian=True)
         error = np.sqrt(np.maximum(np.einsum("pii->pi", inverse), 0)) / size
         least = self.weakest * candidates.typical(cloud.light[good].mean(1)) if good.any() else 0.0
-        good &= (cloud.light > part * np.maximum(SIGNIFICANCE * error[:, 3:], least)).all(1)
+        seen = size[:, 3:] > SEEN * np.maximum(size[:, 3:].max(1), 1e-30)[:, None]
+        good &= ((cloud.light > part * np.maximum(SIGNIFICANCE * error[:, 3:], least)) | ~seen).all(1)
         first, second, overlap = overlaps(normal)
         same = (overlap > MERGED_OVERLAP).all(1) & good[first] & good[second]
         apart = (cloud.positions_mm[first] - cloud.positions_mm[second]) / state.model.voxel_mm
