@@ -20,6 +20,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
+from lfpiv.geometry.names import COMPONENTS
 from lfpiv.report import markup
 from lfpiv.report.fields import Survey, embed, survey
 from lfpiv.report.markup import number, percent, significant
@@ -48,9 +49,6 @@ ARROW_TINTS = ("#101418", "#9aa0a6")
 """Colours of measured and of replaced vectors in a slice."""
 MASKED_FILL, MASKED_LINE = "#d5d8db", "#9aa0a6"
 """Colours of masked cells in a slice and of their hatching."""
-
-COMPONENTS = {"x": "u", "y": "v", "z": "w"}
-"""Axis -> name of the velocity component along it."""
 
 _DEPTH_TITLES = (
     "z [mm]",

@@ -11,7 +11,7 @@ ones.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -62,6 +62,13 @@ USUAL_SIGMA_VOXEL = 0.7
 """Size of particles where the images do not show it [voxel]."""
 SIZE_STEP = 1.25
 """Ratio of the sizes that are compared."""
+CLEAR_OVERLAP = 0.3
+"""Overlap of a particle's image with another one above which it does not tell the size."""
+LEAST_CLEAR, MOST_CLEAR = 8, 100
+"""Least and largest number of particles that tell the size."""
+LARGEST_RATIO = 1.15
+"""Largest size of the particles over that which the autocovariance of the images shows, before particles are found.
+Particles that are not told apart look larger."""
 SIZE_FITS = 4
 """Largest number of comparisons of sizes in a round."""
 
@@ -124,6 +131,8 @@ class _State:
     scene: Scene
     cloud: Cloud
     scatter: float
+    largest_voxel: float
+    """Largest size of the particles [voxel]."""
     normal: Normal | None = None
 
     def refine(self, steps: int) -> None:
@@ -177,7 +186,7 @@ class ParticleSearch:
         if volume is None:
             volume = candidates.reconstructed(self.weights, images, deviation, candidates.FIRST_ITERATIONS)
         cloud = self._nothing if volume is None else candidates.volume_peaks(self.weights, volume)
-        state = _State(model, scene, cloud, START_SCATTER)
+        state = _State(model, scene, cloud, START_SCATTER, LARGEST_RATIO * model.sigma_voxel)
         for number in range(self.rounds):
             before = len(state.cloud)
             if number:
@@ -293,16 +302,32 @@ def _fit_size(state: _State) -> None:
 
 
 def _better_size(state: _State) -> ParticleImages:
-    """Return the model with the size of particles that explains the images best, from three sizes."""
+    """Return the model with the size that explains the images of clear particles best, from three sizes."""
     assert state.normal is not None
-    variance = state.scene.variance(state.normal.model)
+    cloud = state.cloud[_clear(state.normal, state.cloud.light)]
+    own = rendered(state.model, state.model.lists(cloud.positions_mm), cloud.light)
+    scene = replace(state.scene, counts=state.scene.counts - (state.normal.model - own))
+    variance, lit = state.scene.variance(state.normal.model), own > 0
     chi2 = []
     for power in (-1, 0, 1):
         other = state.model.of_size(state.model.sigma_voxel * SIZE_STEP**power)
-        moved, _ = refine(other, state.scene, state.cloud, iterations=1, scatter=state.scatter)
-        left = state.scene.counts - rendered(other, other.lists(moved.positions_mm), moved.light)
-        chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2).sum(dtype=np.float64)))
+        moved, _ = refine(other, scene, cloud, iterations=1, scatter=state.scatter)
+        left = scene.counts - rendered(other, other.lists(moved.positions_mm), moved.light)
+        chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2)[lit].sum(dtype=np.float64)))
     below, here, above = chi2
     curvature, slope = below - 2 * here + above, (below - above) / 2
     change = float(np.clip(slope / curvature, -2, 2)) if curvature > 0 else 2 * float(np.sign(slope))
-    return state.model.of_size(state.model.sigma_voxel * SIZE_STEP**change)
+    return state.model.of_size(min(state.model.sigma_voxel * SIZE_STEP**change, state.largest_voxel))
+
+
+def _clear(normal: Normal, light: np.ndarray) -> np.ndarray:
+    """Return particles of typical light whose images hardly overlap others; of all particles if few do not."""
+    first, second, overlap = overlaps(normal)
+    mixed = np.zeros(len(light), bool)
+    close = (overlap > CLEAR_OVERLAP).any(1)
+    mixed[first[close]], mixed[second[close]] = True, True
+    clear = np.flatnonzero(~mixed) if (~mixed).sum() >= LEAST_CLEAR else np.arange(len(light))
+    mean = np.maximum(light[clear].mean(1), 1e-9)
+    unlike = np.abs(np.log(mean / max(candidates.typical(mean), 1e-9)))
+    usual: np.ndarray = clear[np.argsort(unlike, kind="stable")[:MOST_CLEAR]]
+    return usual

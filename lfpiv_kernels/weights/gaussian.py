@@ -167,7 +167,8 @@ def _reaches(inputs: Inputs, view: View, centre: wp.vec2f):
 
 @wp.func_native("""
     return lfpiv::write_lens(
-        inputs, view, particle, lens, ray, centre[0], centre[1], pixel_out.data + first, (float*)(values_out.data + first)
+        inputs, view, particle, lens, ray, centre[0], centre[1],
+        pixel_out.data + first, (float*)(values_out.data + first)
     );
 """)
 def _write_lens(
