@@ -129,6 +129,13 @@ def voxel_place(points_mm: np.ndarray, grid: Grid) -> np.ndarray:
     return place
 
 
+def lies_in(points_mm: np.ndarray, grid: Grid, margin_voxel: float = 0.0) -> np.ndarray:
+    """Return which points (x, y, z) [mm] lie in a volume or up to a margin beside it, shape (point,)."""
+    place = voxel_place(points_mm, grid)
+    above, below = place > -0.5 - margin_voxel, place < np.array(grid.shape) - 0.5 + margin_voxel
+    return np.asarray((above & below).all(1))
+
+
 def is_finite(value: object) -> TypeGuard[float]:
     """Return whether a value is a finite real number."""
     return isinstance(value, numbers.Real) and math.isfinite(value)

@@ -11,8 +11,6 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.quantities import Scale, scale_of
 from lfpiv.velocity import derived
 
-COMPONENTS = {"x": "u", "y": "v", "z": "w"}
-"""Axis -> name of the velocity component along it."""
 IN_SLICE = {"z": ("x", "y"), "y": ("x", "z"), "x": ("y", "z")}
 """Axis normal to a slice -> its horizontal and its vertical axis."""
 VELOCITIES = ("u", "v", "w", "speed")

@@ -15,8 +15,9 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 from scipy import ndimage
 
+from lfpiv.geometry.names import COMPONENTS
 from lfpiv.quantities import significant
-from lfpiv.report.flow import COMPONENTS, IN_SLICE, Quantity
+from lfpiv.report.flow import IN_SLICE, Quantity
 from lfpiv.report.svg import arrows, cell_edges, colour_bar, new_panel, spread_ticks, style, to_svg
 
 MOST_SLICES = 5

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.names import COMPONENTS
 from lfpiv.quantities import Scale
 from lfpiv.report import flow, markup
 from lfpiv.report.fields import Survey, embed, survey
@@ -241,7 +242,7 @@ def damping_table(damping: DampingFigures | None) -> str:
         return ""
     rows = [
         [
-            f"{flow.COMPONENTS[axis]}, along {axis}",
+            f"{COMPONENTS[axis]}, along {axis}",
             f"{number(found.slope, 3)} ± {number(found.slope_error, 3)}",
             f"{number(found.offset, 3)} ± {number(found.offset_error, 3)}",
             "taken off" if found.applied else "not significant",

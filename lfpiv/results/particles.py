@@ -12,15 +12,13 @@ import xarray as xr
 
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import plain, replacing, state_origin
+from lfpiv.geometry.names import PARTICLE
 from lfpiv.results import datasets
 from lfpiv.results.stacked_files import NAME
 from lfpiv.version import versions
 
 FOLDER = "particles"
 """Folder of the tables inside the folder of a run."""
-
-PARTICLE = "particle"
-"""Dimension of a table of linked particles."""
 
 PARTICLE_UNITS = {
     **dict.fromkeys("xyz", "mm"),

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from lfpiv.reconstruction.recording import checked_images
 from lfpiv.results.pair_files import PairVolumes
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.tracking.finding import ParticleSearch
@@ -42,7 +41,7 @@ def track(
         Doubts whether particles can be told apart.
     """
     first, second = (
-        search.find(checked_images(search.weights, frame.images), volume, noise=frame.noise)
+        search.find(frame.images, volume, noise=frame.noise)
         for frame, volume in zip(light, volumes.volumes, strict=True)
     )
     table = link_particles(first, second, vectors, dt_s=float(vectors.attrs["dt_s"]))

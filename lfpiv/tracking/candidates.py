@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from lfpiv.geometry.volume import voxel_place
+from lfpiv.geometry.grid import AXES
 from lfpiv.metrics.particles import find_particles
 from lfpiv.reconstruction.settings import PLAIN
 from lfpiv.reconstruction.volume import reconstruct
@@ -31,27 +31,39 @@ def typical(values: np.ndarray) -> float:
     return float(ordered[np.searchsorted(np.cumsum(ordered), 0.5 * ordered.sum())])
 
 
-def volume_peaks(volume: xr.DataArray, cameras: int, least_light: float | None = None) -> Cloud:
+def volume_peaks(weights: Weights, volume: xr.DataArray, least_light: float | None = None) -> Cloud:
     """Return the peaks of a volume as particles whose light is that of the voxels around.
 
     Parameters
     ----------
+    weights : Weights
+        The operator. Peaks that no camera sees are left out.
     volume : DataArray, shape (z, y, x)
         Reconstruction [counts per unit weight].
-    cameras : int
-        Number of cameras.
     least_light : float, optional
         Least light of a particle [counts]. Default: `LEAST_PEAK` of the typical one.
     """
-    values = volume.values.astype(float)
-    peaks = find_particles(volume, 0.0 if least_light is not None else LEAST_PEAK * typical(values[values > 0]))
+    values = np.where(_views(weights, volume) > 0, volume.values.astype(float), 0.0)
+    threshold = 0.0 if least_light is not None else LEAST_PEAK * typical(values[values > 0])
+    peaks = find_particles(volume.copy(data=values), threshold)
     around = 27 * ndimage.uniform_filter(values, 3, mode="constant")
     offset = peaks.positions_mm[:, ::-1] - [float(volume[axis][0]) for axis in volume.dims]
     index = np.rint(offset / float(volume.attrs["voxel_mm"])).astype(int)
     index = np.clip(index, 0, np.array(values.shape) - 1)
     light = around[tuple(index.T)]
     chosen = light > (LEAST_PEAK * typical(light) if least_light is None else least_light)
-    return Cloud(positions_mm=peaks.positions_mm[chosen], light=np.repeat(light[chosen, None], cameras, axis=1))
+    every = np.repeat(light[chosen, None], len(weights.cameras), axis=1)
+    return Cloud(positions_mm=peaks.positions_mm[chosen], light=every)
+
+
+def _views(weights: Weights, volume: xr.DataArray) -> np.ndarray:
+    """Return how many cameras see each voxel of a volume on any grid within that of the weights, shape (z, y, x)."""
+    nearest = [
+        np.abs(weights.grid.axis_mm(number)[:, None] - volume[axis].values).argmin(0)
+        for number, axis in enumerate(AXES)
+    ]
+    views: np.ndarray = weights.views[np.ix_(*nearest)]
+    return views
 
 
 def reconstructed(
@@ -62,10 +74,3 @@ def reconstructed(
         return reconstruct(weights, images, iterations, floor=dict(noise), floor_share=0.02, **PLAIN)
     except ValueError:
         return None
-
-
-def inside(weights: Weights, positions_mm: np.ndarray, margin_voxel: float) -> np.ndarray:
-    """Return which positions lie in the grid of the weights or up to a margin beside it."""
-    place = voxel_place(positions_mm, weights.grid)
-    above, below = place > -0.5 - margin_voxel, place < np.array(weights.grid.shape) - 0.5 + margin_voxel
-    return np.asarray((above & below).all(1))

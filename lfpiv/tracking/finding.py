@@ -11,14 +11,14 @@ ones.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 
 from lfpiv.experiment.settings import Tracking
 from lfpiv.geometry.grid import Grid
-from lfpiv.geometry.volume import is_finite
+from lfpiv.geometry.volume import is_finite, lies_in
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import checked_images
 from lfpiv.tracking import candidates
@@ -37,10 +37,13 @@ MERGED_OVERLAP = 0.75
 """Overlap of their images in all cameras above which two candidates are one particle."""
 MERGED_SIGMA = 3.0
 """The same [standard error of their distance]."""
-MARGIN_VOXEL = 0.5
-"""How far particles may lie outside the grid of the weights [voxel]."""
+MARGIN_VOXEL = 12.0
+"""How far outside the grid of the weights particles may lie that only explain light [voxel]."""
+FOUND_MARGIN_VOXEL = 0.5
+"""How far outside the grid of the weights found particles may lie [voxel]."""
 SEEN = 0.3
-"""Least share of a particle's image on a camera's sensor for the camera to see it, relative to the largest share."""
+"""Least root of a camera's information about a particle's light, relative to the largest one, for the camera to see
+it."""
 FIRST_STEPS, STEPS, LAST_STEPS = 4, 4, 4
 """Iterations of the first round, of the later rounds, and after the last one."""
 EARLY = 0.5
@@ -58,6 +61,13 @@ USUAL_SIGMA_VOXEL = 0.7
 """Size of particles where the images do not show it [voxel]."""
 SIZE_STEP = 1.25
 """Ratio of the sizes that are compared."""
+CLEAR_OVERLAP = 0.3
+"""Overlap of a particle's image with another one above which it does not tell the size."""
+LEAST_CLEAR, MOST_CLEAR = 8, 100
+"""Least and largest number of particles that tell the size."""
+LARGEST_RATIO = 1.15
+"""Largest size of the particles over that which the autocovariance of the images shows, before particles are found.
+Particles that are not told apart look larger."""
 SIZE_FITS = 4
 """Largest number of comparisons of sizes in a round."""
 
@@ -120,6 +130,8 @@ class _State:
     scene: Scene
     cloud: Cloud
     scatter: float
+    largest_voxel: float
+    """Largest size of the particles [voxel]."""
     normal: Normal | None = None
 
     def refine(self, steps: int) -> None:
@@ -151,6 +163,10 @@ class ParticleSearch:
         self._sizer: ParticleSizer | None = None
 
     @property
+    def _nothing(self) -> Cloud:
+        return Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, len(self.weights.cameras))))
+
+    @property
     def _grid(self) -> Grid:
         return self.weights.grid if self.grid is None else self.grid
 
@@ -168,10 +184,8 @@ class ParticleSearch:
         model = self.images if self.sigma_voxel is not None else self.images.of_size(self._first_size(images))
         if volume is None:
             volume = candidates.reconstructed(self.weights, images, deviation, candidates.FIRST_ITERATIONS)
-        count = len(self.weights.cameras)
-        nothing = Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, count)))
-        cloud = nothing if volume is None else candidates.volume_peaks(volume, count)
-        state = _State(model, scene, cloud, START_SCATTER)
+        cloud = self._nothing if volume is None else candidates.volume_peaks(self.weights, volume)
+        state = _State(model, scene, cloud, START_SCATTER, LARGEST_RATIO * model.sigma_voxel)
         for number in range(self.rounds):
             before = len(state.cloud)
             if number:
@@ -188,18 +202,23 @@ class ParticleSearch:
                 state.cloud = self._pruned(state)
             if not len(state.cloud):
                 break
-            state.scatter = light_scatter(state.cloud.light)
+            state.refine(1)
+            assert state.normal is not None
+            state.scatter = light_scatter(state.normal, state.cloud.light, state.scatter)
             if self.sigma_voxel is None and number < SIZED_ROUNDS:
                 _fit_size(state)
             state.refine(1)
             if number and len(state.cloud) == before:
                 break
         if len(state.cloud):
+            if self.sigma_voxel is None:
+                _fit_size(state)
             state.refine(LAST_STEPS)
             state.cloud = self._pruned(state)
         if len(state.cloud):
             state.refine(2)
-        return FoundParticles.of(self.weights.cameras, self._grid, state.model, state.scene, state.cloud, state.normal)
+        every = FoundParticles.of(self.weights.cameras, self._grid, state.model, state.scene, state.cloud, state.normal)
+        return every[lies_in(every.positions_mm, self.weights.grid, FOUND_MARGIN_VOXEL)]
 
     def _first_size(self, images: Mapping[str, np.ndarray]) -> float:
         self._sizer = self._sizer or ParticleSizer(self.weights)
@@ -215,25 +234,25 @@ class ParticleSearch:
             for number, (name, camera) in enumerate(self.weights.cameras.items())
         }
         volume = candidates.reconstructed(self.weights, images, noise, candidates.RESIDUAL_ITERATIONS)
-        count = cloud.light.shape[1]
         if volume is None:
-            return Cloud(positions_mm=np.zeros((0, 3)), light=np.zeros((0, count)))
-        return candidates.volume_peaks(volume, count, LEFT_SHARE * candidates.typical(cloud.light.mean(1)))
+            return self._nothing
+        return candidates.volume_peaks(self.weights, volume, LEFT_SHARE * candidates.typical(cloud.light.mean(1)))
 
     def _pruned(self, state: _State, part: float = 1.0) -> Cloud:
-        """Return the particles that all cameras confirm, those closer than one particle's size merged.
+        """Return the particles that all cameras which see them confirm, those closer than one particle's size merged.
 
         `part` is the part of the limits that applies.
         """
         cloud, normal = state.cloud, state.normal
         assert normal is not None
-        good = candidates.inside(self.weights, cloud.positions_mm, MARGIN_VOXEL)
+        good = lies_in(cloud.positions_mm, self.weights.grid, MARGIN_VOXEL)
         own = diagonal_blocks(normal.matrix, normal.right.shape)
         size = np.sqrt(np.maximum(np.einsum("pii->pi", own), 1e-30))
         inverse = np.linalg.pinv(own / size[:, :, None] / size[:, None, :], hermitian=True)
         error = np.sqrt(np.maximum(np.einsum("pii->pi", inverse), 0)) / size
         least = self.weakest * candidates.typical(cloud.light[good].mean(1)) if good.any() else 0.0
-        good &= (cloud.light > part * np.maximum(SIGNIFICANCE * error[:, 3:], least)).all(1)
+        seen = size[:, 3:] > SEEN * np.maximum(size[:, 3:].max(1), 1e-30)[:, None]
+        good &= ((cloud.light > part * np.maximum(SIGNIFICANCE * error[:, 3:], least)) | ~seen).all(1)
         first, second, overlap = overlaps(normal)
         same = (overlap > MERGED_OVERLAP).all(1) & good[first] & good[second]
         apart = (cloud.positions_mm[first] - cloud.positions_mm[second]) / state.model.voxel_mm
@@ -282,16 +301,32 @@ def _fit_size(state: _State) -> None:
 
 
 def _better_size(state: _State) -> ParticleImages:
-    """Return the model with the size of particles that explains the images best, from three sizes."""
+    """Return the model with the size that explains the images of clear particles best, from three sizes."""
     assert state.normal is not None
-    variance = state.scene.variance(state.normal.model)
+    cloud = state.cloud[_clear(state.normal, state.cloud.light)]
+    own = rendered(state.model, state.model.lists(cloud.positions_mm), cloud.light)
+    scene = replace(state.scene, counts=state.scene.counts - (state.normal.model - own))
+    variance, lit = state.scene.variance(state.normal.model), own > 0
     chi2 = []
     for power in (-1, 0, 1):
         other = state.model.of_size(state.model.sigma_voxel * SIZE_STEP**power)
-        moved, _ = refine(other, state.scene, state.cloud, iterations=1, scatter=state.scatter)
-        left = state.scene.counts - rendered(other, other.lists(moved.positions_mm), moved.light)
-        chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2).sum(dtype=np.float64)))
+        moved, _ = refine(other, scene, cloud, iterations=1, scatter=state.scatter)
+        left = scene.counts - rendered(other, other.lists(moved.positions_mm), moved.light)
+        chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2)[lit].sum(dtype=np.float64)))
     below, here, above = chi2
     curvature, slope = below - 2 * here + above, (below - above) / 2
     change = float(np.clip(slope / curvature, -2, 2)) if curvature > 0 else 2 * float(np.sign(slope))
-    return state.model.of_size(state.model.sigma_voxel * SIZE_STEP**change)
+    return state.model.of_size(min(state.model.sigma_voxel * SIZE_STEP**change, state.largest_voxel))
+
+
+def _clear(normal: Normal, light: np.ndarray) -> np.ndarray:
+    """Return particles of typical light whose images hardly overlap others; of all particles if few do not."""
+    first, second, overlap = overlaps(normal)
+    mixed = np.zeros(len(light), bool)
+    close = (overlap > CLEAR_OVERLAP).any(1)
+    mixed[first[close]], mixed[second[close]] = True, True
+    clear = np.flatnonzero(~mixed) if (~mixed).sum() >= LEAST_CLEAR else np.arange(len(light))
+    mean = np.maximum(light[clear].mean(1), 1e-9)
+    unlike = np.abs(np.log(mean / max(candidates.typical(mean), 1e-9)))
+    usual: np.ndarray = clear[np.argsort(unlike, kind="stable")[:MOST_CLEAR]]
+    return usual

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lfpiv.geometry.grid import Grid
-from lfpiv.geometry.volume import voxel_place
+from lfpiv.geometry.volume import lies_in
 from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Normal, Scene, covariances, overlaps
 
@@ -43,6 +43,11 @@ class FoundParticles:
 
     def __len__(self) -> int:
         return len(self.positions_mm)
+
+    def __getitem__(self, chosen: np.ndarray) -> FoundParticles:
+        """Return some of the particles, with the figures of all."""
+        arrays = {name: getattr(self, name)[chosen] for name in ("positions_mm", "errors_mm", "light", "residual")}
+        return replace(self, **arrays)
 
     @classmethod
     def of(
@@ -84,7 +89,7 @@ class FoundParticles:
             voxel_mm=grid.voxel_mm,
             explained=float(np.clip(explained, 0, 1)),
             crowding=_crowding(normal),
-            per_microlens=int(_inside(cloud.positions_mm, grid).sum()) / _microlenses(cameras, grid),
+            per_microlens=int(lies_in(cloud.positions_mm, grid).sum()) / _microlenses(cameras, grid),
         )
 
 
@@ -104,12 +109,6 @@ def _crowding(normal: Normal) -> float:
     """Return the mean number of other particles whose images overlap a particle's by half or more, in any camera."""
     _, _, overlap = overlaps(normal)
     return float(2 * (overlap > 0.5).any(1).sum() / max(len(normal.right), 1))
-
-
-def _inside(positions_mm: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return which particles lie in a volume."""
-    place = voxel_place(positions_mm, grid)
-    return np.asarray(((place > -0.5) & (place < np.array(grid.shape) - 0.5)).all(1))
 
 
 def _microlenses(cameras: Mapping[str, CalibratedCamera], grid: Grid) -> float:

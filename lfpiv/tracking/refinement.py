@@ -218,15 +218,32 @@ def overlaps(normal: Normal) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return first, second, light[upper] / np.sqrt(np.maximum(own[first] * own[second], 1e-30))
 
 
-def light_scatter(light: np.ndarray) -> float:
-    """Return the relative scatter of particles' light between the cameras, robustly over all particles."""
-    mean = light.mean(1)
-    usable = mean > 0
-    if light.shape[1] < 2 or usable.sum() < 3:
+def light_scatter(normal: Normal, light: np.ndarray, scatter: float) -> float:
+    """Return the relative scatter of particles' light between the cameras, robustly over all particles.
+
+    The scatter that was assumed before holds the light of the cameras together. Its pull is undone, and the variance of
+    noise is subtracted.
+
+    Parameters
+    ----------
+    normal : Normal
+        Equations whose solution the light is.
+    light : ndarray, shape (particle, camera)
+        Light of each particle [counts].
+    scatter : float
+        Scatter that the equations assume.
+    """
+    mean, cameras = light.mean(1), light.shape[1]
+    strength = 1 / np.maximum(scatter * mean, 1e-9) ** 2
+    own = np.einsum("pii->pi", diagonal_blocks(normal.matrix, normal.right.shape))[:, 3:]
+    known = own - strength[:, None] * (1 - 1 / cameras)
+    usable = (mean > 0) & (known > 1e-3 * own).all(1)
+    if cameras < 2 or usable.sum() < 3:
         return SCATTER_RANGE[1]
-    ratio = light[usable] / mean[usable, None]
-    variance = np.square(ratio - 1).sum(1) / (light.shape[1] - 1)
-    return float(np.clip(np.sqrt(np.median(variance) / CHI2_MEDIAN), *SCATTER_RANGE))
+    known, mean = known[usable], mean[usable, None]
+    free = (light[usable] - mean) * (1 + strength[usable, None] / known)
+    square = (np.square(free).sum(1) / (cameras - 1) - (1 / known).mean(1)) / mean[:, 0] ** 2
+    return float(np.clip(np.sqrt(max(np.median(square), 0) / CHI2_MEDIAN), *SCATTER_RANGE))
 
 
 def covariances(normal: Normal) -> np.ndarray:

@@ -5,12 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.names import COMPONENTS, PARTICLE
 from lfpiv.tracking.found import FoundParticles
-
-PARTICLE = "particle"
-"""Dimension of a table."""
-COMPONENTS = {"x": "u", "y": "v", "z": "w"}
-"""Axis -> velocity along it."""
 
 
 def link_table(

@@ -10,11 +10,13 @@ import numpy as np
 import xarray as xr
 from scipy.spatial import cKDTree
 
+from lfpiv.geometry.names import PARTICLE
+
 JOINT_VOXEL = 0.5
 """Largest distance between the end of a link and the beginning of the next one [voxel]."""
 GAP_VOXEL = 1.0
 """Largest distance between a particle that is predicted over a missing link and the next link [voxel]."""
-INSTANT, PARTICLE = "instant", "particle"
+INSTANT = "instant"
 
 
 def particle_tracks(table: xr.Dataset, *, joint_voxel: float = JOINT_VOXEL, gap_voxel: float = GAP_VOXEL) -> xr.Dataset:

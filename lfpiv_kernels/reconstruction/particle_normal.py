@@ -1,7 +1,9 @@
 """Warp: normal equations of overlapping particle images, a block per pair of particles.
 
-Each particle goes through its pixels and through the particles that light the same pixels. So no two threads write the
-same block, and sums do not depend on the number of threads. Twin: a product of dense matrices.
+Each particle is multiplied with itself and with the later ones that light the same pixels. So no two threads write the
+same block, and sums do not depend on the number of threads. On the CPU a C++ loop spreads the particle's image over
+scratch memory and goes through the images of its neighbours. On CUDA, where no thread has so much memory, a kernel
+goes through the particles of each pixel. Twin: a product of dense matrices.
 """
 
 from dataclasses import dataclass
@@ -10,15 +12,68 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch, to_device
 from lfpiv_kernels.weights.gaussian import ImageLists
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(native.options("particle_pairs.h", contract="fast"))
 
 MOST_NEIGHBOURS = 128
 """Largest number of particles that overlap one, itself included. Further ones are left out of the matrix."""
 PARTS = 16
 """Parts of a launch on the CPU: the work differs from particle to particle."""
+
+
+@wp.struct
+class Images:
+    """Pixels of the particles."""
+
+    first: wp.array(dtype=wp.int64)
+    pixel: wp.array(dtype=int)
+    values: wp.array(dtype=wp.vec4f)
+    box: wp.array(dtype=wp.int32)
+    """First i and j, last i and j of the lenses of each particle."""
+    weight: wp.array(dtype=float)
+    """Weight of each pixel."""
+    residual: wp.array(dtype=float)
+    """Residual of each pixel [counts]."""
+    span: int
+    """Pixels from the first to the last one of a particle, the most of all particles."""
+
+
+@wp.func_native("""
+    lfpiv::multiply_images(
+        images, particle, most, slot < 0 ? nullptr : scratch_out.data + (int64_t)slot * 4 * images.span,
+        neighbour_out.data + (int64_t)particle * most, (float*)block_out.data + (int64_t)particle * most * 16,
+        (float*)(right_out.data + particle)
+    );
+""")
+def _multiply(
+    images: Images,
+    particle: int,
+    most: int,
+    slot: int,
+    scratch_out: wp.array(dtype=float),
+    neighbour_out: wp.array2d(dtype=int),
+    block_out: wp.array2d(dtype=wp.mat44f),
+    right_out: wp.array(dtype=wp.vec4f),
+): ...
+
+
+@wp.kernel
+def _multiply_images(
+    # in
+    images: Images,
+    most: int,  # slots of a particle's table of neighbours
+    slot: int,
+    first_particle: int,
+    # out
+    scratch_out: wp.array(dtype=float),  # zeros, and zeros again afterwards
+    neighbour_out: wp.array2d(dtype=int),
+    block_out: wp.array2d(dtype=wp.mat44f),
+    right_out: wp.array(dtype=wp.vec4f),
+):
+    _multiply(images, first_particle + wp.tid(), most, slot, scratch_out, neighbour_out, block_out, right_out)
 
 
 @wp.struct
@@ -97,20 +152,12 @@ def pair_blocks(lists: ImageLists, weight: np.ndarray, residual: np.ndarray) -> 
     weight, residual : ndarray, shape (pixel,), float32
         Weight and residual of each pixel.
     """
-    count, size = len(lists.first) - 1, len(weight)
-    entries = sparse.csr_array(
-        (np.arange(len(lists.pixel), dtype=np.int32), lists.pixel, lists.first), shape=(count, size)
-    ).tocsc()
-    device = Lists()
-    device.first, device.pixel = to_device(lists.first), to_device(lists.pixel)
-    device.values = to_device(np.ascontiguousarray(lists.values), wp.vec4f)
-    device.pixel_first, device.entry = to_device(entries.indptr.astype(np.int32)), to_device(entries.data)
-    device.particle = to_device(np.repeat(np.arange(count, dtype=np.int32), np.diff(lists.first)))
-    device.weight, device.residual = (to_device(np.ascontiguousarray(a, np.float32)) for a in (weight, residual))
+    count = len(lists.first) - 1
     neighbour = to_device(np.full((count, MOST_NEIGHBOURS), -1, np.int32))
     block = to_device(np.zeros((count, MOST_NEIGHBOURS, 4, 4), np.float32), wp.mat44f)
     right = to_device(np.zeros((count, 4), np.float32), wp.vec4f)
-    launch(Call(_add_pairs, count, [device, MOST_NEIGHBOURS], [neighbour, block, right]), parts=PARTS)
+    call = _by_particle if runtime.device().kind == "cpu" else _by_pixel
+    launch(call(lists, weight, residual, [neighbour, block, right]), parts=PARTS)
     near = neighbour.numpy()
     row, slot = np.nonzero(near >= 0)
     column, upper = near[row, slot], block.numpy()[row, slot]
@@ -119,3 +166,33 @@ def pair_blocks(lists: ImageLists, weight: np.ndarray, residual: np.ndarray) -> 
     blocks = np.concatenate([upper, upper[off].transpose(0, 2, 1)])
     order = np.lexsort((columns, rows))
     return PairBlocks(row=rows[order], column=columns[order], block=blocks[order], right=right.numpy())
+
+
+def _by_particle(lists: ImageLists, weight: np.ndarray, residual: np.ndarray, outputs: list[wp.array]) -> Call:
+    """Return the call for the CPU."""
+    count = len(lists.first) - 1
+    some = np.diff(lists.first) > 0
+    ends = lists.first[:-1][some]
+    low, high = (pick.reduceat(lists.pixel, ends) if some.any() else np.zeros(1) for pick in (np.minimum, np.maximum))
+    images = Images()
+    images.first, images.pixel = to_device(lists.first), to_device(lists.pixel)
+    images.values, images.box = to_device(lists.values, wp.vec4f), to_device(lists.box.reshape(-1))
+    images.weight, images.residual = (to_device(np.ascontiguousarray(a, np.float32)) for a in (weight, residual))
+    images.span = int((high - low).max()) + 1
+    scratch = to_device(np.zeros(runtime.CHUNKS * images.span * 4, np.float32))
+    return Call(_multiply_images, count, [images, MOST_NEIGHBOURS], [scratch, *outputs], scratch=True)
+
+
+def _by_pixel(lists: ImageLists, weight: np.ndarray, residual: np.ndarray, outputs: list[wp.array]) -> Call:
+    """Return the call for CUDA."""
+    count = len(lists.first) - 1
+    entries = sparse.csr_array(
+        (np.arange(len(lists.pixel), dtype=np.int32), lists.pixel, lists.first), shape=(count, len(weight))
+    ).tocsc()
+    device = Lists()
+    device.first, device.pixel = to_device(lists.first), to_device(lists.pixel)
+    device.values = to_device(np.ascontiguousarray(lists.values), wp.vec4f)
+    device.pixel_first, device.entry = to_device(entries.indptr.astype(np.int32)), to_device(entries.data)
+    device.particle = to_device(np.repeat(np.arange(count, dtype=np.int32), np.diff(lists.first)))
+    device.weight, device.residual = (to_device(np.ascontiguousarray(a, np.float32)) for a in (weight, residual))
+    return Call(_add_pairs, count, [device, MOST_NEIGHBOURS], outputs)

@@ -4,7 +4,8 @@ A pixel at X under the lens centred at c looks through the lens's centre at the 
 through P misses the lens's centre by g = (I - K)^-1 ((s, t)(P) - c), see ``footprint``. The particle and the pixel
 smear g. The weight is the amplitude of the pixel's cell on the pupil times the probability that g lies in the lens's
 cell: differences of error functions along the cell's axes. A shift of the particle shifts g, so its derivative is a
-difference of normal densities. Unlike the weights of voxels these are not rounded to levels.
+difference of normal densities. Unlike the weights of voxels these are not rounded to levels. The loop over the pixels
+of a lens is C++.
 
 Twin: ``reference.gaussian_image``.
 """
@@ -14,14 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lfpiv_kernels import native
 from lfpiv_kernels.launch import Call, launch, to_device
 from lfpiv_kernels.weights.microimages import LAYERS, Microimages
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(native.options("gaussian.h", contract="fast"))
 
-REACH = 2.8
+REACH: float = native.constant("gaussian.h", "REACH")
 """Distance from a cell at which a Gaussian is cut off [standard deviation]."""
-VALUES = 4
+VALUES: int = native.constant("gaussian.h", "VALUES")
 """Numbers of a pixel: derivatives by x, y, z, and the weight."""
 PARTS = 16
 """Parts of a launch on the CPU: the work differs from particle to particle."""
@@ -163,51 +165,23 @@ def _reaches(inputs: Inputs, view: View, centre: wp.vec2f):
     return wp.abs(at[0]) < reach[0] and wp.abs(at[1]) < reach[1]
 
 
-@wp.func
-def _pupil_point(inputs: Inputs, centre: wp.vec2f, column: int, row: int, share: float):
-    """Return the pupil point of the part of a pixel inside the pupil [mm]."""
-    pixel = wp.vec2f(float(column) + 0.5 - inputs.half[0], float(row) + 0.5 - inputs.half[1]) * inputs.pixel_mm
-    p = (centre * (1.0 + inputs.ratio) - pixel) / inputs.ratio
-    if share < 1.0:
-        cell = inputs.pixel_mm / inputs.ratio
-        p = p * (1.0 - (1.0 - share) * 0.5 * cell / wp.max(wp.length(p), cell))
-    return p
-
-
-@wp.func
-def _below(x: float, density: float):
-    """Return the probability of a standard normal variable below x, from its density (Hastings; error 1e-7)."""
-    t = 1.0 / (1.0 + 0.2316419 * wp.abs(x))
-    series = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))))
-    tail = density * series
-    return wp.where(x > 0.0, 1.0 - tail, tail)
-
-
-@wp.func
-def _within(low: float, high: float, at: float, sigma: float):
-    """Return the probability that a normal variable lies between two limits, and its derivative by the mean."""
-    inverse = 1.0 / sigma
-    x, y = (low - at) * inverse, (high - at) * inverse
-    density_x = 0.39894228 * wp.exp(-0.5 * x * x)
-    density_y = 0.39894228 * wp.exp(-0.5 * y * y)
-    return wp.vec2f(_below(y, density_y) - _below(x, density_x), (density_x - density_y) * inverse)
-
-
-@wp.func
-def _weights(inputs: Inputs, particle: int, view: View, p: wp.vec2f, at: wp.vec2f):
-    """Return the derivatives of a pixel's weight by x, y, z [1 / voxel] and the weight, without share and gain."""
-    inside, slope_a, slope_b = float(0.0), float(0.0), float(0.0)
-    for k in range(inputs.rectangles.shape[0]):
-        along_a = _within(inputs.rectangles[k, 0], inputs.rectangles[k, 1], at[0], view.sigma[0])
-        along_b = _within(inputs.rectangles[k, 2], inputs.rectangles[k, 3], at[1], view.sigma[1])
-        inside += along_a[0] * along_b[0]
-        slope_a += along_a[1] * along_b[0]
-        slope_b += along_a[0] * along_b[1]
-    weights = wp.vec4f(0.0, 0.0, 0.0, inside)
-    for axis in range(3):
-        shift = view.to_cell @ _edge(inputs, particle, axis, p)
-        weights[axis] = slope_a * shift[0] + slope_b * shift[1]
-    return weights * view.amplitude
+@wp.func_native("""
+    return lfpiv::write_lens(
+        inputs, view, particle, lens, ray, centre[0], centre[1],
+        pixel_out.data + first, (float*)(values_out.data + first)
+    );
+""")
+def _write_lens(
+    inputs: Inputs,
+    view: View,
+    particle: int,
+    lens: int,
+    ray: int,
+    centre: wp.vec2f,
+    first: wp.int64,
+    pixel_out: wp.array(dtype=int),
+    values_out: wp.array(dtype=wp.vec4f),
+) -> int: ...
 
 
 @wp.kernel
@@ -217,9 +191,11 @@ def _bound_pixels(
     first_particle: int,
     # out
     most_out: wp.array(dtype=int),
+    box_out: wp.array(dtype=wp.vec4i),
 ):
     particle = first_particle + wp.tid()
     view = _view(inputs, particle)
+    box_out[particle] = view.bounds
     lenses = wp.int32(0)
     for j in range(view.bounds[1], view.bounds[3] + 1):
         for i in range(view.bounds[0], view.bounds[2] + 1):
@@ -232,7 +208,7 @@ def _bound_pixels(
 def _write_pixels(
     # in
     inputs: Inputs,
-    first_entry: wp.array(dtype=wp.int64),
+    room: wp.array(dtype=wp.int64),  # first entry that each particle may write
     first_particle: int,
     # out
     count_out: wp.array(dtype=int),
@@ -241,36 +217,50 @@ def _write_pixels(
 ):
     particle = first_particle + wp.tid()
     view = _view(inputs, particle)
-    first = int(first_entry[particle])
-    entry = wp.int32(0)
+    count = wp.int32(0)
     for j in range(view.bounds[1], view.bounds[3] + 1):
         for i in range(view.bounds[0], view.bounds[2] + 1):
             centre = _lens_centre(inputs, i, j)
             if _reaches(inputs, view, centre):
                 lens = j * inputs.lenses[2] + i
                 ray = ((j * LAYERS + 1) * inputs.lenses[2] + i) * inputs.edge * inputs.edge
-                for row in range(inputs.edge):
-                    for column in range(inputs.edge):
-                        share = inputs.share[ray]
-                        pixel = inputs.pixel[ray]
-                        ray += 1
-                        if share > 0.0 and pixel >= 0:
-                            p = _pupil_point(
-                                inputs,
-                                centre,
-                                inputs.corners[2 * lens] + column,
-                                inputs.corners[2 * lens + 1] + row,
-                                share,
-                            )
-                            at = view.to_cell @ (_position(inputs, particle, p) - centre)
-                            beyond_a = wp.abs(at[0]) - inputs.extent[0] - REACH * view.sigma[0]
-                            beyond_b = wp.abs(at[1]) - inputs.extent[1] - REACH * view.sigma[1]
-                            if beyond_a < 0.0 and beyond_b < 0.0 and inputs.gain[pixel] > 0.0:
-                                weights = _weights(inputs, particle, view, p, at)
-                                pixel_out[first + entry] = pixel
-                                values_out[first + entry] = weights * (share * inputs.gain[pixel])
-                                entry += 1
-    count_out[particle] = entry
+                first = room[particle] + wp.int64(count)
+                count += _write_lens(inputs, view, particle, lens, ray, centre, first, pixel_out, values_out)
+    count_out[particle] = count
+
+
+@wp.func_native("""
+    for (int k = 0; k < count; ++k) {
+        pixel_out.data[first + k] = pixel.data[room + k];
+        values_out.data[first + k] = values.data[room + k];
+    }
+""")
+def _copy(
+    count: int,
+    room: wp.int64,
+    pixel: wp.array(dtype=int),
+    values: wp.array(dtype=wp.vec4f),
+    first: wp.int64,
+    pixel_out: wp.array(dtype=int),
+    values_out: wp.array(dtype=wp.vec4f),
+): ...
+
+
+@wp.kernel
+def _close_gaps(
+    # in
+    room: wp.array(dtype=wp.int64),
+    first: wp.array(dtype=wp.int64),
+    pixel: wp.array(dtype=int),
+    values: wp.array(dtype=wp.vec4f),
+    first_particle: int,
+    # out
+    pixel_out: wp.array(dtype=int),
+    values_out: wp.array(dtype=wp.vec4f),
+):
+    particle = first_particle + wp.tid()
+    count = int(first[particle + 1] - first[particle])
+    _copy(count, room[particle], pixel, values, first[particle], pixel_out, values_out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,6 +273,8 @@ class ImageLists:
     """Pixels, shape (entry,), int32. A pixel that a particle lights through two lenses occurs twice."""
     values: np.ndarray
     """Derivatives of the weight by x, y, z [1 / voxel] and the weight, shape (entry, 4), float32."""
+    box: np.ndarray
+    """First i and j, last i and j of the lenses that each particle can light, shape (particle, 4), int32."""
 
 
 class GaussianImages:
@@ -335,13 +327,15 @@ class GaussianImages:
         inputs.model = to_device(np.ascontiguousarray(model, np.float32))
         inputs.scale = float(sigma)
         most = to_device(np.zeros(count, np.int32))
-        launch(Call(_bound_pixels, count, [inputs], [most]), parts=PARTS)
+        box = to_device(np.zeros((count, 4), np.int32), wp.vec4i)
+        launch(Call(_bound_pixels, count, [inputs], [most, box]), parts=PARTS)
         room = np.concatenate([[0], np.cumsum(most.numpy(), dtype=np.int64)])
         used = to_device(np.zeros(count, np.int32))
         pixel = to_device(np.empty(room[-1], np.int32))
         values = to_device(np.empty((room[-1], VALUES), np.float32), wp.vec4f)
         launch(Call(_write_pixels, count, [inputs, to_device(room)], [used, pixel, values]), parts=PARTS)
-        length = used.numpy()
-        first = np.concatenate([[0], np.cumsum(length, dtype=np.int64)])
-        chosen = np.arange(first[-1]) + np.repeat(room[:-1] - first[:-1], length)
-        return ImageLists(first=first, pixel=pixel.numpy()[chosen], values=values.numpy()[chosen])
+        first = np.concatenate([[0], np.cumsum(used.numpy(), dtype=np.int64)])
+        closed = np.empty(first[-1], np.int32), np.empty((first[-1], VALUES), np.float32)
+        outputs = [to_device(closed[0]), to_device(closed[1], wp.vec4f)]
+        launch(Call(_close_gaps, count, [to_device(room), to_device(first), pixel, values], outputs), parts=PARTS)
+        return ImageLists(first=first, pixel=outputs[0].numpy(), values=outputs[1].numpy(), box=box.numpy())
