@@ -24,7 +24,7 @@ from lfpiv.experiment.settings import (
     Particles,
     RawImages,
 )
-from lfpiv.experiment.toml import read_toml
+from lfpiv.experiment.toml import parse, read_text, read_toml
 from lfpiv.geometry.grid import AXES, Grid
 
 DECODED_PIXELS = 100_000_000
@@ -68,7 +68,7 @@ def open_experiment(path: str | Path) -> Experiment:
 def read_experiment(path: str | Path) -> Experiment:
     """Read and check an experiment as `open_experiment` does, without its particle images."""
     path = Path(path)
-    table = read_toml(path, ExperimentTable)
+    table = _read_table(path)
     names = [camera.name for camera in table.camera]
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -117,6 +117,19 @@ def read_experiment(path: str | Path) -> Experiment:
             nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
     return replace(experiment, solid=solid_voxels(path, table.volume, grid))
+
+
+def _read_table(path: Path) -> ExperimentTable:
+    """Read the tables of an experiment file; a scene of the simulator is refused as such."""
+    try:
+        return read_toml(path, ExperimentTable)
+    except InputError:
+        if "flow" in parse(read_text(path), path):
+            raise InputError(
+                f"{path}: expected an experiment file, found a scene of the simulator, with a table [flow]. Use "
+                f"`lfpiv simulate {path} --out DIR` first, and then DIR/experiment.toml."
+            ) from None
+        raise
 
 
 def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:

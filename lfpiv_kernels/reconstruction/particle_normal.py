@@ -10,10 +10,11 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
+from lfpiv_kernels import native
 from lfpiv_kernels.launch import Call, launch, to_device
 from lfpiv_kernels.weights.gaussian import ImageLists
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(native.quiet_options())
 
 MOST_NEIGHBOURS = 128
 """Largest number of particles that overlap one, itself included. Further ones are left out of the matrix."""

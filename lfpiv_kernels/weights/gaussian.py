@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lfpiv_kernels import native
 from lfpiv_kernels.launch import Call, launch, to_device
 from lfpiv_kernels.weights.microimages import LAYERS, Microimages
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(native.quiet_options())
 
 REACH = 2.8
 """Distance from a cell at which a Gaussian is cut off [standard deviation]."""
