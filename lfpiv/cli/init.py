@@ -263,15 +263,18 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> str:
     InputError
         If the file exists, an answer is missing or wrong, or the values do not fit each other.
     """
-    from lfpiv.experiment.opening import read_experiment
+    from lfpiv.experiment.opening import check_tables, read_experiment
+    from lfpiv.experiment.settings import ExperimentTable
     from lfpiv.experiment.template import Values, experiment_text
+    from lfpiv.experiment.toml import parse, validated
     from lfpiv.files import write_text
 
     if path.exists():
         raise InputError(f"{path}: expected a new file to write, found one that exists. Name another, or remove it.")
     answers = _answers(given, path.absolute().parent.name)
     values = Values.model_validate(answers)
-    text = experiment_text(values, path)
+    text = experiment_text(values)
+    check_tables(path, validated(parse(text, path), path, ExperimentTable))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(text, path)

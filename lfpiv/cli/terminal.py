@@ -166,7 +166,7 @@ def print_init(experiment: Path, missing: str) -> None:
     """Print where the experiment file is, what is missing, and the next command."""
     say(f"experiment: {experiment}")
     if missing:
-        say(f"not there yet: {missing}")
+        say(f"not complete yet: {missing}")
     say(f"next: lfpiv run {experiment} --out results")
 
 
@@ -189,7 +189,7 @@ def print_demo(summary: dict[str, Any], out: Path) -> None:
     valid, speed = 100 * summary["valid_fraction"], found["speed_m_per_s"]
     error, largest = found["mean_error_voxel"], found["largest_displacement_voxel"]
     total_s = summary["timings_s"]["total"]
-    say(f"measured  a ring vortex: {found['vectors']:,} vectors, {valid:.0f} % valid, up to {speed:.1f} m/s")
+    say(f"measured  a ring vortex: {found['vectors']:,} vectors, {valid:.0f} % valid, {speed:.1f} m/s in the median")
     say(f"error     {error:.2f} voxel on average where the flow moves by up to {largest:.1f} voxel; {total_s:.0f} s")
     say(f"look at   {out / 'report.html'} in a browser; the vectors are in {vectors}")
 

@@ -69,6 +69,45 @@ def read_experiment(path: str | Path) -> Experiment:
     """Read and check an experiment as `open_experiment` does, without its particle images."""
     path = Path(path)
     table = _read_table(path)
+    grid = check_tables(path, table)
+    board, particles = table.board, table.particles
+    experiment = Experiment(
+        path=path,
+        name=table.name,
+        dt_s=table.dt_s,
+        cameras=tuple(_camera(path, camera) for camera in table.camera),
+        board=board,
+        grid=grid,
+        guard_mm=table.volume.guard_mm,
+        pairs=particles.count,
+        frames=particles.frames,
+        series=particles.series,
+        smart=table.smart,
+        self_calibration=table.self_calibration,
+        bootstrap=table.bootstrap,
+        correlation=table.correlation,
+        tracking=table.tracking,
+        network=table.network,
+        compute=table.compute,
+        particle_images=particles.images,
+        background=particles.background,
+    )
+    for camera in experiment.cameras:
+        if camera.orientation is not None:
+            nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
+            nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
+    _check_calibration_images(experiment)
+    return replace(experiment, solid=solid_voxels(path, table.volume, grid))
+
+
+def check_tables(path: Path, table: ExperimentTable) -> Grid:
+    """Check the tables of an experiment file against each other, without any image; return the grid of the volume.
+
+    Raises
+    ------
+    InputError
+        If they do not fit each other.
+    """
     names = [camera.name for camera in table.camera]
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -90,33 +129,7 @@ def read_experiment(path: str | Path) -> Experiment:
         )
     grid = _grid(path, table.volume, len(names))
     _check_windows(path, table.correlation, grid)
-    experiment = Experiment(
-        path=path,
-        name=table.name,
-        dt_s=table.dt_s,
-        cameras=tuple(_camera(path, camera) for camera in table.camera),
-        board=board,
-        grid=grid,
-        guard_mm=table.volume.guard_mm,
-        pairs=particles.count,
-        frames=particles.frames,
-        series=series,
-        smart=table.smart,
-        self_calibration=table.self_calibration,
-        bootstrap=table.bootstrap,
-        correlation=table.correlation,
-        tracking=table.tracking,
-        network=table.network,
-        compute=table.compute,
-        particle_images=particles.images,
-        background=particles.background,
-    )
-    for camera in experiment.cameras:
-        if camera.orientation is not None:
-            nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
-            nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
-    _check_calibration_images(experiment)
-    return replace(experiment, solid=solid_voxels(path, table.volume, grid))
+    return grid
 
 
 def _read_table(path: Path) -> ExperimentTable:

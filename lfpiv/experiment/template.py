@@ -7,7 +7,6 @@ are often changed as comments.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -24,8 +23,7 @@ from lfpiv.experiment.bounds import (
     PathText,
     PixelPitch,
 )
-from lfpiv.experiment.settings import Dots, ExperimentTable, Table
-from lfpiv.experiment.toml import parse, validated
+from lfpiv.experiment.settings import Dots, Table
 
 COMMENT_COLUMN = 45
 """Column at which comments begin."""
@@ -61,19 +59,11 @@ class Values(Table):
     dt_s: Interval
 
 
-def experiment_text(values: Values, path: Path) -> str:
-    """Return the text of an experiment file. Paths in it are relative to the file `path`.
-
-    Raises
-    ------
-    InputError
-        If the values do not fit each other.
-    """
+def experiment_text(values: Values) -> str:
+    """Return the text of an experiment file."""
     parts = [_head(values), *(_camera(values, name, angle) for name, angle in values.cameras)]
     parts += [_board(values), _volume(values), _particles(values), _OPTIONAL]
-    text = "\n".join(parts)
-    validated(parse(text, path), path, ExperimentTable)
-    return text
+    return "\n".join(parts)
 
 
 def _head(values: Values) -> str:
