@@ -142,9 +142,9 @@ def _run(
 @_command("init", "lfpiv init", f"lfpiv init jet/experiment.toml {init.EXAMPLE}")
 @init.with_options
 def _init(
-    experiment: Annotated[
-        Path, typer.Argument(metavar="[EXPERIMENT.toml]", help="The file to write; default: experiment.toml.")
-    ] = Path("experiment.toml"),
+    experiment: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="The file to write.")] = Path(
+        "experiment.toml"
+    ),
     **answers: str | None,
 ) -> None:
     """Write a commented experiment file from options. On a terminal, ask for what they leave out.

@@ -104,7 +104,7 @@ QUESTIONS = (
         key="f_number",
         option="--f-number",
         form="a number",
-        text="f-number of the main lens, as set on its ring",
+        text="aperture of the main lens: the f-number set on its ring",
         read=float,
     ),
     Question(

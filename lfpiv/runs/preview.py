@@ -23,7 +23,7 @@ from lfpiv.report.preview import Level, Preview, draw
 from lfpiv.runs import guard, rig
 from lfpiv.runs.frame_light import FrameLight, pair_light, read_darks
 from lfpiv.runs.pair_vectors import LastVectors
-from lfpiv.runs.pair_volumes import Reconstruction
+from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.runs.run import open_run
 from lfpiv.weights.operator import Weights, build_weights
 
@@ -88,7 +88,7 @@ def preview(
         )
         current.progress("coarse volume", 0.0)
         between = LastVectors(coarse.dt_s)
-        work = Reconstruction(experiment=coarse, weights=weights, guard=layers, refinement=1.0, between=between)
+        work = Reconstructor(experiment=coarse, weights=weights, guard=layers, refinement=1.0, between=between)
         volumes = work.volumes([frame.images for frame in light], [frame.noise for frame in light])
         current.progress("coarse volume", 1.0)
         name = current.experiment.name_of(number)
