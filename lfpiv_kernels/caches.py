@@ -32,6 +32,8 @@ _KERNEL, _INDEX = ".tic", ".tcb"
 _SOURCES = (".cpp", ".cu", ".h")
 """Files of a module that Warp does not read again."""
 
+_compilation_logged = False
+
 
 def prepare() -> None:
     """Set the environment so that Taichi and Warp can start; call it before either is imported.
@@ -109,6 +111,14 @@ def taichi_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lfpiv" / "taichi"
 
 
+def log_compilation(folder: Path) -> None:
+    """Log, once per process, that kernels are compiled into a folder."""
+    global _compilation_logged
+    if not _compilation_logged:
+        log.info("compiling kernels, once; they are kept in %s", folder)
+    _compilation_logged = True
+
+
 def verify_warp(folder: Path) -> None:
     """Remove modules of this package from Warp's cache whose files have changed; record those of new ones."""
     removed = 0
@@ -133,8 +143,11 @@ def verify_warp(folder: Path) -> None:
     _tell(folder, removed, "modules")
 
 
-def verify_taichi(folder: Path) -> None:
-    """Remove Taichi's compiled kernels that are not as `seal_taichi` recorded them; all of them if the index is not."""
+def verify_taichi(folder: Path) -> bool:
+    """Remove Taichi's compiled kernels that are not as `seal_taichi` recorded them; all of them if the index is not.
+
+    Return whether some are left.
+    """
     with _locked(folder):
         files = {path.name: path for path in _kernels(folder)}
         try:
@@ -145,9 +158,10 @@ def verify_taichi(folder: Path) -> None:
         changed = [name for name in files if name in known and known[name] != _digest(files[name])]
         if not all(name.endswith(_KERNEL) for name in (*unrecorded, *changed)):
             unrecorded = list(files)
-        for name in (*unrecorded, *changed):
-            files[name].unlink(missing_ok=True)
+        for name in {*unrecorded, *changed}:
+            files.pop(name).unlink(missing_ok=True)
     _tell(folder, len(changed), "files")
+    return bool(files)
 
 
 def seal_taichi(folder: Path, finish: Callable[[], None]) -> None:

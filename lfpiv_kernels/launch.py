@@ -2,11 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import runtime
+from lfpiv_kernels import caches, runtime
+
+_loaded: set[tuple[str, str]] = set()
+"""Modules and devices that `load` has met in this process."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ def launch(*calls: Call, parts: int | None = None, device: str | None = None) ->
     where = runtime.device()
     device = device or where.warp
     for call in calls:
-        wp.load_module(call.kernel.module, device=device)  # before threads start: compilation is not thread-safe
+        load(call.kernel, device)  # before threads start: compilation is not thread-safe
     on_cpu = where.kind == "cpu"
     if not on_cpu:
         parts = 1
@@ -65,6 +69,17 @@ def launch(*calls: Call, parts: int | None = None, device: str | None = None) ->
                 free.append(slot)
 
     runtime.run_chunks(len(calls) * parts, run, chunks=len(calls) * parts)
+
+
+def load(kernel: wp.Kernel, device: str) -> None:
+    """Load the module of a kernel on a device. Log that kernels are compiled if the module is not in the cache."""
+    module = kernel.module
+    if (module.name, device) not in _loaded:
+        _loaded.add((module.name, device))
+        folder = Path(wp.config.kernel_cache_dir)
+        if not (folder / module.get_module_identifier(1 if device == "cpu" else None)).is_dir():
+            caches.log_compilation(folder)
+    wp.load_module(module, device=device)
 
 
 def to_device(values: np.ndarray, dtype: type | None = None, device: str | None = None) -> wp.array:

@@ -42,6 +42,7 @@ class Device:
 
 _device: Device | None = None
 _pool: ThreadPoolExecutor | None = None
+_taichi_folder: Path | None = None  # for the kernels of Taichi, if it held none at the start
 _starting = threading.Lock()
 _forked = False
 
@@ -72,7 +73,7 @@ def start(request: str = "auto", *, threads: int | None = None) -> Device:
 
 
 def _start(request: str, threads: int | None) -> Device:
-    global _device, _pool
+    global _device, _pool, _taichi_folder
     if _forked:
         raise RuntimeError(
             "device: kernels ran before this process was forked, and cannot run in it. Start processes by 'spawn' or "
@@ -101,7 +102,7 @@ def _start(request: str, threads: int | None) -> Device:
     import taichi as ti
 
     compiled = caches.taichi_folder()
-    caches.verify_taichi(compiled)
+    _taichi_folder = None if caches.verify_taichi(compiled) else compiled
     named = {} if "TI_OFFLINE_CACHE_FILE_PATH" in os.environ else {"offline_cache_file_path": str(compiled)}
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that log_level does not silence
@@ -162,6 +163,14 @@ def _quiet_stderr() -> Iterator[None]:
 def device() -> Device:
     """Return the running device. Start it with "auto" if nothing runs yet."""
     return _device or start("auto")
+
+
+def device_of_taichi() -> Device:
+    """Return the running device for a kernel of Taichi. Log that kernels are compiled if the cache held none."""
+    where = device()
+    if _taichi_folder is not None:
+        caches.log_compilation(_taichi_folder)
+    return where
 
 
 def run_chunks(size: int, job: Callable[[int, int, int], None], *, chunks: int = CHUNKS) -> None:

@@ -221,7 +221,7 @@ def test_the_tutorial_quotes_the_demonstration(quoted):
     assert quoted.unknown_numbers(text) == ["0.04"]  # the published one
     good = {
         "calibration": {
-            name: {"dots_found": 343, "sigma_nor_test": sigma}
+            name: {"dots_found": 245, "sigma_nor_test": sigma}
             for name, sigma in zip(("left", "right"), said["sigma"], strict=True)
         },
         "demo": {"mean_error_voxel": said["error"][0], "largest_displacement_voxel": said["moved"][0]},
@@ -232,8 +232,8 @@ def test_the_tutorial_quotes_the_demonstration(quoted):
         {"demo": good["demo"] | {"mean_error_voxel": 2 * said["error"][0]}},
         {"demo": good["demo"] | {"mean_error_voxel": float("nan")}},
         {"valid_fraction": 0.9},
-        {"calibration": good["calibration"] | {"left": {"dots_found": 342, "sigma_nor_test": 0.0025}}},
-        {"calibration": good["calibration"] | {"left": {"dots_found": 343, "sigma_nor_test": 0.005}}},
+        {"calibration": good["calibration"] | {"left": {"dots_found": 244, "sigma_nor_test": 0.0015}}},
+        {"calibration": good["calibration"] | {"left": {"dots_found": 245, "sigma_nor_test": 0.005}}},
     ):
         assert len(quoted.differences(text, scene, good | changed)) == 1, changed
 

@@ -17,7 +17,7 @@ MOVED_VOXEL = 0.05
 SIGMA_PITCH = 0.0005
 """Of the ends of the range of sigma_nor, likewise; another seed of the network moves it by 0.0003."""
 VALID_PERCENT = 1.0
-"""Of the valid vectors: about four vectors of the demonstration's 400."""
+"""Of the valid vectors: about 25 vectors of the demonstration's 2,560."""
 
 _PATTERNS = {
     "pixels": r"cameras of (\d+) x (\d+) pixels",
@@ -43,7 +43,7 @@ def quotes(text: str) -> dict[str, tuple[float, ...]]:
 
 def unknown_numbers(text: str) -> list[str]:
     """Numbers in the list of the demonstration's figures that nothing checks."""
-    section = re.search(r"(?s)ends with the figures that matter:\n(.*?)\n\n[^-\s]", text)[1]
+    section = re.search(r"(?s)two more that the log and the report have:\n(.*?)\n\n[^-\s]", text)[1]
     for pattern in _PATTERNS.values():
         section = re.sub(pattern.replace(" ", r"\s+"), "", section)
     return re.findall(r"\d[\d.]*\d|\d", section)

@@ -20,8 +20,7 @@ if not (folder / "report.html").exists():
 
 experiment = lfpiv.open_experiment(folder / "experiment" / "experiment.toml")
 calibration = lfpiv.load_calibration(folder / "calibration.h5")
-grid = lfpiv.Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=(4.2, 4.2, 2.4), voxel_mm=0.1)
-weights = lfpiv.build_weights(calibration, grid, form="profiles")
+weights = lfpiv.build_weights(calibration, experiment.grid, form="profiles")
 
 # %%
 # The decoder knows which pixels lie between the microimages, where no light falls: their level is subtracted, their

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from lfpiv.cli import terminal
+from lfpiv.cli import init, terminal
 from lfpiv.cli.terminal import Interrupted, Output
 from lfpiv.errors import ClusterError, InputError, StorageError, printable
 from lfpiv.reproduce import CASES
@@ -43,11 +43,13 @@ def _show_version(value: bool) -> None:
 
 
 ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="The experiment file.")]
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for everything the run writes.")]
+Out = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for everything the run writes.")]
 Pairs = Annotated[
     str,
     typer.Option(
-        "--pairs", metavar="A:B", help="Pairs, or instants of a series, A to B - 1 only; either may be left out."
+        "--pairs",
+        metavar="A:B",
+        help="Pairs, or instants of a series, A to B - 1 only; either may be left out. One number is a single pair.",
     ),
 ]
 Device = Annotated[
@@ -97,6 +99,7 @@ def _command(name: str, *examples: str) -> Callable[[Callable[..., None]], Calla
     "run",
     "lfpiv run experiment.toml --out results",
     "lfpiv run experiment.toml --out results --pairs 0:100 --workers 2",
+    "lfpiv run experiment.toml -o results --pairs 0",
     "lfpiv run experiment.toml --out results --scheduler tcp://head:8786",
 )
 def _run(
@@ -134,6 +137,25 @@ def _run(
     _end(finished)
 
 
+@_command("init", "lfpiv init", f"lfpiv init jet/experiment.toml {init.EXAMPLE}")
+@init.with_options
+def _init(
+    experiment: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="The file to write.")] = Path(
+        "experiment.toml"
+    ),
+    **answers: str | None,
+) -> None:
+    """Write a commented experiment file from options. On a terminal, ask for what they leave out.
+
+    No image needs to exist yet. The file says where each number is found; an existing one is not overwritten.
+    """
+    try:
+        missing = init.write_experiment(experiment, answers)
+    except typer.Abort as error:
+        raise typer.Exit(_fail(1, "interrupted; nothing is written.", error)) from None
+    _output.show({"experiment": str(experiment), "missing": missing}, lambda: terminal.print_init(experiment, missing))
+
+
 @_command(
     "calibrate", "lfpiv calibrate experiment.toml --out results", "lfpiv calibrate experiment.toml --out results --json"
 )
@@ -144,6 +166,26 @@ def _calibrate(experiment: ExperimentFile, out: Out, device: Device = None) -> N
 
         summary = pipeline.calibrate(experiment, out, device=device, progress=progress)
     _output.show(summary, lambda: terminal.print_calibration(summary))
+
+
+@_command("preview", "lfpiv preview experiment.toml --out results", "lfpiv preview experiment.toml -o results --pair 7")
+def _preview(
+    experiment: ExperimentFile,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of a run, with its calibration.")],
+    pair: Annotated[
+        int | None, typer.Option("--pair", metavar="N", help="Pair, or instant of a series; default: the first.")
+    ] = None,
+    device: Device = None,
+) -> None:
+    """Draw one pair of a calibrated rig within seconds, to tune lasers, lenses and seeding.
+
+    DIR/preview/pair_N.png shows a coarse volume, images refocused at several depths, and the light of each camera.
+    """
+    with _output.progress() as progress:
+        from lfpiv.runs.preview import preview
+
+        found = preview(experiment, out, pair, device=device, progress=progress)
+    _output.show(found, lambda: terminal.print_preview(found))
 
 
 @_command("reconstruct", "lfpiv reconstruct experiment.toml --out results --pairs 0:10")
@@ -192,7 +234,7 @@ def _export(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR2", help="Folder to write to; default: DIR/export.")
+        Path | None, typer.Option("--out", "-o", metavar="DIR2", help="Folder to write to; default: DIR/export.")
     ] = None,
     pairs: Pairs = ":",
     depth: Annotated[
@@ -331,10 +373,10 @@ def _parse_pairs(text: str) -> tuple[int, int | None]:
     first, colon, after = text.partition(":")
     try:
         if not colon:
-            raise ValueError
+            return int(first), int(first) + 1
         return int(first or 0), int(after) if after else None
     except ValueError:
-        raise InputError(f"--pairs: expected A:B with whole numbers, found {text!r}.") from None
+        raise InputError(f"--pairs: expected A:B, or one number, in whole numbers, found {text!r}.") from None
 
 
 def _end(summary: dict[str, Any]) -> None:

@@ -35,7 +35,7 @@ def run(out: str | Path, *, device: str | None = None, progress: Progress | None
     Returns
     -------
     dict
-        The content of ``summary.json``, with the vectors' error against the true flow under ``demo``.
+        The content of ``summary.json``, with figures of the first pair under ``demo``; see `compare_with_truth`.
 
     Raises
     ------
@@ -57,9 +57,11 @@ def run(out: str | Path, *, device: str | None = None, progress: Progress | None
 def compare_with_truth(scene: Scene, out: Path) -> dict[str, float]:
     """Return the error of the first pair's interior vectors against the flow averaged over each window [voxel].
 
-    Errors are NaN if there is no vector.
+    Errors are NaN if there is no vector. ``vectors`` is the number of vectors, ``speed_m_per_s`` the median speed of
+    the valid ones.
     """
     vectors = netcdf.read_vectors(Folder(out).vectors(0))
+    speed = np.linalg.norm([vectors[name].values[vectors["valid"].values] for name in "uvw"], axis=0)
     voxel_mm = scene.volume.voxel_mm
     window_mm = np.array(CorrelationSettings.of(vectors).windows[-1][::-1]) * voxel_mm
     inner = vectors.isel({axis: slice(1, -1) for axis in AXES if vectors.sizes[axis] > 2})
@@ -72,4 +74,6 @@ def compare_with_truth(scene: Scene, out: Path) -> dict[str, float]:
         "mean_error_voxel": float(error.mean()) if error.size else float("nan"),
         "median_error_voxel": float(np.median(error)) if error.size else float("nan"),
         "largest_displacement_voxel": float(np.linalg.norm(truth, axis=1).max()),
+        "vectors": vectors["valid"].size,
+        "speed_m_per_s": float(np.median(speed)) if speed.size else float("nan"),
     }

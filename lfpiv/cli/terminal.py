@@ -158,23 +158,50 @@ def print_run(summary: dict[str, Any], out: Path) -> None:
     """Print calibration, vectors, warnings, time and memory of a run, and the path of its report."""
     print_calibration(summary)
     print_vectors(summary, out)
+    print_warnings(summary, out)
+    say(f"{summary['timings_s']['total']:.0f} s, peak memory {summary['peak_memory_mib']:.0f} MiB")
+    say(f"report: {out / 'report.html'}")
+
+
+def print_init(experiment: Path, missing: str) -> None:
+    """Print where the experiment file is, what is missing, and the next command."""
+    say(f"experiment: {experiment}")
+    if missing:
+        say(f"not complete yet: {missing}")
+    say(f"next: lfpiv run {experiment} --out results")
+
+
+def print_preview(found: dict[str, Any]) -> None:
+    """Print the light of each camera and frame, the warnings about the images, and the path of the picture."""
+    for level in found["levels"]:
+        say(
+            f"{level['camera']}, {level['frame']}: typical peak {level['peak']:.0f} counts, noise "
+            f"{level['noise']:.1f}, {100 * level['lit']:.0f} % of the microimages lit, particles: {level['verdict']}"
+        )
+    for text in found["warnings"]:
+        say(f"warning: {text}")
+    say(f"preview: {found['picture']}")
+
+
+def print_demo(summary: dict[str, Any], out: Path) -> None:
+    """Print the warnings of the demonstration, and three lines: what was measured, how well, and where to look."""
+    print_warnings(summary, out)
+    found, vectors = summary["demo"], out / "vectors"
+    valid, speed = 100 * summary["valid_fraction"], found["speed_m_per_s"]
+    error, largest = found["mean_error_voxel"], found["largest_displacement_voxel"]
+    total_s = summary["timings_s"]["total"]
+    say(f"measured  a ring vortex: {found['vectors']:,} vectors, {valid:.0f} % valid, {speed:.1f} m/s in the median")
+    say(f"error     {error:.2f} voxel on average where the flow moves by up to {largest:.1f} voxel; {total_s:.0f} s")
+    say(f"look at   {out / 'report.html'} in a browser; the vectors are in {vectors}")
+
+
+def print_warnings(summary: dict[str, Any], out: Path) -> None:
+    """Print the warnings of a run, up to `LISTED_WARNINGS`."""
     warnings = summary["warnings"]
     for text in warnings[:LISTED_WARNINGS]:
         say(f"warning: {text}")
     if len(warnings) > LISTED_WARNINGS:
         say(f"{len(warnings) - LISTED_WARNINGS:,} more warnings are in {out / 'summary.json'}")
-    say(f"{summary['timings_s']['total']:.0f} s, peak memory {summary['peak_memory_mib']:.0f} MiB")
-    say(f"report: {out / 'report.html'}")
-
-
-def print_demo(summary: dict[str, Any], out: Path) -> None:
-    """Print the error of the demonstration against the simulated flow, and the result of its run."""
-    truth = summary["demo"]
-    say(
-        f"against the simulated flow: mean error {truth['mean_error_voxel']:.2f} voxel, "
-        f"where displacements reach {truth['largest_displacement_voxel']:.2f} voxel"
-    )
-    print_run(summary, out)
 
 
 def print_case(key: str, result: dict[str, Any]) -> None:

@@ -24,7 +24,7 @@ from lfpiv.experiment.settings import (
     Particles,
     RawImages,
 )
-from lfpiv.experiment.toml import read_toml
+from lfpiv.experiment.toml import parse, read_text, read_toml
 from lfpiv.geometry.grid import AXES, Grid
 
 DECODED_PIXELS = 100_000_000
@@ -68,7 +68,47 @@ def open_experiment(path: str | Path) -> Experiment:
 def read_experiment(path: str | Path) -> Experiment:
     """Read and check an experiment as `open_experiment` does, without its particle images."""
     path = Path(path)
-    table = read_toml(path, ExperimentTable)
+    table = _read_table(path)
+    grid = check_tables(path, table)
+    board, particles = table.board, table.particles
+    experiment = Experiment(
+        path=path,
+        name=table.name,
+        dt_s=table.dt_s,
+        cameras=tuple(_camera(path, camera) for camera in table.camera),
+        board=board,
+        grid=grid,
+        guard_mm=table.volume.guard_mm,
+        pairs=particles.count,
+        frames=particles.frames,
+        series=particles.series,
+        smart=table.smart,
+        self_calibration=table.self_calibration,
+        bootstrap=table.bootstrap,
+        correlation=table.correlation,
+        tracking=table.tracking,
+        network=table.network,
+        compute=table.compute,
+        particle_images=particles.images,
+        background=particles.background,
+    )
+    for camera in experiment.cameras:
+        if camera.orientation is not None:
+            nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
+            nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
+    _check_calibration_images(experiment)
+    mask_path = None if table.volume.mask is None else path.parent / table.volume.mask
+    return replace(experiment, solid=solid_voxels(path, table.volume, grid), mask_path=mask_path)
+
+
+def check_tables(path: Path, table: ExperimentTable) -> Grid:
+    """Check the tables of an experiment file against each other, without any image; return the grid of the volume.
+
+    Raises
+    ------
+    InputError
+        If they do not fit each other.
+    """
     names = [camera.name for camera in table.camera]
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -92,34 +132,20 @@ def read_experiment(path: str | Path) -> Experiment:
     scale_checks.require_scale(path, table.volume, board, cameras)
     grid = _grid(path, table.volume, len(names))
     _check_windows(path, table.correlation, grid)
-    experiment = Experiment(
-        path=path,
-        name=table.name,
-        dt_s=table.dt_s,
-        cameras=cameras,
-        board=board,
-        grid=grid,
-        guard_mm=table.volume.guard_mm,
-        pairs=particles.count,
-        frames=particles.frames,
-        series=series,
-        smart=table.smart,
-        self_calibration=table.self_calibration,
-        bootstrap=table.bootstrap,
-        correlation=table.correlation,
-        tracking=table.tracking,
-        network=table.network,
-        compute=table.compute,
-        particle_images=particles.images,
-        background=particles.background,
-    )
-    for camera in experiment.cameras:
-        if camera.orientation is not None:
-            nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
-            nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
-    _check_calibration_images(experiment)
-    mask_path = None if table.volume.mask is None else path.parent / table.volume.mask
-    return replace(experiment, solid=solid_voxels(path, table.volume, grid), mask_path=mask_path)
+    return grid
+
+
+def _read_table(path: Path) -> ExperimentTable:
+    """Read the tables of an experiment file; a scene of the simulator is refused as such."""
+    try:
+        return read_toml(path, ExperimentTable)
+    except InputError:
+        if "flow" in parse(read_text(path), path):
+            raise InputError(
+                f"{path}: expected an experiment file, found a scene of the simulator, with a table [flow]. Use "
+                f"`lfpiv simulate {path} --out DIR` first, and then DIR/experiment.toml."
+            ) from None
+        raise
 
 
 def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[int, str]]:

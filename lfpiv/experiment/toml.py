@@ -55,7 +55,11 @@ def read_toml(path: Path, model: type[Model]) -> Model:
         If the file cannot be read, is not TOML, or does not fit the model. The message explains the first problem,
         names all missing keys, and the keys of the other problems.
     """
-    values = parse(read_text(path), path)
+    return validated(parse(read_text(path), path), path, model)
+
+
+def validated(values: Mapping[str, Any], path: Path, model: type[Model]) -> Model:
+    """Return the values of a file as a model; `path` names the file in messages. Raise InputError as `read_toml`."""
     try:
         return model.model_validate(values)
     except ValidationError as error:

@@ -11,6 +11,8 @@ import warp as wp
 
 FOLDER = Path(__file__).resolve().parent
 """Folder of the headers."""
+QUIET = "-w"
+"""Option of the CPU's compiler that suppresses warnings, which differ from processor to processor; errors are shown."""
 
 
 def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dict[str, object]:
@@ -32,7 +34,6 @@ def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dic
     """
     include = f'#include "{header}"'
     chosen: dict[str, object] = {
-        "enable_backward": False,
         "max_unroll": unroll,
         "extra_build_options": wp.ModuleBuildOptions(
             extra_cpu_include_dirs=[FOLDER],
@@ -42,9 +43,13 @@ def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dic
             extra_build_dependencies=_included(header),
         ),
     }
-    if contract:
-        chosen["cpu_compiler_flags"] = f"{wp.config.cpu_compiler_flags} -ffp-contract={contract}"
-    return chosen
+    flags = f"-ffp-contract={contract} {QUIET}" if contract else QUIET
+    return chosen | quiet_options(flags)
+
+
+def quiet_options(flags: str = QUIET) -> dict[str, object]:
+    """Return the options of every Warp module: no adjoint kernels, and no warnings of the CPU's compiler."""
+    return {"enable_backward": False, "cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or ''} {flags}".strip()}
 
 
 def constant(header: str, name: str) -> int | float:

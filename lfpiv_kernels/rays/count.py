@@ -91,7 +91,7 @@ def count_rays(rays, shift, window, first_pixel, camera, lattice, *, hexagonal, 
     total : ndarray, shape (window,), int32
         Rays traced.
     """
-    runtime.device()
+    runtime.device_of_taichi()
     count = np.zeros((len(first_pixel), *shape), np.int32)
     total = np.zeros(len(first_pixel), np.int32)
     _count_rays(rays, shift, window, first_pixel, camera, lattice, bool(hexagonal), int(samples), count, total)

@@ -189,7 +189,7 @@ def evaluate(
     rays_per_point = len(pupil) if fan else 1
     if len(points) == 0 or rays_per_point == 0:
         return out
-    device = runtime.device()
+    device = runtime.device_of_taichi()
     kernel = _kernel(sizes, BATCH if device.kind == "cpu" else 1, fan, lens is not None)
     pupil = pupil if fan else np.zeros((1, 2), np.float32)
     lens = np.zeros(1, np.float32) if lens is None else lens

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch, load, to_device
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
@@ -246,7 +246,7 @@ class Projector:
             setattr(self._matrix, name, to_device(np.diff(ends).astype(np.int32) if array is None else array))
         self._matrix.stride = blocks.microimages.edge
         self._matrix.profiles = blocks.form == "profiles"
-        wp.load_module(_project.module, device=runtime.device().warp)  # before threads start
+        load(_project, runtime.device().warp)  # before threads start
         self._spans = self._find_spans()
         self._places = np.cumsum([0] + [stop - start for start, stop in self._spans])
         self.rays = to_device(np.empty(max(int(self._places[-1]), 1), np.float32))  # `scatter` writes it first

@@ -252,7 +252,7 @@ def lens_reach(camera: RenderCamera) -> int:
 
 def _collect(camera: RenderCamera, samples: int, seed: int, board: tuple | None) -> np.ndarray:
     """Return the image of a board, or of uniform light if there is none."""
-    runtime.device()
+    runtime.device_of_taichi()
     image = np.empty(camera.sensor_shape, np.float32)
     widest = 0.0
     if board is not None and not camera.ideal:

@@ -250,7 +250,7 @@ def render_sources(
     ndarray, shape (rows, columns), float64
         Counts per pixel, without noise.
     """
-    runtime.device()
+    runtime.device_of_taichi()
     points_mm = np.asarray(points_mm, float).reshape(-1, 3)
     count = len(points_mm)
     if not np.isfinite(points_mm).all():

@@ -158,7 +158,7 @@ def render_patch(
     ndarray, shape (rows, columns), float64
         Light relative to a fully lit pixel of a lens of gain 1 looking at radiance 1, the patch's largest.
     """
-    runtime.device()
+    runtime.device_of_taichi()
     rotation = np.asarray(camera.rotation, float)
     centre = rotation @ (np.asarray(centre_mm, float) - camera.offset_mm)
     along, across = np.asarray(axes, float) @ rotation.T

@@ -1,5 +1,6 @@
 """The command line: exit status, one message per user error, no files after a failure."""
 
+import importlib.resources
 import json
 import os
 import subprocess
@@ -131,7 +132,8 @@ def test_a_place_for_results_that_is_taken_is_refused_before_work(tiny_experimen
         (["run", "x.toml"], ["--out"]),
         (["frobnicate"], ["frobnicate"]),
         (["run", "x.toml", "--out", "x", "--device", "tpu"], ["--device", "tpu"]),
-        (["run", "x.toml", "--out", "x", "--pairs", "3"], ["--pairs", "A:B"]),
+        (["run", "x.toml", "--out", "x", "--pairs", "3-5"], ["--pairs", "A:B"]),
+        (["run", "x.toml", "--out", "x", "--pairs", ""], ["--pairs", "A:B"]),
         (["run", "no-such-file.toml", "--out", "x"], ["no-such-file.toml", "no such file"]),
         (["run", ".", "--out", "x"], ["a folder"]),
     ],
@@ -183,6 +185,47 @@ def test_json_is_all_of_standard_output_and_quiet_prints_nothing(monkeypatch, tm
     assert json.loads(written) == {**summary, "value": None} and "failed: pair 1: dark" in message
     monkeypatch.setattr(pipeline, "run", lambda *args, **options: {**summary, "failed": []})
     assert commands.call([*command, "--quiet"]) == 0 and capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "pairs"),
+    [("1", (1, 2)), ("0", (0, 1)), ("2:5", (2, 5)), ("2:", (2, None)), (":5", (0, 5)), (":", (0, None))],
+)
+def test_pairs_are_a_single_number_or_a_range(monkeypatch, tmp_path, text, pairs):
+    asked = []
+    monkeypatch.setattr(pipeline, "run", lambda file, out, **options: asked.append((out, options["pairs"])))
+    commands.call(["run", "x.toml", "-o", str(tmp_path), "--quiet", "--pairs", text])
+    assert asked == [(tmp_path, pairs)]
+
+
+@pytest.mark.parametrize("command", ["run", "calibrate", "preview"])
+def test_a_scene_is_named_as_such(tmp_path, capfd, command):
+    scene = tmp_path / "scene.toml"
+    scene.write_text((importlib.resources.files("lfpiv.cli") / "demo_scene.toml").read_text("utf-8"))
+    assert commands.call([command, str(scene), "--out", str(tmp_path / "out")]) == 2
+    message = capfd.readouterr().err
+    assert (
+        message.count("\n") == 1
+        and f"`lfpiv simulate {scene} --out DIR`" in message
+        and not (tmp_path / "out").exists()
+    )
+
+
+def test_the_demonstration_ends_with_warnings_and_three_aligned_lines(tmp_path, capfd):
+    found = {
+        "mean_error_voxel": 0.234,
+        "median_error_voxel": 0.2,
+        "largest_displacement_voxel": 2.71,
+        "vectors": 1234,
+        "speed_m_per_s": 2.66,
+    }
+    summary = {"demo": found, "valid_fraction": 0.996, "timings_s": {"total": 41.2}, "warnings": ["camera left sleeps"]}
+    terminal.print_demo(summary, tmp_path)
+    warning, *lines = capfd.readouterr().out.splitlines()
+    assert warning == "warning: camera left sleeps" and len(lines) == 3
+    assert len({len(line) - len(line.split(maxsplit=1)[1]) for line in lines[:2]}) == 1
+    assert all(word in lines[0] for word in ("1,234 vectors", "100 % valid", "2.7 m/s"))
+    assert "0.23 voxel" in lines[1] and "2.7 voxel" in lines[1] and str(tmp_path / "report.html") in lines[2]
 
 
 def test_options_of_one_call_do_not_reach_the_next(capfd):

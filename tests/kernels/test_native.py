@@ -66,13 +66,40 @@ def build_dependencies(module):
 def test_compiler_has_no_warnings(module, changed_options, capfd, tmp_path):
     """Those that Warp's own compiler gives by default, anywhere, and all others in the headers."""
     runtime.start("cpu")
-    flags = wp.get_module(module).options["cpu_compiler_flags"] or wp.config.cpu_compiler_flags
+    flags = wp.get_module(module).options["cpu_compiler_flags"].removesuffix(native.QUIET)
+    changed_options(module, {"cpu_compiler_flags": flags})
     wp.compile_aot_module(importlib.import_module(module), device="cpu", module_dir=tmp_path / "plain")
     assert capfd.readouterr().err == ""
     changed_options(module, {"cpu_compiler_flags": f"{flags} -Wall -Wextra", "optimization_level": 0})
     wp.compile_aot_module(importlib.import_module(module), device="cpu", module_dir=tmp_path / "strict")
     found = re.findall(rf"^{native.FOLDER}.*warning: .*$", capfd.readouterr().err, re.MULTILINE)
     assert found == []
+
+
+def test_no_module_shows_warnings_of_the_compiler():
+    names = [found.name for found in pkgutil.walk_packages(lfpiv_kernels.__path__, "lfpiv_kernels.")]
+    modules = [wp.get_module(name) for name in names if "wp" in vars(importlib.import_module(name))]
+    flags = {module.name: module.options["cpu_compiler_flags"] for module in modules if module.kernels}
+    assert flags and all(one.split()[-1] == native.QUIET for one in flags.values()), flags
+
+
+@pytest.mark.slow
+def test_warnings_are_silent_and_errors_are_not(changed_options, capfd, tmp_path):
+    runtime.start("cpu")
+    module = "lfpiv_kernels.reconstruction.blur"
+    options = wp.get_module(module).options
+    header = included(module)
+    for line, wrong in (("#warning noise", False), ("#error broken", True)):
+        build = wp.ModuleBuildOptions(extra_cpu_include_dirs=[native.FOLDER], extra_cpu_preamble=f"{header}\n{line}")
+        changed_options(module, {"extra_build_options": build})
+        assert options["cpu_compiler_flags"].endswith(native.QUIET)
+        if wrong:
+            with pytest.raises(Exception, match="build failed"):
+                wp.compile_aot_module(importlib.import_module(module), device="cpu", module_dir=tmp_path / "wrong")
+            assert "broken" in capfd.readouterr().err
+        else:
+            wp.compile_aot_module(importlib.import_module(module), device="cpu", module_dir=tmp_path / "right")
+            assert capfd.readouterr().err == ""
 
 
 def test_a_changed_header_changes_the_module(changed_options, tmp_path, monkeypatch):

@@ -73,6 +73,39 @@ def test_too_little_address_space_is_named():
     assert done.returncode == 1 and "ulimit -v" in done.stderr.splitlines()[-1], done.stderr
 
 
+COMPILE = """
+import logging, sys
+logging.basicConfig(level="INFO", format="%(message)s", stream=sys.stdout)
+import numpy as np
+from lfpiv_kernels import runtime
+runtime.start("cpu", threads=1)
+from lfpiv_kernels.correlation import box_sum
+for _ in range(2):
+    box_sum.box_sum(np.ones((4, 4, 4), np.float32), (2, 2, 2))
+"""
+
+
+@pytest.mark.slow
+def test_compilation_is_told_once_and_only_when_there_is_some(tmp_path):
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    environment.pop("WARP_CACHE_PATH", None)
+    told = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", COMPILE], env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0 and done.stderr == "", done.stderr
+        told.append([line for line in done.stdout.splitlines() if line.startswith("compiling kernels, once")])
+    assert [len(lines) for lines in told] == [1, 0] and str(tmp_path) in told[0][0]
+
+
+def test_taichi_is_silent_where_standard_output_is_wrapped(tmp_path):
+    """Taichi logs, by native code, that it found a graphical shell."""
+    script = "import io, sys\nsys.stdout = io.StringIO()\nimport lfpiv_kernels.rays.mapping"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def names(folder):
     return {path.name for path in folder.iterdir() if path.suffix in (".tic", ".tcb")}
 

@@ -1,0 +1,330 @@
+"""`lfpiv init`: a commented experiment file from answers to questions, or from options of the command line.
+
+`QUESTIONS` defines each value once: its option, its question with the unit and the place where the number is found, and
+how its text is read.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lfpiv.errors import InputError
+
+MOST_PLANES = 1000
+"""Largest number of planes that first, last and step may give."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """One value of a new experiment file."""
+
+    key: str
+    """Field of `Values`."""
+    option: str
+    """Option of the command line."""
+    form: str
+    """Form of the text, in the help."""
+    text: str
+    """What is asked, with the unit and where the number is found."""
+    read: Callable[[str], Any] = str
+    """Reads the text; raises ValueError."""
+    default: str | None = None
+
+    def value(self, text: str) -> Any:
+        """Return the value of an answer, or raise ValueError with what was expected."""
+        from pydantic import TypeAdapter, ValidationError  # here: the command line starts without it
+
+        from lfpiv.experiment.template import Values
+
+        try:
+            value = self.read(text.strip())
+        except ValueError:
+            hint = " with a decimal point" if "," in text and "," not in self.form else ""
+            raise ValueError(f"expected {self.form}{hint}, found {text!r}") from None
+        try:
+            return TypeAdapter(Values.model_fields[self.key].rebuild_annotation()).validate_python(value)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"].removeprefix("Input ").removeprefix("Value error, ")
+            raise ValueError(f"expected {self.form} that {reason}, found {text!r}") from None
+
+
+def _cameras(text: str) -> tuple[tuple[str, float], ...]:
+    """Read "left=45, right=-45"."""
+    parts = [part.partition("=") for part in text.split(",")]
+    return tuple((name.strip(), float(angle)) for name, _, angle in parts)
+
+
+def _product(number: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    """Return what reads numbers with "x" between them, such as "7x7"."""
+    return lambda text: tuple(number(part) for part in text.lower().split("x"))
+
+
+def _planes(text: str) -> tuple[float, ...]:
+    """Read "-2, -1, 0, 1, 2", or "-2:2:1": first, last and step."""
+    if ":" not in text:
+        return tuple(float(part) for part in text.split(","))
+    first, last, step = (float(part) for part in text.split(":"))
+    count = (last - first) / step if step else -1.0
+    if not 0 <= count < MOST_PLANES or abs(count - round(count)) > 1e-6:
+        raise ValueError
+    return tuple(round(first + step * number, 9) for number in range(round(count) + 1))
+
+
+QUESTIONS = (
+    Question(key="name", option="--name", form="text", text="name of the experiment, title of its report"),
+    Question(
+        key="cameras",
+        option="--cameras",
+        form="NAME=ANGLE,...",
+        text="cameras and the angle of each about y [degree], positive on the side of +x: left=45, right=-45",
+        read=_cameras,
+    ),
+    Question(
+        key="focal_length_mm",
+        option="--focal-length",
+        form="a number",
+        text="focal length of the main lens [mm], engraved on it",
+        read=float,
+    ),
+    Question(
+        key="magnification",
+        option="--magnification",
+        form="a number",
+        text="magnification: size on the sensor over size in the volume, of either sign",
+        read=float,
+    ),
+    Question(
+        key="f_number",
+        option="--f-number",
+        form="a number",
+        text="aperture of the main lens: the f-number set on its ring",
+        read=float,
+    ),
+    Question(
+        key="microlens_pitch_mm",
+        option="--microlens-pitch",
+        form="a number",
+        text="distance of the microlenses [mm], from the maker of the array",
+        read=float,
+    ),
+    Question(
+        key="microlens_focal_length_mm",
+        option="--microlens-focal-length",
+        form="a number",
+        text="focal length of the microlenses [mm], from the maker of the array",
+        read=float,
+    ),
+    Question(
+        key="microlens_layout",
+        option="--microlens-layout",
+        form="square or hexagonal",
+        text="arrangement of the microlenses",
+        default="square",
+    ),
+    Question(
+        key="pixel_um",
+        option="--pixel",
+        form="a number",
+        text="pixel pitch of the sensor [um], from the data sheet of the camera",
+        read=float,
+    ),
+    Question(
+        key="image_flip",
+        option="--image-flip",
+        form="none, horizontal, vertical or both",
+        text="pictures show the scene mirrored (none), as it is seen (horizontal), or upside down (vertical)",
+        default="none",
+    ),
+    Question(
+        key="white_image",
+        option="--white",
+        form="a path",
+        text="white images, with {camera} for the name of the camera",
+        default="white/{camera}.tif",
+    ),
+    Question(
+        key="board_images",
+        option="--board",
+        form="a path",
+        text="images of the board, with {camera} and {plane}",
+        default="board/{camera}/plane_{plane:02d}.tif",
+    ),
+    Question(
+        key="dots",
+        option="--dots",
+        form="NXxNY",
+        text="number of dots of the board along x and y: 7x7",
+        read=_product(int),
+    ),
+    Question(
+        key="spacing_mm",
+        option="--spacing",
+        form="a number",
+        text="distance of the dots [mm], from the drawing of the board",
+        read=float,
+    ),
+    Question(
+        key="dot_diameter_mm",
+        option="--dot-diameter",
+        form="a number",
+        text="diameter of a dot [mm], from the drawing of the board",
+        read=float,
+    ),
+    Question(
+        key="planes_mm",
+        option="--planes",
+        form="FIRST:LAST:STEP or Z,Z,...",
+        text="depths of the planes of the board [mm], read on the stage: -2:2:0.5",
+        read=_planes,
+    ),
+    Question(
+        key="particle_images",
+        option="--images",
+        form="a path",
+        text="particle images, with {camera}, {pair} and {frame}, or {camera} and {instant} for a time series",
+        default="particles/{camera}/pair_{pair:04d}_{frame}.tif",
+    ),
+    Question(
+        key="count",
+        option="--pairs",
+        form="a whole number",
+        text="number of image pairs, or of instants of a time series",
+        read=int,
+    ),
+    Question(
+        key="size_mm",
+        option="--size",
+        form="XxYxZ",
+        text="size of the volume [mm], which the light fills and all cameras see: 10x10x6",
+        read=_product(float),
+    ),
+    Question(
+        key="voxel_mm",
+        option="--voxel",
+        form="a number",
+        text="edge of a voxel [mm], about a microlens over the magnification",
+        read=float,
+    ),
+    Question(
+        key="dt_s",
+        option="--dt",
+        form="a number",
+        text="time between the two frames [s], from the timing of the laser: 1e-4",
+        read=float,
+    ),
+)
+
+
+EXAMPLE = (
+    "--cameras left=45,right=-45 --focal-length 100 --magnification -1 --f-number 4 --microlens-pitch 0.1 "
+    "--microlens-focal-length 0.8 --pixel 5.5 --dots 7x7 --spacing 1 --dot-diameter 0.1 --planes=-2:2:0.5 --pairs 100 "
+    "--size 6x6x3 --dt 1e-4"
+)
+"""Options of a complete call."""
+
+
+def with_options(function: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that takes ``**answers`` an option for each of `QUESTIONS`."""
+    own = inspect.signature(function, eval_str=True)
+    parameters = [one for one in own.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
+    for one in QUESTIONS:
+        default = "" if one.default is None else f" Default: {one.default}"
+        option = typer.Option(one.option, metavar="TEXT", help=f"{one.text[0].upper()}{one.text[1:]}.{default}")
+        kind = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(one.key, kind, default=None, annotation=Annotated[str | None, option]))
+    function.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return function
+
+
+def write_experiment(path: Path, given: Mapping[str, str | None]) -> str:
+    """Write a new experiment file from given answers; on an interactive terminal ask for the others.
+
+    Parameters
+    ----------
+    path : Path
+        The file to write.
+    given : mapping of str to str or None
+        Key of a question -> its answer, None where there is none.
+
+    Returns
+    -------
+    str
+        What is missing before the experiment can run; empty if nothing is.
+
+    Raises
+    ------
+    InputError
+        If the file exists, an answer is missing or wrong, or the values do not fit each other.
+    """
+    from lfpiv.experiment.opening import check_tables, read_experiment
+    from lfpiv.experiment.settings import ExperimentTable
+    from lfpiv.experiment.template import Values, experiment_text
+    from lfpiv.experiment.toml import parse, validated
+    from lfpiv.files import write_text
+
+    if path.exists():
+        raise InputError(f"{path}: expected a new file to write, found one that exists. Name another, or remove it.")
+    answers = _answers(given, path.absolute().parent.name)
+    values = Values.model_validate(answers)
+    text = experiment_text(values)
+    check_tables(path, validated(parse(text, path), path, ExperimentTable))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(text, path)
+    except OSError as error:
+        raise InputError(f"{path}: the file cannot be written ({error.strerror}). Name another folder.") from None
+    try:
+        read_experiment(path)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def _answers(given: Mapping[str, str | None], folder: str) -> dict[str, Any]:
+    """Read the given answers, and ask for the missing ones or take their defaults."""
+    answers: dict[str, Any] = {}
+    interactive, missing = sys.stdin.isatty(), []
+    for one in QUESTIONS:
+        text = given[one.key]
+        default = _default(one, answers, folder)
+        if text is None and interactive:
+            answers[one.key] = _ask(one, default)
+            continue
+        if text is None and default is None:
+            missing += [one.option] if one.key != "voxel_mm" else []  # which follows from others that are missing
+            continue
+        try:
+            answers[one.key] = one.value(default or "" if text is None else text)
+        except ValueError as error:
+            raise InputError(f"{one.option}: {error}.") from None
+    if missing:
+        raise InputError(f"init: expected {', '.join(missing)}: without a terminal nothing is asked.")
+    return answers
+
+
+def _default(one: Question, answers: Mapping[str, Any], folder: str) -> str | None:
+    """Return the default of a question, which may follow from earlier answers."""
+    if one.key == "name":
+        return folder or "experiment"
+    if one.key == "voxel_mm" and {"microlens_pitch_mm", "magnification"} <= set(answers):
+        return f"{answers['microlens_pitch_mm'] / abs(answers['magnification']):.3g}"
+    return one.default
+
+
+def _ask(one: Question, default: str | None) -> Any:
+    """Ask until the answer can be read."""
+
+    def read(text: str) -> Any:
+        try:
+            return one.value(text)
+        except ValueError as error:
+            raise typer.BadParameter(f"{error}.") from None
+
+    return typer.prompt(one.text[0].upper() + one.text[1:], default=default, value_proc=read, err=True)

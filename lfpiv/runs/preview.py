@@ -1,0 +1,175 @@
+"""Preview of one pair of a calibrated rig: a coarse volume by the steps of a run, refocused planes and light levels.
+
+The run's own steps are done on larger voxels, which takes seconds. Only the picture is written.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.geometry.grid import Grid
+from lfpiv.lightfield.image_checks import saturated_share
+from lfpiv.progress import Progress
+from lfpiv.reconstruction.intensity_cap import PEAK_SIGMA, typical_peak
+from lfpiv.report.preview import Level, Preview, draw
+from lfpiv.runs import guard, rig
+from lfpiv.runs.frame_light import FrameLight, pair_light, read_darks
+from lfpiv.runs.pair_vectors import LastVectors
+from lfpiv.runs.pair_volumes import Reconstructor
+from lfpiv.runs.run import open_run
+from lfpiv.weights.operator import Weights, build_weights
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
+
+log = logging.getLogger(__name__)
+
+MOST_VOXELS = 60_000
+"""Largest number of voxels of the coarse volume, without its guard layers."""
+ITERATIONS = 5
+"""Largest number of SMART iterations."""
+
+
+def preview(
+    experiment: Experiment | str | Path,
+    out: str | Path,
+    pair: int | None = None,
+    *,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Draw a preview of one pair into ``preview/`` of an output folder that holds the calibration.
+
+    Parameters
+    ----------
+    experiment : Experiment or path
+        The experiment, or its file.
+    out : path
+        Output folder with ``calibration.h5``.
+    pair : int, optional
+        Pair, or instant of a series; default: the first.
+    device, progress
+        As for `lfpiv.runs.pipeline.run`.
+
+    Returns
+    -------
+    dict
+        ``picture``, the file; ``levels``, the light of each camera and frame; ``warnings``, sentences; ``voxel_mm``.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no calibration that fits the experiment, or the pair's images cannot be used.
+    """
+    selected = None if pair is None else (pair, pair + 1)
+    with open_run(experiment, out, device, progress, selected, writes_results=False) as current:
+        number = current.numbers[0]
+        calibration = rig.with_standing_light(current, rig.load_calibration(current).calibration)
+        coarse = coarsened(current.experiment)
+        raw: dict[tuple[str, Frame], np.ndarray] = {}
+
+        def read(name: str, frame: Frame) -> np.ndarray:
+            raw[name, frame] = current.experiment.particle_image(name, *frame)
+            return raw[name, frame]
+
+        light = pair_light(current.experiment, calibration.cameras, read_darks(current.experiment), number, read)
+        layers = guard.layers(coarse, None)
+        grid = guard.with_guard(coarse, layers).grid
+        weights = build_weights(
+            calibration, grid, form=_form(calibration.cameras), progress=current.step("coarse weights")
+        )
+        current.progress("coarse volume", 0.0)
+        between = LastVectors(coarse.dt_s)
+        work = Reconstructor(experiment=coarse, weights=weights, guard=layers, refinement=1.0, between=between)
+        volumes = work.volumes([frame.images for frame in light], [frame.noise for frame in light])
+        current.progress("coarse volume", 1.0)
+        name = current.experiment.name_of(number)
+        shown = Preview(
+            title=f"{current.experiment.name}, {name}: preview on voxels of {coarse.grid.voxel_mm:.3g} mm",
+            volumes={_name(current.experiment, frame.frame): one for frame, one in zip(light, volumes, strict=True)},
+            refocused=_refocused(weights, light[0], coarse.grid),
+            counts=light[0].images,
+            levels=[
+                _level(current.experiment, frame, camera, raw)
+                for frame in light
+                for camera in calibration.cameras.values()
+            ],
+        )
+        picture = current.folder.path / "preview" / f"{name.replace(' ', '_')}.png"
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        draw(shown, picture)
+    return {
+        "picture": str(picture),
+        "voxel_mm": coarse.grid.voxel_mm,
+        "levels": [level.to_json() for level in shown.levels],
+        "warnings": [warning.sentence for frame in light for warning in frame.warnings],
+    }
+
+
+def coarsened(experiment: Experiment) -> Experiment:
+    """Return an experiment with at most about `MOST_VOXELS` voxels in the same volume, reconstructed in few steps."""
+    grid = experiment.grid
+    edge = max(1.0, (grid.size / MOST_VOXELS) ** (1 / 3)) * grid.voxel_mm
+    x, y, z = (n * grid.voxel_mm for n in reversed(grid.shape))
+    cx, cy, cz = grid.centre_mm.tolist()
+    coarse = Grid.from_extent(centre_mm=(cx, cy, cz), size_mm=(max(x, edge), max(y, edge), max(z, edge)), voxel_mm=edge)
+    solid = None if experiment.solid is None else np.ascontiguousarray(experiment.solid[coarse.nearest_in(grid)])
+    smart = experiment.smart.model_copy(update={"iterations": ITERATIONS, "motion_passes": 0})
+    return replace(experiment, grid=coarse, solid=solid, smart=smart)
+
+
+def _form(cameras: Mapping[str, CalibratedCamera]) -> str:
+    """Return the form of weights that is built fastest."""
+    square = all(camera.lattice.layout == "square" for camera in cameras.values())
+    return "profiles" if square else "pixels"
+
+
+def _refocused(weights: Weights, light: FrameLight, grid: Grid) -> dict[str, xr.DataArray]:
+    """Return the mean light on the pixels of each voxel, by camera [counts]."""
+    stacks = {}
+    for name, image in light.images.items():
+        back = weights.of_camera(name).T
+        seen = back({name: np.ones_like(image)})
+        stack = np.divide(back({name: image}), seen, out=np.zeros_like(seen), where=seen > 0)
+        inner = stack[grid.within(weights.grid)]
+        stacks[name] = xr.DataArray(inner, grid.coordinates(), ("z", "y", "x"))
+    return stacks
+
+
+def _name(experiment: Experiment, frame: Frame) -> str:
+    """Return the name of a frame of a pair, or of an instant."""
+    return f"frame {frame.name}" if experiment.series is None else f"instant {frame.number}"
+
+
+def _level(
+    experiment: Experiment,
+    light: FrameLight,
+    camera: CalibratedCamera,
+    raw: Mapping[tuple[str, Frame], np.ndarray],
+) -> Level:
+    """Measure the light of one camera in one frame."""
+    name = camera.name
+    image, recorded, noise = light.images[name], raw[name, light.frame], light.noise[name]
+    pitch = camera.optics.microimage_pitch_px
+    peak = typical_peak(image, pitch, noise)
+    edge = max(1, round(pitch))
+    rows, columns = (n // edge for n in image.shape)
+    brightest = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge).max(axis=(1, 3))
+    return Level(
+        camera=name,
+        frame=_name(experiment, light.frame),
+        dark=float(np.median(recorded - image)),
+        noise=noise,
+        peak=peak if np.isfinite(peak) else 0.0,
+        lit=float((brightest > PEAK_SIGMA * noise).mean()),
+        saturated=saturated_share(recorded),
+        structure=light.structure[name],
+    )
