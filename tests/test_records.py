@@ -19,7 +19,7 @@ from lfpiv import records
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Frame
 from lfpiv.records import RecordError
-from lfpiv.results import datasets, netcdf, provenance
+from lfpiv.results import datasets, netcdf, provenance, summary_file
 from lfpiv.results.folder import Folder, make_writable
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, VolumeFile
 from lfpiv.runs import background, guard, refinement, summary
@@ -197,7 +197,7 @@ def test_an_earlier_summary_of_any_form_is_used_or_left_out(tmp_path, changed):
 def test_a_changed_summary_is_left_out_by_name(tmp_path, caplog):
     """A digit of a figure, which no form shows; a summary of an earlier version states no digest."""
     path = tmp_path / "summary.json"
-    summary.write(SUMMARY, path)
+    summary_file.write(SUMMARY, path)
     whole = path.read_text()
     assert summary.read(path).weights_s == 2.0 and not caplog.messages
     path.write_text(whole.replace("100.0", "900.0"))

@@ -158,7 +158,7 @@ def _listed(places: Sequence[_Place], most: int, values: Any) -> str:
 def _wanted(problem: Mapping[str, Any]) -> str:
     """Return what a value should have been for one form of it."""
     kind, context, found = problem["type"], problem.get("ctx", {}), problem.get("input")
-    expected = {
+    expected: str = {
         "float_type": "a number",
         "int_type": "a whole number",
         "int_from_float": "a whole number",

@@ -222,7 +222,8 @@ def _survey(contents: Contents, folder: Folder) -> _Survey:
     """Go through the figures of all finished pairs once. If they are too many for the summary, write them to a file."""
     total, images, vectors = len(contents.vectors), Gathering(), Gathering()
     tracked = folder.particles(0).parent.is_dir()
-    totals, listed, empty = dict.fromkeys(_SUMMED, 0.0), [], []
+    totals, listed = dict.fromkeys(_SUMMED, 0.0), []
+    empty: list[int] = []
     with _lines(folder.pairs if total > MOST_LISTED else None) as write:
         for place, (pair, figures) in enumerate(contents.vectors.items()):
             entry = {"pair": pair, "file": folder.vectors(pair).name, **figures.to_json()}
