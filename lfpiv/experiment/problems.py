@@ -116,7 +116,7 @@ def _places(error: ValidationError, values: Mapping[str, Any]) -> list[_Place]:
 
 def _follows_from_another(problem: Mapping[str, Any]) -> bool:
     """Return whether a list is reported as too short only because entries of it have problems of their own."""
-    return problem["type"] == "too_short" and len(problem["input"]) >= problem["ctx"]["min_length"]
+    return bool(problem["type"] == "too_short") and len(problem["input"]) >= problem["ctx"]["min_length"]
 
 
 def _in_file(problem: Mapping[str, Any], values: Any) -> Location:

@@ -103,16 +103,17 @@ def calibrate(run: Run) -> Calibrated:
     """
     from lfpiv.calibration.cameras import calibrate_or_continue
 
-    marks = provenance.read_marks(run.folder.calibration)
+    marks, kept = provenance.read_marks(run.folder.calibration), _Kept(run)
     if run.calibration_stamp.fits(marks):
         try:
-            return load_calibration(run)
+            found = load_calibration(run)
+            kept.remove()
+            return found
         except DamagedFile as error:
             provenance.reject(run.folder.calibration, error.reason)
     elif marks is not None:
         log.info("%s changed: calibration made again", ", ".join(run.calibration_stamp.changes(marks)))
     start = time.perf_counter()
-    kept = _Kept(run)
     calibration = calibrate_or_continue(run.experiment, kept, run.step("calibration"))
     seconds = time.perf_counter() - start
     _write(calibration, run.folder.calibration, {**run.calibration_stamp.attributes, "seconds": seconds})

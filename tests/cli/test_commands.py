@@ -71,7 +71,7 @@ SPOILERS = {
     "zero size": (lambda e: edit(e, "size_mm = [0.8,", "size_mm = [0.0,"), "volume.size_mm[0]"),
     "too little memory": (lambda e: edit(e, "voxel_mm = 0.05", "voxel_mm = 1e-3"), "GiB"),
     "more than any memory": (
-        lambda e: edit(e, "size_mm = [0.8, 0.6, 0.4]", "size_mm = [1e6, 1e6, 1e6]"),
+        lambda e: edit(e, "voxel_mm = 0.05", "guard_mm = 1e5\nvoxel_mm = 0.05"),
         "at most 1e+11 voxels",
     ),
     "no such pair": (lambda e: None, "pairs"),

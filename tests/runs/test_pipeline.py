@@ -52,6 +52,7 @@ def test_every_file_of_the_contract_is_there_and_whole(finished):
     _, out, summary = finished
     names = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
     assert names == [
+        ".record.json",
         "background.h5",
         "calibration.h5",
         "guard.json",
@@ -192,6 +193,8 @@ def test_a_new_image_concerns_its_pair_alone_and_a_lost_one_none(small_run, tmp_
     images[-1].rename(tmp_path / "elsewhere")
     assert unfinished() == []
     shutil.copy(tmp_path / "elsewhere", images[-1])
+    assert unfinished() == []
+    shutil.copy(images[0], images[-1])
     assert unfinished() == [2]
 
 
