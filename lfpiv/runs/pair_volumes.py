@@ -18,7 +18,7 @@ import xarray as xr
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.experiment.settings import Correlation
+from lfpiv.experiment.settings import DEFAULT_WINDOWS, Correlation
 from lfpiv.geometry.grid import Grid, Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS
@@ -32,7 +32,7 @@ from lfpiv.runs.guard import with_guard
 from lfpiv.runs.pair_vectors import LastVectors
 from lfpiv.runs.refinement import refined
 from lfpiv.runs.sequences import restarted
-from lfpiv.velocity.settings import DEFAULT_WINDOWS, FIRST_SEARCH
+from lfpiv.velocity.settings import FIRST_SEARCH
 
 if TYPE_CHECKING:
     from lfpiv.weights.operator import Weights
