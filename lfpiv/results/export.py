@@ -147,8 +147,8 @@ def export_results(
             if form is Format.CSV:
                 written, of_particles = _write_csv(results, target, step), _write_particle_csv(tables, target)
                 columns = {name: {"units": unit} for name, unit in particles.PARTICLE_UNITS.items()}
-                known = dict.fromkeys(written, csv_tables.columns_of(results)) | dict.fromkeys(of_particles, columns)
-                csv_tables.describe(known, target)
+                described = dict.fromkeys(written, csv_tables.columns_of(results))
+                csv_tables.describe(described | dict.fromkeys(of_particles, columns), target)
                 return written + of_particles
             if form is Format.VTP:
                 times = dict(

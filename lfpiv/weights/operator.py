@@ -20,7 +20,7 @@ from lfpiv.experiment.settings import Compute
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.prompt import Card, Shown, count, times
+from lfpiv.prompt import Card, Shown
 from lfpiv.weights.blocks import (
     BLOCK_BYTES,
     CHUNK_VOXELS,
@@ -31,6 +31,7 @@ from lfpiv.weights.blocks import (
     largest_weight,
     sample_blocks,
 )
+from lfpiv.weights.card import card_of
 from lfpiv.weights.choice import Choice, choose_form, choose_uncounted, memory_check, warn_of_errors
 from lfpiv.weights.counting import CountedVoxels, add_entries, add_window, count_blocks, count_voxels
 from lfpiv.weights.even_light import EvenLight, project_even_light
@@ -103,20 +104,8 @@ class Weights(Shown):
 
     def card(self) -> Card:
         """Return what matters of the weights, for people."""
-        grid, forms = self.stored.grid, self.forms
-        facts = [
-            ("voxels", f"{times(grid.shape)} (z, y, x) of {grid.voxel_mm:.4g} mm"),
-            *((axis, f"{low:.4g} to {high:.4g} mm") for axis, (low, high) in zip("xyz", _extent(grid), strict=True)),
-            ("method", self.method),
-            ("memory", f"{self.memory_bytes / 2**20:,.0f} MiB"),
-            ("use", "images = weights(volume), volume = weights.T(images)"),
-        ]
-        rows = [
-            (name, times(camera.optics.sensor_shape), forms.get(name, "counted when first needed"))
-            for name, camera in self.cameras.items()
-        ]
-        title = f"Weights of {count(grid.size, 'voxel')} on {count(len(rows), 'camera')}"
-        return Card(title, tuple(facts), (("camera", "pixels (rows, columns)", "stored as"), *rows))
+        shapes = {name: camera.optics.sensor_shape for name, camera in self.cameras.items()}
+        return card_of(self.stored.grid, shapes, self.forms, self.method, self.memory_bytes)
 
     def of_camera(self, name: str) -> Weights:
         """Return the weights of one of the cameras. They share memory with these."""
@@ -325,12 +314,6 @@ class Weights(Shown):
         if name not in self._counted:
             self._counted[name] = CountedVoxels(self.stored, self.cameras[name])
         return self._counted[name]
-
-
-def _extent(grid: Grid) -> list[tuple[float, float]]:
-    """Return the faces of a grid along x, y, z [mm]."""
-    half = grid.voxel_mm / 2
-    return [(float(axis[0]) - half, float(axis[-1]) + half) for axis in map(grid.axis_mm, (2, 1, 0))]
 
 
 class Adjoint:

@@ -109,6 +109,11 @@ BAD_KEYS = {
         "pairs = 2\n[correlation]\nwindows = [[16, 16, 16]]",
         ["correlation.windows", "16", "along z"],
     ),
+    "big edge": (
+        "pairs = 2",
+        "pairs = 2\n[correlation]\nwindows = [14, 8]",
+        ["correlation.windows", "14", "along z", "State [8, 12, 14]"],
+    ),
     "no hidden layer": ("pairs = 2", "pairs = 2\n[network]\nhidden = []", ["network.hidden", "at least 1"]),
     "million dots": ("dots = [5, 5]", "dots = [1000000, 1000000]", ["board.dots", "1000000 x 1000000", "sees about"]),
     "tiny board": (

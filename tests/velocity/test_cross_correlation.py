@@ -12,7 +12,7 @@ from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, shear,
 import lfpiv
 from lfpiv.experiment.settings import DEFAULT_WINDOWS
 from lfpiv.velocity.cross_correlation import Verdict
-from lfpiv.velocity.settings import CorrelationSettings
+from lfpiv.velocity.settings import CorrelationSettings, cut_windows
 from lfpiv.velocity.validation import LEAST_SEEN
 from lfpiv_kernels.correlation import correlate as kernel
 from lfpiv_kernels.correlation import deform
@@ -229,6 +229,10 @@ def test_default_windows_are_cut_to_the_volume_and_others_refused():
     whole = max(first.shape)  # the error names the largest window that fits
     with pytest.raises(ValueError, match=rf"got {whole} along z, which has {len(first)} voxels.*{len(first)}, "):
         lfpiv.correlate(first, second, windows=(whole, 12))
+
+
+def test_windows_are_cut_where_that_is_wanted():
+    assert cut_windows((32, (16, 12, 16), 8), (12, 40, 14)) == ((12, 32, 14), (12, 12, 14), (8, 8, 8))
 
 
 def test_a_number_is_the_window_of_a_single_pass():
