@@ -10,6 +10,8 @@ from lfpiv.report.flow import Quantity, View
 from lfpiv.report.markup import number, significant
 from lfpiv.report.svg import INK, SERIES, new_panel, spread_ticks, style, to_svg
 
+TAIL = 4.0
+"""Multiple of the median up to which uncertainties have bars of their own."""
 BAND = 2.0
 """Standard deviations to either side that a band shows."""
 
@@ -74,12 +76,15 @@ def displacement_histogram(vectors: xr.Dataset, axis: str) -> tuple[str, np.ndar
 
 
 def uncertainty_histogram(uncertainty: np.ndarray) -> str:
-    """Draw a histogram of uncertainties [voxel], with their median."""
+    """Draw a histogram of uncertainties [voxel], with their median. The last bar holds all larger ones."""
     median = float(np.median(uncertainty))
-    top = max(float(np.percentile(uncertainty, 99.5)), 1e-9)
+    top = max(min(float(np.percentile(uncertainty, 99.5)), TAIL * median), 1e-9)
     figure, (axes,) = new_panel(2.6)
     axes.hist(
-        uncertainty, np.linspace(0, top, int(np.clip(np.sqrt(uncertainty.size), 8, 50)) + 1), color=SERIES[0], alpha=0.8
+        np.minimum(uncertainty, top),
+        np.linspace(0, top, int(np.clip(np.sqrt(uncertainty.size), 8, 50)) + 1),
+        color=SERIES[0],
+        alpha=0.8,
     )
     axes.axvline(median, color=INK, linewidth=1.2, linestyle="--")
     axes.set(xlim=(0, top))

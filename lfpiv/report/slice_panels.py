@@ -30,8 +30,8 @@ MASKED_FILL, MASKED_LINE = "#d5d8db", "#9aa0a6"
 """Colours of masked cells in a slice and of their hatching."""
 SAMPLES = 160
 """Number of samples along the longer edge of a slice, to which colours are interpolated."""
-SHARE = 99.0
-"""Percentile of a quantity's magnitude at which its colours end."""
+SHARE, SHARE_ERRORS = 99.0, 95.0
+"""Percentile of a quantity's magnitude at which its colours end; of the uncertainty, which has a long tail."""
 
 Overlay = Literal["arrows", "streamlines", "none"]
 
@@ -102,18 +102,22 @@ def slice_panel(
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
-    """Return values interpolated linearly between the vectors, as they are beside unknown ones."""
+    """Return values interpolated linearly between the vectors; cells of unknown ones are masked."""
     fine = int(np.clip(SAMPLES // max(values.shape), 1, 16))
-    if not np.isfinite(values).all():
-        return np.ma.masked_invalid(np.repeat(np.repeat(values, fine, 0), fine, 1))
+    unknown = ~np.isfinite(values)
+    if unknown.all():
+        return np.ma.masked_all(values.shape)
+    nearest = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
     places = np.meshgrid(*((np.arange(n * fine) + 0.5) / fine - 0.5 for n in values.shape), indexing="ij")
-    return np.asarray(ndimage.map_coordinates(values, places, order=1, mode="nearest"))
+    smooth = ndimage.map_coordinates(values[tuple(nearest)], places, order=1, mode="nearest")
+    return np.ma.masked_where(np.repeat(np.repeat(unknown, fine, 0), fine, 1), smooth)
 
 
 def limits(values: np.ndarray, kind: Quantity) -> tuple[float, float]:
     """Return the ends of the colours of a quantity."""
     values = np.abs(values[np.isfinite(values)])
-    top = float(np.percentile(values, SHARE)) if values.size else 0.0
+    share = SHARE_ERRORS if kind.label == "uncertainty" else SHARE
+    top = float(np.percentile(values, share)) if values.size else 0.0
     return (-(top or 1.0) if kind.signed else 0.0), top or 1.0
 
 

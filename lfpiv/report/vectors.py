@@ -54,13 +54,24 @@ def section(vectors: Mapping[int, pathlib.Path], naming: Naming = PAIRS, damping
         markup.paragraph(_overview(found, len(vectors), thinning, first, naming.noun)),
         _slice_view(name, first, fields, kinds, view, scale),
         _space_view(name, fields, kinds),
-        _vorticity(name, fields, kinds, view),
-        _uncertainty(name, first, fields, kinds, view),
-        _displacements(name, first),
+        *_figures(name, first, fields, kinds, view),
         damping_table(damping),
         data,
     ]
     return "\n".join(part for part in parts if part)
+
+
+def _figures(
+    name: str, first: xr.Dataset, fields: xr.Dataset, kinds: dict[str, Quantity], view: View
+) -> tuple[str, ...]:
+    """Return the still figures of a field; a sentence where no vector is valid."""
+    if not first["valid"].values.any():
+        return (markup.paragraph(f"No vector of {name} is valid, so there is no more to draw."),)
+    return (
+        _vorticity(name, fields, kinds, view),
+        _uncertainty(name, first, fields, kinds, view),
+        _displacements(name, first),
+    )
 
 
 def _overview(found: Survey, pairs: int, thinning: int, first: xr.Dataset, noun: str) -> str:
@@ -212,7 +223,10 @@ def _uncertainty(name: str, first: xr.Dataset, fields: xr.Dataset, kinds: dict[s
         uncertainty_over_depth(first),
         uncertainty_histogram(known),
     ]
-    text = f"{name.capitalize()}: standard deviation of each component of a displacement, as stated with the vectors."
+    text = (
+        f"{name.capitalize()}: standard deviation of each component of a displacement, as stated with the vectors. The "
+        "last bar holds all larger ones."
+    )
     return "<h3>Uncertainty</h3>" + markup.figure(panels, text)
 
 

@@ -62,7 +62,7 @@ def _tiles(experiment: Experiment, summary: Summary) -> Iterator[Tile]:
             "valid vectors",
             good=GOOD_SHARE,
             bad=POOR_SHARE,
-            written=lambda share: percent(share),
+            written=lambda share: f"{significant(100 * share)} %",
         )
         yield from _uncertainty(summary, experiment.grid.voxel_mm / 1000 / experiment.dt_s)
         yield from _residual(summary)

@@ -89,7 +89,7 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
     values = first[f"projection_{along}"].isel(frame=0).transpose(up, across).values
     edges = [cell_edges(first[axis].values) for axis in (across, up)]
     spans = [high - low for low, high in edges]
-    figure, (axes,) = new_panel(float(np.clip(2.8 * spans[1] / spans[0], 0.5, 3.4)) + 1.35)
+    figure, (axes,) = new_panel(float(np.clip(3.05 * spans[1] / spans[0], 0.5, 3.6)) + 1.35)
     shown = axes.imshow(
         values,
         cmap="magma",

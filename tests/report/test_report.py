@@ -411,6 +411,7 @@ def test_tiles_judge_the_figures_of_the_run(reported):
     assert (uncertainty.value, uncertainty.level) == ("0.10 voxel", Level.GOOD)
     assert uncertainty.label == "median uncertainty: 10 mm/s"  # a tenth of 0.1 mm in 1 ms
     pairs = [pair | {"residual": {"a": [0.9, 0.7]}} for pair in reported.summary["pairs"]]
+    assert tiles_of(reported, valid_fraction=0.997)["valid vectors"].value == "99.7 %"  # not all of them
     residual = tiles_of(reported, pairs=pairs)["of the images unexplained, worst volume"]
     assert (residual.value, residual.level) == ("70 %", Level.LOOK)
     assert all(tile.limits.startswith("good: ") and "; bad: " in tile.limits for tile in good.values())

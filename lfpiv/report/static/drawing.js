@@ -162,8 +162,8 @@ function roundBelow(value) {
   return [5, 2, 1].find((step) => step * power <= value * (1 + 1e-9)) * power;
 }
 
-/** Return about `count` round values between two ends. */
-function ticks(low, high, count) {
+/** Return about `count` round values between two ends, at least three where there are. */
+function ticks(low, high, count, tries = 3) {
   const rough = (high - low) / count;
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].find((factor) => factor * power >= rough * (1 - 1e-9)) * power;
@@ -171,5 +171,5 @@ function ticks(low, high, count) {
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k += 1) {
     found.push(Number((k * step).toPrecision(12)));
   }
-  return found;
+  return found.length < 3 && tries > 0 ? ticks(low, high, 1.5 * count, tries - 1) : found;
 }

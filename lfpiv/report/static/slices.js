@@ -122,7 +122,7 @@ class SliceView {
   /** Return the colour map of the chosen quantity: its stops and ends, and a value's share of it. */
   scale() {
     const name = this.elements.colour.value;
-    const limit = this.field.magnitudeQuantile(name, 0.99) || 1;
+    const limit = this.field.magnitudeQuantile(name, name === "uncertainty" ? 0.95 : 0.99) || 1; // it has a long tail
     const signed = this.field.isSigned(name);
     return {
       stops: signed ? this.colours.signed : this.colours.positive,
