@@ -129,7 +129,7 @@ def _draw_volume(row: SubFigure, volumes: Mapping[str, xr.DataArray]) -> None:
 
 def _draw_planes(row: SubFigure, name: str, stack: xr.DataArray) -> None:
     """Draw planes through the refocused images of a camera, with one colour scale."""
-    row.suptitle(f"{name}: refocused at these depths; particles are sharp where they are", fontsize=10)
+    row.suptitle(f"{name}: refocused at these depths; particles are sharp at their own depth", fontsize=10)
     count = stack.sizes["z"]
     places = np.unique(np.linspace(0, count - 1, min(PLANES, count)).round().astype(int))
     top = float(np.percentile(stack.values, BRIGHT_PERCENTILE)) or 1.0

@@ -6,7 +6,7 @@ The run's own steps are done on larger voxels, which takes seconds. Only the pic
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
 from lfpiv.lightfield.image_checks import saturated_share
 from lfpiv.progress import Progress
@@ -24,17 +26,17 @@ from lfpiv.runs import guard, rig
 from lfpiv.runs.frame_light import FrameLight, pair_light, read_darks
 from lfpiv.runs.pair_vectors import LastVectors
 from lfpiv.runs.pair_volumes import Reconstructor
-from lfpiv.runs.run import open_run
+from lfpiv.runs.run import Run, open_run
 from lfpiv.weights.operator import Weights, build_weights
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.camera import CalibratedCamera
+    from lfpiv.calibration.camera import CalibratedCamera, Calibration
 
 log = logging.getLogger(__name__)
 
-MOST_VOXELS = 60_000
+MOST_VOXELS = 40_000
 """Largest number of voxels of the coarse volume, without its guard layers."""
-ITERATIONS = 5
+ITERATIONS = 3
 """Largest number of SMART iterations."""
 
 
@@ -80,31 +82,19 @@ def preview(
             raw[name, frame] = current.experiment.particle_image(name, *frame)
             return raw[name, frame]
 
-        light = pair_light(current.experiment, calibration.cameras, read_darks(current.experiment), number, read)
-        layers = guard.layers(coarse, None)
-        grid = guard.with_guard(coarse, layers).grid
-        weights = build_weights(
-            calibration, grid, form=_form(calibration.cameras), progress=current.step("coarse weights")
-        )
-        current.progress("coarse volume", 0.0)
-        between = LastVectors(coarse.dt_s)
-        work = Reconstructor(experiment=coarse, weights=weights, guard=layers, refinement=1.0, between=between)
-        volumes = work.volumes([frame.images for frame in light], [frame.noise for frame in light])
-        current.progress("coarse volume", 1.0)
-        name = current.experiment.name_of(number)
+        light = pair_light(coarse, calibration.cameras, read_darks(coarse), number, read)
+        volumes, refocused = _reconstruct(current, coarse, calibration, light)
+        cameras = calibration.cameras.values()
         shown = Preview(
-            title=f"{current.experiment.name}, {name}: preview on voxels of {coarse.grid.voxel_mm:.3g} mm",
-            volumes={_name(current.experiment, frame.frame): one for frame, one in zip(light, volumes, strict=True)},
-            refocused=_refocused(weights, light[0], coarse.grid),
+            title=f"{coarse.name}, {coarse.name_of(number)}: preview on voxels of {coarse.grid.voxel_mm:.3g} mm",
+            volumes=volumes,
+            refocused=refocused,
             counts=light[0].images,
-            levels=[
-                _level(current.experiment, frame, camera, raw)
-                for frame in light
-                for camera in calibration.cameras.values()
-            ],
+            levels=[_level(coarse, frame, camera, raw) for frame in light for camera in cameras],
         )
-        picture = current.folder.path / "preview" / f"{name.replace(' ', '_')}.png"
-        picture.parent.mkdir(parents=True, exist_ok=True)
+        picture = current.folder.path / "preview" / f"{coarse.noun}_{number}.png"
+        with writing(picture):
+            picture.parent.mkdir(parents=True, exist_ok=True)
         draw(shown, picture)
     return {
         "picture": str(picture),
@@ -112,6 +102,25 @@ def preview(
         "levels": [level.to_json() for level in shown.levels],
         "warnings": [warning.sentence for frame in light for warning in frame.warnings],
     }
+
+
+def _reconstruct(
+    current: Run, coarse: Experiment, calibration: Calibration, light: Sequence[FrameLight]
+) -> tuple[dict[str, xr.DataArray], dict[str, xr.DataArray]]:
+    """Return the coarse volume of each frame, and the refocused planes of the first one by camera."""
+    layers = guard.layers(coarse, None)
+    grid, form = guard.with_guard(coarse, layers).grid, _form(calibration.cameras)
+    weights = build_weights(calibration, grid, form=form, progress=current.step("coarse weights"))
+    current.progress("coarse volumes", 0.0)
+    between = LastVectors(coarse.dt_s)
+    work = Reconstructor(experiment=coarse, weights=weights, guard=layers, refinement=1.0, between=between)
+    try:
+        volumes = work.volumes([frame.images for frame in light], [frame.noise for frame in light])
+    except ValueError as error:
+        raise InputError(f"{coarse.name_of(current.numbers[0])}: {error}") from error
+    current.progress("coarse volumes", 1.0)
+    named = {_name(coarse, frame.frame): one for frame, one in zip(light, volumes, strict=True)}
+    return named, _refocused(weights, light[0], coarse.grid)
 
 
 def coarsened(experiment: Experiment) -> Experiment:
