@@ -1,4 +1,4 @@
-"""Plots of what particle tracking finds against seeding, drawn from the figures of `perf/accuracy/particle_tracking.py`.
+"""Plots of what particle tracking finds against seeding: the figures of `perf/accuracy/particle_tracking.py`.
 
 `panels` needs no Sphinx; `setup` registers the directive ``{tracking-limits}``.
 """
@@ -35,6 +35,8 @@ def _panel(rows: Sequence[Mapping[str, Any]], key: str, label: str, logarithmic:
     for number, (cameras, name) in enumerate(NAMES.items()):
         for condition, line in LINES.items():
             values = _means(rows, key, cameras, condition)
+            if not values:
+                continue
             text = name if condition == "clean" else None
             axes.plot(*zip(*values, strict=True), color=svg.SERIES[number], ls=line, marker="o", ms=3, label=text)
     seedings = sorted({row["ppm"] for row in rows})
@@ -58,7 +60,7 @@ def _means(rows: Sequence[Mapping[str, Any]], key: str, cameras: int, condition:
         value = row["figures"][key]
         if row["cameras"] == cameras and row["condition"] == condition and value is not None:
             found.setdefault(row["ppm"], []).append(value)
-    return [(ppm, sum(values) / len(values)) for ppm, values in sorted(found.items())] or [(float("nan"),) * 2]
+    return [(ppm, sum(values) / len(values)) for ppm, values in sorted(found.items())]
 
 
 def setup(app):

@@ -227,8 +227,8 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.UNLINKED: (
         "{share:percent} % of the particles found in a frame have a partner in the other one (usual are more than "
-        "{limit:percent} %): many found particles are none, or they left the volume. Links are few but checked; to find "
-        "more, widen the guard layers (volume.guard_mm) where particles are lit beyond the volume, or use less seeding"
+        "{limit:percent} %): many of them may be no particles, or have left the volume. Widen the guard "
+        "layers (volume.guard_mm) if particles are lit beyond the volume, or use less seeding"
     ),
     Code.FEWER_WORKERS: (
         "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "
