@@ -14,7 +14,7 @@ from lfpiv.report import svg
 
 FIGURES = Path(__file__).resolve().parents[1] / "figures" / "particle_tracking.json"
 NAMES = {1: "one camera", 2: "two cameras", 3: "three cameras"}
-LINES = {"clean": "-", "real": "--"}
+LINES, MARKERS = {"clean": "-", "real": "--"}, {"clean": "o", "real": "x"}
 SHOWN = (
     ("found", "found, share of the true ones", False),
     ("false", "false, share of the found ones", False),
@@ -38,7 +38,14 @@ def _panel(rows: Sequence[Mapping[str, Any]], key: str, label: str, logarithmic:
             if not values:
                 continue
             text = name if condition == "clean" else None
-            axes.plot(*zip(*values, strict=True), color=svg.SERIES[number], ls=line, marker="o", ms=3, label=text)
+            axes.plot(
+                *zip(*values, strict=True),
+                color=svg.SERIES[number],
+                ls=line,
+                marker=MARKERS[condition],
+                ms=4,
+                label=text,
+            )
     seedings = sorted({row["ppm"] for row in rows})
     svg.style(axes, title=label, xlabel="particles per microlens", ylabel="", legend=key == "found")
     axes.set_xscale("log")
