@@ -396,6 +396,17 @@ def test_the_picture_of_the_house_shows_every_package_below_those_that_import_it
         assert y != other_y or x < other_x or x > other_x + width
 
 
+def test_plots_of_particle_tracking_show_every_figure():
+    limits = extension("tracking_limits")
+    stored = json.loads(limits.FIGURES.read_text("utf-8"))
+    shown = {(row["condition"], row["cameras"]) for row in stored["rows"]}
+    assert {condition for condition, _ in shown} <= limits.LINES.keys()
+    assert {cameras for _, cameras in shown} <= limits.NAMES.keys()
+    drawn = limits.panels(stored)
+    assert drawn.count("<svg") == len(limits.SHOWN) and not re.search(r"\bnan\b", drawn)
+    assert not set(re.findall(r"#[0-9a-f]{6}", drawn))  # colours are the page's
+
+
 def test_plots_of_methods_side_by_side_show_every_stored_method():
     side_by_side = extension("side_by_side")
     stored = json.loads(side_by_side.FIGURES.read_text("utf-8"))

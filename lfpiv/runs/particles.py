@@ -15,6 +15,10 @@ from lfpiv.warn import Code, Warning
 
 CROWDED, CROWDED_ONE = 0.7, 0.15
 """Mean number of overlapping neighbours of a particle above which particles are mixed up; the second for one camera."""
+LEAST_LINKED = 0.65
+"""Least share of the found particles that are linked, without a warning. Ghosts in two frames have no partners."""
+LEAST_FOUND = 20
+"""Least number of particles in a frame that this share is judged by."""
 
 
 def track(
@@ -45,7 +49,7 @@ def track(
         for frame, volume in zip(light, volumes.volumes, strict=True)
     )
     table = link_particles(first, second, vectors, dt_s=float(vectors.attrs["dt_s"]))
-    return table, crowded_warnings(table, len(search.weights.cameras))
+    return table, [*crowded_warnings(table, len(search.weights.cameras)), *unlinked_warnings(table)]
 
 
 def crowded_warnings(table: xr.Dataset, cameras: int) -> list[Warning]:
@@ -55,3 +59,11 @@ def crowded_warnings(table: xr.Dataset, cameras: int) -> list[Warning]:
         return []
     figures = {"crowding": crowding, "limit": limit, "per_microlens": float(np.mean(table.attrs["per_microlens"]))}
     return [Warning(code=Code.CROWDED, figures=figures)]
+
+
+def unlinked_warnings(table: xr.Dataset) -> list[Warning]:
+    """Return a warning if few of the found particles have a partner in the other frame."""
+    found = float(np.mean(table.attrs["found"]))
+    if found < LEAST_FOUND or (share := float(table.attrs["linked"]) / found) >= LEAST_LINKED:
+        return []
+    return [Warning(code=Code.UNLINKED, figures={"share": share, "limit": LEAST_LINKED})]

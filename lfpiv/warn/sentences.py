@@ -60,6 +60,7 @@ class Code(enum.Enum):
     REPEATED = "repeated"
     UNSEEDED = "unseeded"
     CROWDED = "crowded"
+    UNLINKED = "unlinked"
     # the run
     FEWER_WORKERS = "fewer_workers"
     ONE_GPU = "one_gpu"
@@ -223,6 +224,11 @@ SENTENCES: Mapping[Code, str] = {
         "the image of a particle overlaps those of {crowding:.2g} others by half or more ({limit:g} is the limit; "
         "{per_microlens:.2g} particles per microlens were found): some particles are missed and some found are none. "
         "Rely on the correlation, or use less seeding"
+    ),
+    Code.UNLINKED: (
+        "{share:percent} % of the particles found in a frame have a partner in the other one (usual are more than "
+        "{limit:percent} %): many of them may be no particles, or have left the volume. Widen the guard "
+        "layers (volume.guard_mm) if particles are lit beyond the volume, or use less seeding"
     ),
     Code.FEWER_WORKERS: (
         "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "

@@ -21,9 +21,10 @@ import numpy as np
 import xarray as xr
 from reconstruction_bench import CACHE
 from reconstruction_cases import ANGLES_DEG, CONDITIONS, Case, Recorded, Rig, make_flow, make_rig, record
-from reconstruction_ways import guard_layers, weights_of
+from reconstruction_ways import weights_of
 
 from lfpiv import files
+from lfpiv.geometry.grid import Layers
 from lfpiv.geometry.volume import lies_in
 from lfpiv.metrics.particles import match_particles
 from lfpiv.reproduce.rigs import VOXEL_MM
@@ -39,6 +40,8 @@ BRIGHT = 0.4
 """Least light of a particle, relative to the mean of all particles at the centre of the sheet, of a bright one."""
 SPREAD_VOXEL = 1.5
 """Spread of displacements that links assume: no correlation predicts them."""
+ASIDE_VOXEL = 5
+"""Width of the lit region beside the volume in realistic images [voxel]."""
 WRONG_VOXEL = 1.0
 """Error of a displacement above which a link joins two particles [voxel]."""
 
@@ -57,7 +60,7 @@ def measure(case: Case, folder: Path) -> dict[str, float]:
         a frame.
     """
     rig, recorded = make_rig(case.scale, case.angles_deg), record(case, folder / "images")
-    grid = rig.grid.padded(guard_layers(rig, recorded))
+    grid = rig.grid.padded(_lit_layers(case, rig))
     search = ParticleSearch(weights_of(rig, grid), rig.grid)
     start = time.process_time()
     found = [
@@ -69,6 +72,13 @@ def measure(case: Case, folder: Path) -> dict[str, float]:
     figures |= {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
     links = link_particles(found[0], found[1], dt_s=1.0, spread_voxel=SPREAD_VOXEL)
     return figures | _displacements(case, rig, links, figures["particles"])
+
+
+def _lit_layers(case: Case, rig: Rig) -> Layers:
+    """Return guard layers as wide as particles are lit beyond the volume, which a user knows from the light sheet."""
+    beyond = CONDITIONS[case.condition].beyond
+    along_z, aside = (max(1, round(count)) for count in (beyond * rig.grid.shape[0], ASIDE_VOXEL if beyond else 0))
+    return (along_z, along_z), (aside, aside), (aside, aside)
 
 
 def _light(case: Case, rig: Rig, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -2,10 +2,16 @@
 
 import numpy as np
 import pytest
+import xarray as xr
+from support.ideal_rig import IdealRig
 from support.tracking_rig import LIGHT, READ_NOISE, SIGMA_VOXEL, VOXEL_MM, TrackingRig
 
-from lfpiv import find_particles
+from lfpiv import build_weights, find_particles
+from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.metrics.particles import match_particles
+from lfpiv.tracking.candidates import volume_peaks
+from lfpiv.tracking.particle_images import ParticleImages
+from lfpiv.tracking.refinement import CHI2_MEDIAN, Cloud, Scene, light_scatter, refine, rendered
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +63,35 @@ def test_light_that_one_camera_does_not_confirm_is_no_particle(rig):
 def test_noise_holds_no_particles(rig):
     found = find_particles(rig.weights, rig.images(np.zeros((0, 3)), 4), noise=READ_NOISE, rounds=1)
     assert len(found) == 0 and found.explained == 0.0
+
+
+def test_light_of_unlike_cameras_keeps_its_scatter(rig):
+    """The prior that holds the light of the cameras together must not shrink the scatter that it is made from."""
+    images = ParticleImages(cameras=rig.cameras, voxel_mm=VOXEL_MM, sigma_voxel=SIGMA_VOXEL)
+    rng = np.random.default_rng(8)
+    light = 2e4 * np.exp(0.3 * rng.standard_normal((20, 2)))
+    cloud = Cloud(positions_mm=rig.random(20, 9), light=light)
+    counts = rendered(images, images.lists(cloud.positions_mm), light)
+    scene = Scene(counts=counts, read_variance=np.full_like(counts, READ_NOISE**2))
+    scatter = 0.1
+    for _ in range(6):
+        cloud, normal = refine(images, scene, cloud, iterations=3, scatter=scatter)
+        scatter = light_scatter(normal, cloud.light, scatter)
+    ratio = light / light.mean(1, keepdims=True)
+    exact = np.sqrt(np.median(np.square(ratio - 1).sum(1)) / CHI2_MEDIAN)
+    assert scatter == pytest.approx(exact, rel=0.1)
+
+
+@pytest.mark.slow
+def test_voxels_that_no_camera_sees_hold_no_candidates(rig):
+    wide = Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(6.0, 1.6, 1.2), voxel_mm=VOXEL_MM)
+    weights = build_weights(IdealRig(rig.cameras), wide)
+    values = np.where(weights.views == 0, 1e6, 0.0)
+    assert values[:, :, 0].any()
+    values[6, 8, 30] = 1.0
+    far = xr.DataArray(values, wide.coordinates(), AXES, attrs={"voxel_mm": VOXEL_MM})
+    peaks = volume_peaks(weights, far)
+    assert len(peaks) == 1
 
 
 @pytest.mark.slow
