@@ -25,13 +25,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy import ndimage
 
 from lfpiv.experiment.settings import Correlation
 from lfpiv.reconstruction.motion import LEAST_VALID
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import MotionField
-from lfpiv.reconstruction.sieve import TRUNCATE
+from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv_kernels.correlation import deform
@@ -219,16 +218,12 @@ def coefficients(volume: np.ndarray, sieve_voxel: float) -> np.ndarray:
     """
     if sieve_voxel == 0:
         return volume
-
-    def blurred(values: np.ndarray) -> np.ndarray:
-        result: np.ndarray = ndimage.gaussian_filter(values, sieve_voxel, mode="constant", truncate=TRUNCATE)
-        return result
-
-    found: np.ndarray = volume
-    least = np.float32(FAINTEST * volume.max())
+    nz, ny, nx = volume.shape
+    sieve, flat = Sieve(sieve_voxel, (nz, ny, nx)), volume.ravel()
+    found, least = flat, np.float32(FAINTEST * volume.max())
     for _ in range(UNBLURRED):
-        found = found * blurred(volume / np.maximum(blurred(found), least))
-    return found
+        found = found * sieve(flat / np.maximum(sieve(found), least))
+    return found.reshape(volume.shape)
 
 
 def _correlate(first: xr.DataArray, second: xr.DataArray, settings: Mapping[str, Any]) -> xr.Dataset:

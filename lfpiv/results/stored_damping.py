@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfpiv import files
-from lfpiv.files import writing
-from lfpiv.records import RecordError, digest, read_object, read_text, validate
-from lfpiv.results import provenance
+from lfpiv.records import read_object, validate
+from lfpiv.results import provenance, stored_outcome
 from lfpiv.results.provenance import Marks, Stamp
 from lfpiv.velocity.damping import Damping
 
@@ -42,44 +40,29 @@ class StoredDamping:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Content:
-    settings_hash: str
-    depends_on: str
+class _Entries:
     damping: dict[str, Any] | None
     pairs: tuple[int, ...]
     seconds: float
     reason: str
-    digest: str
 
 
 def read(path: Path) -> tuple[StoredDamping, Marks] | None:
-    """Read the damping of a run, whether it fits or not, and its marks; None if it is missing or damaged.
+    """Read the damping of a run, whether it fits or not, and its marks; None if it is missing or damaged."""
+    return stored_outcome.read(path, _parse)
 
-    The log names a damaged file and the reason.
-    """
-    try:
-        stored = read_object(read_text(path))
-        found = validate(_Content, stored)
-        if found.digest != digest(stored):
-            raise RecordError("its entries are not those that were written: the digest differs")
-        read_object(found.depends_on)
-        damping = None if found.damping is None else Damping.from_json(found.damping)
-        known = StoredDamping(damping=damping, pairs=found.pairs, seconds=found.seconds, reason=found.reason)
-        return known, Marks(settings_hash=found.settings_hash, depends_on=found.depends_on)
-    except FileNotFoundError:
-        return None
-    except RecordError as error:
-        provenance.reject(path, str(error))
-        return None
+
+def _parse(content: dict[str, Any]) -> StoredDamping:
+    found = validate(_Entries, content)
+    damping = None if found.damping is None else Damping.from_json(found.damping)
+    return StoredDamping(damping=damping, pairs=found.pairs, seconds=found.seconds, reason=found.reason)
 
 
 def write(found: StoredDamping, stamp: Stamp, path: Path) -> None:
     """Write the damping of a run, atomically."""
     damping = None if found.damping is None else found.damping.to_json()
-    about = {"damping": damping, "pairs": list(found.pairs), "seconds": found.seconds, "reason": found.reason}
-    content = files.plain({**stamp.attributes, **about})
-    with writing(path):
-        files.write_json({**content, "digest": digest(content)}, path)
+    entries = {"damping": damping, "pairs": found.pairs, "seconds": found.seconds, "reason": found.reason}
+    stored_outcome.write(entries, stamp, path)
 
 
 def of_vectors(path: Path, depends_on: Mapping[str, Any]) -> Damping | None:

@@ -121,7 +121,7 @@ def _measure(work: PairWork, pairs: list[int], progress: StepProgress) -> Dampin
     for pair in pairs[:IMITATED]:
         frames += [work.light_again(frame) for frame in work.experiment.pair_frames(pair)]
     noise = {name: sum(frame.noise[name] for frame in frames) / len(frames) for name in frames[0].noise}
-    first = work.reconstruction.solver.smart.solve(frames[0].images, floor=frames[0].noise)
+    first = work.reconstructor.solver.smart.solve(frames[0].images, floor=frames[0].noise)
     return measure_damping(
         work.weights,
         vectors,

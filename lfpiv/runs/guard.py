@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lfpiv import files
-from lfpiv.files import writing
 from lfpiv.geometry.grid import AXES, NO_LAYERS, Layers
 from lfpiv.reconstruction.beyond import FaceLight, light_beyond
-from lfpiv.records import RecordError, digest, read_object, read_text, validate
-from lfpiv.results import provenance, stamps
+from lfpiv.records import RecordError, validate
+from lfpiv.results import stamps, stored_outcome
 from lfpiv.results.provenance import Marks
 from lfpiv.runs import memory
 from lfpiv.warn import Code, Warning
@@ -57,7 +55,7 @@ class Guard:
         return asdict(self)
 
     @classmethod
-    def from_json(cls, stored: dict[str, Any]) -> Guard:
+    def from_json(cls, stored: Any) -> Guard:
         """Read the form that a file stores.
 
         Raises
@@ -74,34 +72,9 @@ class Guard:
         return found
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Stored:
-    """Content of the file."""
-
-    settings_hash: str
-    depends_on: str
-    guard: dict[str, Any]
-    digest: str = ""
-    """Digest of the other entries; empty in files of earlier versions."""
-
-
 def read(folder: Folder) -> tuple[Guard, Marks] | None:
-    """Read the stored outcome, whether it fits or not, and its marks; None if it is missing or damaged.
-
-    The log names a damaged file and the reason.
-    """
-    try:
-        content = read_object(read_text(folder.guard))
-        found = validate(_Stored, content)
-        if "digest" in content and found.digest != digest(content):
-            raise RecordError("its entries are not those that were written: the digest differs")
-        read_object(found.depends_on)
-        return Guard.from_json(found.guard), Marks(settings_hash=found.settings_hash, depends_on=found.depends_on)
-    except FileNotFoundError:
-        return None
-    except RecordError as error:
-        provenance.reject(folder.guard, str(error))
-        return None
+    """Read the stored outcome, whether it fits or not, and its marks; None if it is missing or damaged."""
+    return stored_outcome.read(folder.guard, lambda content: Guard.from_json(content.get("guard")), sealed=False)
 
 
 def layers(experiment: Experiment, guard: Guard | None) -> Layers:
@@ -144,9 +117,7 @@ def decide(
     guard = Guard(pairs=tuple(instants), faces=faces, layers=allowed, short=allowed != demanded)
     log.info("light beyond the volume: measured in %.1f s", time.perf_counter() - start)
     stamp = stamps.of_guard(experiment, stamp_hash, guard.pairs, background)
-    with writing(folder.guard):
-        content = {**stamp.attributes, "guard": guard.to_json()}
-        files.write_json({**content, "digest": digest(content)}, folder.guard)
+    stored_outcome.write({"guard": guard.to_json()}, stamp, folder.guard)
     return guard
 
 

@@ -33,7 +33,7 @@ from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.instants import Instants, failure
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
 from lfpiv.runs.pair_vectors import LastVectors, measure_vectors, without_unmeasured
-from lfpiv.runs.pair_volumes import Reconstruction, reconstruction_s
+from lfpiv.runs.pair_volumes import Reconstructor, reconstruction_s
 from lfpiv.runs.particles import track
 from lfpiv.runs.sequences import SequentialInstants
 from lfpiv.runs.side_threads import ReadAhead, Writer
@@ -147,10 +147,10 @@ class PairWork:
         return []
 
     @cached_property
-    def reconstruction(self) -> Reconstruction:
-        """Reconstruction of images with the weights, made once for all pairs."""
+    def reconstructor(self) -> Reconstructor:
+        """SMART with the weights, made once for all pairs."""
         assert self.weights is not None
-        return Reconstruction(
+        return Reconstructor(
             experiment=self.experiment,
             weights=self.weights,
             guard=self.guard,
@@ -211,7 +211,7 @@ class PairWork:
         light = pair_light(self.experiment, self.cameras, self.darks, files.pair, self.images.image)
         self.writer.wait_large()
         self._log(files.pair, [warning for frame in light for warning in frame.warnings])
-        return self.reconstruction.pair(light, files.pair, progress)
+        return self.reconstructor.pair(light, files.pair, progress)
 
     def read_light(self, file: VolumeFile) -> FrameLight:
         """Read and check the images of an instant whose volume is to be reconstructed.
@@ -248,7 +248,7 @@ class PairWork:
         """
         self._log(light.frame.number, light.warnings)
         self.writer.wait_large()
-        return self.reconstruction.instant(light, progress)
+        return self.reconstructor.instant(light, progress)
 
     def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
         """Reconstruct one instant of a series from the one before; return it and what the next one needs.
@@ -261,7 +261,7 @@ class PairWork:
         instant = light.frame.number
         self._log(instant, light.warnings)
         self.writer.wait_large()
-        found, coming = self.reconstruction.follow(light, before, progress)
+        found, coming = self.reconstructor.follow(light, before, progress)
         self._log(instant, found.record.warnings[len(light.warnings) :])
         return found, coming
 
@@ -278,7 +278,7 @@ class PairWork:
         ValueError
             If the images cannot be reconstructed.
         """
-        first, second = self.reconstruction.volumes(images, noise)
+        first, second = self.reconstructor.volumes(images, noise)
         return measure_vectors(first, second, self.experiment, self.between)
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:

@@ -1,6 +1,6 @@
 """Volumes of a pair or of an instant: reconstruct its images and return them on the voxels of the experiment.
 
-The grid of the weights has guard layers and perhaps finer voxels than the experiment. `Reconstruction` makes the
+The grid of the weights has guard layers and perhaps finer voxels than the experiment. `Reconstructor` makes the
 solvers for that grid once. It samples each volume on the voxels that are written.
 """
 
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruction:
+class Reconstructor:
     """Reconstruction of the images of a run, whose solvers are made once."""
 
     experiment: Experiment

@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lfpiv import files
-from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.reconstruction.refinement import LARGEST, STEP, measure_size, needed_refinement
-from lfpiv.records import RecordError, digest, read_object, read_text, validate
-from lfpiv.results import provenance, stamps
+from lfpiv.records import RecordError, validate
+from lfpiv.results import stamps, stored_outcome
 from lfpiv.results.provenance import Marks
 from lfpiv.runs import memory
 from lfpiv.runs.guard import SampledLight, with_guard
@@ -52,7 +50,7 @@ class Refinement:
         return asdict(self)
 
     @classmethod
-    def from_json(cls, stored: dict[str, Any]) -> Refinement:
+    def from_json(cls, stored: Any) -> Refinement:
         """Read the form that a file stores.
 
         Raises
@@ -67,34 +65,9 @@ class Refinement:
         return found
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Stored:
-    """Content of the file."""
-
-    settings_hash: str
-    depends_on: str
-    refinement: dict[str, Any]
-    digest: str
-
-
 def read(folder: Folder) -> tuple[Refinement, Marks] | None:
-    """Read the stored outcome, whether it fits or not, and its marks; None if it is missing or damaged.
-
-    The log names a damaged file and the reason.
-    """
-    try:
-        content = read_object(read_text(folder.refinement))
-        found = validate(_Stored, content)
-        if found.digest != digest(content):
-            raise RecordError("its entries are not those that were written: the digest differs")
-        read_object(found.depends_on)
-        marks = Marks(settings_hash=found.settings_hash, depends_on=found.depends_on)
-        return Refinement.from_json(found.refinement), marks
-    except FileNotFoundError:
-        return None
-    except RecordError as error:
-        provenance.reject(folder.refinement, str(error))
-        return None
+    """Read the stored outcome, whether it fits or not, and its marks; None if it is missing or damaged."""
+    return stored_outcome.read(folder.refinement, lambda content: Refinement.from_json(content.get("refinement")))
 
 
 def factor(experiment: Experiment, found: Refinement | None) -> float:
@@ -148,9 +121,7 @@ def decide(
     )
     _log(experiment, found, time.perf_counter() - start)
     stamp = stamps.of_guard(experiment, stamp_hash, found.pairs, background)
-    with writing(folder.refinement):
-        content = {**stamp.attributes, "refinement": found.to_json()}
-        files.write_json({**content, "digest": digest(content)}, folder.refinement)
+    stored_outcome.write({"refinement": found.to_json()}, stamp, folder.refinement)
     return found
 
 
