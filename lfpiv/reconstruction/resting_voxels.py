@@ -22,6 +22,8 @@ ALL = 2
 """Epochs at the start in which no voxel rests."""
 CYCLE = 4
 """Epochs from one of all voxels to the next in which voxels rest."""
+FEWEST_VOXELS = 100_000
+"""Voxels of a volume from which on some rest. In smaller ones the launches take the time that rest would save."""
 LIGHT = 0.01
 """Share of the active voxels' light that rests from the next epoch on."""
 
@@ -54,7 +56,8 @@ class RestingVoxels:
         ndarray or None
             1 for voxels that take part, 0 for those that rest, shape (voxel,), float32. None for all.
         """
-        if epoch < ALL or (epoch - ALL) % (CYCLE + 1) == CYCLE:
+        few = volume.size < FEWEST_VOXELS
+        if few or epoch < ALL or (epoch - ALL) % (CYCLE + 1) == CYCLE:
             self.wake()
             return None
         light = volume if self._active is None else volume * self._active

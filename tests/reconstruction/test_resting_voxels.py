@@ -21,6 +21,12 @@ TOLERANCE_STEP = 1e-5  # float32 against float64, relative
 NEVER = 10**6
 
 
+@pytest.fixture(autouse=True)
+def small_volumes_rest_too(monkeypatch):
+    """Let voxels of the small volumes of these tests rest."""
+    monkeypatch.setattr(resting_voxels, "FEWEST_VOXELS", 0)
+
+
 @pytest.fixture(scope="module")
 def recorded():
     """Weights of a volume of 10 x 16 x 16 voxels, blobs in it, and their noisy images."""
@@ -70,6 +76,13 @@ def test_voxels_rest_in_cycles_and_more_of_them_in_each_epoch(equations):
     assert all((after <= before).all() and after.sum() < before.sum() for before, after in pairwise(cycle))
     bright = volume * cycle[0]
     assert bright.sum(dtype=float) == pytest.approx((1 - resting_voxels.LIGHT) * volume.sum(dtype=float), rel=2e-3)
+
+
+def test_no_voxel_of_a_small_volume_rests(equations, monkeypatch):
+    volume = np.random.default_rng(2).lognormal(0, 3, 1000).astype(np.float32)
+    monkeypatch.setattr(resting_voxels, "FEWEST_VOXELS", volume.size + 1)
+    resting = RestingVoxels(equations)
+    assert [resting.active_in(epoch, volume) for epoch in range(12)] == [None] * 12
 
 
 def test_light_at_rest_counts_until_it_is_released(equations):
