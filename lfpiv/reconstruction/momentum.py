@@ -38,6 +38,13 @@ class Momentum:
         """Exponent beta of the next extrapolation; 0 when the momentum starts."""
         return min((self.time - 1) / self.following_time, self.largest)
 
+    def stopped(self, coefficients: np.ndarray, where: np.ndarray) -> Momentum:
+        """Return the momentum without memory of some voxels, whose coefficients do not change by it.
+
+        `where` is true there, shape (voxel,).
+        """
+        return Momentum(np.where(where, coefficients, self.previous), self.time, self.largest)
+
     def extrapolate(self, coefficients: np.ndarray) -> tuple[np.ndarray, Momentum]:
         """Return extrapolated coefficients after a step, and the momentum after it.
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfpiv.reconstruction.momentum import Momentum
+from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State
 from lfpiv.reconstruction.steps import Step
@@ -69,6 +70,7 @@ def iterate_epochs(
     subsets: Sequence[Subset],
     steps: Sequence[Step],
     epochs: int,
+    resting: RestingVoxels | None = None,
 ) -> Iterator[tuple[State, Misfit]]:
     """Iterate over the subsets; yield the state after each epoch, and the sum of its subsets' misfits.
 
@@ -86,14 +88,19 @@ def iterate_epochs(
         The subsets in their order, and the step of each.
     epochs : int
         Number of epochs.
+    resting : RestingVoxels, optional
+        Lets dark voxels rest. Default: all voxels take part in all epochs.
     """
     coefficients, momentum = state.coefficients, Momentum(state.coefficients, largest=SUBSET_MOMENTUM)
     for epoch in range(epochs):
         misfit, length = Misfit(0.0, 0.0), np.float32(1 / (1 + SHORTENING * epoch))
+        active = None if resting is None else resting.active_in(epoch, sieve(coefficients))
+        if active is not None:
+            momentum = momentum.stopped(coefficients, active == 0)
         for subset, step in zip(subsets, steps, strict=True):
-            volume = sieve(coefficients)
+            volume = sieve(coefficients) if active is None else sieve(coefficients) * active
             misfit += equations.compare_subset(subset.camera, subset.lenses, volume)
             exponent = equations.back_project_subset(subset.camera, subset.lenses, volume)
             exponent *= length
-            coefficients, momentum = momentum.extrapolate(step(coefficients, exponent))
+            coefficients, momentum = momentum.extrapolate(step(coefficients, exponent, active))
         yield State(coefficients, momentum, state.steps), misfit

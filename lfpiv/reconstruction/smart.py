@@ -79,6 +79,16 @@ class ImageEquations:
             camera.projector.gather(exponent, active=volume)
         return exponent
 
+    def hold(self, volume: np.ndarray) -> None:
+        """Add the projections of a volume to those of each volume that is compared from now on, until `release`."""
+        for comparison in self._comparisons:
+            comparison.hold(volume)
+
+    def release(self) -> None:
+        """Forget the volumes that are held."""
+        for comparison in self._comparisons:
+            comparison.release()
+
     def compare_subset(self, camera: int, lenses: int, volume: np.ndarray) -> Misfit:
         """Do as `compare` for the rays of one camera through some lenses only, see ``projector.ALL``."""
         return Misfit(*self._comparisons[camera].compare(volume, lenses))

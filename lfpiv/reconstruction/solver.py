@@ -17,6 +17,7 @@ from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Subset, iterate_epochs, step_sizes, subsets_of
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import Recording, checked_images, record
+from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve, Smoothing
@@ -169,7 +170,10 @@ class SmartSolver:
         epochs = history.iterations - min(WHOLE_PASSES, -(-history.iterations // 2))
         if epochs:
             history.append(equations.compare(sieve(state.coefficients)))  # exact, as all steps begin here
-        states = iterate_epochs(equations, state, sieve, subsets=self.subsets, steps=steps, epochs=epochs)
+        resting = RestingVoxels(equations)
+        states = iterate_epochs(
+            equations, state, sieve, subsets=self.subsets, steps=steps, epochs=epochs, resting=resting
+        )
         for state, misfit in states:  # noqa: B007 - the last state is the result
             if history.epochs:
                 history.append(misfit)
@@ -178,6 +182,7 @@ class SmartSolver:
                 progress(history.epochs / (history.iterations + 1))
             if history.settled(len(self.subsets)):
                 break
+        resting.wake()
         return state
 
     def _solve_whole(
@@ -261,9 +266,14 @@ class SmartSolver:
         points = self.settings.sieve_voxel == AUTO and sieve.sigma_voxel == 0
         return POINT_CAP if points else CAP
 
-    @cached_property
+    @property
     def _particle_sizer(self) -> ParticleSizer:
-        return ParticleSizer(self.weights)
+        """Return the estimator of the weights. Making it takes as long as two passes, so other solvers share it."""
+        derived, key = self.weights.derived, ("particle sizer", self.weights.volume)
+        if key not in derived:
+            derived[key] = ParticleSizer(self.weights)
+        sizer: ParticleSizer = derived[key]
+        return sizer
 
     @cached_property
     def _views(self) -> np.ndarray | None:

@@ -12,9 +12,9 @@ zero where the gradient is zero, so both steps have the same solutions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -29,8 +29,19 @@ SHARPENED_VOXEL = 2.0
 LARGEST_STEP = 3.0
 """Largest absolute logarithm by which a sharpened step changes a voxel."""
 
-Step = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Takes coefficients and exponent, shape (voxel,), float32; returns new coefficients. Zeros stay zero."""
+LEAST_ACTIVE = 0.05
+"""Least share of active voxels, weighted by the sharpening's Gaussian, by which a blur of theirs is divided."""
+
+
+class Step(Protocol):
+    """Step of the iteration; arrays have shape (voxel,), float32."""
+
+    def __call__(self, coefficients: np.ndarray, exponent: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
+        """Return the next coefficients. Zeros stay zero.
+
+        `active` is 1 for voxels that take part and 0 for those that do not change; `exponent` is 0 there.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -41,9 +52,12 @@ class SmartStep:
     """mu / G s, shape (voxel,), float32."""
     sieve: Sieve
 
-    def __call__(self, coefficients: np.ndarray, exponent: np.ndarray) -> np.ndarray:
+    def __call__(self, coefficients: np.ndarray, exponent: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
         """Return the next coefficients."""
-        following: np.ndarray = update(coefficients.copy(), self.sieve(exponent), self.size)
+        blurred = self.sieve(exponent)
+        if active is not None:
+            blurred = blurred * active
+        following: np.ndarray = update(coefficients.copy(), blurred, self.size)
         return following
 
 
@@ -56,10 +70,12 @@ class SharpenedStep:
     shape: tuple[int, int, int]
     """Voxel counts in stored order."""
 
-    def __call__(self, coefficients: np.ndarray, exponent: np.ndarray) -> np.ndarray:
-        """Return the next coefficients."""
+    def __call__(self, coefficients: np.ndarray, exponent: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
+        """Return the next coefficients. The blur is the mean over active voxels."""
         logarithm = exponent * self.size
         blurred = self._blur(logarithm)
+        if active is not None:
+            blurred *= active / np.maximum(self._blur(active), np.float32(LEAST_ACTIVE))
         following: np.ndarray = sharpened(coefficients.copy(), logarithm, blurred, SHARPENING, LARGEST_STEP)
         return following
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -101,6 +101,8 @@ class Weights(Shown):
         self._lens_sums: dict[tuple[str, int], np.ndarray] = {}
         self.volume = stored.grid
         """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
+        self.derived: dict[tuple[Hashable, ...], Any] = {}
+        """What is derived from the weights and kept as long as they are, by its kind and what else it depends on."""
 
     def card(self) -> Card:
         """Return what matters of the weights, for people."""

@@ -102,18 +102,16 @@ class Matrix:
     profiles: bool
 
 
-@wp.func_native("""
-    lfpiv::prefetch_next(matrix, voxel, lenses);
-    return lfpiv::gather(lfpiv::blocks_of(matrix, voxel, lenses), rays.data);
-""")
+@wp.func_native("return lfpiv::gather(lfpiv::blocks_of(matrix, voxel, lenses), rays.data);")
 def _gather(matrix: Matrix, voxel: int, lenses: int, rays: wp.array(dtype=float)) -> float: ...
 
 
-@wp.func_native("""
-    lfpiv::prefetch_next(matrix, voxel, lenses);
-    lfpiv::scatter(lfpiv::blocks_of(matrix, voxel, lenses), intensity, rays_out.data);
-""")
+@wp.func_native("lfpiv::scatter(lfpiv::blocks_of(matrix, voxel, lenses), intensity, rays_out.data);")
 def _scatter(matrix: Matrix, voxel: int, lenses: int, intensity: float, rays_out: wp.array(dtype=float)): ...
+
+
+@wp.func_native("lfpiv::prefetch_next(matrix, active.data, voxel, lenses);")
+def _prefetch_next(matrix: Matrix, active: wp.array(dtype=float), voxel: int, lenses: int): ...
 
 
 @wp.kernel
@@ -128,6 +126,7 @@ def _back_project(
     volume_out: wp.array(dtype=float),
 ):
     voxel = first_voxel + wp.tid()
+    _prefetch_next(matrix, active, voxel, lenses)
     if active[voxel] == 0.0:
         return
     volume_out[voxel] = volume_out[voxel] + matrix.scale[voxel] * _gather(matrix, voxel, lenses, rays)
@@ -144,6 +143,7 @@ def _project(
     rays_out: wp.array(dtype=float),
 ):
     voxel = first_voxel + wp.tid()
+    _prefetch_next(matrix, volume, voxel, lenses)
     intensity = volume[voxel] * matrix.scale[voxel]
     if intensity != 0.0:
         _scatter(matrix, voxel, lenses, intensity, rays_out)

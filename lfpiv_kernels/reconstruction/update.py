@@ -20,7 +20,8 @@ SMALLEST = float(np.finfo(np.float32).tiny)
 
 @wp.func_native("""
     lfpiv::compare(
-        lfpiv::pixel_run(map, run), image.data, gain.data, floor, rays_out.data, squares_out.data, divergence_out.data
+        lfpiv::pixel_run(map, run), image.data, gain.data, held.data, floor, rays_out.data, squares_out.data,
+        divergence_out.data
     );
 """)
 def _compare_run(
@@ -28,6 +29,7 @@ def _compare_run(
     map: PixelRays,
     image: wp.array(dtype=float),
     gain: wp.array(dtype=float),
+    held: wp.array(dtype=float),
     floor: float,
     rays_out: wp.array(dtype=float),
     squares_out: wp.array(dtype=wp.float64),
@@ -41,6 +43,7 @@ def _compare(
     map: PixelRays,
     image: wp.array(dtype=float),
     gain: wp.array(dtype=float),
+    held: wp.array(dtype=float),
     floor: float,
     first_run: int,
     # out
@@ -48,7 +51,7 @@ def _compare(
     squares_out: wp.array(dtype=wp.float64),  # per run
     divergence_out: wp.array(dtype=wp.float64),
 ):
-    _compare_run(first_run + wp.tid(), map, image, gain, floor, rays_out, squares_out, divergence_out)
+    _compare_run(first_run + wp.tid(), map, image, gain, held, floor, rays_out, squares_out, divergence_out)
 
 
 @wp.kernel
@@ -121,7 +124,20 @@ class Comparison:
         self._floor = float(floor)
         self._image, self._gain = (to_device(array[projector.map.pixel], float) for array in (image, gain))
         device = runtime.device().warp
+        self._size = len(image)
+        self._held = wp.zeros(len(projector.map.pixel), dtype=float, device=device)
         self._sums = [wp.zeros(projector.map.rays.runs, dtype=wp.float64, device=device) for _ in range(2)]
+
+    def hold(self, volume: np.ndarray) -> None:
+        """Add the projection of `volume` to that of each volume that is compared from now on. Overwrites the rays."""
+        self.projector.scatter(volume)
+        image = wp.zeros(self._size, dtype=float, device=self._held.device)
+        self.projector.map.collect(self.projector.rays, image)
+        self._held = to_device(self._held.numpy() + image.numpy()[self.projector.map.pixel], float)
+
+    def release(self) -> None:
+        """Forget the volumes that are held."""
+        self._held.zero_()
 
     def compare(self, volume: np.ndarray, lenses: int = ALL) -> tuple[float, float]:
         """Project `volume`, shape (voxel,), and write gain * log((image + floor) / (projection + floor)) on the rays.
@@ -137,7 +153,8 @@ class Comparison:
         """
         self.projector.scatter(volume, lenses)
         rays = self.projector.map.rays if lenses == ALL else self.projector.map.of_lenses[lenses]
-        inputs, outputs = [rays, self._image, self._gain, self._floor], [self.projector.rays, *self._sums]
+        inputs = [rays, self._image, self._gain, self._held, self._floor]
+        outputs = [self.projector.rays, *self._sums]
         launch(Call(_compare, rays.runs, inputs, outputs), parts=_parts(rays.runs, FEWEST_RUNS))
         squares, divergence = (float(sums.numpy()[: rays.runs].sum()) for sums in self._sums)
         return squares, divergence

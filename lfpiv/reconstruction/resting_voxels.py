@@ -1,0 +1,83 @@
+"""Dark voxels rest: in most epochs only those voxels take part that hold nearly all of the light.
+
+Most voxels of a particle volume are nearly dark after a few epochs [1]_. They change little, but a dark voxel has as
+many weights as a bright one. So after the first `ALL` epochs, each epoch lays to rest the faintest voxels that hold
+`LIGHT` of the light of those that still take part. Their light stays in the projections as it is, and their weights
+are not visited. After `CYCLE` such epochs all voxels take part in one. Then the next cycle begins.
+
+No voxel is lost: one that rests and should be brighter is found in the next epoch of all voxels, or in the last passes,
+in which none rests. The light that the sieve spreads from active voxels into resting ones counts when these wake.
+
+.. [1] C. Atkinson, J. Soria, "An efficient simultaneous reconstruction technique for tomographic particle image
+   velocimetry", Exp. Fluids 47 (2009) 553-568, doi:10.1007/s00348-009-0728-0. It leaves such voxels out for good.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lfpiv.reconstruction.smart import ImageEquations
+
+ALL = 2
+"""Epochs at the start in which no voxel rests."""
+CYCLE = 4
+"""Epochs from one of all voxels to the next in which voxels rest."""
+FEWEST_VOXELS = 100_000
+"""Voxels of a volume from which on some rest. In smaller ones the launches take the time that rest would save."""
+LIGHT = 0.01
+"""Share of the active voxels' light that rests from the next epoch on."""
+
+
+class RestingVoxels:
+    """The voxels that rest, epoch by epoch.
+
+    Parameters
+    ----------
+    equations : ImageEquations
+        Locked. They hold the light of the voxels that rest.
+    """
+
+    def __init__(self, equations: ImageEquations):
+        self._equations = equations
+        self._active: np.ndarray | None = None
+
+    def active_in(self, epoch: int, volume: np.ndarray) -> np.ndarray | None:
+        """Choose the voxels that take part in the next epoch.
+
+        Parameters
+        ----------
+        epoch : int
+            Number of the epoch, from 0 on.
+        volume : ndarray, shape (voxel,), float32
+            The volume before it.
+
+        Returns
+        -------
+        ndarray or None
+            1 for voxels that take part, 0 for those that rest, shape (voxel,), float32. None for all.
+        """
+        few = volume.size < FEWEST_VOXELS
+        if few or epoch < ALL or (epoch - ALL) % (CYCLE + 1) == CYCLE:
+            self.wake()
+            return None
+        light = volume if self._active is None else volume * self._active
+        active = (light >= faintest_kept(light, LIGHT)) & (light > 0)
+        self._equations.hold(np.where(active, np.float32(0), light))
+        self._active = active.astype(np.float32)
+        return self._active
+
+    def wake(self) -> None:
+        """Let all voxels take part again."""
+        if self._active is not None:
+            self._equations.release()
+        self._active = None
+
+
+def faintest_kept(light: np.ndarray, share: float) -> float:
+    """Return the light of the faintest value that is kept when the faintest, with a share of all light, are left out.
+
+    Equal values are kept or left out together.
+    """
+    ordered = np.sort(light)
+    below = np.cumsum(ordered, dtype=np.float64)
+    return float(ordered[min(np.searchsorted(below, share * below[-1]), len(ordered) - 1)])
