@@ -152,7 +152,9 @@ def _evenly_lit(weights: Weights) -> np.ndarray:
 
 
 class ParticleSizer:
-    """Estimator of the particles' size, and of the scatter of their brightness, for one rig. Making it projects a volume of each known size.
+    """Estimator of the particles' size and of the scatter of their brightness, for one rig.
+
+    Making it projects a volume of each known size.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from lfpiv.geometry.volume import is_finite
 
 NORMALISATIONS = ("column", "paper")
 AUTO = "auto"
-"""Sieve and intensity cap that suit the size of the particles."""
+"""Sieve and intensity cap that suit the size and the brightness of the particles."""
 FLOOR_SHARE = 0.1
 """Default of the least noise floor, as a share of an image's brightness."""
 
