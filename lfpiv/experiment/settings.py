@@ -72,7 +72,8 @@ class Smart(Table):
     """Lower limit of the noise floor, as a share of the images' brightness; 0 takes the measured noise."""
     intensity_cap: Annotated[float, Field(strict=True, ge=0, le=100)] | Literal["auto"] = "auto"
     """Upper limit of the images' counts, as a multiple of the median over the lit microimages of each one's brightest
-    pixel; 0 switches it off, "auto" takes 1 for particles smaller than voxels and 2 for larger ones."""
+    pixel; 0 switches it off, "auto" does so where the images show equally bright particles, and takes 1 for other
+    particles smaller than voxels and 2 for larger ones."""
     sieve_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] | Literal["auto"] = "auto"
     """Standard deviation of the Gaussians that make up the volume [voxel]; 0 lets voxels vary freely, "auto" takes the
     particles' size from the images, or 0 where particles are smaller than voxels."""

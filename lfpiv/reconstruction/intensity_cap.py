@@ -5,6 +5,9 @@ particles. A volume has one brightness per particle. What a camera shows beyond 
 sight, and the brightest particles make the most. The limit is a multiple of the typical peak, the median over the lit
 microimages of each one's brightest pixel. A few bright particles do not change it.
 
+Equally bright particles need no limit. It cuts the light of those that lie behind one another, and makes ghosts
+instead. So the images are asked first how unlike bright the particles are (`ParticleSizer.brightness_scatter`).
+
 .. [1] U. Shavit, R. J. Lowe, J. V. Steinbuck, "Intensity capping: a simple method to improve cross-correlation PIV
    results", Exp. Fluids 42 (2007) 225-240, doi:10.1007/s00348-006-0233-7.
 """

@@ -1,4 +1,4 @@
-"""Size of the particles, measured in the cameras' images: `ParticleSizer`.
+"""Size of the particles and scatter of their brightness, measured in the cameras' images: `ParticleSizer`.
 
 A sub-aperture image has one pixel of every lens, those that see the same pupil point. Particles at random places make
 it shot noise. Its autocovariance is that of one particle's image times the mean square of the particles' light, at any
@@ -9,6 +9,11 @@ weights, give the ratio for each size.
 Noise of different pixels is independent, so a pixel is never multiplied with itself but with a neighbour in the pupil.
 That neighbour lies across the direction in which the two lenses lie. So a particle's depth shifts its image by the same
 amount in the numerator and in the denominator of the ratio.
+
+The mean light, the covariance and the third cumulant are proportional to the means of a, a^2 and a^3 over the
+particles, a the light of one. So mean times third cumulant over the square of the covariance, relative to the same of
+equal particles, is <a><a^3> / <a^2>^2 at any seeding density. It is 1 for equal particles and exp(s^2) for a log-normal
+a whose logarithm has the standard deviation s.
 
 .. [1] S. O. Rice, "Mathematical analysis of random noise", Bell Syst. Tech. J. 23 (1944) 282-332,
    doi:10.1002/j.1538-7305.1944.tb00874.x.
@@ -47,6 +52,8 @@ LIT_SHARE = 0.1
 """Least light of a lens that counts, as a share of the brightest lens's light of an evenly lit volume."""
 LEAST_RANGE = 0.1
 """Least difference of the ratio between the smallest and the largest width. Below it the lenses are too coarse."""
+UNLIKE = 1.1
+"""Least scatter of the brightness, <a><a^3> / <a^2>^2, of particles that are called unlike bright."""
 SIGNIFICANCE = 5.0
 """Least ratio of the covariance to its standard error over the sub-apertures. Below it noise hides the particles."""
 VOXEL_VARIANCE = 1 / 12
@@ -88,15 +95,29 @@ class SubApertures:
 
         The mean product `FAR_LENSES` away is subtracted: light that varies slowly and was not removed with the mean.
         """
-        pixels = np.asarray(image, np.float32).reshape(-1)
-        here, right, below = (
-            self._fluctuation(pixels[self._first + step], even)
-            for step, even in zip(self._steps, self._even, strict=True)
-        )
+        here, right, below = self._fluctuations(np.asarray(image, np.float32).reshape(-1))
         same = (here * (right + below)).sum((1, 2))
         near = self._apart(here, right, below, 1)
         far = np.mean([self._apart(here, right, below, lenses) for lenses in FAR_LENSES], axis=0)
         return np.stack([same - far, near - far])
+
+    def cumulants(self, image: np.ndarray) -> np.ndarray:
+        """Return sums over the lenses, shape (3, sub-aperture): the light, products of two and of three fluctuations.
+
+        The fluctuations are those of neighbours in the pupil at the same lens, whose noise is independent.
+        """
+        pixels = np.asarray(image, np.float32).reshape(-1)
+        here, right, below = self._fluctuations(pixels)
+        light = (pixels[self._first] * self._lit).sum((1, 2))
+        return np.stack([light, (here * (right + below)).sum((1, 2)) / 2, (here * right * below).sum((1, 2))])
+
+    def _fluctuations(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the fluctuations of the sub-apertures and of their neighbours to the right and below."""
+        here, right, below = (
+            self._fluctuation(pixels[self._first + step], even)
+            for step, even in zip(self._steps, self._even, strict=True)
+        )
+        return here, right, below
 
     @staticmethod
     def _apart(here: np.ndarray, right: np.ndarray, below: np.ndarray, lenses: int) -> np.ndarray:
@@ -131,7 +152,9 @@ def _evenly_lit(weights: Weights) -> np.ndarray:
 
 
 class ParticleSizer:
-    """Estimator of the particles' size for one rig. Making it projects a volume of each known size.
+    """Estimator of the particles' size and of the scatter of their brightness, for one rig.
+
+    Making it projects a volume of each known size.
 
     Parameters
     ----------
@@ -153,13 +176,17 @@ class ParticleSizer:
         points = np.zeros(size, np.float32)
         points[lit] = 1.0
         ratios: dict[str, list[float]] = {name: [] for name in self._sub_apertures}
+        equal: dict[str, list[float]] = {name: [] for name in self._sub_apertures}
         for width in WIDTHS_VOXEL:
             images = weights(Sieve(width, weights.grid.shape)(points).reshape(weights.grid.shape), out=own)
             for name, sub_apertures in known.items():
                 same, next_lens = sub_apertures.covariances(images[name]).sum(1)
                 ratios[name].append(next_lens / same if same > 0 else 0.0)
+                equal[name].append(_skewness(sub_apertures.cumulants(images[name])))
         self._ratios = {name: np.maximum.accumulate(values) for name, values in ratios.items()}
         """Covariance one lens away over that at the same lens for each of `WIDTHS_VOXEL`, rising."""
+        self._equal = equal
+        """`_skewness` of equal particles for each of `WIDTHS_VOXEL`."""
 
     def size(self, images: Mapping[str, np.ndarray]) -> float | None:
         """Estimate the size of the particles: the Gaussian of voxels whose images are as wide as the measured ones.
@@ -202,3 +229,35 @@ class ParticleSizer:
         text = "unknown size, in" if size is None else f"{size:.2f}"
         log.debug("particles of %s voxel: sieve of %.2f voxel", text, sieve)
         return sieve if sieve >= LEAST_SIEVE_VOXEL else 0.0
+
+    def brightness_scatter(self, images: Mapping[str, np.ndarray], sieve_voxel: float) -> float | None:
+        """Estimate how unlike bright the particles are in a camera, <a><a^3> / <a^2>^2 of a particle's light a.
+
+        Light that is no particle's, such as stray light, raises it.
+
+        Parameters
+        ----------
+        images : mapping of str to ndarray
+            As of `size`.
+        sieve_voxel : float
+            The sieve that matches the particles' size [voxel], 0 for small ones.
+
+        Returns
+        -------
+        float or None
+            1 for equal particles; mean of the cameras. None if noise hides the particles in every camera.
+        """
+        scatters, variance = [], sieve_voxel**2 + VOXEL_VARIANCE if sieve_voxel else 0.0
+        for name, known in self._equal.items():
+            cumulants = self._sub_apertures[name].cumulants(images[name])
+            products = cumulants[1]
+            equal = float(np.interp(variance, np.square(WIDTHS_VOXEL), known))
+            if equal > 0 and products.mean() > SIGNIFICANCE * products.std() / len(products) ** 0.5:
+                scatters.append(_skewness(cumulants) / equal)
+        return float(np.mean(scatters)) if scatters else None
+
+
+def _skewness(cumulants: np.ndarray) -> float:
+    """Return mean times third cumulant over the square of the covariance, 0 without light."""
+    light, second, third = cumulants.sum(1)
+    return float(light * third / second**2) if second > 0 else 0.0

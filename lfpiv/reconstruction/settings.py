@@ -12,7 +12,7 @@ from lfpiv.geometry.volume import is_finite
 
 NORMALISATIONS = ("column", "paper")
 AUTO = "auto"
-"""Sieve and intensity cap that suit the size of the particles."""
+"""Sieve and intensity cap that suit the size and the brightness of the particles."""
 DEFAULTS = Smart()
 """Settings of SMART where none are stated."""
 PLAIN: dict[str, Any] = {"intensity_cap": 0.0, "sieve_voxel": 0.0, "subsets": 1, "tolerance": 0.0}

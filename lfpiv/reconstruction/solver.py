@@ -15,7 +15,7 @@ from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Subset, iterate_epochs, step_sizes, subsets_of
-from lfpiv.reconstruction.particle_size import ParticleSizer
+from lfpiv.reconstruction.particle_size import UNLIKE, ParticleSizer
 from lfpiv.reconstruction.recording import Recording, checked_images, record
 from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
@@ -114,7 +114,7 @@ class SmartSolver:
         count = settings.iterations if iterations is None else iterations
         images = checked_images(self.weights, images)
         sieve = Sieve(self._sieve_voxel(images), stored.shape)
-        cap = self._intensity_cap(sieve)
+        cap = self._intensity_cap(images, sieve)
         recordings = record(self.weights, images, floor=floor, floor_share=settings.floor_share, intensity_cap=cap)
         cameras = [self._equation(name, one) for name, one in recordings.items()]
         norm = _norm(cameras)
@@ -259,10 +259,13 @@ class SmartSolver:
         sieve = self.settings.sieve_voxel
         return self._particle_sizer.matching_sieve(images) if isinstance(sieve, str) else sieve
 
-    def _intensity_cap(self, sieve: Sieve) -> float:
+    def _intensity_cap(self, images: Mapping[str, np.ndarray], sieve: Sieve) -> float:
         cap = self.settings.intensity_cap
         if not isinstance(cap, str):
             return cap
+        scatter = self._particle_sizer.brightness_scatter(images, sieve.sigma_voxel)
+        if scatter is not None and scatter < UNLIKE:
+            return 0.0
         points = self.settings.sieve_voxel == AUTO and sieve.sigma_voxel == 0
         return POINT_CAP if points else CAP
 

@@ -71,8 +71,9 @@ def reconstruct(
     intensity_cap : float or "auto"
         Upper limit of the counts as a multiple of the typical peak, the median over the lit microimages of each one's
         brightest pixel; 0 for none. It makes particles of unlike brightness more alike between cameras and frames
-        (`lfpiv.reconstruction.intensity_cap`). "auto": 1 for particles that ``sieve_voxel = "auto"`` finds smaller than
-        voxels, otherwise 2, which cuts a hundredth of the light of equally bright particles.
+        (`lfpiv.reconstruction.intensity_cap`). "auto": none if the images show equally bright particles
+        (`lfpiv.reconstruction.particle_size`); otherwise 1 for particles that ``sieve_voxel = "auto"`` finds smaller
+        than voxels, and 2 for larger ones.
     normalisation : {"column", "paper"}
         See above.
     accelerate : bool

@@ -7,6 +7,7 @@ from support.ideal_rig import two_cameras
 
 import lfpiv
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP, typical_peak
+from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import record
 
 NOISE = 2.0  # [counts]
@@ -47,10 +48,10 @@ def weights(device):
     )
 
 
-def scene(weights, spread, seed, size=0.5):
+def scene(weights, spread, seed, size=0.5, share=0.02):
     """Truth with equally bright particles, and images whose particles have a brightness of their own per camera."""
     grid, rng = weights.grid, np.random.default_rng(seed)
-    count = round(0.02 * grid.size)
+    count = round(share * grid.size)
     place = np.array(grid.first_centre_mm)[::-1] + grid.voxel_mm * (rng.random((count, 3)) * grid.shape[::-1] - 0.5)
     truth = 3e4 * lfpiv.metrics.truth_volume(place, None, grid, size).values
     images = {}
@@ -100,9 +101,49 @@ def test_particles_of_unlike_brightness_are_found_better_and_equal_ones_as_well(
     assert change[0.0] > -LARGEST_LOSS
 
 
-@pytest.mark.parametrize(("size", "sieve", "expected"), [(0.0, "auto", POINT_CAP), (0.9, "auto", CAP), (0.0, 0.0, CAP)])
-def test_the_cap_suits_the_particles_size_where_it_is_measured(weights, size, sieve, expected):
-    _, images = scene(weights, 0.0, 5, size)
+@pytest.fixture(scope="module")
+def sizer(weights):
+    return ParticleSizer(weights)
+
+
+def test_the_scatter_of_the_brightness_is_that_of_a_log_normal_one(weights, sizer):
+    """<a><a^3> / <a^2>^2 is exp(s^2), twice the number of particles or not; of some 20 particles it is hardly known."""
+
+    def scatter(spread, share):
+        found = [sizer.brightness_scatter(scene(weights, spread, seed, share=share)[1], 0.5) for seed in range(8)]
+        return np.mean(found)
+
+    for share in (0.02, 0.04):
+        assert scatter(0.5, share) / scatter(0.0, share) == pytest.approx(np.exp(0.25), abs=0.12)
+
+
+def test_the_scatter_of_the_brightness_does_not_depend_on_the_light(weights, sizer):
+    _, images = scene(weights, 1.0, 2)
+    dimmer = {name: image / 4 for name, image in images.items()}
+    assert sizer.brightness_scatter(dimmer, 0.5) == pytest.approx(sizer.brightness_scatter(images, 0.5), rel=1e-4)
+
+
+def test_noise_has_no_scatter_of_the_brightness(weights, sizer):
+    rng = np.random.default_rng(7)
+    images = {name: rng.normal(0, NOISE, image.shape) for name, image in scene(weights, 0.0, 7)[1].items()}
+    assert sizer.brightness_scatter(images, 0.5) is None
+    assert (
+        plain_steps.reconstruct(weights, images, 0, intensity_cap="auto", sieve_voxel="auto").intensity_cap == POINT_CAP
+    )
+
+
+@pytest.mark.parametrize(
+    ("spread", "size", "sieve", "expected"),
+    [
+        (1.0, 0.0, "auto", POINT_CAP),
+        (1.0, 0.9, "auto", CAP),
+        (1.0, 0.0, 0.0, CAP),
+        (0.0, 0.0, "auto", 0.0),
+        (0.0, 0.9, "auto", 0.0),
+    ],
+)
+def test_the_cap_suits_the_particles_brightness_and_size(weights, spread, size, sieve, expected):
+    _, images = scene(weights, spread, 5, size)
     assert (
         plain_steps.reconstruct(weights, images, 0, intensity_cap="auto", sieve_voxel=sieve).intensity_cap == expected
     )
