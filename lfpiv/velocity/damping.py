@@ -38,6 +38,8 @@ LARGEST_ERROR = 0.1
 """Largest standard error of a slope that is corrected, as a share of the slope."""
 LEAST_WINDOWS = 8
 """Least number of valid windows of all simulated pairs."""
+LEAST_PAIRS = 4
+"""Least number of simulated pairs whose scatter gives a standard error."""
 COVERED = 0.95
 """Share of the errors that two standard deviations should cover."""
 
@@ -229,8 +231,8 @@ def displacement(vectors: xr.Dataset) -> np.ndarray:
 def estimate_damping(pairs: Sequence[Simulated], recorded: Sequence[xr.Dataset] = ()) -> Damping:
     """Estimate the damping from simulated pairs, and compare them with vectors of recorded ones.
 
-    Standard errors are those of a jackknife over octants of all pairs. Neighbouring vectors share half of their windows
-    and are not independent, octants nearly are.
+    Standard errors are those of a jackknife over octants of all pairs, or over pairs if these scatter more.
+    Neighbouring vectors share half of their windows and are not independent.
 
     Raises
     ------
@@ -247,13 +249,14 @@ def estimate_damping(pairs: Sequence[Simulated], recorded: Sequence[xr.Dataset] 
 def _of_axis(pairs: Sequence[Simulated], axis: str, likeness: Likeness | None) -> AxisDamping:
     """Regress measured on imposed displacements of one axis."""
     pairs = [pair for pair in pairs if pair.used.any()]
-    parts = [part for pair in pairs for part in _parts(pair, axis)]
-    sums = np.array([((away**2).sum(), (away * moved).sum()) for away, moved, _ in parts])
-    slope, slope_error = _jackknife(sums, empty=1.0)
-    rests = [(len(away), (error - (slope - 1) * away).sum()) for away, _, error in parts]
-    offset, offset_error = _jackknife(np.array(rests, float), empty=0.0)
+    parts = [list(_parts(pair, axis)) for pair in pairs]
+    sums = [[((away**2).sum(), (away * moved).sum()) for away, moved, _ in pair] for pair in parts]
+    slope, slope_error = _ratio(sums, empty=1.0)
+    rests = [[(len(away), (error - (slope - 1) * away).sum()) for away, _, error in pair] for pair in parts]
+    offset, offset_error = _ratio(rests, empty=0.0)
     errors = np.concatenate([_scaled_errors(pair, axis, slope, offset) for pair in pairs])
-    fluctuation = np.sqrt(sums[:, 0].sum() / sum(len(away) for away, _, _ in parts))
+    squares = sum(below for pair in sums for below, _ in pair)
+    fluctuation = np.sqrt(squares / sum(len(away) for pair in parts for away, _, _ in pair))
     doubt = 0.0 if likeness is None else likeness.doubt * abs(slope - 1)
     return AxisDamping(
         slope=slope,
@@ -274,6 +277,18 @@ def _parts(pair: Simulated, axis: str) -> Iterator[tuple[np.ndarray, np.ndarray,
     for octant in octants(used.shape):
         if (some := used & octant).any():
             yield away[some], moved[some], (found - exact)[some]
+
+
+def _ratio(sums: Sequence[Sequence[tuple[float, float]]], *, empty: float) -> tuple[float, float]:
+    """Return the ratio of summed numerators to denominators of the octants of each pair, and its standard error.
+
+    The octants of a pair share its mean, so that a jackknife over whole pairs gives the larger error where there are
+    enough of them.
+    """
+    ratio, error = _jackknife(np.array([part for pair in sums for part in pair], float), empty=empty)
+    if len(sums) >= LEAST_PAIRS:
+        error = max(error, _jackknife(np.array([np.sum(pair, axis=0) for pair in sums]), empty=empty)[1])
+    return ratio, error
 
 
 def _jackknife(sums: np.ndarray, *, empty: float) -> tuple[float, float]:

@@ -146,3 +146,15 @@ def test_too_few_valid_vectors_say_so():
     nothing = Simulated(vectors=pair.vectors.assign(valid=~pair.vectors["valid"]), imposed=pair.imposed)
     with pytest.raises(ValueError, match="valid"):
         estimate_damping([nothing])
+
+
+def test_the_error_of_a_slope_is_that_of_pairs_where_these_scatter_more():
+    rng = np.random.default_rng(8)
+    pairs = []
+    for slope in (0.6, 0.7, 0.9, 1.0):
+        imposed = flow(rng)
+        mean = imposed.mean((0, 1, 2))
+        pairs.append(Simulated(vectors=vectors_of(mean + slope * (imposed - mean)), imposed=imposed))
+    few, enough = (estimate_damping(pairs[:count]).axes["x"] for count in (3, 4))
+    scatter = np.std([0.6, 0.7, 0.9, 1.0], ddof=1) / np.sqrt(4)
+    assert abs(enough.slope_error / scatter - 1) < 0.1 and few.slope_error < scatter
