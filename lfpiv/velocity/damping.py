@@ -38,6 +38,8 @@ LARGEST_ERROR = 0.1
 """Largest standard error of a slope that is corrected, as a share of the slope."""
 LEAST_WINDOWS = 8
 """Least number of valid windows of all simulated pairs."""
+LARGEST_LOSS = 1.1
+"""Largest expected error of corrected vectors over that of raw ones. Division by the slope amplifies random errors."""
 LEAST_PAIRS = 4
 """Least number of simulated pairs whose scatter gives a standard error."""
 COVERED = 0.95
@@ -66,6 +68,8 @@ class AxisDamping:
     """Root mean square of the simulated fluctuations [voxel]."""
     uncertainty_factor: float
     """Factor by which the standard deviations of the correlation statistics are too small."""
+    scatter: float = 0.0
+    """Root mean square of the simulated errors that slope and offset leave [voxel]."""
     alike: bool = True
     """Whether simulated pairs are not harder to measure than recorded ones; else nothing is corrected."""
 
@@ -73,8 +77,15 @@ class AxisDamping:
     def applied(self) -> bool:
         """Whether the slope differs from 1 significantly, so that vectors are corrected."""
         known = self.alike and self.slope_error <= LARGEST_ERROR * self.slope
-        significant = known and abs(self.slope - 1) > SIGNIFICANT * self.slope_error
+        significant = known and abs(self.slope - 1) > SIGNIFICANT * self.slope_error and not self.amplifies
         return significant and self.fluctuation >= LEAST_FLUCTUATION and SLOPES[0] <= self.slope <= SLOPES[1]
+
+    @property
+    def amplifies(self) -> bool:
+        """Whether the correction would amplify random errors by clearly more than it takes off."""
+        raw = np.hypot(self.scatter, (1 - self.slope) * self.fluctuation)
+        corrected = np.hypot(self.scatter, self.slope_error * self.fluctuation / self.slope) / self.slope
+        return bool(corrected > LARGEST_LOSS * raw)
 
     @property
     def used_slope(self) -> float:
@@ -252,12 +263,13 @@ def _of_axis(pairs: Sequence[Simulated], axis: str, likeness: Likeness | None) -
     parts = [list(_parts(pair, axis)) for pair in pairs]
     sums = [[((away**2).sum(), (away * moved).sum()) for away, moved, _ in pair] for pair in parts]
     slope, slope_error = _ratio(sums, empty=1.0)
-    rests = [[(len(away), (error - (slope - 1) * away).sum()) for away, _, error in pair] for pair in parts]
-    offset, offset_error = _ratio(rests, empty=0.0)
+    shifts = [[(len(away), (error - (slope - 1) * away).sum()) for away, _, error in pair] for pair in parts]
+    offset, offset_error = _ratio(shifts, empty=0.0)
     errors = np.concatenate([_scaled_errors(pair, axis, slope, offset) for pair in pairs])
     squares = sum(below for pair in sums for below, _ in pair)
     fluctuation = np.sqrt(squares / sum(len(away) for pair in parts for away, _, _ in pair))
     doubt = 0.0 if likeness is None else likeness.doubt * abs(slope - 1)
+    rests = np.concatenate([error - offset - (slope - 1) * away for pair in parts for away, _, error in pair])
     return AxisDamping(
         slope=slope,
         slope_error=float(np.hypot(slope_error, doubt)),
@@ -265,6 +277,7 @@ def _of_axis(pairs: Sequence[Simulated], axis: str, likeness: Likeness | None) -
         offset_error=offset_error,
         fluctuation=float(fluctuation),
         uncertainty_factor=max(float(np.quantile(errors, COVERED)) / 2, 1.0),
+        scatter=float(np.sqrt(np.mean(rests**2))),
         alike=likeness is None or not likeness.harder,
     )
 

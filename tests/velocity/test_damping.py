@@ -103,6 +103,7 @@ def axis_of(**changed):
         {"fluctuation": 0.05},
         {"slope": 0.45},
         {"slope": 1.5},
+        {"slope": 0.85, "fluctuation": 0.2, "scatter": 0.2},
     ],
 )
 def test_what_is_not_significant_is_not_corrected(changed):
