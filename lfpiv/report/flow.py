@@ -95,14 +95,12 @@ def stored(vectors: xr.Dataset) -> dict[str, xr.DataArray]:
 
 def shown(vectors: xr.Dataset, kinds: dict[str, Quantity]) -> xr.Dataset:
     """Return all quantities of a measured field in their units, with ``valid`` and ``masked``."""
-    values = stored(vectors)
-    values["speed"] = np.sqrt(sum(values[name] ** 2 for name in "uvw"))
-    if "vorticity_x" in values:
-        values["vorticity"] = np.sqrt(sum(values[f"vorticity_{axis}"] ** 2 for axis in "xyz"))
-    fields = {
-        name: (AXES, kinds[name].factor * np.asarray(field.transpose(*AXES).values, float))
-        for name, field in values.items()
-    }
+    values = {name: field.transpose(*AXES).values.astype(float) for name, field in stored(vectors).items()}
+    values["speed"] = np.sqrt(values["u"] ** 2 + values["v"] ** 2 + values["w"] ** 2)
+    if "q" in values:
+        x, y, z = (values[f"vorticity_{axis}"] for axis in "xyz")
+        values["vorticity"] = np.sqrt(x**2 + y**2 + z**2)
+    fields = {name: (AXES, kinds[name].factor * part) for name, part in values.items()}
     return xr.Dataset(
         {**fields, "valid": (AXES, vectors["valid"].values), "masked": (AXES, masked_of(vectors))},
         {axis: vectors[axis].variable for axis in AXES},
@@ -143,12 +141,12 @@ def best_view(vectors: xr.Dataset) -> View:
         rms = float(np.sqrt(total[layer] / max(count[layer], 1)))
         if total[layer] > best[0] and rms > SIGNIFICANT * _noise(vectors):
             within = square.take([layer], AXES.index(normal))
-            place = list(np.unravel_index(int(within.argmax()), within.shape))
+            place = [int(k) for k in np.unravel_index(int(within.argmax()), within.shape)]
             place[AXES.index(normal)] = layer
-            best = float(total[layer]), normal, tuple(map(int, place))
+            best = float(total[layer]), normal, tuple(place)
     if best[1]:
-        normal, place = best[1], dict(zip(AXES, best[2], strict=True))
-        return View(normal=normal, place=place, quantity=f"vorticity_{normal}", along=_longer(vectors, normal))
+        normal, through = best[1], dict(zip(AXES, best[2], strict=True))
+        return View(normal=normal, place=through, quantity=f"vorticity_{normal}", along=_longer(vectors, normal))
     normal = max(IN_SLICE, key=lambda axis: np.prod([vectors.sizes[other] for other in IN_SLICE[axis]]))
     middle = {axis: vectors.sizes[axis] // 2 for axis in AXES}
     return View(normal=normal, place=middle, quantity="speed", along=_longer(vectors, normal))

@@ -101,16 +101,16 @@ def slice_panel(
     return to_svg(figure, f"{alt}{over[overlay]}.")
 
 
-def _smooth(values: np.ndarray) -> np.ndarray:
+def _smooth(values: np.ndarray) -> np.ma.MaskedArray:
     """Return values interpolated linearly between the vectors; cells of unknown ones are masked."""
     fine = int(np.clip(SAMPLES // max(values.shape), 1, 16))
     unknown = ~np.isfinite(values)
     if unknown.all():
-        return np.ma.masked_all(values.shape)
+        return np.ma.masked_array(values, unknown)
     nearest = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
     places = np.meshgrid(*((np.arange(n * fine) + 0.5) / fine - 0.5 for n in values.shape), indexing="ij")
     smooth = ndimage.map_coordinates(values[tuple(nearest)], places, order=1, mode="nearest")
-    return np.ma.masked_where(np.repeat(np.repeat(unknown, fine, 0), fine, 1), smooth)
+    return np.ma.masked_array(smooth, np.repeat(np.repeat(unknown, fine, 0), fine, 1))
 
 
 def limits(values: np.ndarray, kind: Quantity) -> tuple[float, float]:
@@ -146,12 +146,13 @@ def _draw_arrows(axes: Axes, slab: xr.Dataset, names: tuple[str, str], longest: 
 def _draw_streamlines(axes: Axes, slab: xr.Dataset, names: tuple[str, str]) -> None:
     """Draw the streamlines of the velocity in a slice."""
     across, up = names
-    velocity = [np.ma.masked_invalid(np.where(slab["masked"], np.nan, slab[COMPONENTS[axis]])) for axis in names]
+    u, v = velocity = [np.ma.masked_invalid(np.where(slab["masked"], np.nan, slab[COMPONENTS[axis]])) for axis in names]
     if min(slab.sizes.values()) < 2 or not any(np.any(part != 0) for part in velocity):
         return
-    places = [np.linspace(float(slab[axis][0]), float(slab[axis][-1]), slab.sizes[axis]) for axis in names]
-    density = 1.1 * np.clip([1.0, slab.sizes[up] / slab.sizes[across]], 0.35, 1.0)
-    drawn = axes.streamplot(*places, *velocity, density=density, color="#0b0f14", linewidth=0.9, arrowsize=0.8)
+    x, y = (np.linspace(float(slab[axis][0]), float(slab[axis][-1]), slab.sizes[axis]) for axis in names)
+    shape = float(np.clip(slab.sizes[up] / slab.sizes[across], 0.35, 1.0))
+    density = (1.1, 1.1 * shape)
+    drawn = axes.streamplot(x, y, u, v, density=density, color="#0b0f14", linewidth=0.9, arrowsize=0.8)
     for patch in axes.patches:
         patch.set_in_layout(False)  # the heads of the arrows lie inside; measuring them takes long
     drawn.lines.set_path_effects([patheffects.withStroke(linewidth=2.2, foreground="#ffffff")])
