@@ -28,6 +28,7 @@ extensions = [
     "tables",
     "mathml",
     "side_by_side",
+    "accuracy_plots",
 ]
 exclude_patterns = ["_build", "_ext", "gallery", "generated/extra"]
 nitpicky = True
