@@ -29,6 +29,7 @@ extensions = [
     "mathml",
     "side_by_side",
     "accuracy_plots",
+    "drawings",
 ]
 exclude_patterns = ["_build", "_ext", "gallery", "generated/extra"]
 nitpicky = True
