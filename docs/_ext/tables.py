@@ -1,4 +1,4 @@
-"""Tables that cannot rot: keys of the experiment and scene files, options of the command line, sentences of the warnings.
+"""Tables that cannot rot: keys of experiment and scene files, options of the command line, sentences of the warnings.
 
 `key_rows`, `commands`, `help_text` and `warning_rows` need no Sphinx; `setup` registers the directives ``{keys}``,
 ``{command}`` and ``{warning-list}``.
