@@ -42,6 +42,8 @@ SLAB = 6
 """Number of layers of the volume whose largest intensities are shown."""
 BRIGHT = 99.7
 """Percentile of an image that is drawn white."""
+STRIDE = 2
+"""Every how manyth vector is drawn along x and z."""
 FINER = 4
 """Number of points of the drawn surface per vector, along each axis."""
 
@@ -58,20 +60,20 @@ def draw(results: Path, path: Path) -> None:
         volume = stored["intensity"].load()
     figure = Figure(figsize=(13, 4.0), facecolor="white")
     FigureCanvasAgg(figure)
-    _raw(figure.add_axes((0.005, 0.03, 0.235, 0.83)), image)
+    _raw(figure.add_axes((0.002, 0.03, 0.2555, 0.83)), image)
     radius = camera.optics.pupil_radius_mm
     for number, place in enumerate(VIEWS):
-        axes = figure.add_axes((0.255, 0.03 + 0.28 * (2 - number), 0.13, 0.27))
+        axes = figure.add_axes((0.268, 0.03 + 0.28 * (2 - number), 0.13, 0.27))
         view, _ = camera.decoder.sub_aperture(image, (place * radius, 0.0))
         _grey(axes, np.nan_to_num(view).T)
         axes.text(0.03, 0.06, f"u = {place:+.2f} R", color="white", fontsize=8, transform=axes.transAxes)
     _volume_panel(figure, volume)
     _flow(figure.add_axes((0.655, -0.06, 0.345, 1.02), projection="3d"), vectors)
     for x, text in (
-        (0.122, "raw plenoptic image"),
-        (0.32, "views through the pupil"),
+        (0.13, "raw plenoptic image"),
+        (0.333, "views through the pupil"),
         (0.51, "reconstructed particles"),
-        (0.83, "velocities and vorticity of a ring vortex"),
+        (0.83, "velocities and vorticity of a ring vortex, coloured by w"),
     ):
         figure.text(x, 0.93, text, ha="center", fontsize=11.5)
     figure.savefig(path, dpi=110)
@@ -109,7 +111,7 @@ def _volume_panel(figure: Figure, volume) -> None:
         (0.03 + low + 0.01, 0.82 - low, above, y, "y"),
         (0.03, low, below, z, "z"),
     ):
-        axes = figure.add_axes((0.405, bottom, width, share))
+        axes = figure.add_axes((0.41, bottom, width, share))
         extent = (x[0], x[-1], vertical[0], vertical[-1])
         axes.imshow(
             np.sqrt(shown), cmap="magma", extent=extent, origin="lower", vmax=np.sqrt(np.percentile(shown, BRIGHT))
@@ -120,10 +122,13 @@ def _volume_panel(figure: Figure, volume) -> None:
 
 
 def _flow(axes, vectors) -> None:
-    """Draw a surface of equal vorticity, coloured by w, and the vectors of the middle plane."""
+    """Draw the far half of a surface of equal vorticity, coloured by w, and the vectors of the middle plane."""
     curl = derived.vorticity(vectors)["vorticity_magnitude"]
     x, y, z = (vectors[axis].values for axis in "xyz")
-    finer = {axis: np.linspace(own[0], own[-1], FINER * len(own)) for axis, own in zip("xyz", (x, y, z), strict=True)}
+    plane = len(y) // 2
+    finer = {
+        axis: np.linspace(own[0], own[-1], FINER * len(own)) for axis, own in zip("xyz", (x, y[plane:], z), strict=True)
+    }
     smooth = curl.fillna(0).interp(finer, method="cubic").transpose("z", "y", "x").values
     steps = [finer[axis][1] - finer[axis][0] for axis in "zyx"]
     points, faces, _, _ = marching_cubes(smooth, LEVEL * smooth.max(), spacing=steps)
@@ -135,15 +140,21 @@ def _flow(axes, vectors) -> None:
     colours = Normalize(-largest, largest)(along.values[faces].mean(1))
     corners = points[faces][:, :, ::-1]
     surface = Poly3DCollection(
-        corners, facecolors=colormaps["coolwarm"](colours), shade=True, lightsource=LightSource(225, 40), linewidths=0
+        corners,
+        facecolors=colormaps["coolwarm"](colours),
+        shade=True,
+        lightsource=LightSource(225, 40),
+        antialiased=False,
     )
     axes.add_collection3d(surface)
-    middle = vectors.isel(y=vectors.sizes["y"] // 2)
+    middle = vectors.isel(y=plane, x=slice(None, None, STRIDE), z=slice(None, None, STRIDE))
     grid = np.meshgrid(middle.x, middle.z)
     speed = float(np.sqrt(middle.u**2 + middle.v**2 + middle.w**2).max())
-    length = 0.28 * (x[-1] - x[0]) / speed
+    length = 0.2 * (x[-1] - x[0]) / speed
     parts = [length * middle[name].values for name in "uvw"]
-    axes.quiver(grid[0], np.full_like(grid[0], float(middle.y)), grid[1], *parts, color="#333", lw=0.9)
+    axes.quiver(
+        grid[0], np.full_like(grid[0], float(middle.y)), grid[1], *parts, color="#222", lw=1.1, arrow_length_ratio=0.35
+    )
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
     axes.set_zlim(z[0], z[-1])
