@@ -29,6 +29,8 @@ extensions = [
     "mathml",
     "side_by_side",
     "tracking_limits",
+    "accuracy_plots",
+    "drawings",
 ]
 exclude_patterns = ["_build", "_ext", "gallery", "generated/extra"]
 nitpicky = True

@@ -24,14 +24,22 @@ class _Camera(CalibratedCamera):
         return np.ones(self.optics.sensor_shape, np.float32)
 
 
-def rig(sensor: tuple[int, int], bent_mm: float = 0.0) -> Calibration:
-    """Make two calibrated cameras. `bent_mm` scales the network's output. About a third of it is of second order."""
+POSES = (
+    ("cam1", 44.2, 0.05, (0.031, -0.022)),
+    ("cam2", -45.9, -0.08, (-0.02, 0.04)),
+    ("cam3", 1.1, 0.03, (0.01, 0.013)),
+)
+"""Name, angle about y and roll of the array [degree], and offset of the array [mm]."""
+
+
+def rig(sensor: tuple[int, int], bent_mm: float = 0.0, cameras: int = 2) -> Calibration:
+    """Make calibrated cameras. `bent_mm` scales the network's output. About a third of it is of second order."""
     optics = Optics(
         focal_length_mm=100.0, magnification=-1.0, f_number=4.0, microlens_pitch_mm=0.1, pixel_mm=0.0055,
         microlens_focal_length_mm=0.8, sensor_shape=sensor,
     )  # fmt: skip
-    cameras = {}
-    for name, angle, roll, origin in (("cam1", 44.2, 0.05, (0.031, -0.022)), ("cam2", -45.9, -0.08, (-0.02, 0.04))):
+    calibrated = {}
+    for name, angle, roll, origin in POSES[:cameras]:
         rng, turn = np.random.default_rng(abs(int(angle))), np.radians(roll)
         x, y = 0.1 * np.cos(turn), 0.1 * np.sin(turn)
         network = Network(
@@ -42,7 +50,7 @@ def rig(sensor: tuple[int, int], bent_mm: float = 0.0) -> Calibration:
             output_centre=np.zeros(2),
             output_scale=np.full(2, max(bent_mm, 1e-3)),
         )
-        cameras[name] = _Camera(
+        calibrated[name] = _Camera(
             name=name,
             optics=optics,
             lattice=LensLattice(origin_mm=origin, basis_mm=((x, -y), (y, x))),
@@ -50,7 +58,7 @@ def rig(sensor: tuple[int, int], bent_mm: float = 0.0) -> Calibration:
             network=network,
             baseline=thin_lens_model(optics, angle),
         )
-    return Calibration(cameras)
+    return Calibration(calibrated)
 
 
 def grid(scale: dict) -> Grid:
@@ -96,13 +104,15 @@ def _rows_of(blocks, first: int, last: int) -> sparse.csr_array:
     return sparse.csr_array((data, index), shape=(last - first, rays.sensor_shape[0] * rays.sensor_shape[1]))
 
 
-def particles(shape: tuple[int, int, int], shift=0.0, seed: int = 0) -> np.ndarray:
-    """Draw Gaussian particles of 0.7 voxel standard deviation, 0.012 per voxel, moved by `shift`."""
+def particles(
+    shape: tuple[int, int, int], shift=0.0, seed: int = 0, *, per_voxel: float = 0.012, sd: float = 0.7
+) -> np.ndarray:
+    """Draw Gaussian particles with a standard deviation `sd` [voxel], moved by `shift`."""
     rng = np.random.default_rng(seed)
-    at = rng.random((int(0.012 * np.prod(shape)), 3)) * shape + shift
+    at = rng.random((int(per_voxel * np.prod(shape)), 3)) * shape + shift
     stencil = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
     voxel = np.rint(at).astype(int)[:, None] + stencil
-    light = np.exp(-((voxel - at[:, None]) ** 2).sum(-1) / (2 * 0.7**2))
+    light = np.exp(-((voxel - at[:, None]) ** 2).sum(-1) / (2 * sd**2))
     inside = ((voxel >= 0) & (voxel < shape)).all(-1)
     flat = np.ravel_multi_index(tuple(voxel[inside].T), shape)
     return np.bincount(flat, light[inside], np.prod(shape)).reshape(shape).astype(np.float32)

@@ -28,6 +28,7 @@ from lfpiv.experiment.settings import ExperimentTable
 from lfpiv.experiment.toml import tomllib
 from lfpiv.runs import pipeline
 from lfpiv.simulation.scene import Scene, open_scene
+from lfpiv.warn import Code
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -199,6 +200,8 @@ def tables():
 
 def extension(name):
     """A module of the pages' builder."""
+    if str(DOCS / "_ext") not in sys.path:
+        sys.path.append(str(DOCS / "_ext"))
     spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / "_ext" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -419,6 +422,32 @@ def test_plots_of_methods_side_by_side_show_every_stored_method():
     for row in stored["seeding"]:
         if row["ppm"] == side_by_side.TABLE_PPM:
             assert f"<td>{row['figures']['error'][0]:.3f}" in side_by_side.table(stored)
+
+
+def test_plots_of_the_accuracy_show_every_stored_part():
+    accuracy_plots = extension("accuracy_plots")
+    stored = accuracy_plots.stored_figures()
+    assert set(stored) == {*accuracy_plots.PLOTS, "seeds", "flows", "methods"} - {"seeding", "quality"}
+    for name in accuracy_plots.PLOTS:
+        drawn = accuracy_plots.draw(name, stored)
+        assert drawn.startswith("<svg") and not re.search(r"\bnan\b", drawn), name
+        assert not set(re.findall(r"#[0-9a-f]{6}", drawn))  # colours are the page's
+
+
+def test_pages_show_every_drawing():
+    drawings = extension("drawings")
+    pages = "".join(page.read_text("utf-8") for page in PAGES.values())
+    shown = [name for line in re.findall(r"^```\{drawing\} (.+)$", pages, re.MULTILINE) for name in line.split()]
+    assert sorted(shown) == sorted(drawings.DRAWINGS)
+    for name in shown:
+        drawn = drawings.draw(name)
+        assert drawn.startswith("<svg") and not set(re.findall(r"#[0-9a-f]{6}", drawn)), name
+
+
+def test_the_page_on_troubles_lists_every_warning(tables):
+    assert "```{warning-list}" in PAGES["docs/troubleshooting.md"].read_text("utf-8")
+    rows = dict(tables.warning_rows())
+    assert len(rows) == len(Code) - 1 and all("{" not in sentence for sentence in rows.values())
 
 
 def test_sections_of_the_method_name_modules_that_exist():

@@ -1,6 +1,7 @@
-"""Tables that cannot rot: keys of the experiment and scene files from their models, options from the command line.
+"""Tables that cannot rot: keys of experiment and scene files, options of the command line, sentences of the warnings.
 
-`key_rows`, `commands` and `help_text` need no Sphinx; `setup` registers the directives ``{keys}`` and ``{command}``.
+`key_rows`, `commands`, `help_text` and `warning_rows` need no Sphinx; `setup` registers the directives ``{keys}``,
+``{command}`` and ``{warning-list}``.
 """
 
 from __future__ import annotations
@@ -140,6 +141,18 @@ def keys_markdown(name: str) -> str:
     return markdown_table(("key", "value", "default", "meaning"), rows)
 
 
+def warning_rows() -> list[tuple[str, str]]:
+    """Return the code of each warning and its sentence, figures as dots."""
+    from lfpiv.warn import Code
+    from lfpiv.warn.sentences import SENTENCES
+
+    rows = []
+    for code, sentence in SENTENCES.items():
+        if code is not Code.OTHER:
+            rows.append((f"`{code.value}`", re.sub(r"\{[^}]*\}", "...", sentence)))
+    return rows
+
+
 def setup(app):
     """Register the directives."""
     from docutils import nodes
@@ -161,6 +174,13 @@ def setup(app):
         def run(self):
             return [nodes.literal_block(text := help_text(self.arguments[0]), text, language="none")]
 
+    class WarningList(SphinxDirective):
+        """Table of the warnings."""
+
+        def run(self):
+            return self.parse_text_to_nodes(markdown_table(("code", "says"), warning_rows()))
+
     app.add_directive("keys", Keys)
+    app.add_directive("warning-list", WarningList)
     app.add_directive("command", Command)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -61,7 +61,7 @@ def seeding(
             for flow in FLOWS
         }
         scores = {flow: [score(case, WAYS[name], folder) for case in members] for flow, members in cases.items()}
-        figures = {figure: _mean(_values(scores, figure)) for figure in FIGURES}
+        figures = {figure: mean_of_flows(_values(scores, figure)) for figure in FIGURES}
         single = {figure: _values(scores, figure) for figure in ("error", "q")}
         rows[key] = {"way": name, "cameras": cameras, "ppm": ppm, "figures": figures, "by_flow": single}
         print(
@@ -69,7 +69,7 @@ def seeding(
         )
     for (_, _, ppm), row in rows.items():
         own = rows["ours", 2, ppm]["by_flow"]
-        row["beyond_ours"] = {figure: _mean(values, own[figure]) for figure, values in row["by_flow"].items()}
+        row["beyond_ours"] = {figure: mean_of_flows(values, own[figure]) for figure, values in row["by_flow"].items()}
     return list(rows.values())
 
 
@@ -78,7 +78,7 @@ def _values(scores: Mapping[str, Sequence[Mapping[str, float]]], figure: str) ->
     return {flow: [one[figure] for one in members] for flow, members in scores.items()}
 
 
-def _mean(
+def mean_of_flows(
     values: Mapping[str, Sequence[float | None]], reference: Mapping[str, Sequence[float | None]] | None = None
 ) -> tuple[float, float]:
     """Return the mean of a figure over flows and its standard error by the scatter over seeds within each flow.

@@ -94,6 +94,8 @@ class Case:
     angles_deg: tuple[float, ...] = ANGLES_DEG[2]
     scale: str = "small"
     frames: int = 2
+    speed: float = 1.0
+    """Displacements relative to those of the flow."""
 
     @property
     def windows(self) -> tuple[int, ...] | None:
@@ -104,7 +106,8 @@ class Case:
         kind = f"blobs {self.blob_voxel:g}" if self.blob_voxel else "points"
         angles = " ".join(f"{angle:g}" for angle in self.angles_deg)
         more = ("" if self.frames == 2 else f", {self.frames} frames") + (", paper" if self.scale == "paper" else "")
-        return f"{self.flow} {self.ppm:g} ppm {kind} {self.condition}, cameras {angles}{more}"
+        speed = "" if self.speed == 1 else f", {self.speed:g} times as fast"
+        return f"{self.flow} {self.ppm:g} ppm {kind} {self.condition}, cameras {angles}{more}{speed}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -167,7 +170,7 @@ def _scene_camera(scale: str, number: int, angle_deg: float) -> SceneCamera:
 def make_flow(case: Case):
     """Return the flow of a case. Lengths grow with the volume, displacements with the root of its size."""
     size = SIZE_MM[case.scale][0] / SIZE_MM["small"][0]
-    speed = size**0.5
+    speed = case.speed * size**0.5
     if case.flow == "ring":
         return Ring(radius_mm=0.9 * size, core_mm=0.7 * size, peak_mm=0.16 * speed)
     if case.flow == "swirl":
@@ -202,6 +205,8 @@ def record(case: Case, folder: Path) -> Recorded:
     positions, light = _particles(case, condition, len(rig.cameras))
     angles = "_".join(f"{angle:g}" for angle in case.angles_deg)
     name = f"{case.scale}_{case.flow}_{case.ppm:g}_{case.seed}_{case.blob_voxel:g}_{case.condition}_{angles}"
+    if case.speed != 1:
+        name += f"_{case.speed:g}"
     settings = {"case": asdict(case), "condition": _plain(condition), "form": IMAGES_FORM}
 
     def images_of(frame: int) -> dict[str, np.ndarray]:

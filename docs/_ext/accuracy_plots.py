@@ -1,0 +1,178 @@
+"""Plots of the page on accuracy, drawn from stored figures in the colours of the page, light or dark.
+
+`draw` needs no Sphinx; `setup` registers the directive ``{accuracy-plot} NAME``. `perf/accuracy/headlines.py` and
+`perf/accuracy/method_comparison.py` write the figures.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib.axes import Axes
+from side_by_side import FIGURES as METHODS
+
+from lfpiv.report import svg
+
+FIGURES = METHODS.with_name("accuracy.json")
+OURS, TRUTH, BEFORE, PAPER = svg.SERIES[0], svg.INK, svg.SERIES[2], svg.SERIES[1]
+AXIS_COLOURS = dict(zip("xyz", svg.SERIES, strict=False))
+HEIGHT_INCH = 2.7
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def stored_figures() -> dict[str, Any]:
+    """Return the figures of both files."""
+    figures: dict[str, Any] = json.loads(FIGURES.read_text("utf-8"))
+    return figures | {"methods": json.loads(METHODS.read_text("utf-8"))["seeding"]}
+
+
+def draw(name: str, stored: Mapping[str, Any]) -> str:
+    """Return one of `PLOTS` as SVG."""
+    figure, (axes,) = svg.new_panel(HEIGHT_INCH)
+    alt = PLOTS[name](axes, stored)
+    return svg.to_svg(figure, alt)
+
+
+def _line(axes: Axes, x: Sequence[float], rows: Sequence[Sequence[float]], colour: str, label: str, style: str = "-"):
+    """Draw means with their standard errors."""
+    mean, spread = ([row[part] or 0.0 for row in rows] for part in (0, 1))
+    axes.errorbar(x, mean, spread, color=colour, ls=style, lw=1.6, marker="o", ms=3.5, elinewidth=1, label=label)
+
+
+def _method(stored: Mapping[str, Any], way: str, figure: str) -> tuple[list[float], list[Sequence[float]]]:
+    rows = [row for row in stored["methods"] if row["way"] == way and row["cameras"] == 2]
+    return [row["ppm"] for row in rows], [row["figures"][figure] for row in rows]
+
+
+def _finish(axes: Axes, title: str, xlabel: str, ylabel: str, *, log_x: Sequence[float] = (), legend: bool = True):
+    if log_x:
+        axes.set_xscale("log")
+        axes.set_xticks(log_x, [f"{value:g}" for value in log_x])
+        axes.set_xticks([], minor=True)
+    axes.set_ylim(0, None)
+    svg.style(axes, title=title, xlabel=xlabel, ylabel=ylabel, legend=legend)
+
+
+def error_against_seeding(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the errors of this software, of the paper's iterations and of the true particles."""
+    styles = {
+        "paper": ("the paper's 10 iterations", PAPER, "-"),
+        "ours": ("this software", OURS, "-"),
+        "truth": ("true particles", TRUTH, ":"),
+    }
+    for way, (label, colour, style) in styles.items():
+        seedings, values = _method(stored, way, "error")
+        _line(axes, seedings, values, colour, label, style)
+    _finish(axes, "error against seeding", "particles per microlens", "mean error [voxel]", log_x=seedings)
+    return "Mean error of the displacement against seeding"
+
+
+def quality_against_seeding(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw Q and the number of ghosts per particle."""
+    for way, colour, name in (("ours", OURS, "this software"), ("paper", PAPER, "paper")):
+        seedings, quality = _method(stored, way, "q")
+        _line(axes, seedings, quality, colour, f"Q, {name}")
+        _line(axes, seedings, _method(stored, way, "ghosts")[1], colour, f"ghosts, {name}", ":")
+    _finish(axes, "Q, and ghosts per particle", "particles per microlens", "", log_x=seedings)
+    return "Q and ghosts per particle against seeding"
+
+
+def error_against_angle(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the mean absolute error of each component against the angle of the cameras."""
+    rows: Rows = stored["angle"]
+    angles = [row["half_angle_deg"] for row in rows]
+    for axis, colour in AXIS_COLOURS.items():
+        _line(axes, angles, [row[f"error_{axis}"] for row in rows], colour, axis)
+    axes.set_xticks(angles, [f"±{angle:g}" for angle in angles])
+    _finish(axes, "two cameras", "angle from z [degree]", "mean |error| [voxel]")
+    return "Mean absolute error along x, y and z against the angle of two cameras"
+
+
+def error_against_cameras(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the mean absolute error of each component for one to four cameras."""
+    rows: Rows = stored["cameras"]
+    for number, (axis, colour) in enumerate(AXIS_COLOURS.items()):
+        places = [row["cameras"] + 0.26 * (number - 1) for row in rows]
+        mean, spread = ([row[f"error_{axis}"][part] or 0.0 for row in rows] for part in (0, 1))
+        axes.bar(places, mean, 0.24, yerr=spread, color=colour, ecolor=svg.INK, label=axis)
+    axes.set_xticks([row["cameras"] for row in rows])
+    _finish(axes, "number of cameras", "cameras", "mean |error| [voxel]")
+    return "Mean absolute error along x, y and z for one to four cameras"
+
+
+def error_against_displacement(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the mean error against the largest displacement."""
+    rows: Rows = stored["displacement"]
+    _line(axes, [1.6 * row["speed"] for row in rows], [row["error"] for row in rows], OURS, "")
+    _finish(axes, "error against displacement", "largest displacement [voxel]", "mean error [voxel]", legend=False)
+    return "Mean error against the largest displacement"
+
+
+def error_against_window(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the mean error against the last window."""
+    rows: Rows = stored["window"]
+    windows = [row["window"] for row in rows]
+    _line(axes, windows, [row["ours"] for row in rows], OURS, "this software")
+    _line(axes, windows, [row["truth"] for row in rows], TRUTH, "true particles", ":")
+    axes.set_xticks(windows)
+    _finish(axes, "error against window", "last window [voxel]", "mean error [voxel]")
+    return "Mean error against the edge of the last window"
+
+
+def weights_error(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the difference of weights from counted rays."""
+    for angle, colour in ((0.0, svg.SERIES[0]), (45.0, svg.SERIES[1])):
+        rows = [row for row in stored["weights"] if row["angle_deg"] == angle]
+        percent = [[100 * (part or 0.0) for part in row["error"]] for row in rows]
+        _line(axes, [row["voxel_pitch"] for row in rows], percent, colour, f"camera at {angle:g} degrees")
+    _finish(axes, "weights against counted rays", "voxel [microlens pitch]", "difference [%]")
+    return "Relative difference of integrated weights from counted rays against the voxel's size"
+
+
+def stated_uncertainty(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the true error of vectors against their stated uncertainty."""
+    rows: Rows = stored["uncertainty"]
+    stated = [row["stated"] for row in rows]
+    _line(axes, stated, [row["true"] for row in rows], OURS, "clean and realistic images")
+    end = 1.05 * max(*stated, *(row["true"][0] for row in rows))
+    axes.plot([0, end], [0, end], color=TRUTH, ls=":", lw=1.2, label="equal")
+    axes.set_xlim(0, end)
+    _finish(axes, "uncertainty of a component", "stated [voxel]", "true rms error [voxel]")
+    return "True rms error against the stated uncertainty"
+
+
+PLOTS = {
+    "seeding": error_against_seeding,
+    "quality": quality_against_seeding,
+    "angle": error_against_angle,
+    "cameras": error_against_cameras,
+    "displacement": error_against_displacement,
+    "window": error_against_window,
+    "weights": weights_error,
+    "uncertainty": stated_uncertainty,
+}
+"""Plots by name."""
+
+
+def setup(app):
+    """Register the directive."""
+    from docutils import nodes
+    from sphinx.util.docutils import SphinxDirective
+
+    class AccuracyPlot(SphinxDirective):
+        """Plots side by side."""
+
+        required_arguments, optional_arguments = 1, len(PLOTS) - 1
+
+        def run(self):
+            for path in (FIGURES, METHODS):
+                self.env.note_dependency(str(path))
+            stored = stored_figures()
+            drawn = "".join(draw(name, stored) for name in self.arguments)
+            return [nodes.raw("", f'<div class="side-by-side">{drawn}</div>', format="html")]
+
+    app.add_directive("accuracy-plot", AccuracyPlot)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
