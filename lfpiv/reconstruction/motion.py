@@ -4,7 +4,7 @@ Images of two cameras hardly distinguish particles from ghosts: SMART keeps what
 the flow from one frame to the other; ghosts do so only where all particles around move alike. So both frames are
 reconstructed, the motion is measured, and each frame is reconstructed again from a first guess that both volumes share
 along the motion (`lfpiv.reconstruction.shared_light`), as in motion tracking enhancement [1]_. There both volumes are
-averaged; here only the brightness changes (docs/accuracy.md).
+averaged; here only the brightness changes (docs/notebook/accuracy.md).
 
 Volumes that share their light have noise in common, which their correlation cannot show. So the volumes of each frame
 by itself stay with the result, and `unshared_quality` measures the uncertainty in those.
@@ -245,7 +245,7 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     """Measure uncertainty, peak ratio and correlation of vectors in the volumes of each frame by itself.
 
     `correlate` takes for noise what two volumes do not have in common (`lfpiv_kernels.correlation.uncertainty`).
-    Volumes that share their light have noise in common, so it states two thirds of the random error (docs/accuracy.md).
+    Volumes that share their light have noise in common, so it states two thirds of the random error (docs/notebook/accuracy.md).
     The volumes of `UNSHARED` have independent noise. Here they are deformed onto each other by the vectors'
     displacements, and the same statistics are taken of them in the same windows: s. Correlated once more, they show a
     displacement that differs from the vectors' by d: sharing corrected it, or a wrong motion biased it. The uncertainty

@@ -206,7 +206,7 @@ def _result(
             "over each window, in voxels; x, y, z: mean absolute components.",
             "The standard error is that of the vector-by-vector difference; with other windows, of the two means. "
             f"{bench.ABOUT_STANDARD_ERROR} It applies to this pair and flow. Another flow or "
-            "seeding may change the order of the choices (docs/accuracy.md).",
+            "seeding may change the order of the choices (docs/notebook/accuracy.md).",
             _verdict(choices, gaps, default),
             "Q is measured against blobs of "
             f"{rigs.BLOB_VOXEL:g} voxel, also for points. Choices of the correlation do not change Q.",
