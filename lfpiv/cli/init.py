@@ -83,7 +83,7 @@ QUESTIONS = (
         key="cameras",
         option="--cameras",
         form="NAME=ANGLE,...",
-        text="cameras and the angle of each about y [degree], positive on the side of +x: left=45, right=-45",
+        text="cameras and the angle of each about y [degree], positive on the side of +x, such as left=45, right=-45",
         read=_cameras,
     ),
     Question(
@@ -160,7 +160,7 @@ QUESTIONS = (
         key="dots",
         option="--dots",
         form="NXxNY",
-        text="number of dots of the board along x and y: 7x7",
+        text="number of dots of the board along x and y, such as 7x7",
         read=_product(int),
     ),
     Question(
@@ -181,7 +181,7 @@ QUESTIONS = (
         key="planes_mm",
         option="--planes",
         form="FIRST:LAST:STEP or Z,Z,...",
-        text="depths of the planes of the board [mm], read on the stage: -2:2:0.5",
+        text="depths of the planes of the board [mm], read on the stage, such as -2:2:0.5",
         read=_planes,
     ),
     Question(
@@ -202,7 +202,7 @@ QUESTIONS = (
         key="size_mm",
         option="--size",
         form="XxYxZ",
-        text="size of the volume [mm], which the light fills and all cameras see: 10x10x6",
+        text="size of the volume [mm], which the light fills and all cameras see, such as 10x10x6",
         read=_product(float),
     ),
     Question(
@@ -216,7 +216,7 @@ QUESTIONS = (
         key="dt_s",
         option="--dt",
         form="a number",
-        text="time between the two frames [s], from the timing of the laser: 1e-4",
+        text="time between the two frames [s], from the timing of the laser, such as 1e-4",
         read=float,
     ),
 )

@@ -41,7 +41,7 @@ def changed_options():
         wp.set_module_options(options, importlib.import_module(module))
 
     yield change
-    for module, options in changed:
+    for module, options in reversed(changed):
         wp.set_module_options(options, importlib.import_module(module))
 
 
