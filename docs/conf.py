@@ -31,6 +31,7 @@ extensions = [
     "tracking_limits",
     "accuracy_plots",
     "drawings",
+    "performance_plots",
 ]
 exclude_patterns = ["_build", "_ext", "gallery", "generated/extra"]
 nitpicky = True

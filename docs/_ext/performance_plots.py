@@ -1,0 +1,126 @@
+"""Plots and a table of the page on performance, drawn from stored figures in the colours of the page, light or dark.
+
+`draw` and `table` need no Sphinx; `setup` registers the directives ``{performance-plot} NAME ...`` and
+``{performance-table}``. `perf/scaling.py` and `perf/run.py` write the figures.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from lfpiv.report import svg
+
+FOLDER = Path(__file__).resolve().parents[1] / "figures"
+SCALING, PEERS = FOLDER / "scaling.json", FOLDER / "peers.jsonl"
+PARTS = {"weights_s": "weights, once", "volumes_s": "both volumes", "vectors_s": "vectors"}
+PEER_NAMES = {
+    "project_small": "projection, SciPy CSR",
+    "back_project_small": "back projection, SciPy CSR",
+    "smart_small": "SMART, SciPy CSR",
+    "deform_medium": "deformation, SciPy splines",
+    "correlate_8_medium": "correlation 8³, OpenPIV",
+    "correlate_16_medium": "correlation 16³, OpenPIV",
+    "train_small": "training, SciPy least squares",
+}
+"""What a case of `perf/run.py` does, and whose work it is compared with."""
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def scaling_rows() -> Rows:
+    """Return time and memory by size and cameras."""
+    rows: Rows = json.loads(SCALING.read_text("utf-8"))["rows"]
+    return rows
+
+
+def peer_rows() -> Rows:
+    """Return how many times as fast as its peer each case is, with the range of the turns."""
+    lines = [json.loads(line) for line in PEERS.read_text("utf-8").splitlines()]
+    return [line for line in lines if line.get("metric") == "faster_than_peer"]
+
+
+def scaling(axes: Axes) -> str:
+    """Draw the times of a pair against the number of voxels, of two cameras."""
+    rows = [row for row in scaling_rows() if row["cameras"] == 2]
+    voxels = [row["voxels"] ** 3 for row in rows]
+    for (key, label), colour in zip(PARTS.items(), svg.SERIES, strict=False):
+        axes.loglog(voxels, [row[key] for row in rows], "o-", color=colour, lw=1.6, ms=3.5, label=label)
+    axes.set_xticks(voxels, [f"{row['voxels']}³" for row in rows])
+    axes.set_xticks([], minor=True)
+    svg.style(axes, title="time of a pair, two cameras", xlabel="voxels", ylabel="wall time [s]", legend=True)
+    return "Time of weights, volumes and vectors against the number of voxels"
+
+
+def peers(axes: Axes) -> str:
+    """Draw how many times as fast as its peer each kernel is."""
+    rows = peer_rows()
+    place, values = range(len(rows)), [row["value"] for row in rows]
+    spread = [[abs(row["value"] - row["turns"][side]) for row in rows] for side in (0, 1)]
+    axes.barh(place, values, xerr=spread, height=0.6, color=svg.SERIES[0], ecolor=svg.INK)
+    axes.set_xscale("log")
+    axes.set_xlim(1, 2.2 * max(values))
+    axes.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+    axes.set_xticks([], minor=True)
+    axes.set_yticks(place, [PEER_NAMES[row["case"]] for row in rows])
+    axes.invert_yaxis()
+    svg.style(axes, title="times as fast as its peer", xlabel="ratio of wall times, in turns")
+    return "How many times as fast as other software each kernel is"
+
+
+PLOTS = {"scaling": scaling, "peers": peers}
+"""Plots by name."""
+
+
+def draw(name: str) -> str:
+    """Return one of `PLOTS` as SVG."""
+    figure, (axes,) = svg.new_panel(2.8)
+    alt = PLOTS[name](axes)
+    return svg.to_svg(figure, alt)
+
+
+def table() -> str:
+    """Return time and memory by size and cameras as Markdown."""
+    lines = [
+        "| volume | cameras | weights, once | both volumes | vectors | weights in memory | peak memory |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in scaling_rows():
+        times = " | ".join(f"{row[key]:.2g} s" for key in PARTS)
+        lines.append(
+            f"| {row['voxels']}³ voxels | {row['cameras']} | {times} | {row['weights_gib']:.2g} GiB | "
+            f"{row['peak_gib']:.2g} GiB |"
+        )
+    return "\n".join(lines)
+
+
+def setup(app):
+    """Register the directives."""
+    from docutils import nodes
+    from sphinx.util.docutils import SphinxDirective
+
+    class PerformancePlot(SphinxDirective):
+        """Plots side by side."""
+
+        required_arguments, optional_arguments = 1, len(PLOTS) - 1
+
+        def run(self):
+            for path in (SCALING, PEERS):
+                self.env.note_dependency(str(path))
+            drawn = "".join(draw(name) for name in self.arguments)
+            return [nodes.raw("", f'<div class="side-by-side">{drawn}</div>', format="html")]
+
+    class PerformanceTable(SphinxDirective):
+        """Time and memory."""
+
+        def run(self):
+            self.env.note_dependency(str(SCALING))
+            return self.parse_text_to_nodes(table())
+
+    app.add_directive("performance-plot", PerformancePlot)
+    app.add_directive("performance-table", PerformanceTable)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
