@@ -60,7 +60,7 @@ class SpaceView {
     const { clientWidth, clientHeight } = this.elements.scene;
     const spans = ["x", "y", "z"].map((name) => this.field.spacing(name) * this.field.axis[name].length);
     const unit = Math.cbrt(spans[0] * spans[1] * spans[2]); // plotly's unit of length for aspectmode "data"
-    const narrow = Math.min(Math.max((1.5 * clientHeight) / clientWidth, 1), 1.5);
+    const narrow = Math.min(Math.max((1.5 * clientHeight) / clientWidth, 1), 1.8);
     const distance = (START_DISTANCE * narrow * Math.hypot(...spans)) / unit;
     const eye = Object.fromEntries(Object.entries(START_EYE).map(([name, value]) => [name, distance * value]));
     return { eye, up: { x: 0, y: 0, z: 1 }, center: { x: 0, y: 0, z: -0.06 } };
