@@ -18,6 +18,7 @@ from support import report_run
 import lfpiv
 from lfpiv import quantities
 from lfpiv.experiment.settings import Series
+from lfpiv.geometry.names import COMPONENTS
 from lfpiv.report import calibration, flow, markup, overview, slice_panels, vectors, verdicts, volumes
 from lfpiv.report import pairs as pairs_section
 from lfpiv.report.dot_map import dot_map
@@ -334,8 +335,8 @@ def vortex(normal, noise=0.0, seed=0, shape=(9, 11, 13)):
     from_axis = {"x": x, "y": y, "z": z}
     speed = np.exp(-(from_axis[across] ** 2 + from_axis[up] ** 2 + (from_axis[normal] / 2) ** 2) / 0.2)
     parts = {name: np.zeros(shape) for name in "uvw"}
-    parts[flow.COMPONENTS[across]] = -0.1 * from_axis[up] * speed
-    parts[flow.COMPONENTS[up]] = 0.1 * from_axis[across] * speed
+    parts[COMPONENTS[across]] = -0.1 * from_axis[up] * speed
+    parts[COMPONENTS[up]] = 0.1 * from_axis[across] * speed
     rng = np.random.default_rng(seed)
     for name, part in parts.items():
         field[name] = field[name].dims, part + noise * rng.standard_normal(shape)
