@@ -263,7 +263,7 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> str:
     InputError
         If the file exists, an answer is missing or wrong, or the values do not fit each other.
     """
-    from lfpiv.experiment.opening import check_tables, read_experiment
+    from lfpiv.experiment.opening import check_tables, grid_of, read_experiment
     from lfpiv.experiment.settings import ExperimentTable
     from lfpiv.experiment.template import Values, experiment_text
     from lfpiv.experiment.toml import parse, validated
@@ -274,7 +274,9 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> str:
     answers = _answers(given, path.absolute().parent.name)
     values = Values.model_validate(answers)
     text = experiment_text(values)
-    check_tables(path, validated(parse(text, path), path, ExperimentTable))
+    table = validated(parse(text, path), path, ExperimentTable)
+    check_tables(path, table)
+    grid_of(path, table)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(text, path)

@@ -69,13 +69,16 @@ def read_experiment(path: str | Path) -> Experiment:
     """Read and check an experiment as `open_experiment` does, without its particle images."""
     path = Path(path)
     table = _read_table(path)
-    grid = check_tables(path, table)
+    check_tables(path, table)
     board, particles = table.board, table.particles
+    cameras = tuple(_camera(path, camera) for camera in table.camera)
+    scale_checks.require_scale(path, table.volume, board, cameras)
+    grid = grid_of(path, table)
     experiment = Experiment(
         path=path,
         name=table.name,
         dt_s=table.dt_s,
-        cameras=tuple(_camera(path, camera) for camera in table.camera),
+        cameras=cameras,
         board=board,
         grid=grid,
         guard_mm=table.volume.guard_mm,
@@ -101,8 +104,8 @@ def read_experiment(path: str | Path) -> Experiment:
     return replace(experiment, solid=solid_voxels(path, table.volume, grid), mask_path=mask_path)
 
 
-def check_tables(path: Path, table: ExperimentTable) -> Grid:
-    """Check the tables of an experiment file against each other, without any image; return the grid of the volume.
+def check_tables(path: Path, table: ExperimentTable) -> None:
+    """Check the tables of an experiment file against each other, without any image.
 
     Raises
     ------
@@ -128,9 +131,11 @@ def check_tables(path: Path, table: ExperimentTable) -> Grid:
             f"{path}: smart.motion_passes: expected 0 for a time series, where each instant is reconstructed once and "
             f"used in two pairs, found {table.smart.motion_passes}. Set it to 0."
         )
-    cameras = tuple(_camera(path, camera) for camera in table.camera)
-    scale_checks.require_scale(path, table.volume, board, cameras)
-    grid = _grid(path, table.volume, len(names))
+
+
+def grid_of(path: Path, table: ExperimentTable) -> Grid:
+    """Return the grid of the volume; refuse one that does not fit the memory or the windows."""
+    grid = _grid(path, table.volume, len(table.camera))
     _check_windows(path, table.correlation, grid)
     return grid
 

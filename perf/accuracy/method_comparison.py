@@ -1,4 +1,4 @@
-"""Compare methods of the field on the same images, against seeding and in time; the figures of docs/notebook/accuracy.md.
+"""Compare methods of the field on the same images, against seeding and in time; figures of the notebook.
 
     python perf/accuracy/method_comparison.py --out docs/_static/methods.json [--seeds 1,2,3] [--time-scale paper]
 

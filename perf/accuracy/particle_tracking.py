@@ -1,4 +1,4 @@
-"""Measure what particle tracking finds against seeding, cameras and quality of the images, for `docs/notebook/accuracy.md`.
+"""Measure what particle tracking finds against seeding, cameras and quality of the images.
 
     python perf/accuracy/particle_tracking.py --out docs/figures/particle_tracking.json
 

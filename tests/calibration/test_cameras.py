@@ -26,7 +26,7 @@ from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.image_checks import APERTURE, microimage_px, stated_px
 from lfpiv.runs import summary
-from lfpiv.simulation.flows import KINDS, window_mean
+from lfpiv.simulation.flows import Ring, window_mean
 from lfpiv.simulation.scene import true_mapping
 from lfpiv.simulation.simulator import simulate
 from lfpiv.warn import Code
@@ -380,7 +380,7 @@ def test_the_sample_experiment_reaches_the_projects_figures(sample_data, tmp_pat
         assert error <= MAPPING_AIM_PITCH
         assert summary["calibration"][truth["name"]]["sigma_nor_test"] <= 0.03
     vectors = xr.open_dataset(tmp_path / "vectors" / "pair_0000.nc")
-    flow = KINDS["ring"](**{key: value for key, value in spec["flow"].items() if key != "kind"})
+    flow = Ring(**spec["flow"])
     z, y, x = np.meshgrid(vectors.z, vectors.y, vectors.x, indexing="ij")
     window_mm = 0.1 * json.loads(vectors.attrs["settings"])["windows"][-1][0]
     expected = window_mean(flow, np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1), window_mm) / 0.1

@@ -156,6 +156,7 @@ def test_volumes_are_as_good_with_fewer_voxels_visited(recorded, monkeypatch):
 
 def test_solvers_of_the_same_weights_share_the_estimator_of_sizes(recorded, monkeypatch):
     weights, images = recorded
+    monkeypatch.setattr(weights, "derived", {})
     made = []
     monkeypatch.setattr(solver, "ParticleSizer", lambda weights: made.append(weights) or ParticleSizer(weights))
     for _ in range(2):

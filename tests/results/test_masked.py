@@ -9,6 +9,8 @@ from support.vector_sets import random_vectors
 
 import lfpiv
 from lfpiv.experiment.opening import open_experiment
+from lfpiv.quantities import scale_of
+from lfpiv.report import flow, slice_panels
 from lfpiv.report import vectors as report
 from lfpiv.results import netcdf, provenance, stamps
 from lfpiv.runs import pair_figures
@@ -83,10 +85,13 @@ def test_figures_leave_masked_vectors_out_and_name_unseeded_ones():
 
 def test_slices_hatch_masked_cells_only():
     vectors, masked = masked_vectors()
-    assert "<pattern" not in report.slices(vectors.drop_vars("masked"), most=1)[0]
-    panel = report.slices(vectors, most=1)[0]
-    assert "<pattern" in panel and report.MASKED_FILL in panel
-    rows = report.depth_rows(vectors)
+    kinds = flow.describe(vectors)
+    whole, parts = (flow.shown(field, kinds) for field in (vectors.drop_vars("masked"), vectors))
+    place = int(np.argmax(masked.any((1, 2))))
+    assert "<pattern" not in slice_panels.slice_panel(whole, kinds, "z", place, "w", "arrows")
+    panel = slice_panels.slice_panel(parts, kinds, "z", place, "w", "arrows")
+    assert "<pattern" in panel and slice_panels.MASKED_FILL in panel
+    rows = report.depth_rows(vectors, scale_of(1.0, "m/s"))
     assert [row[1] for row in rows] == [str(n) for n in (~masked).sum((1, 2))]
 
 
