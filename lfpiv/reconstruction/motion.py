@@ -245,7 +245,7 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     """Measure uncertainty, peak ratio and correlation of vectors in the volumes of each frame by itself.
 
     `correlate` takes for noise what two volumes do not have in common (`lfpiv_kernels.correlation.uncertainty`).
-    Volumes that share their light have noise in common, so it states two thirds of the random error (notebook, accuracy).
+    Volumes that share their light have noise in common, so it states two thirds of the random error.
     The volumes of `UNSHARED` have independent noise. Here they are deformed onto each other by the vectors'
     displacements, and the same statistics are taken of them in the same windows: s. Correlated once more, they show a
     displacement that differs from the vectors' by d: sharing corrected it, or a wrong motion biased it. The uncertainty
