@@ -50,8 +50,8 @@ MODULES = {
 ENDINGS = ("py", "md", "h", "toml", "h5", "json", "html", "nc", "pvd", "jsonl", "zarr", "cih")
 """Endings of file names, which look like attributes of modules."""
 
-LONG = ("demo", "reproduce", "simulate")
-"""Commands that are checked to be understood, and not run: each has tests of its own."""
+LONG = ("demo", "init", "reproduce", "simulate")
+"""Commands that take long or ask questions: they are checked to be understood, and not run. Each has tests of its own."""
 
 
 def blocks(page):
