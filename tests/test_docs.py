@@ -51,7 +51,7 @@ ENDINGS = ("py", "md", "h", "toml", "h5", "json", "html", "nc", "pvd", "jsonl", 
 """Endings of file names, which look like attributes of modules."""
 
 LONG = ("demo", "init", "reproduce", "simulate")
-"""Commands that take long or ask questions: they are checked to be understood, and not run. Each has tests of its own."""
+"""Commands that take long or ask questions: checked to be understood, not run. Each has tests of its own."""
 
 
 def blocks(page):
