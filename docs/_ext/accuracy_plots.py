@@ -77,6 +77,7 @@ def quality_against_seeding(axes: Axes, stored: Mapping[str, Any]) -> str:
         _line(axes, seedings, quality, colour, f"Q, {name}")
         _line(axes, seedings, _method(stored, way, "ghosts")[1], colour, f"ghosts, {name}", ":")
     _finish(axes, "Q, and ghosts per particle", "particles per microlens", "", log_x=seedings)
+    axes.set_ylim(0, 2.0)  # the legend lies above the lines
     return "Q and ghosts per particle against seeding"
 
 
