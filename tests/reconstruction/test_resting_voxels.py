@@ -149,8 +149,8 @@ def test_volumes_are_as_good_with_fewer_voxels_visited(recorded, monkeypatch):
     visited.clear()
     monkeypatch.setattr(resting_voxels, "ALL", NEVER)
     whole = lfpiv.reconstruct(weights, images, **settings)
-    assert some < 0.9 * sum(visited)
-    assert rested.attrs["misfit"][-1] < 1.05 * whole.attrs["misfit"][-1]
+    assert some < 0.85 * sum(visited)
+    assert rested.attrs["misfit"][-1] < 1.02 * whole.attrs["misfit"][-1]
     assert np.corrcoef(rested.values.ravel(), whole.values.ravel())[0, 1] > 0.99
 
 
