@@ -33,6 +33,6 @@ def test_particles_stand_beside_the_vectors_and_follow_their_settings(small_run,
     assert file.stat().st_mtime_ns == made
 
     experiment.write_text(experiment.read_text("utf-8").replace("rounds = 2", "rounds = 1"), "utf-8")
-    caplog.set_level(logging.INFO)
+    caplog.set_level(logging.INFO, "lfpiv")
     pipeline.run(experiment, out, pairs=(0, 1))
     assert file.stat().st_mtime_ns > made and "tracking.rounds" in caplog.text
