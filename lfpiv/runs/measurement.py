@@ -21,7 +21,7 @@ from lfpiv.progress import Progress, StepProgress, ignore_progress, part_of
 from lfpiv.prompt import Card, Shown, count, times
 from lfpiv.results.pair_files import PairVolumes
 from lfpiv.runs import memory, rig, worker_plan
-from lfpiv.runs.frame_light import FrameLight, pair_light, read_darks
+from lfpiv.runs.frame_light import FrameLight, pair_light
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED
 from lfpiv.runs.run import open_run
@@ -167,18 +167,7 @@ def prepare(
         finest = current.reconstructed_experiment
         worker_plan.require_memory(finest, memory.weights_bytes(finest), 1)
         weights, _ = rig.build_weights(current, prepared, current.numbers[:1])
-        work = PairWork(
-            experiment=current.experiment,
-            folder=current.folder,
-            calibration_hash=current.calibration_stamp.hash,
-            guard=current.guard_layers,
-            refinement=current.refinement_factor,
-            weights=weights,
-            cameras=weights.cameras,
-            darks=read_darks(current.experiment),
-            keep_volumes=False,
-            background=current.background,
-        )
+        work = rig.pair_work(current, weights, keep_volumes=False)
         return Rig(
             experiment=current.experiment,
             calibration=prepared.calibration,

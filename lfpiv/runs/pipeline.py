@@ -16,7 +16,6 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
 from lfpiv.runs import bootstrap, dispatch, local_workers, memory, rig, task, unchanged, worker_plan
-from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
@@ -27,7 +26,6 @@ from lfpiv.runs.unchanged import Command
 from lfpiv.runs.worker_plan import Plan
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.camera import Calibration
     from lfpiv.weights.operator import Weights
 
 PAIRS = "image pairs"
@@ -144,7 +142,7 @@ def reconstruct(
         done = Invocation(tried=checked.failed or Tried(current.numbers))
         if checked.failed is None and (first := checked.todo.ahead()):
             weights, figures = rig.build_weights(current, prepared, first)
-            work = _work(current, weights, keep_volumes=True, vectors=False)
+            work = rig.pair_work(current, weights, keep_volumes=True, vectors=False)
             done = Invocation(tried=_sequential(current, work, checked.todo), weights=figures)
         return current.finish(calibrated, _with_reused(current, done, checked.todo, "volumes"), report=False)
 
@@ -174,7 +172,7 @@ def correlate(
                 "made with the present settings, found none. Run `lfpiv reconstruct` first."
             )
         calibration = rig.with_standing_light(current, calibrated.calibration)
-        work = _work(current, None, keep_volumes=False, calibration=calibration)
+        work = rig.pair_work(current, None, keep_volumes=False, calibration=calibration)
         done = Invocation(tried=_sequential(current, work, todo))
         return current.finish(calibrated, _with_reused(current, done, todo, "vectors"), report=False)
 
@@ -241,7 +239,7 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
         if isinstance(workers, Plan):
             finest = current.reconstructed_experiment
             workers = worker_plan.fit_memory(workers, finest, weights.memory_bytes, current.device)
-    work = _work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration)
+    work = rig.pair_work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration)
     if isinstance(workers, Plan) and workers.workers == 1:
         return Invocation(tried=_sequential(current, work, todo), weights=figures), _known(weights)
     if isinstance(workers, Plan):
@@ -272,7 +270,7 @@ def _bootstrap(current: Run, prepared: Prepared, done: Invocation, weights: _Wei
         if known is None:
             known, figures = rig.build_weights(current, prepared, list(current.numbers[:1]))
             built.append(figures)
-        return _work(current, known, keep_volumes=False, calibration=prepared.calibration)
+        return rig.pair_work(current, known, keep_volumes=False, calibration=prepared.calibration)
 
     bootstrap.decide(
         current.experiment,
@@ -295,33 +293,6 @@ def _with_reused(current: Run, done: Invocation, todo: Todo, kind: str) -> Invoc
 
 def _step_name(current: Run) -> str:
     return PAIRS if current.experiment.series is None else INSTANTS
-
-
-def _work(
-    current: Run,
-    weights: Weights | None,
-    *,
-    keep_volumes: bool,
-    vectors: bool = True,
-    calibration: Calibration | None = None,
-) -> PairWork:
-    """Return the work on pairs. A series takes its cameras from `calibration` if there are no weights."""
-    cameras = {} if calibration is None or current.experiment.series is None else calibration.cameras
-    if weights is not None:
-        cameras = weights.cameras
-    return PairWork(
-        experiment=current.experiment,
-        folder=current.folder,
-        calibration_hash=current.calibration_stamp.hash,
-        guard=current.guard_layers,
-        refinement=current.refinement_factor,
-        weights=weights,
-        cameras=cameras,
-        darks=read_darks(current.experiment) if cameras else {},
-        keep_volumes=keep_volumes,
-        background=current.background,
-        vectors=vectors,
-    )
 
 
 def _sequential(current: Run, work: PairWork, todo: Todo) -> Tried:

@@ -1,4 +1,4 @@
-"""Steps that a run does once for all pairs: calibration, self-calibration and weights.
+"""Steps that a run does once for all pairs: calibration, self-calibration, weights and the work that pairs share.
 
 Each step reuses the result in the output folder if it still fits the experiment.
 """
@@ -23,9 +23,10 @@ from lfpiv.files import MIB, writing
 from lfpiv.records import RecordError, validate
 from lfpiv.results import datasets, provenance, stamps
 from lfpiv.runs import background, guard, memory, moved_cameras, refinement
-from lfpiv.runs.frame_light import sampled_light
+from lfpiv.runs.frame_light import read_darks, sampled_light
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
+from lfpiv.runs.pair import PairWork
 from lfpiv.warn import Code, Warning, collected, warn
 
 if TYPE_CHECKING:
@@ -239,6 +240,33 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
         profile_errors=weights.profile_errors,
         count_errors=counted,
         self_calibration=self_calibration,
+    )
+
+
+def pair_work(
+    run: Run,
+    weights: Weights | None,
+    *,
+    keep_volumes: bool,
+    vectors: bool = True,
+    calibration: Calibration | None = None,
+) -> PairWork:
+    """Return the work on pairs. A series takes its cameras from `calibration` if there are no weights."""
+    cameras = {} if calibration is None or run.experiment.series is None else calibration.cameras
+    if weights is not None:
+        cameras = weights.cameras
+    return PairWork(
+        experiment=run.experiment,
+        folder=run.folder,
+        calibration_hash=run.calibration_stamp.hash,
+        guard=run.guard_layers,
+        refinement=run.refinement_factor,
+        weights=weights,
+        cameras=cameras,
+        darks=read_darks(run.experiment) if cameras else {},
+        keep_volumes=keep_volumes,
+        background=run.background,
+        vectors=vectors,
     )
 
 
