@@ -7,8 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"))
-"""Units of times, each with its length [s]."""
+from lfpiv.quantities import scale_of
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,8 @@ def seconds(value: float) -> str:
     >>> seconds(5e-05), seconds(0.002), seconds(3.0)
     ('50 us', '2 ms', '3 s')
     """
-    size, unit = next(((size, unit) for size, unit in TIME_UNITS if value >= size * (1 - 1e-9)), TIME_UNITS[-1])
-    return f"{value / size:.4g} {unit}"
+    scale = scale_of(value, "s")
+    return f"{value * scale.factor:.4g} {scale.unit.replace('µ', 'u')}"  # plain letters, for any terminal
 
 
 def times(values: Sequence[float]) -> str:

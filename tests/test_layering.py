@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "errors": set(),
     "version": set(),
     "progress": set(),
-    "prompt": set(),
+    "prompt": {"quantities"},
     "quantities": set(),
     "hdf5": {"errors", "records"},
     "records": set(),
