@@ -6,6 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from lfpiv.geometry.grid import Grid
+from lfpiv.geometry.volume import lies_in, voxel_place
 
 REACH = 1 / 6
 """Standard deviation of the Gaussian that smooths a volume, as a share of its edges. Many particles are within it."""
@@ -38,10 +39,10 @@ class LightField:
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the light at points (x, y, z) [mm], shape (point,)."""
-        places = ((points_mm[:, ::-1] - self._grid.first_centre_mm) / self._grid.voxel_mm).T
-        inside = ((places >= -0.5) & (places < np.array(self._grid.shape)[:, None] - 0.5)).all(0)
+        inside = lies_in(points_mm, self._grid)
         if self._light is None:
             return inside.astype(float)
+        places = voxel_place(points_mm, self._grid).T
         light: np.ndarray = ndimage.map_coordinates(self._light, places, order=1, mode="nearest") * inside
         return light
 
