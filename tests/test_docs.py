@@ -434,6 +434,16 @@ def test_plots_of_the_accuracy_show_every_stored_part():
         assert not set(re.findall(r"#[0-9a-f]{6}", drawn))  # colours are the page's
 
 
+def test_plots_of_the_performance_show_every_stored_case():
+    performance_plots = extension("performance_plots")
+    rows = performance_plots.peer_rows()
+    assert {row["case"] for row in rows} == set(performance_plots.PEER_NAMES)
+    assert performance_plots.table().count("\n") == len(performance_plots.scaling_rows()) + 1
+    for name in performance_plots.PLOTS:
+        drawn = performance_plots.draw(name)
+        assert drawn.startswith("<svg") and not set(re.findall(r"#[0-9a-f]{6}", drawn)), name
+
+
 def test_pages_show_every_drawing():
     drawings = extension("drawings")
     pages = "".join(page.read_text("utf-8") for page in PAGES.values())

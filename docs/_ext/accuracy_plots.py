@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
+from panels import add_directive
 from side_by_side import FIGURES as METHODS
 
 from lfpiv.report import svg
@@ -160,20 +161,4 @@ PLOTS = {
 
 def setup(app):
     """Register the directive."""
-    from docutils import nodes
-    from sphinx.util.docutils import SphinxDirective
-
-    class AccuracyPlot(SphinxDirective):
-        """Plots side by side."""
-
-        required_arguments, optional_arguments = 1, len(PLOTS) - 1
-
-        def run(self):
-            for path in (FIGURES, METHODS):
-                self.env.note_dependency(str(path))
-            stored = stored_figures()
-            drawn = "".join(draw(name, stored) for name in self.arguments)
-            return [nodes.raw("", f'<div class="side-by-side">{drawn}</div>', format="html")]
-
-    app.add_directive("accuracy-plot", AccuracyPlot)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}
+    return add_directive(app, "accuracy-plot", lambda name: draw(name, stored_figures()), PLOTS, (FIGURES, METHODS))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
+from panels import add_directive
 
 from lfpiv.report import svg
 
@@ -205,17 +206,4 @@ def draw(name: str) -> str:
 
 def setup(app):
     """Register the directive."""
-    from docutils import nodes
-    from sphinx.util.docutils import SphinxDirective
-
-    class Drawing(SphinxDirective):
-        """Drawings side by side."""
-
-        required_arguments, optional_arguments = 1, len(DRAWINGS) - 1
-
-        def run(self):
-            drawn = "".join(draw(name) for name in self.arguments)
-            return [nodes.raw("", f'<div class="side-by-side">{drawn}</div>', format="html")]
-
-    app.add_directive("drawing", Drawing)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}
+    return add_directive(app, "drawing", draw, DRAWINGS)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from panels import add_directive
 
 from lfpiv.report import svg
 
@@ -52,6 +53,7 @@ def scaling(axes: Axes) -> str:
         axes.loglog(voxels, [row[key] for row in rows], "o-", color=colour, lw=1.6, ms=3.5, label=label)
     axes.set_xticks(voxels, [f"{row['voxels']}³" for row in rows])
     axes.set_xticks([], minor=True)
+    axes.tick_params(which="minor", colors=svg.INK)
     svg.style(axes, title="time of a pair, two cameras", xlabel="voxels", ylabel="wall time [s]", legend=True)
     return "Time of weights, volumes and vectors against the number of voxels"
 
@@ -100,19 +102,7 @@ def table() -> str:
 
 def setup(app):
     """Register the directives."""
-    from docutils import nodes
     from sphinx.util.docutils import SphinxDirective
-
-    class PerformancePlot(SphinxDirective):
-        """Plots side by side."""
-
-        required_arguments, optional_arguments = 1, len(PLOTS) - 1
-
-        def run(self):
-            for path in (SCALING, PEERS):
-                self.env.note_dependency(str(path))
-            drawn = "".join(draw(name) for name in self.arguments)
-            return [nodes.raw("", f'<div class="side-by-side">{drawn}</div>', format="html")]
 
     class PerformanceTable(SphinxDirective):
         """Time and memory."""
@@ -121,6 +111,5 @@ def setup(app):
             self.env.note_dependency(str(SCALING))
             return self.parse_text_to_nodes(table())
 
-    app.add_directive("performance-plot", PerformancePlot)
     app.add_directive("performance-table", PerformanceTable)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}
+    return add_directive(app, "performance-plot", draw, PLOTS, (SCALING, PEERS))
