@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support import plain_steps
 from support.ideal_rig import optics, two_cameras
+from support.noisy_blobs import noisy_blobs
 
 import lfpiv
 from lfpiv.reconstruction import momentum, ordered_subsets
@@ -35,16 +36,8 @@ def weights(request):
 
 @pytest.fixture(scope="module")
 def volume_of_blobs():
-    """Weights of a volume of 10 x 16 x 16 voxels, blobs in it, and their noisy images."""
-    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.6, 1.6, 1.0), voxel_mm=0.1)
-    weights = lfpiv.build_weights(two_cameras(optics=optics(rows=400, columns=440)), grid, form="profiles")
-    rng = np.random.default_rng(3)
-    coefficients = np.zeros(grid.size, np.float32)
-    coefficients[rng.choice(grid.size, 120, replace=False)] = 4e5
-    truth = Sieve(0.6, grid.shape)(coefficients).reshape(grid.shape)
-    images = weights(truth)
-    noisy = {name: (image + rng.normal(0, 8, image.shape)).astype(np.float32) for name, image in images.items()}
-    return weights, truth, noisy
+    """Weights of a small volume, blobs in it, and their noisy images."""
+    return noisy_blobs(120)
 
 
 def test_subsets_partition_the_pixels_that_see_one_half(weights):

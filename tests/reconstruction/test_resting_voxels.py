@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy import ndimage
-from support.ideal_rig import optics, two_cameras
+from support.noisy_blobs import noisy_blobs
 
 import lfpiv
 from lfpiv.reconstruction import resting_voxels, solver, steps
@@ -29,15 +29,9 @@ def small_volumes_rest_too(monkeypatch):
 
 @pytest.fixture(scope="module")
 def recorded():
-    """Weights of a volume of 10 x 16 x 16 voxels, blobs in it, and their noisy images."""
-    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.6, 1.6, 1.0), voxel_mm=0.1)
-    weights = lfpiv.build_weights(two_cameras(optics=optics(rows=400, columns=440)), grid, form="profiles")
-    rng = np.random.default_rng(3)
-    points = np.zeros(grid.size, np.float32)
-    points[rng.choice(grid.size, 40, replace=False)] = 4e5
-    truth = Sieve(0.6, grid.shape)(points).reshape(grid.shape)
-    noisy = {name: (image + rng.normal(0, 8, image.shape)).astype(np.float32) for name, image in weights(truth).items()}
-    return weights, noisy
+    """Weights of a small volume, and noisy images of blobs in it."""
+    weights, _, images = noisy_blobs(40)
+    return weights, images
 
 
 @pytest.fixture(scope="module")
