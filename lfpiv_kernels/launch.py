@@ -46,7 +46,7 @@ def launch(*calls: Call, parts: int | None = None, device: str | None = None) ->
     device = device or where.warp
     for call in calls:
         load(call.kernel, device)  # before threads start: compilation is not thread-safe
-    on_cpu = where.kind == "cpu"
+    on_cpu = where.form == "cpu"
     if not on_cpu:
         parts = 1
     elif parts is None:

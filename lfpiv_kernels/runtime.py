@@ -31,6 +31,9 @@ class Device:
     """ "cpu" or "cuda"."""
     threads: int
     """Threads that run CPU launches."""
+    form: str = "cpu"
+    """Loops of the kernels: "cpu", a vector of lanes per step, or "gpu", a lane per thread. "gpu" on the CPU is for
+    tests, see ``native.EMULATED``."""
     reason: str = ""
     """Why this device was picked; empty if it was the one requested."""
 
@@ -89,6 +92,8 @@ def _start(request: str, threads: int | None) -> Device:
     caches.prepare()
     import warp as wp
 
+    from lfpiv_kernels import native
+
     wp.config.log_level = wp.LOG_ERROR  # no banner, no notes on compilation
     with _quiet_stderr():  # without a CUDA driver, native code writes whatever the log level
         wp.init()
@@ -97,7 +102,8 @@ def _start(request: str, threads: int | None) -> Device:
         raise RuntimeError("device: 'cuda' was requested but none is visible; use 'auto' to allow the CPU.")
     kind = "cuda" if request != "cpu" and wp.is_cuda_available() else "cpu"
     reason = "no CUDA device visible" if request == "auto" and kind == "cpu" else ""
-    count = threads or cores()
+    form = "gpu" if kind == "cuda" or native.EMULATED else "cpu"
+    count = 1 if native.EMULATED else threads or cores()  # a GPU adds atomically, the CPU's threads do not
 
     import taichi as ti
 
@@ -123,7 +129,7 @@ def _start(request: str, threads: int | None) -> Device:
         ) from None
     atexit.register(caches.seal_taichi, compiled, ti.reset)
     _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
-    _device = Device(kind, count, reason)
+    _device = Device(kind, count, form, reason)
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_forget_threads)
     if reason:
@@ -180,7 +186,7 @@ def run_chunks(size: int, job: Callable[[int, int, int], None], *, chunks: int =
     memory. Exceptions of a job are raised here. Kernels whose parts need nothing else are launched by ``launch``.
     """
     where = device()
-    if where.kind == "cuda":
+    if where.form == "gpu":
         job(0, 0, size)
         return
     edges = [size * part // chunks for part in range(chunks + 1)]

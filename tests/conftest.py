@@ -23,6 +23,17 @@ def pytest_addoption(parser):
         default="cpu",
         help="device on which kernel tests run; cuda never falls back to the CPU",
     )
+    parser.addoption(
+        "--emulate-gpu",
+        action="store_true",
+        help="run the kernels' loops for a GPU on the CPU, one thread after the other",
+    )
+
+
+def pytest_configure(config):
+    """Choose the kernels' loops before any test imports them."""
+    if config.getoption("--emulate-gpu"):
+        os.environ["LFPIV_EMULATE_GPU"] = "1"
 
 
 def share_of_cores(worker, workers):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation import split_gpu
 from lfpiv_kernels.correlation.layout import Lattice, Layers, Phased, make_layers
 from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan
@@ -43,7 +44,11 @@ def _split(
 
 def split_call(volume: wp.array, plan: Plan, lattice: Lattice, split: wp.array) -> Call:
     """Return the call that stores a volume by phase."""
-    return Call(_split, lattice.planes, [volume, wp.vec3i(*plan.shape), lattice], [split])
+    inputs = [volume, wp.vec3i(*plan.shape), lattice]
+    if runtime.device().form == "gpu":
+        plane = lattice.phases[1] * lattice.phases[2] * lattice.lanes
+        return Call(split_gpu.split_voxels, lattice.planes, inputs, [split], inner=(plane,))
+    return Call(_split, lattice.planes, inputs, [split])
 
 
 @wp.func_native(
@@ -101,7 +106,7 @@ def _gather_blocks(
 
 def is_gathered(plan: Plan) -> bool:
     """Return whether blocks are added up over each window's y and x once, for all windows that share rows of blocks."""
-    return runtime.device().kind == "cpu" and min(plan.block_count[1:]) > 2
+    return runtime.device().form == "cpu" and min(plan.block_count[1:]) > 2
 
 
 def gather(plan: Plan, layers: range, ring: int, sums: wp.array) -> None:
@@ -125,12 +130,12 @@ class DirectProducts:
         """Allocate what a group of lanes needs: its blocks and as many planes of the surroundings."""
         edges = zip(plan.block[1:], plan.lags[1:], strict=True)
         pitch = LANES * plan.block[0] * (math.prod(plan.block[1:]) + math.prod(b + n - 1 for b, n in edges))
-        on_cpu = runtime.device().kind == "cpu"
+        on_cpu = runtime.device().form == "cpu"
         return cls(plan, ring, new_array(runtime.CHUNKS * pitch if on_cpu else 1), pitch)
 
     def sum(self, first: Phased, second: Phased, layers: range, sums: wp.array) -> None:
         """Sum the products of some layers of blocks and their surroundings at every lag."""
-        group, parts = (LANES, 1) if runtime.device().kind == "cpu" else (1, self.plan.lags[0])
+        group, parts = (LANES, 1) if runtime.device().form == "cpu" else (1, self.plan.lags[0])
         tasks = make_layers(self.plan, layers, self.ring, group)
         inputs = [first, second, tasks, parts, self.scratch_pitch]
         size = len(layers) * tasks.groups * parts

@@ -77,7 +77,7 @@ def _sum_along(volume: np.ndarray, axis: int, width: int) -> np.ndarray:
     source, sums = (np.zeros(whole_groups(volume.size) + width * pitch, np.float32) for _ in range(2))
     source[: volume.size] = volume.ravel()
     source, sums = to_device(source, float), to_device(sums, float)
-    part = 1 if runtime.device().kind == "cuda" else PART
+    part = 1 if runtime.device().form == "gpu" else PART
     for terms, distance in ((factor, pitch), (width // factor, factor * pitch)):
         if terms > 1:
             launch(Call(_box_sum, -(-volume.size // part), [source, distance, terms, volume.size, part], [sums]))

@@ -128,7 +128,7 @@ def deform_pair(
     shape = tuple(n - 2 * MARGIN for n in first.shape)
     nodes = wp.array(np.ascontiguousarray(field, np.float32), dtype=wp.vec3, device=where.warp)
     outputs = [wp.empty(shape, dtype=float, device=where.warp) for _ in range(2)]
-    batch = shape[2] if on_cpu else 1
+    batch = shape[2] if where.form == "cpu" else 1
     inputs = [*flat, wp.vec3i(*first.shape), nodes, wp.vec3(*spacing), OFFSET, MARGIN, batch]
     launch(Call(_deform_pair, shape[0], inputs, outputs, inner=(shape[1], -(-shape[2] // batch))))
     return outputs[0].numpy(), outputs[1].numpy()

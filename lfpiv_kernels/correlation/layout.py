@@ -54,6 +54,16 @@ class Lattice:
 
 
 @wp.struct
+class Extent:
+    """A volume with zeros around it, and the windows that fit; triples in the order (z, y, x)."""
+
+    shape: wp.vec3i  # of the volume
+    margin: wp.vec3i  # zeros on either side
+    window: wp.vec3i
+    factors: wp.vec2i  # of the window's edges along y and x
+
+
+@wp.struct
 class Layers:
     """Layers of blocks whose sums of products a launch forms, (layer, lag, lane)."""
 

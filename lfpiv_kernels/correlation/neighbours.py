@@ -10,12 +10,13 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation import neighbours_gpu
 from lfpiv_kernels.launch import Call, launch
 
 wp.set_module_options(native.options("neighbours.h"))
 
 VECTORS = native.constant("neighbours.h", "VECTORS")
-"""Vectors that a CPU task predicts at once; a CUDA thread predicts one."""
+"""Vectors that a CPU task predicts at once; a GPU's thread predicts one component of one."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def _predict(
     keep: wp.array(dtype=int),  # flat, (z, y, x): 1 where a vector counts as neighbour
     points: wp.array(dtype=int),  # linear index of the vectors wanted
     shape: wp.vec3i,  # of the grid
-    group: int,  # vectors per thread: `VECTORS` on the CPU, 1 on CUDA
+    group: int,  # vectors per task
     first_group: int,
     # out
     prediction_out: wp.array(dtype=float),  # flat, (vector, component, 6): as in `Prediction`
@@ -104,7 +105,9 @@ def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Predicti
     inputs = [wp.array(np.ascontiguousarray(a, kind).ravel(), dtype=t, device=where.warp) for a, kind, t in arrays]
     prediction = wp.empty((len(points), 3, 6), dtype=float, device=where.warp)
     count = wp.empty(len(points), dtype=int, device=where.warp)
-    group = VECTORS if where.kind == "cpu" else 1
-    inputs += [wp.vec3i(*keep.shape), group]
-    launch(Call(_predict, -(-len(points) // group), inputs, [prediction.flatten(), count]))
+    inputs, outputs = [*inputs, wp.vec3i(*keep.shape)], [prediction.flatten(), count]
+    if where.form == "gpu":
+        launch(Call(neighbours_gpu.predict_vectors, 3 * len(points), inputs, outputs))
+    else:
+        launch(Call(_predict, -(-len(points) // VECTORS), [*inputs, VECTORS], outputs))
     return Prediction(*np.moveaxis(prediction.numpy(), -1, 0), count.numpy())

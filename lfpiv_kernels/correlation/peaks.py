@@ -68,7 +68,7 @@ def _find_peaks_of_group(
 ): ...
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=64)
 def _find_peaks(
     # in
     sums: Sums,
@@ -109,7 +109,7 @@ class PeakFinder:
         """Allocate memory for the coefficients of at most `depth` layers of windows at once, and for all peaks."""
         lags, group = math.prod(plan.lags), 1
         rows = lags + math.prod(plan.lags[:2])
-        if runtime.device().kind == "cpu":
+        if runtime.device().form == "cpu":
             group = LANES * min(-(-plan.lanes // LANES), max(1, SCORE_BYTES // (4 * LANES * lags)))
             size = runtime.CHUNKS * _slot_pitch(plan, rows, group)
         else:
@@ -135,7 +135,7 @@ class PeakFinder:
         windows.groups, windows.group = -(-plan.lanes // self.group), self.group
         windows.pitch, windows.lanes = plan.pitch, plan.lanes
         windows.slot_pitch = _slot_pitch(plan, self.rows, self.group)
-        windows.score_pitch = self.group if runtime.device().kind == "cpu" else len(layers) * windows.groups
+        windows.score_pitch = self.group if runtime.device().form == "cpu" else len(layers) * windows.groups
         windows.peak_pitch = plan.count[0] * plan.lanes
         return windows
 

@@ -135,7 +135,7 @@ def possible_plans(shape: Triple, window: Triple, step: Triple, search: Triple) 
     whole = Plan(tuple(shape), tuple(window), tuple(step), tuple(search), origin, count, tuple(window))
     shared = replace(whole, block=tuple(math.gcd(w, s) for w, s in zip(window, step, strict=True)))
     direct = [whole, shared]
-    if runtime.device().kind != "cpu":
+    if runtime.device().form == "gpu":
         return direct
     return direct + [replace(plan, spectral=True) for plan in direct]
 

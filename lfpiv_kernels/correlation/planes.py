@@ -14,7 +14,7 @@ PART = 1 << 10
 
 
 @wp.func_native("""
-#if !defined(__CUDA_ARCH__)
+#if !LFPIV_GPU
     const auto scratch = scratch_out.data + (int64_t)slot * scratch_pitch;
     lfpiv::transform_planes(volume, transform, first_plane, stride, part, task, scratch, plane_out.data);
 #endif

@@ -13,7 +13,7 @@ from lfpiv_kernels.correlation.blocks import split_call
 from lfpiv_kernels.correlation.layout import Phased, Statistics, Storage
 from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import Plan, Triple
-from lfpiv_kernels.correlation.windows import plane_sums_call, plane_sums_shape, signal_floor, statistics_call
+from lfpiv_kernels.correlation.windows import plane_sums_calls, plane_sums_shape, signal_floor, statistics_call
 from lfpiv_kernels.launch import Call, launch, to_device
 
 
@@ -59,17 +59,15 @@ class _Volume:
         flat = to_device(values.ravel(), float)
         return cls(values, flat, search, voxels, statistics, split, (first_sums, second_sums), (mean, scale))
 
-    def calls(self, plan: Plan, square: float) -> tuple[Call, Call, Call]:
-        """Return the calls that store voxels by phase, sum over windows, and then measure the windows."""
+    def calls(self, plan: Plan, square: float) -> list[list[Call]]:
+        """Return steps of calls: store voxels by phase and sum over windows, then measure the windows."""
         corner = tuple(o - r for o, r in zip(plan.origin, self.search, strict=True))
         windows = self.statistics.lattice(plan, plan.origin)
-        return (
-            split_call(self.flat, plan, self.voxels.lattice(plan, corner), self.split),
-            plane_sums_call(self.flat, plan, self.search, windows, self.sums),
-            statistics_call(
-                self.sums, plan, self.search, windows, signal_floor(self.values, square, plan), self.measured
-            ),
-        )
+        split = split_call(self.flat, plan, self.voxels.lattice(plan, corner), self.split)
+        first, *more = plane_sums_calls(self.flat, plan, self.search, windows, self.sums)
+        floor = signal_floor(self.values, square, plan)
+        last = statistics_call(self.sums, plan, self.search, windows, floor, self.measured)
+        return [[split, first], *([call] for call in more), [last]]
 
     def side(self) -> Side:
         """Describe voxels and statistics for the kernels."""
@@ -100,7 +98,6 @@ def make_sides(
         Largest lags at which windows of each volume are measured, order (z, y, x) [voxel].
     """
     first, second = (_Volume.of(plan, *pair) for pair in zip(volumes, searches, strict=True))
-    splits, sums, statistics = zip(first.calls(plan, squares[0]), second.calls(plan, squares[1]), strict=True)
-    launch(*splits, *sums)
-    launch(*statistics)
+    for step in zip(first.calls(plan, squares[0]), second.calls(plan, squares[1]), strict=True):
+        launch(*(call for calls in step for call in calls))
     return first.side(), second.side()

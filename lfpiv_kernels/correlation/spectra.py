@@ -21,7 +21,7 @@ wp.set_module_options(native.options("spectra.h", contract="fast"))
 
 
 @wp.func_native("""
-#if !defined(__CUDA_ARCH__)
+#if !LFPIV_GPU
     const auto scratch = scratch_out.data + (int64_t)slot * scratch_pitch;
     lfpiv::correlate_spectra(first, second, transform, layers, past, task, scratch, sum_out.data);
 #endif

@@ -9,7 +9,8 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.correlation.layout import Lattice
+from lfpiv_kernels.correlation import windows_gpu
+from lfpiv_kernels.correlation.layout import Extent, Lattice
 from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan, Triple, largest_factor, whole_groups
 from lfpiv_kernels.launch import Call
@@ -18,16 +19,6 @@ wp.set_module_options(native.options("windows.h", contract="fast"))
 
 SIGNAL_FLOOR = 1e-4
 """Lowest variance of a window that holds signal, as a share of the whole volume's variance."""
-
-
-@wp.struct
-class Extent:
-    """A volume with zeros around it, and the windows that fit; triples in the order (z, y, x)."""
-
-    shape: wp.vec3i  # of the volume
-    margin: wp.vec3i  # zeros on either side
-    window: wp.vec3i
-    factors: wp.vec2i  # of the window's edges along y and x
 
 
 @wp.func_native(
@@ -52,18 +43,15 @@ def _sum_planes(
     extent: Extent,
     lattice: Lattice,  # windows wanted, counted from the first that fits
     scratch_pitch: wp.int64,
-    slot: int,  # scratch memory to use; -1: that of the plane
+    slot: int,  # scratch memory to use
     begin: int,
     # out
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),  # sums over the windows' y and x, (z, y, x) with as many y and x as windows fit
     square_out: wp.array(dtype=float),  # the same of the squares
 ):
-    z = begin + wp.tid()
-    memory = slot
-    if slot < 0:
-        memory = z
-    _sum_plane(volume, extent, lattice, z, wp.int64(memory) * scratch_pitch, scratch_out, sum_out, square_out)
+    scratch = wp.int64(slot) * scratch_pitch
+    _sum_plane(volume, extent, lattice, begin + wp.tid(), scratch, scratch_out, sum_out, square_out)
 
 
 @wp.func_native("lfpiv::measure_row(sum.data, square.data, extent, floor, lattice, y, mean_out.data, scale_out.data);")
@@ -110,16 +98,21 @@ def plane_sums_shape(plan: Plan, search: Triple) -> Triple:
     return depth, *(n + 2 * r - w + 1 for n, r, w in reach)
 
 
-def plane_sums_call(
+def plane_sums_calls(
     volume: wp.array, plan: Plan, search: Triple, lattice: Lattice, sums: tuple[wp.array, wp.array]
-) -> Call:
-    """Return the call that sums values and squares of each plane over the windows' y and x."""
+) -> list[Call]:
+    """Return the calls, one after the other, that sum values and squares of each plane over the windows' y and x."""
+    if runtime.device().form == "gpu":
+        extent, (depth, rows, columns) = _extent(plan, search), plane_sums_shape(plan, search)
+        along_x = [new_array(depth * plan.shape[1] * columns) for _ in range(2)]
+        return [
+            Call(windows_gpu.sum_rows, depth * plan.shape[1], [volume, extent], along_x, inner=(columns,)),
+            Call(windows_gpu.sum_columns, depth, [*along_x, extent, lattice], sums, inner=(rows, columns)),
+        ]
     pitch = whole_groups(plan.shape[2] + 2 * search[2] + LANES)
     scratch_pitch = pitch * (4 + 2 * plan.shape[1] + 2 * (plan.shape[1] + 2 * search[1] + 1))
-    on_cpu = runtime.device().kind == "cpu"
-    scratch = new_array((runtime.CHUNKS if on_cpu else plan.shape[0]) * scratch_pitch)
-    inputs = [volume, _extent(plan, search), lattice, scratch_pitch]
-    return Call(_sum_planes, plan.shape[0], inputs, [scratch, *sums], scratch=True)
+    inputs, scratch = [volume, _extent(plan, search), lattice, scratch_pitch], new_array(runtime.CHUNKS * scratch_pitch)
+    return [Call(_sum_planes, plan.shape[0], inputs, [scratch, *sums], scratch=True)]
 
 
 def signal_floor(volume: np.ndarray, square: float, plan: Plan) -> float:
@@ -140,5 +133,7 @@ def statistics_call(
     statistics: tuple[wp.array, wp.array],
 ) -> Call:
     """Return the call that finds mean and scale of windows from the sums of their planes."""
-    inputs = [*sums, _extent(plan, search), floor, lattice]
-    return Call(_window_statistics, plane_sums_shape(plan, search)[1], inputs, statistics)
+    inputs, (_, rows, columns) = [*sums, _extent(plan, search), floor, lattice], plane_sums_shape(plan, search)
+    if runtime.device().form == "gpu":
+        return Call(windows_gpu.window_statistics, rows, inputs, statistics, inner=(columns,))
+    return Call(_window_statistics, rows, inputs, statistics)

@@ -4,6 +4,7 @@ A kernel module names its header in ``wp.set_module_options(native.options("proj
 functions then call the header's functions in one line. Constants that C++ and Python share are written in the header.
 """
 
+import os
 import re
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import warp as wp
 
 FOLDER = Path(__file__).resolve().parent
 """Folder of the headers."""
+EMULATED = "LFPIV_EMULATE_GPU" in os.environ
+"""Whether kernels for the CPU take the loops written for a GPU, one thread after the other: slow, for tests."""
 QUIET = "-w"
 """Option of the CPU's compiler that suppresses warnings, which differ from processor to processor; errors are shown."""
 
@@ -33,12 +36,13 @@ def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dic
         If there is no such header.
     """
     include = f'#include "{header}"'
+    emulated = f"#define LFPIV_EMULATE_GPU\n{include}"
     chosen: dict[str, object] = {
         "max_unroll": unroll,
         "extra_build_options": wp.ModuleBuildOptions(
             extra_cpu_include_dirs=[FOLDER],
             extra_cuda_include_dirs=[FOLDER],
-            extra_cpu_preamble=include,
+            extra_cpu_preamble=emulated if EMULATED else include,
             extra_cuda_preamble=include,
             extra_build_dependencies=_included(header),
         ),

@@ -38,7 +38,7 @@ LFPIV_INLINE void split_plane(const float* volume, const Triple& shape, const La
         }
 }
 
-#if defined(__CUDA_ARCH__)
+#if LFPIV_GPU
 
 /// Voxels of one lane's block and its surroundings, read from the volumes.
 template <class Volume>
@@ -118,7 +118,7 @@ LFPIV_INLINE void correlate_blocks(const Volume& first, const Volume& second, co
     const int begin = part * nz / parts, end = (part + 1) * nz / parts;
     float* to = sums + (int64_t)(layer % layers.ring) * nz * ny * nx * layers.lanes + lane;
     const int64_t plane_pitch = (int64_t)ny * nx * layers.lanes;
-#if defined(__CUDA_ARCH__)
+#if LFPIV_GPU
     const BlockVoxels<Volume> voxels{first, second, first.values.data + (int64_t)plane * first.plane + lane,
                                      second.values.data + (int64_t)plane * second.plane + lane};
     for (int lag = begin; lag < end; ++lag)

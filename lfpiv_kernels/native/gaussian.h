@@ -14,7 +14,7 @@ constexpr int VALUES = 4;
 /// Return 1 / sqrt(2 pi) exp(-x^2 / 2), relative error 3e-7.
 LFPIV_INLINE V normal_density(V x) {
     constexpr float ROOT = 0.39894228f;
-#if defined(__CUDA_ARCH__)
+#if LFPIV_GPU
     return ROOT * expf(-0.5f * x * x);
 #else
     const V power = max(-0.72134752f * x * x, splat(-120.0f));  // of 2

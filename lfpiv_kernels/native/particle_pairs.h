@@ -6,7 +6,7 @@
 
 namespace lfpiv {
 
-#if !defined(__CUDA_ARCH__)
+#if !LFPIV_GPU
 
 /// Derivatives by x, y, z, and the weight of a pixel.
 using Four = Floats<4>;

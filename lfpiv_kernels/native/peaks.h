@@ -54,7 +54,7 @@ LFPIV_INLINE void sum_blocks(const float* sums, const Windows& windows, const Wi
                              [[maybe_unused]] float* columns, const Use& use) {
     const int64_t layer_pitch = (int64_t)lags * windows.lanes;
     const float* from = sums + task.layer % windows.ring * layer_pitch + (int64_t)lag * windows.lanes + task.lane;
-#if defined(__CUDA_ARCH__)
+#if LFPIV_GPU
     V total = V{};
     for (int x = 0; x < windows.blocks[2]; ++x) total += sum_column(from + x, windows, task.layer, layer_pitch);
     use(0, total);

@@ -42,7 +42,7 @@ struct PixelRun {
         for (int n = (int)((int64_t)darks * run / runs); n < last; ++n) rays_out[dark[n]] = 0.0f;
     }
 
-#if defined(__CUDA_ARCH__)
+#if LFPIV_GPU
     /// Pixels that `for_pixels` gives at once. Neighbouring threads have neighbouring pixels.
     static constexpr int GROUP = 1;
     LFPIV_INLINE int begin() const { return start + run; }

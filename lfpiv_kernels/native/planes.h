@@ -6,7 +6,7 @@
 
 namespace lfpiv {
 
-#if !defined(__CUDA_ARCH__)
+#if !LFPIV_GPU
 
 /// Rows that are summed in registers at once, and vectors of each.
 constexpr int MOST_ROWS = 6, ROW_VECTORS = 4;

@@ -81,7 +81,7 @@ LFPIV_INLINE Row gather_pixels(const float* ray, int rows, int columns, int stri
     return first_lanes(even + odd, columns);
 }
 
-#if defined(__CUDA_ARCH__)
+#if LFPIV_GPU
 
 /// Return the sums along the columns of `groups` groups of rows, each row times its level.
 LFPIV_INLINE Row sum_rows(const float* ray, int groups, int stride, const unsigned char* down) {
@@ -180,7 +180,7 @@ LFPIV_INLINE float gather(const VoxelBlocks& blocks, const float* rays) {
     return sum(total);
 }
 
-#if !defined(__CUDA_ARCH__)  // without atomics: each thread needs rays of its own
+#if !LFPIV_GPU  // without atomics: each thread needs rays of its own
 
 /// Add light to two rows.
 LFPIV_INLINE void add_to_rows(float* ray, int stride, RowPair light) {

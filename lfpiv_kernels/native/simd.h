@@ -14,9 +14,16 @@
 #define LFPIV_INLINE inline __attribute__((always_inline))
 #endif
 
+/// Whether loops are written for a GPU: a thread per lane. Tests compile them for the processor as well.
+#if defined(__CUDA_ARCH__) || defined(LFPIV_EMULATE_GPU)
+#define LFPIV_GPU 1
+#else
+#define LFPIV_GPU 0
+#endif
+
 namespace lfpiv {
 
-#if defined(__CUDA_ARCH__)
+#if LFPIV_GPU
 
 /// Lanes of a vector `V`.
 constexpr int WIDTH = 1;
@@ -88,7 +95,7 @@ LFPIV_INLINE T max(T a, T b) {
     return a > b ? a : b;
 }
 
-#if defined(__CUDA_ARCH__)
+#if LFPIV_GPU
 
 LFPIV_INLINE float abs(float x) { return fabsf(x); }
 LFPIV_INLINE float sqrt(float x) { return sqrtf(x); }

@@ -9,7 +9,7 @@ namespace lfpiv {
 /// Frequencies along y that are computed at once; rows of the waves are padded to a multiple of it.
 constexpr int ROWS = 3;
 
-#if !defined(__CUDA_ARCH__)
+#if !LFPIV_GPU
 
 /// Pairs of lags, an even and an odd one, that are summed at once.
 constexpr int MOST_PAIRS = WIDTH == 16 ? 5 : 2;

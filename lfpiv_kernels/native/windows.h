@@ -96,40 +96,63 @@ LFPIV_INLINE void store_phases(const float* values, int begin, int count, const 
     }
 }
 
-/// Measure mean and scale of the windows that start at row y, from the sums of `sum_plane`, and store them by phase.
+/// Where the statistics of the windows that start at row y are stored, and how many voxels a window has.
+template <class Extent, class Lattice>
+struct StatisticsRow {
+    bool wanted;  // whether windows of the lattice start there
+    int columns;  // windows that fit along x
+    int z;        // plane of the volume at which the lattice begins
+    int64_t plane_pitch, to_row, to_plane;
+    double share;  // of a voxel in its window
+
+    LFPIV_INLINE StatisticsRow(const Extent& extent, const Lattice& lattice, int y) {
+        const int row = y - lattice.corner[1], phase = row % lattice.stride[1], lane_row = row / lattice.stride[1];
+        wanted = row >= 0 && phase < lattice.phases[1] && (lane_row + 1) * lattice.pitch <= lattice.lanes;
+        columns = windows_along(extent, 2);
+        z = lattice.corner[0] - extent.margin[0];
+        plane_pitch = (int64_t)windows_along(extent, 1) * columns;
+        to_row = (int64_t)phase * lattice.phases[2] * lattice.lanes + lane_row * lattice.pitch;
+        to_plane = (int64_t)lattice.phases[1] * lattice.phases[2] * lattice.lanes;
+        share = 1.0 / (extent.window[0] * extent.window[1] * extent.window[2]);
+    }
+};
+
+/// Return 1 / sqrt(sum of squared deviations) from the sums of a window's values and squares, and their mean.
 /// Windows whose sum of squared deviations is at most `floor` hold no signal: their scale is 0.
+LFPIV_INLINE float window_scale(double total, double square, double mean, float floor) {
+    const float deviation = (float)(square - total * mean);
+    return deviation > floor ? 1.0f / sqrtf(max(deviation, floor)) : 0.0f;
+}
+
+/// Measure mean and scale of the windows that start at row y, from the sums of `sum_plane`, and store them
+/// by phase.
 template <class Extent, class Lattice>
 LFPIV_INLINE void measure_row(const float* sums, const float* squares, const Extent& extent, float floor,
                               const Lattice& lattice, int y, float* mean, float* scale) {
-    const int row = y - lattice.corner[1], phase = row % lattice.stride[1], lane_row = row / lattice.stride[1];
-    if (row < 0 || phase >= lattice.phases[1] || (lane_row + 1) * lattice.pitch > lattice.lanes) return;
-    const int columns = windows_along(extent, 2), depth = extent.window[0], z = lattice.corner[0] - extent.margin[0];
-    const int64_t plane_pitch = (int64_t)windows_along(extent, 1) * columns;
-    const int64_t to_row = (int64_t)phase * lattice.phases[2] * lattice.lanes + lane_row * lattice.pitch;
-    const int64_t to_plane = (int64_t)lattice.phases[1] * lattice.phases[2] * lattice.lanes;
-    const double share = 1.0 / (depth * extent.window[1] * extent.window[2]);
+    const StatisticsRow<Extent, Lattice> row(extent, lattice, y);
+    if (!row.wanted) return;
+    const int depth = extent.window[0];
     double total[MOST_WINDOWS], square[MOST_WINDOWS];
     float means[MOST_WINDOWS], scales[MOST_WINDOWS];
-    for (int begin = 0; begin < columns; begin += MOST_WINDOWS) {
-        const int count = min(columns - begin, MOST_WINDOWS);
+    for (int begin = 0; begin < row.columns; begin += MOST_WINDOWS) {
+        const int count = min(row.columns - begin, MOST_WINDOWS);
         for (int x = 0; x < count; ++x) total[x] = square[x] = 0.0;
-        const int64_t start = (int64_t)y * columns + begin;
+        const int64_t start = (int64_t)y * row.columns + begin;
         auto plane_of = [&](const float* of, int p) {
-            return p >= 0 && p < extent.shape[0] ? of + start + p * plane_pitch : nullptr;
+            return p >= 0 && p < extent.shape[0] ? of + start + p * row.plane_pitch : nullptr;
         };
         for (int plane = 1 - depth; plane < lattice.planes; ++plane) {
-            const int ahead = z + plane + depth - 1, behind = plane > 0 ? z + plane - 1 : -1;
+            const int ahead = row.z + plane + depth - 1, behind = plane > 0 ? row.z + plane - 1 : -1;
             move(total, count, plane_of(sums, ahead), plane_of(sums, behind));
             move(square, count, plane_of(squares, ahead), plane_of(squares, behind));
             if (plane < 0 || plane % lattice.stride[0] >= lattice.phases[0]) continue;
             for (int x = 0; x < count; ++x) {
-                const double m = total[x] * share;
-                const float deviation = (float)(square[x] - total[x] * m);
+                const double m = total[x] * row.share;
                 means[x] = (float)m;
-                scales[x] = deviation > floor ? 1.0f / sqrtf(max(deviation, floor)) : 0.0f;
+                scales[x] = window_scale(total[x], square[x], m, floor);
             }
-            store_phases(means, begin, count, lattice, mean + plane * to_plane + to_row);
-            store_phases(scales, begin, count, lattice, scale + plane * to_plane + to_row);
+            store_phases(means, begin, count, lattice, mean + plane * row.to_plane + row.to_row);
+            store_phases(scales, begin, count, lattice, scale + plane * row.to_plane + row.to_row);
         }
     }
 }

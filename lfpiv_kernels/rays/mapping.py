@@ -190,7 +190,7 @@ def evaluate(
     if len(points) == 0 or rays_per_point == 0:
         return out
     device = runtime.device_of_taichi()
-    kernel = _kernel(sizes, BATCH if device.kind == "cpu" else 1, fan, lens is not None)
+    kernel = _kernel(sizes, BATCH if device.form == "cpu" else 1, fan, lens is not None)
     pupil = pupil if fan else np.zeros((1, 2), np.float32)
     lens = np.zeros(1, np.float32) if lens is None else lens
     step = max(1, CHUNK_RAYS // rays_per_point)

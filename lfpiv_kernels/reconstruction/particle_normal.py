@@ -156,7 +156,7 @@ def pair_blocks(lists: ImageLists, weight: np.ndarray, residual: np.ndarray) -> 
     neighbour = to_device(np.full((count, MOST_NEIGHBOURS), -1, np.int32))
     block = to_device(np.zeros((count, MOST_NEIGHBOURS, 4, 4), np.float32), wp.mat44f)
     right = to_device(np.zeros((count, 4), np.float32), wp.vec4f)
-    call = _by_particle if runtime.device().kind == "cpu" else _by_pixel
+    call = _by_particle if runtime.device().form == "cpu" else _by_pixel
     launch(call(lists, weight, residual, [neighbour, block, right]), parts=PARTS)
     near = neighbour.numpy()
     row, slot = np.nonzero(near >= 0)

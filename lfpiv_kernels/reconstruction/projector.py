@@ -234,7 +234,7 @@ class Projector:
     def __init__(self, blocks: Blocks):
         self._turn, self._reserved = threading.RLock(), False
         self.blocks = blocks
-        self._on_cpu = runtime.device().kind == "cpu"
+        self._on_cpu = runtime.device().form == "cpu"
         self._matrix = Matrix()
         for name in ("first_block", "first_value", "ray", "height", "width", "scale"):
             setattr(self._matrix, name, to_device(getattr(blocks, name)))

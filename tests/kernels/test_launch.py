@@ -44,7 +44,7 @@ def test_parts_that_run_side_by_side_have_scratch_memory_of_their_own(device):
     slots = to_device(np.full(1000, -2, np.int32))
     launch(Call(_note_slot, 1000, [], [slots], scratch=True))
     found = slots.numpy()
-    assert (found == -1).all() if device.kind == "cuda" else (found.min() >= 0 and found.max() < 8)
+    assert (found == -1).all() if device.form == "gpu" else (found.min() >= 0 and found.max() < 8)
 
 
 def test_arrays_on_the_cpu_are_views():

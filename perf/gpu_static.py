@@ -1,0 +1,140 @@
+"""Show what the CUDA compiler makes of the Warp kernels, on a machine without a GPU.
+
+    pip install '.[gpu-check]'
+    python perf/gpu_static.py [--arch 75 80 90 100] [--json FILE]
+
+Warp compiles each module to PTX, and ptxas assembles it: registers, stack and spilled bytes of each kernel, and the
+share of a multiprocessor's threads for which the registers suffice (occupancy). Kernels that only the CPU runs are
+left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import pkgutil
+import re
+import shutil
+import subprocess
+import sysconfig
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+REGISTERS, THREADS = 65536, 2048
+"""Of a multiprocessor, compute capabilities 8.0 to 10.0; 7.5 has half as many threads."""
+BLOCK = 256
+"""Threads of a block: Warp's default."""
+REGISTER_UNIT = 256
+"""Registers are given to warps of 32 threads in units of this many."""
+ARCHITECTURES = (75, 80, 90, 100)
+"""Compute capabilities. The compiler in Warp no longer knows 7.0."""
+CPU_ONLY = {
+    "blocks": ("_split", "_gather_blocks"),
+    "neighbours": ("_predict",),
+    "particle_normal": ("_multiply_images",),
+    "planes": ("_transform_planes",),
+    "projector": ("_project",),
+    "spectra": ("_correlate_spectra",),
+    "windows": ("_sum_planes", "_window_statistics"),
+}
+"""Kernels by module that a GPU never runs: it has other kernels in their place."""
+CPU_MODULES = ("neighbours", "planes", "spectra", "windows")
+"""Modules without a kernel for a GPU; their headers need not compile for one."""
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """What ptxas says of a kernel."""
+
+    module: str
+    name: str
+    architecture: int
+    registers: int
+    stack: int
+    """Bytes per thread."""
+    spilled: int
+    """Bytes that are stored and loaded for want of registers."""
+    shared: int
+    """Bytes of shared memory per block."""
+
+    @property
+    def occupancy(self) -> float:
+        """Share of a multiprocessor's threads for which the registers suffice."""
+        per_warp = -(-self.registers * 32 // REGISTER_UNIT) * REGISTER_UNIT
+        blocks = REGISTERS // max(per_warp * BLOCK // 32, 1)
+        return min(1.0, blocks * BLOCK / THREADS)
+
+
+def assembler() -> str | None:
+    """Return the path of ptxas, from the extra `gpu-check` or the search path; None if there is none."""
+    installed = Path(sysconfig.get_paths()["purelib"]).glob("nvidia/*/bin/ptxas")
+    return next((str(path) for path in installed), None) or shutil.which("ptxas")
+
+
+def measure(architecture: int) -> Iterator[Kernel]:
+    """Compile and assemble all kernels for a GPU of one architecture.
+
+    Raises
+    ------
+    RuntimeError
+        If ptxas is missing or refuses a module.
+    """
+    import warp as wp
+
+    import lfpiv_kernels
+
+    for found in pkgutil.walk_packages(lfpiv_kernels.__path__, "lfpiv_kernels."):
+        module, short = importlib.import_module(found.name), found.name.rpartition(".")[2]
+        if short in CPU_MODULES or not wp.get_module(found.name).kernels:
+            continue
+        for kernel in _assemble(module, short, architecture):
+            if kernel.name not in CPU_ONLY.get(short, ()):
+                yield kernel
+
+
+def _assemble(module: object, short: str, architecture: int) -> Iterator[Kernel]:
+    import warp as wp
+
+    ptxas = assembler()
+    if ptxas is None:
+        raise RuntimeError("ptxas: expected the CUDA assembler, found none; pip install 'lfpiv[gpu-check]'.")
+    with tempfile.TemporaryDirectory() as folder:
+        (path,) = map(Path, wp.compile_aot_module(module, arch=architecture, module_dir=folder, use_ptx=True))
+        path.write_bytes(path.read_bytes().replace(b"\0", b""))  # Warp ends its PTX with a zero, which ptxas refuses
+        command = [ptxas, "-v", f"--gpu-name=sm_{architecture}", str(path), "-o", str(Path(folder) / "cubin")]
+        said = subprocess.run(command, capture_output=True, text=True)
+    if said.returncode:
+        raise RuntimeError(f"{short}: ptxas refuses it for sm_{architecture}: {said.stderr.strip()}")
+    entries = r"Compiling entry function '(\S+?)_[0-9a-f]{8}_cuda\S*'(.*?)(?=Compiling entry|\Z)"
+    for name, text in re.findall(entries, said.stderr, re.DOTALL):
+
+        def number(pattern: str, text: str = text) -> int:
+            found = re.search(pattern, text)
+            return int(found[1]) if found else 0
+
+        spilled = number(r"(\d+) bytes spill stores") + number(r"(\d+) bytes spill loads")
+        numbers = number(r"Used (\d+) registers"), number(r"(\d+) bytes stack"), spilled, number(r"(\d+) bytes smem")
+        yield Kernel(short, name, architecture, *numbers)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arch", type=int, nargs="+", default=[90], help="compute capabilities, without the point")
+    parser.add_argument("--json", type=Path, help="file for the table")
+    given = parser.parse_args()
+    rows = [kernel for architecture in given.arch for kernel in measure(architecture)]
+    print(f"{'kernel':36s} {'sm':>4s} {'registers':>9s} {'occupancy':>9s} {'stack':>6s} {'spilled':>7s}")
+    for row in sorted(rows, key=lambda row: (row.occupancy, row.module, row.name)):
+        name = f"{row.module}.{row.name.lstrip('_')}"
+        print(
+            f"{name:36s} {row.architecture:4d} {row.registers:9d} {row.occupancy:9.2f} {row.stack:6d} {row.spilled:7d}"
+        )
+    if given.json:
+        given.json.write_text(json.dumps([asdict(row) | {"occupancy": row.occupancy} for row in rows], indent=1))
+
+
+if __name__ == "__main__":
+    main()
