@@ -46,8 +46,7 @@ def split_call(volume: wp.array, plan: Plan, lattice: Lattice, split: wp.array) 
     """Return the call that stores a volume by phase."""
     inputs = [volume, wp.vec3i(*plan.shape), lattice]
     if runtime.device().form == "gpu":
-        plane = lattice.phases[1] * lattice.phases[2] * lattice.lanes
-        return Call(split_gpu.split_voxels, lattice.planes, inputs, [split], inner=(plane,))
+        return split_gpu.split_call(inputs, lattice, split)
     return Call(_split, lattice.planes, inputs, [split])
 
 

@@ -107,7 +107,7 @@ def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Predicti
     count = wp.empty(len(points), dtype=int, device=where.warp)
     inputs, outputs = [*inputs, wp.vec3i(*keep.shape)], [prediction.flatten(), count]
     if where.form == "gpu":
-        launch(Call(neighbours_gpu.predict_vectors, 3 * len(points), inputs, outputs))
+        launch(neighbours_gpu.prediction_call(inputs, outputs))
     else:
         launch(Call(_predict, -(-len(points) // VECTORS), [*inputs, VECTORS], outputs))
     return Prediction(*np.moveaxis(prediction.numpy(), -1, 0), count.numpy())

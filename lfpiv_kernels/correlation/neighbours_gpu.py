@@ -3,6 +3,7 @@
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("neighbours_gpu.h"))
 
@@ -22,7 +23,7 @@ def _predict_one(
 
 
 @wp.kernel
-def predict_vectors(
+def _predict_vectors(
     # in
     field: wp.array(dtype=float),  # as in `_predict`; a thread per component of a vector
     keep: wp.array(dtype=int),
@@ -33,5 +34,10 @@ def predict_vectors(
     prediction_out: wp.array(dtype=float),
     count_out: wp.array(dtype=int),
 ):
-    """Predict one component of a vector from its neighbours."""
     _predict_one(field, keep, points, shape, first + wp.tid(), prediction_out, count_out)
+
+
+def prediction_call(inputs: list[object], outputs: list[wp.array]) -> Call:
+    """Return the call that predicts vectors: a thread per component of each."""
+    _, count = outputs
+    return Call(_predict_vectors, 3 * len(count), inputs, outputs)

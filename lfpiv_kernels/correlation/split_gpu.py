@@ -4,6 +4,7 @@ import warp as wp
 
 from lfpiv_kernels import native
 from lfpiv_kernels.correlation.layout import Lattice
+from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("split_gpu.h"))
 
@@ -20,7 +21,7 @@ def _split_voxel(
 
 
 @wp.kernel
-def split_voxels(
+def _split_voxels(
     # in
     volume: wp.array(dtype=float),  # flat, (z, y, x); a thread per element of `split_out`
     shape: wp.vec3i,
@@ -29,6 +30,11 @@ def split_voxels(
     # out
     split_out: wp.array(dtype=float),
 ):
-    """Store one voxel by phase, 0 outside the volume."""
     plane, place = wp.tid()
     _split_voxel(volume, shape, lattice, begin + plane, place, split_out)
+
+
+def split_call(inputs: list[object], lattice: Lattice, split: wp.array) -> Call:
+    """Return the call that stores a volume by phase: a thread per element of `split`."""
+    plane = lattice.phases[1] * lattice.phases[2] * lattice.lanes
+    return Call(_split_voxels, lattice.planes, inputs, [split], inner=(plane,))

@@ -103,12 +103,7 @@ def plane_sums_calls(
 ) -> list[Call]:
     """Return the calls, one after the other, that sum values and squares of each plane over the windows' y and x."""
     if runtime.device().form == "gpu":
-        extent, (depth, rows, columns) = _extent(plan, search), plane_sums_shape(plan, search)
-        along_x = [new_array(depth * plan.shape[1] * columns) for _ in range(2)]
-        return [
-            Call(windows_gpu.sum_rows, depth * plan.shape[1], [volume, extent], along_x, inner=(columns,)),
-            Call(windows_gpu.sum_columns, depth, [*along_x, extent, lattice], sums, inner=(rows, columns)),
-        ]
+        return windows_gpu.sums_calls(volume, _extent(plan, search), lattice, plane_sums_shape(plan, search), sums)
     pitch = whole_groups(plan.shape[2] + 2 * search[2] + LANES)
     scratch_pitch = pitch * (4 + 2 * plan.shape[1] + 2 * (plan.shape[1] + 2 * search[1] + 1))
     inputs, scratch = [volume, _extent(plan, search), lattice, scratch_pitch], new_array(runtime.CHUNKS * scratch_pitch)
@@ -133,7 +128,7 @@ def statistics_call(
     statistics: tuple[wp.array, wp.array],
 ) -> Call:
     """Return the call that finds mean and scale of windows from the sums of their planes."""
-    inputs, (_, rows, columns) = [*sums, _extent(plan, search), floor, lattice], plane_sums_shape(plan, search)
+    inputs, fitting = [*sums, _extent(plan, search), floor, lattice], plane_sums_shape(plan, search)
     if runtime.device().form == "gpu":
-        return Call(windows_gpu.window_statistics, rows, inputs, statistics, inner=(columns,))
-    return Call(_window_statistics, rows, inputs, statistics)
+        return windows_gpu.statistics_call(inputs, fitting, statistics)
+    return Call(_window_statistics, fitting[1], inputs, statistics)

@@ -4,6 +4,8 @@ import warp as wp
 
 from lfpiv_kernels import native
 from lfpiv_kernels.correlation.layout import Extent, Lattice
+from lfpiv_kernels.correlation.memory import new_array
+from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("windows_gpu.h"))
 
@@ -20,7 +22,7 @@ def _sum_row(
 
 
 @wp.kernel
-def sum_rows(
+def _sum_rows(
     # in
     volume: wp.array(dtype=float),  # flat, (z, y, x); a thread per row of a plane and window along x
     extent: Extent,
@@ -29,7 +31,6 @@ def sum_rows(
     sum_out: wp.array(dtype=float),  # sums over the windows' x, (z, y, x) with as many x as windows fit
     square_out: wp.array(dtype=float),  # the same of the squares
 ):
-    """Sum a row of the volume over the x of one window."""
     row, x = wp.tid()
     _sum_row(volume, extent, begin + row, x, sum_out, square_out)
 
@@ -51,9 +52,9 @@ def _sum_column(
 
 
 @wp.kernel
-def sum_columns(
+def _sum_columns(
     # in
-    row_sum: wp.array(dtype=float),  # of `sum_rows`; a thread per plane, and window along y and x
+    row_sum: wp.array(dtype=float),  # of `_sum_rows`; a thread per plane, and window along y and x
     row_square: wp.array(dtype=float),
     extent: Extent,
     lattice: Lattice,
@@ -62,7 +63,6 @@ def sum_columns(
     sum_out: wp.array(dtype=float),  # sums over the windows' y and x, as many y and x as windows fit
     square_out: wp.array(dtype=float),
 ):
-    """Sum a plane over the y and x of one window."""
     z, y, x = wp.tid()
     _sum_column(row_sum, row_square, extent, lattice, begin + z, y, x, sum_out, square_out)
 
@@ -84,9 +84,9 @@ def _measure_column(
 
 
 @wp.kernel
-def window_statistics(
+def _window_statistics(
     # in
-    sum: wp.array(dtype=float),  # of `sum_columns`; a thread per row and column
+    sum: wp.array(dtype=float),  # of `_sum_columns`; a thread per row and column
     square: wp.array(dtype=float),
     extent: Extent,
     floor: float,
@@ -96,6 +96,26 @@ def window_statistics(
     mean_out: wp.array(dtype=float),
     scale_out: wp.array(dtype=float),
 ):
-    """Measure mean and scale of the windows at one row and column in all planes."""
     y, x = wp.tid()
     _measure_column(sum, square, extent, floor, lattice, begin + y, x, mean_out, scale_out)
+
+
+def sums_calls(
+    volume: wp.array, extent: Extent, lattice: Lattice, fitting: tuple[int, int, int], sums: tuple[wp.array, wp.array]
+) -> list[Call]:
+    """Return the calls, one after the other, that sum values and squares of each plane over the windows' y and x.
+
+    `fitting` holds the planes of the volume, and the windows that fit along y and x.
+    """
+    depth, rows, columns = fitting
+    along_x = [new_array(depth * extent.shape[1] * columns) for _ in range(2)]
+    return [
+        Call(_sum_rows, depth * extent.shape[1], [volume, extent], along_x, inner=(columns,)),
+        Call(_sum_columns, depth, [*along_x, extent, lattice], sums, inner=(rows, columns)),
+    ]
+
+
+def statistics_call(inputs: list[object], fitting: tuple[int, int, int], statistics: tuple[wp.array, wp.array]) -> Call:
+    """Return the call that finds mean and scale of windows: a thread for those at one row and column."""
+    _, rows, columns = fitting
+    return Call(_window_statistics, rows, inputs, statistics, inner=(columns,))
