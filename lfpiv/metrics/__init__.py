@@ -13,7 +13,7 @@ from lfpiv.metrics.agreement import (
     uncertainty_calibration,
     weighted_quantile,
 )
-from lfpiv.metrics.confidence import Estimate, block_bootstrap
+from lfpiv.metrics.confidence import RESAMPLES, Estimate, block_bootstrap
 from lfpiv.metrics.images_and_volumes import DotError, dot_error, reconstruction_quality, relative_l2, weight_ssim
 from lfpiv.metrics.particles import (
     ParticleQuality,
@@ -28,6 +28,7 @@ from lfpiv.metrics.particles import (
 from lfpiv.metrics.vector_fields import DisplacementError, displacement_difference, displacement_error, empirical_cdf
 
 __all__ = [
+    "RESAMPLES",
     "DisplacementError",
     "DotError",
     "ErrorCurve",
