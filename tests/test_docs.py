@@ -18,7 +18,6 @@ from pathlib import Path
 
 import matplotlib
 import pytest
-import typer
 from pydantic import BaseModel
 from support.public_names import public_modules
 
@@ -50,7 +49,7 @@ MODULES = {
 ENDINGS = ("py", "md", "h", "toml", "h5", "json", "html", "nc", "pvd", "jsonl", "zarr", "cih")
 """Endings of file names, which look like attributes of modules."""
 
-LONG = ("demo", "init", "reproduce", "simulate")
+LONG = ("benchmark", "demo", "init", "reproduce", "simulate")
 """Commands that take long or ask questions: checked to be understood, not run. Each has tests of its own."""
 
 
@@ -114,22 +113,32 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(reader, name):
         del sys.modules["snippets"]
 
 
+def command_in(words, known):
+    """Name of the command in the words of a line, with that of its group, and the words after it."""
+    names = 2 if " ".join(words[:2]) in known else 1
+    return " ".join(words[:names]), words[names:]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n, page in PAGES.items() if any(commands_of(page))])
-def test_commands_are_understood_and_quick_ones_succeed(reader, name, capfd):
-    known = typer.main.get_command(commands.app).commands
+def test_commands_are_understood_and_quick_ones_succeed(reader, tables, name, capfd):
+    known = tables.commands()
     for words in commands_of(PAGES[name]):
-        if words[0] in known:
-            known[words[0]].make_context(words[0], list(words[1:]))  # raises on what it does not understand
+        command, rest = command_in(words, known)
+        if command in known:
+            known[command].make_context(command, list(rest))  # raises on what it does not understand
         run = words[0].startswith("-") or (words[0] not in LONG and not {"--workers", "--scheduler"} & set(words))
         assert not run or commands.call(words) == 0, (words, capfd.readouterr().err)
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_named_commands_and_options_exist(name):
-    known = typer.main.get_command(commands.app).commands
+def test_named_commands_and_options_exist(tables, name):
+    known = tables.commands()
+    groups = {command.split()[0] for command in known if " " in command}
     for spoken in re.findall(r"`lfpiv ([a-z][^`]*)`", PAGES[name].read_text("utf-8")):
-        command, *rest = spoken.split()
+        if spoken in groups:
+            continue
+        command, rest = command_in(spoken.split(), known)
         assert command in known, spoken
         options = {option for parameter in known[command].params for option in parameter.opts} | {"--help"}
         assert {word for word in rest if word.startswith("--")} <= options, spoken
@@ -253,7 +262,7 @@ def test_every_key_is_described(tables, file):
 
 def test_every_command_has_its_help_in_the_pages(tables):
     page = PAGES["docs/cli.md"].read_text("utf-8")
-    assert set(re.findall(r"^```\{command\} (\S+)", page, re.MULTILINE)) == set(tables.commands())
+    assert set(re.findall(r"^```\{command\} (.+)$", page, re.MULTILINE)) == set(tables.commands())
     for name in tables.commands():
         assert tables.help_text(name).startswith(f"Usage: lfpiv {name}")
 

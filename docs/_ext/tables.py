@@ -105,12 +105,17 @@ def _default(field: Any) -> str:
 
 
 def commands() -> dict[str, Any]:
-    """Return the commands of the command line by name."""
+    """Return the commands of the command line by name, those of a group by both names."""
     import typer
 
     from lfpiv.cli.commands import app
 
-    return {name: command for name, command in typer.main.get_command(app).commands.items() if not command.hidden}
+    found = {}
+    for name, command in typer.main.get_command(app).commands.items():
+        inner = getattr(command, "commands", None)
+        if not command.hidden:
+            found |= {name: command} if inner is None else {f"{name} {own}": inner[own] for own in inner}
+    return found
 
 
 def help_text(name: str) -> str:
@@ -121,7 +126,7 @@ def help_text(name: str) -> str:
     os.environ["COLUMNS"] = "100"
     try:
         with contextlib.redirect_stdout(shown):
-            commands.call([name, "--help"])
+            commands.call([*name.split(), "--help"])
     finally:
         os.environ.pop("COLUMNS")
         if width is not None:
@@ -170,6 +175,7 @@ def setup(app):
         """Help of a command."""
 
         required_arguments = 1
+        final_argument_whitespace = True  # a command of a group has two names
 
         def run(self):
             return [nodes.literal_block(text := help_text(self.arguments[0]), text, language="none")]

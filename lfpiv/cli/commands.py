@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from lfpiv.cli import init, terminal
-from lfpiv.cli.terminal import Interrupted, Output
+from lfpiv.cli import benchmark, init, terminal
+from lfpiv.cli.terminal import Interrupted
 from lfpiv.errors import ClusterError, InputError, StorageError, printable
 from lfpiv.reproduce import CASES
 from lfpiv.version import __version__
@@ -32,8 +32,7 @@ app = typer.Typer(
 EXIT_S = 15.0
 """Longest time that the process may take to end after its work [s]."""
 
-_output = Output()
-"""Output options of the present call. `call` resets them."""
+_output = terminal.OUTPUT
 
 
 def _show_version(value: bool) -> None:
@@ -74,7 +73,9 @@ def _options(
         print(context.get_help())
 
 
-def _command(name: str, *examples: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def _command(
+    name: str, *examples: str, group: typer.Typer = app
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Register a command with examples in its help, and with the options of `_output` after its own."""
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
@@ -89,7 +90,7 @@ def _command(name: str, *examples: str) -> Callable[[Callable[..., None]], Calla
         command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         command.__doc__ = function.__doc__
         epilog = "\b\nExamples:\n" + "\n".join(f"  {example}" for example in examples)  # \b keeps the line breaks
-        app.command(name, epilog=epilog)(command)
+        group.command(name, epilog=epilog)(command)
         return function
 
     return register
@@ -302,6 +303,11 @@ def _reproduce(
         print_case = terminal.print_case if _output.is_text else None
         done = reproduce(cases or ["all"], out, scale, seed=seed, progress=progress, finished=print_case)
     _output.show(done, lambda: terminal.say(f"page: {out / 'index.html'}"))
+
+
+app.add_typer(benchmark.GROUP, name="benchmark")
+for _name, (_function, _examples) in benchmark.COMMANDS.items():
+    _command(_name, *_examples, group=benchmark.GROUP)(_function)
 
 
 @_command("doctor", "lfpiv doctor", "lfpiv doctor --device cuda")

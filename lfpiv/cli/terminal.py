@@ -87,6 +87,10 @@ class Output:
                 logger.removeHandler(handler)
 
 
+OUTPUT = Output()
+"""Options for the output of the present command. Each call of the command line resets them."""
+
+
 class _Printable(logging.Formatter):
     """Format log records; control characters of names and files do not reach the terminal."""
 

@@ -236,15 +236,29 @@ def test_options_of_one_call_do_not_reach_the_next(capfd):
     assert found[0]["finding"] in capfd.readouterr().out.splitlines()[0]
 
 
-@pytest.mark.parametrize("name", sorted(typer.main.get_command(commands.app).commands))
+def known_commands():
+    """Each command by its name, those of a group by both names."""
+    found = {}
+    for name, command in typer.main.get_command(commands.app).commands.items():
+        inner = getattr(command, "commands", None)
+        found |= {name: command} if inner is None else {f"{name} {own}": inner[own] for own in inner}
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(known_commands()))
 def test_help_shows_examples_that_the_parser_takes(name, capfd, monkeypatch):
-    assert commands.call([name, "--help"]) == 0
+    names = name.split()
+    assert commands.call([*names, "--help"]) == 0
     shown = capfd.readouterr().out
     examples = [line.split() for line in shown.split("Examples:")[1].splitlines() if line.strip()]
-    assert examples and all(words[:2] == ["lfpiv", name] for words in examples)
+    assert examples and all(words[: len(names) + 1] == ["lfpiv", *names] for words in examples)
     for _, *words in examples:
-        command = typer.main.get_command(commands.app).commands[name]
-        command.make_context(name, words[1:])  # raises on what it does not know
+        known_commands()[name].make_context(name, words[len(names) :])  # raises on what it does not know
+
+
+def test_a_group_without_command_lists_its_commands(capfd):
+    assert commands.call(["benchmark"]) == 0
+    assert {"list", "make"} <= set(capfd.readouterr().out.split("Commands:")[1].split())
 
 
 def test_the_shell_completes_commands():

@@ -1,0 +1,225 @@
+"""Make cases of the benchmark: images, boards and experiment file in one folder, the truth in it or apart."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv.benchmark import fingerprint
+from lfpiv.benchmark.cases import Case, case_list, case_of, names, public_seed, scene_of
+from lfpiv.benchmark.fingerprint import Fingerprint, Verdict
+from lfpiv.benchmark.grid import (
+    FLOW_FILE,
+    PARTICLES_FILE,
+    flow_truth,
+    measured_numbers,
+    recommended_grid,
+    write_particles,
+)
+from lfpiv.benchmark.readme import README, readme
+from lfpiv.errors import InputError
+from lfpiv.files import write_json, writing
+from lfpiv.progress import Progress, ignore_progress
+from lfpiv.results.datasets import write_dataset
+from lfpiv.simulation.flows import Tracers
+from lfpiv.simulation.scene import Scene
+from lfpiv.simulation.simulator import simulate
+from lfpiv.version import versions
+
+log = logging.getLogger(__name__)
+
+ALL = "all"
+"""Name that stands for all cases that need no further file."""
+
+ABOUT = "benchmark.json"
+"""File of a data set, and of its truth, that says which case it is."""
+
+TRUTH = "truth"
+"""Folder of the truth in that of a data set."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Made:
+    """A made case."""
+
+    case: str
+    """Its name."""
+    folder: Path
+    """Folder of the data set."""
+    truth: Path
+    """Folder of its truth."""
+    verdict: Verdict
+    """Comparison with the recorded fingerprint."""
+    reason: str = ""
+    """Versions of libraries that differ, or why nothing is compared; empty where images and truth are identical."""
+
+
+def make(
+    cases: Sequence[str],
+    out: str | Path,
+    *,
+    truth: str | Path | None = None,
+    seed: int | None = None,
+    tracers: str | Path | None = None,
+    progress: Progress | None = None,
+) -> list[Made]:
+    """Make cases of the benchmark. A case that the folder already holds is kept.
+
+    Parameters
+    ----------
+    cases : sequence of str
+        Names of cases, or "all" for those that need no file of tracers.
+    out : path
+        Folder of the data set; of several cases, the folder in which each has one of its name.
+    truth : path, optional
+        Folder of the truth, for a test in which it is not known; of several cases as `out`. Default: ``truth`` in the
+        data set.
+    seed : int, optional
+        Seed in place of the benchmark's. Nobody who does not know it can make the same images.
+    tracers : path, optional
+        File of tracers for cases that need one.
+    progress : callable, optional
+        Called with (step, finished fraction).
+
+    Returns
+    -------
+    list of Made
+
+    Raises
+    ------
+    InputError
+        If a case is unknown, a file of tracers is missing or unsuitable, or a folder is not empty or not writable.
+    """
+    chosen = _chosen(cases)
+    many = len(chosen) > 1 or ALL in cases
+    scenes = [scene_of(case, seed=seed, tracers=tracers if case.tracers else None) for case in chosen]
+    if tracers is not None and not any(case.tracers for case in chosen):
+        scene_of(chosen[0], tracers=tracers)  # refuses it
+    places = []
+    for case in chosen:
+        folder = Path(out) / case.name if many else Path(out)
+        apart = folder / TRUTH if truth is None else Path(truth) / case.name if many else Path(truth)
+        places.append((folder, apart))
+    report, made = progress or ignore_progress, []
+    for case, scene, (folder, apart) in zip(chosen, scenes, places, strict=True):
+        made.append(_make_or_keep(case, scene, folder, apart, lambda _, done, name=case.name: report(name, done)))
+    return made
+
+
+def _chosen(cases: Sequence[str]) -> list[Case]:
+    """Return the cases of some names, each once, in the order of the list."""
+    known = case_list().case
+    wanted = {case_of(name).name for name in cases if name != ALL}
+    if ALL in cases:
+        wanted |= {case.name for case in known if case.tracers is None}
+    if not wanted:
+        raise InputError(f"expected the name of a case, or {ALL}; found none. The cases are {', '.join(names())}.")
+    return [case for case in known if case.name in wanted]
+
+
+def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress: Progress) -> Made:
+    known = _made_before(case, scene, folder, truth)
+    if known is not None:
+        log.info("%s: made before, kept", case.name)
+        return known
+    if truth != folder / TRUTH and folder.resolve() in truth.resolve().parents:
+        raise InputError(f"--truth {truth}: expected a folder outside {folder}, found one in it. Name another one.")
+    for place in (folder, truth):
+        if place.exists() and not (place.is_dir() and not any(place.iterdir())):
+            raise InputError(f"{place}: expected an empty or absent folder to write to, found files. Name another one.")
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        truth.parent.mkdir(parents=True, exist_ok=True)
+        scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        try:
+            made = _write(case, scene, scratch / "data", folder, truth, progress)
+            if truth != folder / TRUTH:
+                _move(scratch / "data" / TRUTH, truth)
+            os.replace(scratch / "data", folder)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+    return made
+
+
+def _move(source: Path, target: Path) -> None:
+    """Move a folder, to another disk too; it appears under its name when it is complete."""
+    near = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        shutil.move(source, near / "truth")
+        os.replace(near / "truth", target)
+    finally:
+        shutil.rmtree(near, ignore_errors=True)
+
+
+def _made_before(case: Case, scene: Scene, folder: Path, truth: Path) -> Made | None:
+    """Return a case that its folders hold complete, with the same seed."""
+    try:
+        about = [json.loads((place / ABOUT).read_text("utf-8")) for place in (folder, truth)]
+    except (OSError, ValueError):
+        return None
+    same = all((one.get("benchmark"), one.get("case")) == (case_list().version, case.name) for one in about)
+    if not same or about[1].get("seed") != scene.seed:
+        return None
+    return Made(case=case.name, folder=folder, truth=truth, verdict=about[1]["verdict"], reason=about[1]["reason"])
+
+
+def _write(case: Case, scene: Scene, data: Path, folder: Path, truth: Path, progress: Progress) -> Made:
+    """Write a data set with its truth into `data`."""
+    simulate(scene, data, progress=progress)
+    inside = data / TRUTH
+    write_dataset(flow_truth(scene), inside / FLOW_FILE)
+    with np.load(inside / "particles.npz") as arrays:
+        write_particles(dict(arrays), inside / PARTICLES_FILE)
+    found = fingerprint.fingerprint_of(data, inside)
+    verdict, reason = _verdict(case, scene, found)
+    public = _about(case, scene) | {"images_sha256": found.images_sha256}
+    write_json(public, data / ABOUT)
+    (data / README).write_text(readme(case, scene), "utf-8")
+    secret = {"seed": scene.seed, "truth_sha256": found.truth_sha256, "verdict": verdict, "reason": reason}
+    write_json(public | secret | {"versions": versions()}, inside / ABOUT)
+    return Made(case=case.name, folder=folder, truth=truth, verdict=verdict, reason=reason)
+
+
+def _about(case: Case, scene: Scene) -> dict[str, Any]:
+    """Return what a data set says of itself, nothing of its truth."""
+    grid = recommended_grid(scene)
+    sequence = scene.particles.instants is not None
+    return {
+        "benchmark": case_list().version,
+        "case": case.name,
+        "purpose": case.purpose,
+        "dt_s": scene.dt_s,
+        "voxel_mm": scene.volume.voxel_mm,
+        "instants" if sequence else "pairs": list(measured_numbers(scene)),
+        "grid": {
+            "window_mm": grid.window_mm,
+            "spacing_mm": grid.spacing_mm,
+            "x_mm": grid.x,
+            "y_mm": grid.y,
+            "z_mm": grid.z,
+        },
+    }
+
+
+def _verdict(case: Case, scene: Scene, found: Fingerprint) -> tuple[Verdict, str]:
+    """Compare a made case with its recorded fingerprint."""
+    record = fingerprint.record()
+    if case.name not in record.cases:
+        return "not compared", "no fingerprint is recorded"
+    if scene.seed != public_seed(case):
+        return "not compared", "the seed is another one"
+    if case.tracers is not None and isinstance(scene.flow, Tracers):
+        if hashlib.sha256(Path(scene.flow.file).read_bytes()).hexdigest() != case.tracers.sha256:
+            return "not compared", "the file of tracers is another one"
+    verdict = fingerprint.compare(found, record.cases[case.name])
+    return verdict, "" if verdict == "identical" else fingerprint.other_versions(record.versions)
