@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from lfpiv.benchmark.grid import WINDOW_VOXEL
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import Grid
 from lfpiv.simulation.flows import average_truth, window_mean
@@ -18,8 +19,6 @@ from lfpiv.simulation.scene import Scene
 
 FOLDER = "truth"
 """Folder of the truth in a data set."""
-WINDOW_VOXEL = 12
-"""Edge of the reference window [voxel]. A result is scored where such a window lies in the volume."""
 SAMPLES = 40
 """Sample points of the measurable region along its longest edge."""
 FLOW, PARTICLES = "the flow", "true particles"
@@ -72,7 +71,10 @@ class Truth:
 
     @cached_property
     def reference_window_mm(self) -> Point:
-        """Edges (x, y, z) of the reference window, at most half of the volume's [mm]."""
+        """Edges (x, y, z) of the reference window, at most half of the volume's [mm].
+
+        It is that of the recommended grid. A result is scored where such a window lies in the volume.
+        """
         x, y, z = (min(WINDOW_VOXEL * self.voxel_mm, size / 2) for size in self.scene.volume.size_mm)
         return x, y, z
 
