@@ -17,8 +17,6 @@ MATCH_VOXEL = 1.0
 """Largest distance of a found particle from the true one that it is [voxel]."""
 BLOB_VOXEL = 0.7
 """Standard deviation of the blobs of the true volume [voxel]."""
-SOLENOIDAL = 0.1
-"""Largest rms divergence of the truth, relative to the rms of its gradient, at which the divergence is stated."""
 
 PIV4 = "kahler2016"
 LPT = "sciacchitano2021"
@@ -161,8 +159,9 @@ VECTOR_FIGURES = (
         key="divergence",
         title="divergence",
         unit="%",
-        text="Root mean square of the divergence of the displacement by central differences on the result's lattice, "
-        "where all neighbours are kept. Stated where the truth is free of divergence.",
+        text="Root mean square of the divergence of the measured displacement less that of the true one, by central "
+        "differences on the result's lattice where all neighbours are kept. In a flow without divergence that of the "
+        "measured displacement.",
         source=DIVERGENCE,
     ),
     Figure(

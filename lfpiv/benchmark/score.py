@@ -240,20 +240,20 @@ def _mean_of(values: Sequence[float]) -> Estimate:
 
 
 def _particle_figures(truth: Truth, fields: Mapping[int, MeasuredField], numbers: Sequence[int]) -> dict[str, Estimate]:
-    """Match found particles in the volume with true ones, one to one. Those just outside are no false particles."""
+    """Match found particles with true ones, one to one. Found and false are counted of those in the volume."""
     rows: dict[str, list[float]] = {}
     for number in numbers:
         true, found = truth.particles(number), np.empty((0, 3))
         moved = found
         if number in fields:
-            kept = fields[number].kept.copy()
-            kept[kept] = truth.inside(fields[number].positions_mm[kept])
+            kept = fields[number].kept
             found, moved = fields[number].positions_mm[kept], fields[number].displacement_mm[kept]
         pairs = metrics.match_particles(found, true.positions_mm, figures.MATCH_VOXEL * truth.voxel_mm)
         inside = truth.inside(true.positions_mm)
         row = {"found": float(inside[pairs[:, 1]].sum() / max(inside.sum(), 1))}
-        if len(found):
-            row["false"] = 1 - len(pairs) / len(found)
+        within = truth.inside(found)
+        if within.any():
+            row["false"] = 1 - float(within[pairs[:, 0]].sum() / within.sum())
         if len(pairs):
             away = (found[pairs[:, 0]] - true.positions_mm[pairs[:, 1]]) / truth.voxel_mm
             off = (moved[pairs[:, 0]] - true.displacement_mm[pairs[:, 1]]) / truth.voxel_mm

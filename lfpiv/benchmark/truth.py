@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -188,7 +189,7 @@ def open_truth(folder: str | Path) -> Truth:
         scene = Scene.model_validate(json.loads(spec.read_text("utf-8")))
         with np.load(particles, allow_pickle=False) as stored:
             numbers = tuple(sorted({_number(name) for name in stored.files if name.endswith("_displacement_mm")}))
-    except (ValidationError, ValueError, OSError, EOFError) as error:
+    except (ValidationError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{place}: expected the truth of a simulated data set, found it damaged ({text}).") from None
     if not numbers:
