@@ -6,6 +6,8 @@ OpenPIV correlates slices of this software's volumes. It is GPL and optional: it
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -29,10 +31,10 @@ from lfpiv.weights.operator import Weights, build_weights
 
 Volumes = tuple[xr.DataArray, xr.DataArray]
 PAPER_ITERATIONS = 10
-OPENPIV_WINDOW, OPENPIV_SEARCH = 12, 24
-"""Edge of OpenPIV's windows and of its search areas, and thickness of its slices [voxel]."""
-OPENPIV_LEAST_RATIO = 1.2
-"""Least ratio of the highest peak to the second one of a valid vector of OpenPIV."""
+OPENPIV_WINDOWS = (24, 12, 12)
+"""Edges of OpenPIV's windows; the last is the thickness of its slices too [voxel]."""
+OPENPIV_PADDING = 3
+"""Dark margin of the slices [half windows]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,21 +115,20 @@ def correlated(case: Prepared, volumes: Volumes) -> xr.Dataset:
 def by_openpiv(case: Prepared, volumes: Volumes) -> xr.Dataset:
     """Correlate slices of volumes by OpenPIV: u and v in slices along z, w in slices along y.
 
-    A slice is the sum over as many layers as a window is wide. Windows of the first frame are sought in the search
-    areas of the second one.
+    A slice is the sum over as many layers as a window is wide. Windows are deformed in the last two passes.
     """
     first, second = (volume.values.astype(float) for volume in volumes)
-    step = OPENPIV_WINDOW // 2
-    counts = [1 + (size - OPENPIV_WINDOW) // step for size in first.shape]
+    step = OPENPIV_WINDOWS[-1] // 2
+    counts = [1 + (size - OPENPIV_WINDOWS[-1]) // step for size in first.shape]
     moved = np.full((*counts, 3), np.nan)
     valid = np.ones(tuple(counts), bool)
     for number in range(counts[0]):
-        layers = slice(number * step, number * step + OPENPIV_WINDOW)
+        layers = slice(number * step, number * step + OPENPIV_WINDOWS[-1])
         across, down, good = _planar(first[layers].sum(0), second[layers].sum(0))
         moved[number, ..., 0], moved[number, ..., 1] = across, down
         valid[number] &= good
     for number in range(counts[1]):
-        layers = slice(number * step, number * step + OPENPIV_WINDOW)
+        layers = slice(number * step, number * step + OPENPIV_WINDOWS[-1])
         _, down, good = _planar(first[:, layers].sum(1), second[:, layers].sum(1))
         moved[:, number, :, 2] = down
         valid[:, number] &= good
@@ -142,21 +143,20 @@ def by_openpiv(case: Prepared, volumes: Volumes) -> xr.Dataset:
 
 
 def _planar(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return displacements along columns and rows [pixel], rows upwards in the array, and which are valid."""
-    from openpiv import pyprocess
+    """Return displacements along columns and rows [pixel], and which are valid, at centres half a window apart."""
+    from openpiv import windef
+    from openpiv.settings import PIVSettings
 
-    pad = (OPENPIV_SEARCH - OPENPIV_WINDOW) // 2
-    across, up, ratio = pyprocess.extended_search_area_piv(
-        np.pad(first, pad),
-        np.pad(second, pad),
-        window_size=OPENPIV_WINDOW,
-        overlap=OPENPIV_WINDOW // 2,
-        search_area_size=OPENPIV_SEARCH,
-        sig2noise_method="peak2peak",
-        normalized_correlation=True,
-    )
-    across, down = np.asarray(across, float), -np.asarray(up, float)  # OpenPIV's v points against the rows
-    good = np.isfinite(across) & np.isfinite(down) & (np.asarray(ratio) > OPENPIV_LEAST_RATIO)
+    step, settings = OPENPIV_WINDOWS[-1] // 2, PIVSettings()
+    settings.windowsizes, settings.overlap = OPENPIV_WINDOWS, tuple(edge // 2 for edge in OPENPIV_WINDOWS)
+    settings.num_iterations = len(OPENPIV_WINDOWS)
+    around = OPENPIV_PADDING * step  # dark pixels, so that the first pass has enough windows for its spline
+    images = [np.pad(image, around).astype(np.float32) for image in (first, second)]
+    with contextlib.redirect_stdout(io.StringIO()):  # its validation prints
+        _, _, across, up, flags = windef.simple_multipass(*images, settings)
+    inner = (slice(OPENPIV_PADDING, -OPENPIV_PADDING),) * 2
+    across, down = np.asarray(across, float)[inner], -np.asarray(up, float)[inner]  # its v points against the rows
+    good = np.isfinite(across) & np.isfinite(down) & ~np.asarray(flags, bool)[inner]
     return across, down, good
 
 
@@ -185,7 +185,7 @@ def measure(case: Prepared, method: str, pair: int, folder: Path, volumes: Volum
     names = [name for name in ("u", "v", "w", "valid") if name in vectors]
     names += [f"uncertainty_{axis}" for axis in "xyz" if f"uncertainty_{axis}" in vectors]
     kept = vectors[names].drop_attrs(deep=False)
-    edge = OPENPIV_WINDOW * case.grid.voxel_mm
+    edge = OPENPIV_WINDOWS[-1] * case.grid.voxel_mm
     if "settings" in vectors.attrs:
         edge = _window_mm(vectors)
     about = {"voxel_mm": case.grid.voxel_mm, "window_mm": edge, "pair": pair, "seconds": seconds}

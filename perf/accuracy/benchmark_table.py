@@ -2,8 +2,8 @@
 
     python perf/accuracy/benchmark_table.py --out docs/figures/benchmark.json [--cases base,shear] [--methods lfpiv]
 
-Cases and calibrations stay in the folder of `--cache`. A row that the file has is replaced if it is measured anew;
-others are kept. Every method writes NetCDF files, which `lfpiv benchmark score` reads.
+Cases, calibrations and results stay in the folder of `--cache` and are not made again: take another folder for other
+code. A row that the file has is replaced if it is scored anew; others are kept. Every method writes NetCDF files, which `lfpiv benchmark score` reads.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ KEPT = (
 """Figures that are stored."""
 
 
-def measure_case(name: str, methods: Sequence[str], cache: Path) -> list[dict[str, Any]]:
-    """Measure a case by several methods; return a row of each."""
+def measure_case(name: str, methods: Sequence[str], cache: Path, pairs: int) -> list[dict[str, Any]]:
+    """Measure the first pairs of a case by several methods; return a row of each."""
     folder = cache / name
     make([name], folder / "data")
     truth = open_truth(folder / "data")
@@ -52,19 +52,21 @@ def measure_case(name: str, methods: Sequence[str], cache: Path) -> list[dict[st
     rows = []
     for method in methods:
         out = folder / method
-        for pair in truth.numbers:
-            shared = case.rig.volumes(pair) if method == "openpiv" else None
-            measure(case, method, pair, out, shared)
-        rows.append(row_of(name, method, score_method(folder, method)))
+        for pair in truth.numbers[:pairs]:
+            if not (out / "vectors" / f"pair_{pair:04d}.nc").exists():
+                shared = case.rig.volumes(pair) if method == "openpiv" else None
+                measure(case, method, pair, out, shared)
+        rows.append(row_of(name, method, score_method(folder, method, pairs)))
         print(rows[-1]["case"], method, {key: rows[-1]["figures"][key]["value"] for key in KEPT[:9]}, flush=True)
     return rows
 
 
-def score_method(folder: Path, method: str) -> Score:
+def score_method(folder: Path, method: str, pairs: int) -> Score:
     """Score what a method wrote, as `lfpiv benchmark score` does."""
     out = folder / method
     volumes = out / "volumes" if (out / "volumes").is_dir() else None
-    (score,) = score_results(folder / "data", [out], ScoreOptions(volumes=volumes), labels=[METHODS[method][0]])
+    options = ScoreOptions(volumes=volumes, pairs=(0, pairs))
+    (score,) = score_results(folder / "data", [out], options, labels=[METHODS[method][0]])
     return score
 
 
@@ -77,6 +79,7 @@ def row_of(name: str, method: str, score: Score) -> dict[str, Any]:
         "varies": case_of(name).varies,
         "method": method,
         "label": METHODS[method][0],
+        "pairs": len(score.instants),
         "figures": {key: figures[key] for key in KEPT if key in figures},
         "curve": {"part": np.round(CURVE, 3).tolist(), "error": curve},
     }
@@ -88,6 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="JSON file of the rows")
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--pairs", type=int, default=3, help="first pairs of each case that are measured")
     parser.add_argument("--cache", type=Path, default=CACHE, help="folder of cases and results")
     options = parser.parse_args(arguments)
     methods = options.methods.split(",")
@@ -97,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stored = json.loads(options.out.read_text("utf-8")) if options.out.exists() else {"rows": []}
     rows = {(row["case"], row["method"]): row for row in stored["rows"]}
     for name in options.cases.split(","):
-        for row in measure_case(name, methods, options.cache):
+        for row in measure_case(name, methods, options.cache, options.pairs):
             rows[row["case"], row["method"]] = row
         table = {"benchmark": case_list().version, "rows": list(rows.values())}
         files.write_json(files.plain(table), options.out)
