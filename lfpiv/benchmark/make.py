@@ -18,7 +18,7 @@ import numpy as np
 from lfpiv.benchmark import fingerprint
 from lfpiv.benchmark.cases import Case, case_list, case_of, names, public_seed, scene_of
 from lfpiv.benchmark.fingerprint import Fingerprint, Verdict
-from lfpiv.benchmark.grid import (
+from lfpiv.benchmark.plain_truth import (
     FLOW_FILE,
     PARTICLES_FILE,
     flow_truth,

@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 
 from lfpiv.benchmark.cases import Case, case_list
-from lfpiv.benchmark.grid import measured_numbers, recommended_grid
+from lfpiv.benchmark.plain_truth import measured_numbers, recommended_grid
 from lfpiv.simulation.scene import Scene
 from lfpiv.version import __version__
 

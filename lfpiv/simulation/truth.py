@@ -49,7 +49,7 @@ def write_scene(scene: Scene, placed: Sequence[LitParticles | SeriesInstant], fo
     folder : Path
         Existing folder.
     """
-    np.savez_compressed(folder / "particles.npz", **_particles(scene, placed))
+    np.savez_compressed(folder / "particles.npz", **particle_arrays(scene, placed))
     spec = scene.model_dump(mode="json", exclude={"smart", "correlation", "network", "compute"}, exclude_none=True)
     (folder / "spec.json").write_text(json.dumps(spec, indent=1) + "\n", "utf-8")
     board = board_truth(scene)
@@ -59,8 +59,21 @@ def write_scene(scene: Scene, placed: Sequence[LitParticles | SeriesInstant], fo
         np.savez_compressed(folder / "walls.npz", **_walls(scene))
 
 
-def _particles(scene: Scene, placed: Sequence[LitParticles | SeriesInstant]) -> dict[str, Any]:
-    """Return the arrays of the particles."""
+def particle_arrays(scene: Scene, placed: Sequence[LitParticles | SeriesInstant]) -> dict[str, Any]:
+    """Return the arrays of ``truth/particles.npz``.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    placed : sequence of LitParticles or SeriesInstant
+        Particles of each pair, or of each instant of a series.
+
+    Returns
+    -------
+    dict
+        Arrays by their names.
+    """
     arrays: dict[str, Any] = {}
     for number, one in enumerate(placed):
         if isinstance(one, SeriesInstant):

@@ -1,4 +1,4 @@
-"""Recommended grid of a case's vectors, and its truth in forms that need no program of ours: NetCDF and CSV."""
+"""Truth of a case in plain form: particles as CSV, and the flow as NetCDF on the recommended grid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ import xarray as xr
 
 from lfpiv.experiment.bounds import Point
 from lfpiv.simulation.flows import window_mean
+from lfpiv.simulation.particles import lit_particles
 from lfpiv.simulation.scene import Scene
+from lfpiv.simulation.series import place_series
+from lfpiv.simulation.truth import particle_arrays
 
 WINDOW_VOXEL, SPACING_VOXEL = 12, 6
 """Edge of the windows and spacing of the vectors [voxel]."""
@@ -63,6 +66,14 @@ def measured_numbers(scene: Scene) -> range:
     if particles.instants is None:
         return range(particles.pairs)
     return range(particles.first, particles.first + particles.instants - particles.step)
+
+
+def true_particles(scene: Scene) -> dict[str, np.ndarray]:
+    """Return the arrays of ``truth/particles.npz`` of a scene, without rendering its images."""
+    particles = scene.particles
+    if particles.instants is not None:
+        return particle_arrays(scene, place_series(scene))
+    return particle_arrays(scene, [lit_particles(scene, pair) for pair in range(particles.pairs)])
 
 
 def flow_truth(scene: Scene) -> xr.Dataset:
