@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,8 +72,9 @@ def read_result(path: str | Path, truth: Truth, options: ReadOptions | None = No
     options = options or ReadOptions()
     fields: dict[int, MeasuredField] = {}
     files = result_files(Path(path))
+    numbers = _numbers(files, truth)
     for file in files:
-        for one in _read_file(file, truth, options, single=len(files) == 1):
+        for one in _read_file(file, truth, options, numbers.get(file)):
             if one.number in fields:
                 raise InputError(f"{file}: expected each {truth.noun} once, found {one.number} a second time.")
             if one.number not in truth.numbers:
@@ -114,6 +115,16 @@ def _number_of(path: Path) -> int | None:
     return int(match[1]) if match else None
 
 
+def _numbers(files: Sequence[Path], truth: Truth) -> dict[Path, int]:
+    """Return the pair of each file by its name; of as many files as pairs that are named otherwise, by their order."""
+    found = {file: number for file in files if (number := _number_of(file)) is not None}
+    if set(found.values()) <= set(truth.numbers) and len(found) == len(files):
+        return found
+    if len(files) == len(truth.numbers):
+        return dict(zip(files, truth.numbers, strict=True))
+    return {} if len(files) == 1 else found
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Columns:
     """Values of a file, one row per vector, with what it says of them."""
@@ -129,8 +140,8 @@ class _Columns:
     of_particles: bool
 
 
-def _read_file(path: Path, truth: Truth, options: ReadOptions, *, single: bool) -> list[MeasuredField]:
-    """Return the vectors of a file, one field for each pair in it."""
+def _read_file(path: Path, truth: Truth, options: ReadOptions, number: int | None) -> list[MeasuredField]:
+    """Return the vectors of a file, one field for each pair in it; `number` is the pair by its name."""
     columns = _read_table(path, options) if path.suffix.lower() in TABLES else _read_netcdf(path, truth, options)
     if names.NUMBER in columns.values:
         of_row = columns.values[names.NUMBER]
@@ -138,22 +149,19 @@ def _read_file(path: Path, truth: Truth, options: ReadOptions, *, single: bool) 
             raise InputError(f"{path}: expected whole numbers in {columns.named[names.NUMBER]!r}, found others.")
         of_row = of_row.astype(int)
     else:
-        of_row = np.full(len(columns.values["x"]), _stated_number(columns, truth, options, single))
-    return [_field(columns, of_row == number, int(number), truth, options) for number in np.unique(of_row)]
+        of_row = np.full(len(columns.values["x"]), _stated_number(columns, truth, options, number))
+    return [_field(columns, of_row == one, int(one), truth, options) for one in np.unique(of_row)]
 
 
-def _stated_number(columns: _Columns, truth: Truth, options: ReadOptions, single: bool) -> int:
+def _stated_number(columns: _Columns, truth: Truth, options: ReadOptions, number: int | None) -> int:
     """Return the number of the pair of a file that holds one pair."""
-    if options.number is not None and single:
+    if options.number is not None:
         return options.number
     for name in ("pair", "instant"):
         if name in columns.attributes:
             return int(np.ravel(columns.attributes[name])[0])
-    number = _number_of(columns.path)
-    if number is not None and (not single or number in truth.numbers):
+    if number is not None:
         return number
-    if len(truth.numbers) == 1:
-        return truth.numbers[0]
     raise InputError(
         f"{columns.path}: expected the number of the {truth.noun}, one of {len(truth.numbers)}, found none. "
         "State it by --number N, in the file's name, or as a variable or attribute `pair`."

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from lfpiv.benchmark.grid import WINDOW_VOXEL
+from lfpiv.benchmark.plain_truth import WINDOW_VOXEL
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import Grid
 from lfpiv.simulation.flows import average_truth, window_mean

@@ -3,7 +3,8 @@
     python perf/accuracy/benchmark_table.py --out docs/figures/benchmark.json [--cases base,shear] [--methods lfpiv]
 
 Cases, calibrations and results stay in the folder of `--cache` and are not made again: take another folder for other
-code. A row that the file has is replaced if it is scored anew; others are kept. Every method writes NetCDF files, which `lfpiv benchmark score` reads.
+code. A row that the file has is replaced if it is scored anew; others are kept. Every method writes NetCDF files, which
+`lfpiv benchmark score` reads.
 """
 
 from __future__ import annotations

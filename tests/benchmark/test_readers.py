@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from support import known_truth
 
-from lfpiv.benchmark.grid import flow_truth
+from lfpiv.benchmark.plain_truth import flow_truth
 from lfpiv.benchmark.readers import ReadOptions, read_result
 from lfpiv.benchmark.score import ScoreOptions, score_results
 from lfpiv.errors import InputError
@@ -171,3 +171,16 @@ def test_bad_files_and_folders_are_refused(truth, tmp_path):
         assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="found both"):
         read_result(tmp_path, truth)
+
+
+def test_files_in_a_folder_are_the_pairs_in_their_order(truth, tmp_path):
+    folder = known_truth.write_pairs(
+        tmp_path / "result", [known_truth.true_vectors(truth, pair) for pair in truth.numbers]
+    )
+    for pair, name in ((1, "run_2.nc"), (0, "run_1.nc")):  # counted from 1
+        (folder / f"pair_{pair:04d}.nc").rename(folder / name)
+    assert error_of(truth, folder) == pytest.approx((0, 1), abs=1e-9)
+    (folder / "run_2.nc").rename(folder / "run_7.nc")
+    (folder / "run_1.nc").unlink()
+    with pytest.raises(InputError, match="number of the pair"):
+        read_result(folder, truth)
