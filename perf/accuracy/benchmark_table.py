@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark_methods import METHODS, measure, prepared
+from benchmark_methods import METHODS, Volumes, measure, prepared
 
 from lfpiv import files
 from lfpiv.benchmark.cases import case_list, case_of
 from lfpiv.benchmark.make import make
 from lfpiv.benchmark.score import CURVE, Score, ScoreOptions, score_results
 from lfpiv.benchmark.truth import open_truth
+from lfpiv.benchmark.volumes import read_volume
 from lfpiv.calibration.camera import load_calibration
 from lfpiv.calibration.cameras import calibrate
 from lfpiv.experiment.opening import open_experiment
@@ -55,11 +56,18 @@ def measure_case(name: str, methods: Sequence[str], cache: Path, pairs: int) -> 
         out = folder / method
         for pair in truth.numbers[:pairs]:
             if not (out / "vectors" / f"pair_{pair:04d}.nc").exists():
-                shared = case.rig.volumes(pair) if method == "openpiv" else None
-                measure(case, method, pair, out, shared)
+                measure(case, method, pair, out, shared_volumes(folder, method, pair))
         rows.append(row_of(name, method, score_method(folder, method, pairs)))
         print(rows[-1]["case"], method, {key: rows[-1]["figures"][key]["value"] for key in KEPT[:9]}, flush=True)
     return rows
+
+
+def shared_volumes(folder: Path, method: str, pair: int) -> Volumes | None:
+    """Return the volumes that a method takes from this software's, measured before; None if it makes its own."""
+    if method != "openpiv":
+        return None
+    first, second = (read_volume(folder / "lfpiv" / "volumes" / f"pair_{pair:04d}_{frame}.nc") for frame in "ab")
+    return first, second
 
 
 def score_method(folder: Path, method: str, pairs: int) -> Score:
