@@ -32,6 +32,7 @@ extensions = [
     "accuracy_plots",
     "drawings",
     "performance_plots",
+    "benchmark_page",
 ]
 exclude_patterns = ["_build", "_ext", "gallery", "generated/extra"]
 nitpicky = True

@@ -453,6 +453,22 @@ def test_plots_of_the_performance_show_every_stored_case():
         assert drawn.startswith("<svg") and not set(re.findall(r"#[0-9a-f]{6}", drawn)), name
 
 
+def test_the_page_of_the_benchmark_shows_every_stored_row_and_figure():
+    page = extension("benchmark_page")
+    rows = page.stored_rows()
+    assert {row["method"] for row in rows} <= page.STYLES.keys()
+    table = page.rows_markdown(rows)
+    assert table.count("\n") == len(rows) + 1 and all(
+        f"{row['figures']['error']['value']:.3f}" in table for row in rows
+    )
+    drawn = page.panels(rows)
+    assert drawn.count("<svg") == len({row["case"] for row in rows}) and not re.search(r"\bnan\b", drawn)
+    assert not set(re.findall(r"#[0-9a-f]{6}", drawn))  # colours are the page's
+    assert page.cases_markdown().count("\n| `") == len(page.case_rows())
+    listed = page.figures_markdown()
+    assert all(figure.text in listed for figure in page.figures.all_figures())
+
+
 def test_pages_show_every_drawing():
     drawings = extension("drawings")
     pages = "".join(page.read_text("utf-8") for page in PAGES.values())

@@ -1,4 +1,4 @@
-"""Commands `lfpiv benchmark ...`: list and make the cases of the light-field PIV benchmark."""
+"""Commands `lfpiv benchmark ...`: list and make the cases of the light-field PIV benchmark, and score results."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lfpiv.cli import terminal
+from lfpiv.cli import benchmark_score, terminal
 
 GROUP = typer.Typer(
     help="The light-field PIV benchmark: cases with known truth, for any program.",
@@ -73,6 +73,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], tuple[str, ...]]] = {
             "lfpiv benchmark make sequence-dns --out dns --tracers rayleigh_benard_series.npz",
         ),
     ),
+    "score": (benchmark_score.score, benchmark_score.EXAMPLES),
 }
 """Name -> function and examples of each command of the group."""
 

@@ -122,7 +122,7 @@ def _run(
 
     A pair or instant that fails is left out and named; then the exit status is 3, as where no vector is valid.
     """
-    selected = _parse_pairs(pairs)
+    selected = terminal.parse_pairs(pairs)
     with _output.progress() as progress:
         from lfpiv.runs import unchanged
 
@@ -192,7 +192,7 @@ def _preview(
 @_command("reconstruct", "lfpiv reconstruct experiment.toml --out results --pairs 0:10")
 def _reconstruct(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", device: Device = None) -> None:
     """Reconstruct volumes into DIR/volumes."""
-    selected = _parse_pairs(pairs)
+    selected = terminal.parse_pairs(pairs)
     with _output.progress() as progress:
         from lfpiv.runs import pipeline
 
@@ -204,7 +204,7 @@ def _reconstruct(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", devic
 @_command("correlate", "lfpiv correlate experiment.toml --out results --pairs 0:10")
 def _correlate(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", device: Device = None) -> None:
     """Correlate the volumes in DIR/volumes into vectors."""
-    selected = _parse_pairs(pairs)
+    selected = terminal.parse_pairs(pairs)
     with _output.progress() as progress:
         from lfpiv.runs import pipeline
 
@@ -251,7 +251,7 @@ def _export(
     ] = None,
 ) -> None:
     """Write the vectors of a run for other programs: ParaView, xarray, spreadsheets, pivpy."""
-    selected = _parse_pairs(pairs)
+    selected = terminal.parse_pairs(pairs)
     with _output.progress() as progress:
         from lfpiv.results.export import export_results
 
@@ -373,16 +373,6 @@ def _fail(status: int, message: str, error: BaseException | None) -> int:
 
 def _terminate(signum: int, frame: Any) -> None:
     raise KeyboardInterrupt
-
-
-def _parse_pairs(text: str) -> tuple[int, int | None]:
-    first, colon, after = text.partition(":")
-    try:
-        if not colon:
-            return int(first), int(first) + 1
-        return int(first or 0), int(after) if after else None
-    except ValueError:
-        raise InputError(f"--pairs: expected A:B, or one number, in whole numbers, found {text!r}.") from None
 
 
 def _end(summary: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from lfpiv.errors import printable
+from lfpiv.errors import InputError, printable
 from lfpiv.progress import Progress
 from lfpiv.warn import name_pairs
 
@@ -143,6 +143,17 @@ def _log_lines() -> Progress:
             last[step] = now
 
     return update
+
+
+def parse_pairs(text: str) -> tuple[int, int | None]:
+    """Return the first pair and the one behind the last of A:B, of which either may be left out, or of one number."""
+    first, colon, after = text.partition(":")
+    try:
+        if not colon:
+            return int(first), int(first) + 1
+        return int(first or 0), int(after) if after else None
+    except ValueError:
+        raise InputError(f"--pairs: expected A:B, or one number, in whole numbers, found {text!r}.") from None
 
 
 def duration(seconds: float) -> str:

@@ -4,6 +4,16 @@ Equation numbers are the paper's. sigma_nor (Eq. 8) is `lfpiv.calibration.networ
 is in `lfpiv.simulation.swirl`.
 """
 
+from lfpiv.metrics.agreement import (
+    ErrorCurve,
+    LinearResponse,
+    UncertaintyCalibration,
+    error_curve,
+    linear_response,
+    uncertainty_calibration,
+    weighted_quantile,
+)
+from lfpiv.metrics.confidence import RESAMPLES, Estimate, block_bootstrap
 from lfpiv.metrics.images_and_volumes import DotError, dot_error, reconstruction_quality, relative_l2, weight_ssim
 from lfpiv.metrics.particles import (
     ParticleQuality,
@@ -18,21 +28,31 @@ from lfpiv.metrics.particles import (
 from lfpiv.metrics.vector_fields import DisplacementError, displacement_difference, displacement_error, empirical_cdf
 
 __all__ = [
+    "RESAMPLES",
     "DisplacementError",
     "DotError",
+    "ErrorCurve",
+    "Estimate",
+    "LinearResponse",
     "ParticleQuality",
     "Particles",
+    "UncertaintyCalibration",
+    "block_bootstrap",
     "displacement_difference",
     "displacement_error",
     "dot_error",
     "elongation",
     "empirical_cdf",
+    "error_curve",
     "find_particles",
+    "linear_response",
     "match_particles",
     "particle_quality",
     "reconstruction_accuracy",
     "reconstruction_quality",
     "relative_l2",
     "truth_volume",
+    "uncertainty_calibration",
     "weight_ssim",
+    "weighted_quantile",
 ]

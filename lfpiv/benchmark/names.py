@@ -1,0 +1,196 @@
+"""Names and units of quantities in anybody's files: which variable is the velocity along x, and in which unit."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lfpiv.errors import InputError
+
+POSITION, VELOCITY, DISPLACEMENT = ("x", "y", "z"), ("u", "v", "w"), ("dx", "dy", "dz")
+UNCERTAINTY, VALID, NUMBER = ("sx", "sy", "sz"), "valid", "number"
+ROLES = (*POSITION, *VELOCITY, *DISPLACEMENT, *UNCERTAINTY, VALID, NUMBER)
+"""What a variable may be: position, velocity, displacement, standard deviation of either, flag, number of the pair."""
+GROUPS = {"position": POSITION, "velocity": VELOCITY, "displacement": DISPLACEMENT, "uncertainty": UNCERTAINTY}
+"""Names for three roles that share a unit."""
+
+STANDARD_NAMES = {
+    "u": ("sea_water_x_velocity", "x_wind", "eastward_sea_water_velocity", "eastward_wind"),
+    "v": ("sea_water_y_velocity", "y_wind", "northward_sea_water_velocity", "northward_wind"),
+    "w": ("upward_sea_water_velocity", "upward_air_velocity"),
+    "x": ("projection_x_coordinate",),
+    "y": ("projection_y_coordinate",),
+    "z": ("height", "depth", "altitude"),
+}
+"""Names of the CF conventions. There is none for a velocity in any other fluid."""
+
+
+def _along(axis: str) -> dict[str, tuple[str, ...]]:
+    """Return the common names of the quantities along one axis."""
+    u = dict(zip("xyz", "uvw", strict=True))[axis]
+    velocity = (u, f"v{axis}", f"v_{axis}", f"u{axis}", f"velocity_{axis}", f"{axis}_velocity", f"{u}_velocity")
+    displacement = (f"d{axis}", f"displacement_{axis}", f"{axis}_displacement", f"disp_{axis}", f"shift_{axis}")
+    stem = ("uncertainty", "sigma", "std")
+    spread = [f"{one}_{name}" for one in stem for name in (axis, u, f"d{axis}", f"v{axis}")]
+    spread += [f"{u}_{one}" for one in stem]
+    return {
+        axis: (axis, f"{axis}_mm", f"{axis}_m", f"pos_{axis}", f"position_{axis}", f"coord_{axis}"),
+        u: (*velocity, f"vel_{axis}", f"velocity_{u}", f"vel{axis}"),
+        f"d{axis}": (*displacement, f"delta_{axis}", f"delta{axis}"),
+        f"s{axis}": tuple(spread),
+    }
+
+
+COMMON_NAMES: dict[str, tuple[str, ...]] = {
+    **_along("x"),
+    **_along("y"),
+    **_along("z"),
+    VALID: ("valid", "isvalid", "is_valid", "chc"),
+    NUMBER: ("pair", "instant", "pair_number", "instant_number", "image_pair"),
+}
+"""Names that are in use, in small letters."""
+
+_LENGTHS = {
+    1.0: ("mm", "millimetre", "millimeter", "millimetres", "millimeters"),
+    1e3: ("m", "metre", "meter", "metres", "meters"),
+    10.0: ("cm", "centimetre", "centimeter"),
+    1e-3: ("um", "µm", "μm", "micrometre", "micrometer", "micron"),
+}
+LENGTHS_MM = {name: factor for factor, names in _LENGTHS.items() for name in names}
+"""Unit of length -> millimetres."""
+VOXEL_UNITS = ("voxel", "voxels", "vox", "vx")
+_PER_SECOND = re.compile(r"^(.+?)(?:\s*/\s*(?:s|sec|second)|[\s.*·]+s(?:\^|\*\*)?(?:-1|⁻¹))$")
+_TITLE = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
+
+
+def find_names(variables: Mapping[str, Mapping[str, Any]], given: Mapping[str, str], source: str) -> dict[str, str]:
+    """Return which variable has which role.
+
+    A name that is given counts first, then the attribute ``standard_name``, then `COMMON_NAMES`, in small or large
+    letters.
+
+    Parameters
+    ----------
+    variables : mapping
+        Name of a variable -> its attributes.
+    given : mapping
+        Role -> name of a variable.
+    source : str
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If a given name is unknown, two variables could have one role, or a position or a component is missing.
+    """
+    found = {}
+    for role in ROLES:
+        if role in given:
+            if given[role] not in variables:
+                raise InputError(
+                    f"{source}: expected the variable {given[role]!r} of --name {role}, found {_listed(variables)}."
+                )
+            found[role] = given[role]
+            continue
+        fitting = _fitting(role, variables)
+        if len(fitting) > 1:
+            raise InputError(
+                f"{source}: expected one variable for {role}, found {_listed(fitting)}. Choose one by "
+                f"--name {role}=NAME."
+            )
+        if fitting:
+            found[role] = fitting[0]
+    _require(found, POSITION, variables, source)
+    if not any(all(role in found for role in roles) for roles in (VELOCITY, DISPLACEMENT)):
+        _require(found, DISPLACEMENT if any(role in found for role in DISPLACEMENT) else VELOCITY, variables, source)
+    return found
+
+
+def _fitting(role: str, variables: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    standard = STANDARD_NAMES.get(role, ())
+    by_standard = [name for name, about in variables.items() if about.get("standard_name") in standard]
+    if by_standard:
+        return by_standard
+    common = COMMON_NAMES[role]
+    return [name for name in variables if name.lower() in common]
+
+
+def _require(found: Mapping[str, str], roles: Sequence[str], names: Iterable[str], source: str) -> None:
+    for role in roles:
+        if role not in found:
+            quantity = next(group for group, members in GROUPS.items() if role in members)
+            raise InputError(
+                f"{source}: expected the {quantity} {role}, found {_listed(names)}. Name it by --name {role}=NAME."
+            )
+
+
+def _listed(names: Iterable[str]) -> str:
+    names = list(names)
+    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+
+
+def split_title(title: str) -> tuple[str, str | None]:
+    """Return name and unit of a column's title, such as ``x [mm]``, ``x (mm)`` or ``x_mm``; None without a unit."""
+    match = _TITLE.match(title.strip())
+    if match:
+        return match[1].strip(), match[2]
+    name, _, unit = title.strip().rpartition("_")
+    return (name, unit) if name and unit in LENGTHS_MM else (title.strip(), None)
+
+
+def stated_unit(role: str, name: str, attribute: object, given: Mapping[str, str], source: str) -> str:
+    """Return the unit of a variable: the given one for its role or group, or its attribute ``units``.
+
+    Raises
+    ------
+    InputError
+        If neither states it.
+    """
+    group = next((group for group, members in GROUPS.items() if role in members), role)
+    unit = given.get(role) or given.get(group) or attribute
+    if unit is None or not str(unit).strip():
+        raise InputError(f"{source}: expected the unit of {name!r}, found none. State it by --unit {group}=UNIT.")
+    return str(unit).strip()
+
+
+def to_mm(
+    values: np.ndarray, unit: str, source: str, *, dt_s: float | None = None, voxel_mm: float | None = None
+) -> np.ndarray:
+    """Return lengths in millimetres, or velocities times `dt_s`.
+
+    Parameters
+    ----------
+    values : ndarray
+        Numbers in `unit`.
+    unit : str
+        A unit of length; a length per second if `dt_s` is given; or voxels if `voxel_mm` is given.
+    source : str
+        The file and variable, for messages.
+    dt_s : float, optional
+        Time between the two frames [s].
+    voxel_mm : float, optional
+        Edge of a voxel [mm].
+
+    Raises
+    ------
+    InputError
+        If the unit is another.
+
+    Examples
+    --------
+    >>> from lfpiv.benchmark.names import to_mm
+    >>> to_mm(np.array([2.0]), "m s-1", "result.nc", dt_s=1e-4).tolist()
+    [0.2]
+    """
+    per_second = _PER_SECOND.match(unit)
+    if per_second and dt_s is not None and per_second[1].strip() in LENGTHS_MM:
+        return np.asarray(values, float) * LENGTHS_MM[per_second[1].strip()] * dt_s
+    if unit in LENGTHS_MM:
+        return np.asarray(values, float) * LENGTHS_MM[unit]
+    if unit.lower() in VOXEL_UNITS and voxel_mm is not None:
+        return np.asarray(values, float) * voxel_mm
+    known = "mm or m" if dt_s is None else "m/s, mm/s, mm, m or voxel"
+    raise InputError(f"{source}: expected it in {known}, found the unit {unit!r}. State it by --unit.")

@@ -1,0 +1,202 @@
+"""Truth of a simulated data set: its flow and particles, and the region in which a result is scored."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from lfpiv.benchmark.plain_truth import WINDOW_VOXEL
+from lfpiv.errors import InputError
+from lfpiv.geometry.grid import Grid
+from lfpiv.simulation.flows import average_truth, window_mean
+from lfpiv.simulation.scene import Scene
+
+FOLDER = "truth"
+"""Folder of the truth in a data set."""
+SAMPLES = 40
+"""Sample points of the measurable region along its longest edge."""
+FLOW, PARTICLES = "the flow", "true particles"
+"""What a displacement is taken from: the flow itself, or the particles where the flow's file is missing."""
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueParticles:
+    """Particles of one pair midway in time."""
+
+    positions_mm: np.ndarray
+    """Positions (x, y, z) [mm], shape (particle, 3)."""
+    displacement_mm: np.ndarray
+    """Displacements from the first to the second frame [mm], shape (particle, 3)."""
+    intensity: np.ndarray
+    """Intensities relative to the mean, shape (particle,)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Truth:
+    """Truth of a data set, from `open_truth`."""
+
+    scene: Scene
+    folder: Path
+    numbers: tuple[int, ...]
+    """Numbers of the pairs, or of the first instants of a time series."""
+
+    @property
+    def is_series(self) -> bool:
+        """Whether the data set is a time series."""
+        return self.scene.particles.instants is not None
+
+    @property
+    def noun(self) -> str:
+        """Return what a number counts."""
+        return "instant" if self.is_series else "pair"
+
+    @cached_property
+    def grid(self) -> Grid:
+        """Voxels of the volume."""
+        volume = self.scene.volume
+        return Grid.from_extent(centre_mm=volume.centre_mm, size_mm=volume.size_mm, voxel_mm=volume.voxel_mm)
+
+    @property
+    def voxel_mm(self) -> float:
+        """Edge of a voxel [mm]."""
+        return self.grid.voxel_mm
+
+    @cached_property
+    def reference_window_mm(self) -> Point:
+        """Edges (x, y, z) of the reference window, at most half of the volume's [mm].
+
+        It is that of the recommended grid. A result is scored where such a window lies in the volume.
+        """
+        x, y, z = (min(WINDOW_VOXEL * self.voxel_mm, size / 2) for size in self.scene.volume.size_mm)
+        return x, y, z
+
+    def inside(self, points_mm: np.ndarray, margin_windows: float = 0.0) -> np.ndarray:
+        """Return which points (n, 3) lie in the fluid, this many reference windows away from the faces, shape (n,)."""
+        half = np.asarray(self.scene.volume.size_mm) / 2 - margin_windows * np.asarray(self.reference_window_mm)
+        near = np.all(np.abs(points_mm - self.scene.volume.centre_mm) <= half + 1e-6 * self.voxel_mm, axis=1)
+        if self.scene.wall is not None:
+            near[near] = ~self.scene.solid(points_mm[near])
+        fluid: np.ndarray = near
+        return fluid
+
+    @cached_property
+    def samples_mm(self) -> np.ndarray:
+        """Evenly spaced points (n, 3) of the measurable region: half a reference window inside the faces [mm]."""
+        size = np.asarray(self.scene.volume.size_mm) - self.reference_window_mm
+        counts = np.maximum(np.ceil(SAMPLES * size / size.max() - 1e-9), 8).astype(int)
+        axes = [
+            centre + edge * ((np.arange(count) + 0.5) / count - 0.5)
+            for centre, edge, count in zip(self.scene.volume.centre_mm, size, counts, strict=True)
+        ]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        measurable: np.ndarray = points[self.inside(points, 0.5)]
+        return measurable
+
+    def displacement(
+        self, number: int, points_mm: np.ndarray, window_mm: Point | None = None
+    ) -> tuple[np.ndarray, str]:
+        """Return the true displacement at points, and what it is taken from.
+
+        Parameters
+        ----------
+        number : int
+            Pair or instant.
+        points_mm : ndarray, shape (n, 3)
+            Points (x, y, z) midway in time [mm].
+        window_mm : tuple of float, optional
+            Edges (x, y, z) of a window over which the displacement is averaged [mm]. Default: the value at the point.
+
+        Returns
+        -------
+        displacement : ndarray, shape (n, 3)
+            Displacements (x, y, z) [mm]; NaN where they are not known.
+        source : str
+            `FLOW` or `PARTICLES`.
+        """
+        try:
+            flow = self._flow(number)
+        except InputError:  # the file of tracers is not at hand
+            particles = self.particles(number)
+            window = self.reference_window_mm if window_mm is None else window_mm
+            mean = average_truth(particles.positions_mm, particles.displacement_mm, points_mm, window)
+            return mean, PARTICLES
+        if window_mm is None:
+            return np.asarray(flow(points_mm), float), FLOW
+        return window_mean(flow, points_mm, window_mm), FLOW
+
+    def _flow(self, number: int) -> Callable[[np.ndarray], np.ndarray]:
+        flow = self.scene.flow_of(number)
+        flow(np.asarray([self.scene.volume.centre_mm]))  # reads the tracers' file where there is one
+        return flow
+
+    @cached_property
+    def peak_mm(self) -> float:
+        """Largest displacement in the measurable region, over all pairs [mm]."""
+        lengths = [np.linalg.norm(self.displacement(one, self.samples_mm)[0], axis=1) for one in self.numbers]
+        return float(np.nanmax(np.concatenate(lengths)))
+
+    def particles(self, number: int) -> TrueParticles:
+        """Return the particles of a pair midway in time, those in the volume and around it."""
+        kind = f"instant_{number:06d}" if self.is_series else f"pair_{number:04d}"
+        with np.load(self.folder / "particles.npz", allow_pickle=False) as stored:
+            position, displacement = stored[f"{kind}_positions_mm"], stored[f"{kind}_displacement_mm"]
+            intensity = stored[f"{kind}_intensity"]
+        middle = position + displacement / 2 if self.is_series else position
+        return TrueParticles(positions_mm=middle, displacement_mm=displacement, intensity=intensity)
+
+    def frame(self, number: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions (n, 3) [mm] and intensities (n,) of the particles in frame 0 or 1 of a pair."""
+        found = self.particles(number)
+        return found.positions_mm + (frame - 0.5) * found.displacement_mm, found.intensity
+
+
+def open_truth(folder: str | Path) -> Truth:
+    """Open the truth of a simulated data set.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The data set, or its folder `FOLDER`.
+
+    Returns
+    -------
+    Truth
+
+    Raises
+    ------
+    InputError
+        If the folder has no truth, or it is damaged.
+    """
+    given = Path(folder)
+    place = given if (given / "spec.json").is_file() else given / FOLDER
+    spec, particles = place / "spec.json", place / "particles.npz"
+    for path in (spec, particles):
+        if not path.is_file():
+            raise InputError(
+                f"{path}: expected the truth of a simulated data set, found no such file. State the folder of the "
+                "data set, or the one of its truth as --truth."
+            )
+    try:
+        scene = Scene.model_validate(json.loads(spec.read_text("utf-8")))
+        with np.load(particles, allow_pickle=False) as stored:
+            numbers = tuple(sorted({_number(name) for name in stored.files if name.endswith("_displacement_mm")}))
+    except (ValidationError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        text = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{place}: expected the truth of a simulated data set, found it damaged ({text}).") from None
+    if not numbers:
+        raise InputError(f"{particles}: expected particles with displacements, found none.")
+    return Truth(scene=scene, folder=place, numbers=numbers)
+
+
+def _number(name: str) -> int:
+    """Return the number in the name of an array, such as pair_0000_displacement_mm."""
+    return int(name.split("_")[1])
