@@ -173,7 +173,7 @@ def _twice(lines: list[str], number: int) -> str:
 
 
 def _unseen(line: str) -> Iterator[Mistake]:
-    """Characters that look like a blank or like nothing."""
+    """Propose the line without characters that look like a blank or like nothing."""
     for pattern, new, way in ((BLANKS, " ", "Replace it by a blank."), (INVISIBLE, "", "Delete it.")):
         if match := pattern.search(line):
             name = f"{unicodedata.name(match[0])} in place {match.start() + 1}"
@@ -181,7 +181,7 @@ def _unseen(line: str) -> Iterator[Mistake]:
 
 
 def _backslash(line: str) -> Iterator[Mistake]:
-    """A path of Windows in double quotes."""
+    """Propose / in a path of Windows in double quotes."""
     first = next((text for text in _STRING.findall(line) if "\\" in text), None)
     if first is not None:
         slashes = _STRING.sub(lambda text: text[0].replace("\\", "/"), line)
@@ -191,14 +191,14 @@ def _backslash(line: str) -> Iterator[Mistake]:
 
 
 def _comment(line: str) -> Iterator[Mistake]:
-    """A comment of another language."""
+    """Propose # before a comment of another language."""
     match = re.fullmatch(r"(.*?(?:^|\s))(//|%|;|--|!|/\*)\s*([^=]*\S)\s*", line)
     if match:
         yield Mistake("# before a comment", match[2], f"Write # {match[3]}", f"{match[1]}# {match[3]}")
 
 
 def _equals(line: str) -> Iterator[Mistake]:
-    """Another sign than = between key and value, none, or a key with blanks."""
+    """Propose = between key and value, and a key without blanks."""
     match = re.fullmatch(r"(\s*[\w-]+)\s*(:=|==|=>|:)\s*(\S.*)", line)
     if match:
         yield Mistake("= between key and value", match[2], "Write key = value.", f"{match[1]} = {match[3]}")
@@ -212,7 +212,7 @@ def _equals(line: str) -> Iterator[Mistake]:
 
 
 def _brackets(line: str) -> Iterator[Mistake]:
-    """A table whose brackets do not match, or with text behind them."""
+    """Propose a table where its brackets do not match."""
     match = _HEADER.fullmatch(line)
     if match is None or (match["rest"] and match["rest"][0] not in "#]"):
         return
@@ -223,7 +223,7 @@ def _brackets(line: str) -> Iterator[Mistake]:
 
 
 def _value(line: str) -> Iterator[Mistake]:
-    """A value in another form than TOML's."""
+    """Propose a value in TOML's form."""
     match = _STATEMENT.fullmatch(line)
     if match is None:
         return

@@ -96,7 +96,7 @@ def _thousands(value: str, key: str) -> Iterator[Mistake]:
 
 
 def _word_behind(value: str, key: str) -> Iterator[Mistake]:
-    """A unit or another word after a number, such as ``50 mm``."""
+    """Propose a number without the unit or word after it, such as 50 for ``50 mm``."""
     match = _WITH_WORD.fullmatch(value)
     if match is None:
         return
@@ -112,7 +112,7 @@ def _word_behind(value: str, key: str) -> Iterator[Mistake]:
 
 
 def _number_form(value: str, key: str) -> Iterator[Mistake]:
-    """A number that TOML writes otherwise: ``.5``, ``5.``, ``05``, or with signs that are no ASCII characters."""
+    """Propose TOML's form of ``.5``, ``5.``, ``05``, and of signs that are no ASCII characters."""
     plain = unicodedata.normalize("NFKC", value.translate(_DASHES))
     plain = re.sub(r"(?<=[+-])\s+", "", plain)
     match = re.fullmatch(r"([+-]?)(\d*)(?:([.])(\d*))?((?:[eE][+-]?\d+)?)", plain)
@@ -136,7 +136,7 @@ def _calculation(value: str, key: str) -> Iterator[Mistake]:
 
 
 def _word(value: str, key: str) -> Iterator[Mistake]:
-    """A word that other languages know, and text without quotes."""
+    """Propose TOML's form of words that other languages know, and quotes for text."""
     if value.lower() in ("true", "false"):
         yield Mistake("true or false in small letters", value, f"Write {value.lower()}.", value.lower())
     elif value.lower() in ("yes", "no", "on", "off"):
@@ -155,7 +155,7 @@ def _end_mark(value: str, key: str) -> Iterator[Mistake]:
 
 
 def _list_form(value: str, key: str) -> Iterator[Mistake]:
-    """A list in parentheses or braces, without brackets, without commas, or with something behind it."""
+    """Propose a list in brackets, with commas, and with nothing behind it."""
     if value[:1] in ("(", "{") and value[-1:] in (")", "}"):
         mended = f"[{value[1:-1]}]"
         yield Mistake("a list in square brackets", value[0], f"Write {mended}.", mended)
@@ -179,7 +179,7 @@ def _list_form(value: str, key: str) -> Iterator[Mistake]:
 
 
 def _entries(value: str, key: str) -> Iterator[Mistake]:
-    """A list of numbers or words of which some are in another form."""
+    """Propose a list of which each entry is in TOML's form."""
     if not (value.startswith("[") and value.endswith("]")) or any(one in value[1:-1] for one in "[]{}\"'"):
         return
     parts = [part.strip() for part in value[1:-1].split(",")]
