@@ -3,6 +3,7 @@
 import csv
 import json
 import logging
+import os
 import types
 from pathlib import Path
 
@@ -204,7 +205,7 @@ def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(export.os, "replace", full)  # of `export` and of `files`: the last step of every writer
+    monkeypatch.setattr(os, "replace", full)  # the last step of every writer
     for name in ("old", "new"):
         with pytest.raises(StorageError, match=r"(?i)cannot be written: no space left"):
             lfpiv.export_results(folder, to, out=tmp_path / name)
