@@ -89,10 +89,9 @@ def run(
         raise InputError("--workers, --scheduler: expected one of them: a cluster has workers of its own.")
     with open_run(experiment, out, device, progress, pairs) as current:
         read = unchanged.look_at(current.experiment)
-        todo = current.unfinished(volumes=keep_volumes)
-        if todo.ahead():
+        checked = _check(current, current.unfinished(volumes=keep_volumes), workers, scheduler)
+        if checked.failed is None and checked.todo.ahead():
             rig.tell_vectors(current.experiment)
-        checked = _check(current, todo, workers, scheduler)
         calibrated = rig.calibrate(current)
         before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
         if not current.has_light_of(before):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from lfpiv.experiment.settings import DEFAULT_WINDOWS, SMALLEST_WINDOW, Correlation
 from lfpiv.geometry.grid import AXES
 from lfpiv.prompt import times
@@ -38,17 +36,24 @@ def sentence(correlation: Correlation, shape: Triple, voxel_mm: float) -> str:
     )
 
 
-def warnings(correlation: Correlation, shape: Triple) -> Iterator[Warning]:
-    """Yield a warning for each axis along which there are too few vectors for derivatives."""
+def warnings(correlation: Correlation, shape: Triple) -> tuple[Warning, ...]:
+    """Return a warning if there are too few vectors for derivatives along an axis, with windows that give enough."""
     windows = planned(correlation, shape)
-    for axis, count, edge, voxels in reversed(list(zip(AXES, windows.count, windows.window, shape, strict=True))):
-        if count < LEAST_VECTORS:
-            fitting = _fitting(edge, voxels, correlation.overlap)
-            advice = f"a last window of {fitting} voxels or fewer along {axis} has {LEAST_VECTORS}"
-            if fitting is None:
-                advice = f"the volume needs more voxels along {axis} than {voxels}"
-            figures = {"axis": axis, "count": count, "least": LEAST_VECTORS, "advice": advice}
-            yield Warning(code=Code.FEW_VECTORS, figures=figures)
+    axes = reversed(list(zip(AXES, windows.count, windows.window, shape, strict=True)))
+    thin = [(axis, count, edge, voxels) for axis, count, edge, voxels in axes if count < LEAST_VECTORS]
+    if not thin:
+        return ()
+    fitting = {axis: _fitting(edge, voxels, correlation.overlap) for axis, _, edge, voxels in thin}
+    enough = [f"{edge} voxels along {axis}" for axis, edge in fitting.items() if edge is not None]
+    too_small = [f"{voxels} along {axis}" for axis, _, _, voxels in thin if fitting[axis] is None]
+    advice = [f"a last window of at most {', '.join(enough)}"] if enough else []
+    advice += [f"a volume of more voxels than {', '.join(too_small)}"] if too_small else []
+    figures = {
+        "counts": ", ".join(f"{count} along {axis}" for axis, count, _, _ in thin),
+        "least": LEAST_VECTORS,
+        "advice": " and ".join(advice),
+    }
+    return (Warning(code=Code.FEW_VECTORS, figures=figures),)
 
 
 def _fitting(edge: int, voxels: int, overlap: float) -> int | None:

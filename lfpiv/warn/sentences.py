@@ -222,9 +222,9 @@ SENTENCES: Mapping[Code, str] = {
         "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"
     ),
     Code.FEW_VECTORS: (
-        "vectors along {axis}: {count:.0f}, of which derivatives need {least:.0f} along each axis. Report, exports and "
-        "lfpiv.derived are without vorticity, Q-criterion, divergence and strain rate. For them, {advice} "
-        "(correlation.windows, volume.size_mm, volume.voxel_mm)"
+        "few vectors: {counts}; derivatives need {least:.0f} along each axis, so report, exports and lfpiv.derived are "
+        "without vorticity, Q-criterion, divergence and strain rate. They need {advice} (correlation.windows, "
+        "volume.size_mm, volume.voxel_mm)"
     ),
     Code.CROWDED: (
         "the image of a particle overlaps those of {crowding:.2g} others by half or more ({limit:g} is the limit; "

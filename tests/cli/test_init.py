@@ -92,7 +92,7 @@ def test_it_tells_how_many_vectors_a_run_measures(tmp_path, capfd):
     assert "a run measures 9 x 9 x 4 vectors (x, y, z)" in said and "warning" not in said
     assert call(tmp_path / "thin.toml", *EXAMPLE, "--size", "6x6x1.5") == 0
     said = capfd.readouterr().out
-    assert "9 x 9 x 1 vectors" in said and "warning: vectors along z: 1" in said and "vorticity" in said
+    assert "9 x 9 x 1 vectors" in said and "warning: few vectors: 1 along z" in said and "vorticity" in said
 
 
 def test_an_existing_file_is_kept(tmp_path, capfd):
