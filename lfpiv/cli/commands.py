@@ -151,10 +151,11 @@ def _init(
     No image needs to exist yet. The file says where each number is found; an existing one is not overwritten.
     """
     try:
-        missing = init.write_experiment(experiment, answers)
+        written = init.write_experiment(experiment, answers)
     except typer.Abort as error:
         raise typer.Exit(_fail(1, "interrupted; nothing is written.", error)) from None
-    _output.show({"experiment": str(experiment), "missing": missing}, lambda: terminal.print_init(experiment, missing))
+    result = {"experiment": str(experiment), **written._asdict()}
+    _output.show(result, lambda: terminal.print_init(experiment, written))
 
 
 @_command(
@@ -253,13 +254,13 @@ def _export(
     """Write the vectors of a run for other programs: ParaView, xarray, spreadsheets, pivpy."""
     selected = terminal.parse_pairs(pairs)
     with _output.progress() as progress:
-        from lfpiv.results.export import export_results
+        from lfpiv.results.export import export
 
-        written = export_results(
-            folder, to, out=out, pairs=selected, depth_mm=depth, interval_s=interval, progress=progress
-        )
+        done = export(folder, to, out=out, pairs=selected, depth_mm=depth, interval_s=interval, progress=progress)
+    written = done.files
     text = f"export: {written[0]}" if len(written) == 1 else f"export: {len(written)} files in {written[0].parent}"
-    _output.show({"files": [str(path) for path in written]}, lambda: terminal.say(text))
+    left_out = [{"what": list(one.what), "why": one.why} for one in done.left_out]
+    _output.show({"files": [str(path) for path in written], "left_out": left_out}, lambda: terminal.say(text))
 
 
 @_command("simulate", "lfpiv simulate scene.toml --out data")

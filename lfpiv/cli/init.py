@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -243,7 +243,18 @@ def with_options(function: Callable[..., None]) -> Callable[..., None]:
     return function
 
 
-def write_experiment(path: Path, given: Mapping[str, str | None]) -> str:
+class Written(NamedTuple):
+    """What is known of an experiment file that was written."""
+
+    missing: str
+    """What is missing before the experiment can run; empty if nothing is."""
+    vectors: str
+    """How many vectors a run measures."""
+    warnings: tuple[str, ...]
+    """What too few vectors leave out."""
+
+
+def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
     """Write a new experiment file from given answers; on an interactive terminal ask for the others.
 
     Parameters
@@ -255,8 +266,7 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> str:
 
     Returns
     -------
-    str
-        What is missing before the experiment can run; empty if nothing is.
+    Written
 
     Raises
     ------
@@ -268,6 +278,7 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> str:
     from lfpiv.experiment.template import Values, experiment_text
     from lfpiv.experiment.toml import parse, validated
     from lfpiv.files import write_text
+    from lfpiv.velocity import vector_grid
 
     if path.exists():
         raise InputError(f"{path}: expected a new file to write, found one that exists. Name another, or remove it.")
@@ -276,17 +287,20 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> str:
     text = experiment_text(values)
     table = validated(parse(text, path), path, ExperimentTable)
     check_tables(path, table)
-    grid_of(path, table)
+    grid = grid_of(path, table)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(text, path)
     except OSError as error:
         raise InputError(f"{path}: the file cannot be written ({error.strerror}). Name another folder.") from None
+    missing = ""
     try:
         read_experiment(path)
     except InputError as error:
-        return str(error)
-    return ""
+        missing = str(error)
+    vectors = vector_grid.sentence(table.correlation, grid.shape, grid.voxel_mm)
+    warnings = vector_grid.warnings(table.correlation, grid.shape)
+    return Written(missing, vectors, tuple(warning.sentence for warning in warnings))
 
 
 def _answers(given: Mapping[str, str | None], folder: str) -> dict[str, Any]:

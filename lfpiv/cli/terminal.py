@@ -19,6 +19,8 @@ from lfpiv.warn import name_pairs
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from lfpiv.cli.init import Written
+
 log = logging.getLogger("lfpiv")
 
 LOG_EVERY_S = 10.0
@@ -178,11 +180,14 @@ def print_run(summary: dict[str, Any], out: Path) -> None:
     say(f"report: {out / 'report.html'}")
 
 
-def print_init(experiment: Path, missing: str) -> None:
-    """Print where the experiment file is, what is missing, and the next command."""
+def print_init(experiment: Path, written: Written) -> None:
+    """Print where the experiment file is, how many vectors it will give, what is missing, and the next command."""
     say(f"experiment: {experiment}")
-    if missing:
-        say(f"not complete yet: {missing}")
+    say(f"a run measures {written.vectors}")
+    for text in written.warnings:
+        say(f"warning: {text}")
+    if written.missing:
+        say(f"not complete yet: {written.missing}")
     say(f"next: lfpiv run {experiment} --out results")
 
 

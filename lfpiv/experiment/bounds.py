@@ -106,6 +106,9 @@ LONGEST_PART_BYTES = 255
 UNPRINTABLE = ("Cc", "Cs")
 """Categories of Unicode that no name has: control characters and lone surrogates."""
 
+ESCAPED = "\b\f\n\r\t"
+"""Control characters that a path of Windows in double quotes may hold unintended, as ``"raw\\new"`` does."""
+
 
 def _printable(text: str) -> str:
     if any(unicodedata.category(character) in UNPRINTABLE for character in text):
@@ -116,6 +119,8 @@ def _printable(text: str) -> str:
 def _path(text: str) -> str:
     if any(len(part.encode(errors="surrogatepass")) > LONGEST_PART_BYTES for part in text.split("/")):
         raise ValueError(f"names of files and folders of at most {LONGEST_PART_BYTES} bytes")
+    if any(character in ESCAPED for character in text):
+        raise ValueError(r"a path without control characters, which \b, \f, \n, \r and \t in double quotes are; use /")
     return _printable(text)
 
 

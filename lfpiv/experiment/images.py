@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -137,7 +138,8 @@ def _require_file(image: ImagePath, place: str) -> None:
         if isinstance(error, PermissionError):
             raise
         raise InputError(
-            f"{place}: expected an image file, found no such file. Check the path in the experiment file."
+            f"{place}: expected an image file, found no such file. Check the path in the experiment file"
+            f"{_about_backslashes(image.file)}."
         ) from None
     if not stat.S_ISREG(mode):
         found = "a folder" if stat.S_ISDIR(mode) else "a pipe, socket or device"
@@ -147,6 +149,11 @@ def _require_file(image: ImagePath, place: str) -> None:
         raise InputError(
             f"{place}: expected an image file ({', '.join(SUFFIXES)}), found {found}. Convert the image without loss."
         )
+
+
+def _about_backslashes(file: Path) -> str:
+    """Return advice for a path of Windows on another system, where a backslash is a character of a name."""
+    return "; folders are separated by / here, not by a backslash" if "\\" in str(file) and os.sep == "/" else ""
 
 
 def _reader(image: ImagePath) -> Reader:

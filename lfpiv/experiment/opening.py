@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import bounds, images, nominal_checks, scale_checks
+from lfpiv.experiment import bounds, images, nominal_checks, recorded, scale_checks
 from lfpiv.experiment.experiment import CameraSetup, Experiment, board_label, check_shape
 from lfpiv.experiment.mask import solid_voxels
 from lfpiv.experiment.patterns import check_length, check_pattern
@@ -40,9 +40,9 @@ LEAST_BYTES_PER_VOXEL = 64
 def open_experiment(path: str | Path) -> Experiment:
     """Read an experiment file and check all its keys and images.
 
-    White, dark and board images are decoded, and the particle images of up to `CHECKED_PAIRS` pairs, evenly spread, are
-    checked as by `check_pairs`. `lfpiv.run` checks the particle images of all pairs that it does and continues without
-    damaged ones.
+    All pairs must have their images, as folders and headers show. White, dark and board images are decoded, and the
+    particle images of up to `CHECKED_PAIRS` pairs, evenly spread, are checked as by `check_pairs`. `lfpiv.run` checks
+    the particle images of all pairs that it does and continues without damaged ones.
 
     Parameters
     ----------
@@ -60,6 +60,8 @@ def open_experiment(path: str | Path) -> Experiment:
         if a nominal camera certainly sees nothing of the volume.
     """
     experiment = read_experiment(path)
+    if (absent := recorded.missing(experiment)) is not None:
+        raise InputError(absent.message())
     for _, reason in check_pairs(experiment, experiment.spread_pairs(CHECKED_PAIRS)):
         raise InputError(reason)
     return experiment

@@ -6,6 +6,7 @@ A message explains the first problem and names the keys of the others. Missing k
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -24,6 +25,8 @@ MISSING, UNKNOWN = "missing", "extra_forbidden"
 
 _UNITS = {"mm": " mm", "um": " um", "s": " s", "deg": " degrees", "px": " pixels", "gib": " GiB", "voxel": " voxels"}
 """Units in messages by the end of a key."""
+
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 
 Location = tuple[int | str, ...]
 
@@ -91,12 +94,11 @@ class _Place:
             return _kind_expected(problem, model)
         if self.kind == "value_error":
             return f"expected {problem['ctx']['error']}, found {show(found)}."
+        if brackets := _brackets(problem):
+            return brackets
         wanted = list(dict.fromkeys(map(_wanted, self.problems)))
         text = ", ".join(wanted[:-1]) + " or " + wanted[-1] if len(wanted) > 1 else wanted[0]
-        quoted = isinstance(found, str) and all(
-            one["type"] in ("float_type", "int_type", "bool_type") for one in self.problems
-        )
-        return f"expected {text}, found {show(found)}.{' Write it without quotes.' if quoted else ''}"
+        return f"expected {text}, found {show(found)}.{_way(self.problems, found)}"
 
 
 def _places(error: ValidationError, values: Mapping[str, Any]) -> list[_Place]:
@@ -112,6 +114,31 @@ def _places(error: ValidationError, values: Mapping[str, Any]) -> list[_Place]:
     deeper = {location[:length] for location in found for length in range(len(location))}
     places = [_Place(at, some) for at, some in found.items() if not (at in forms and at in deeper)]
     return sorted(places, key=lambda place: place.kind != UNKNOWN)
+
+
+def _brackets(problem: Mapping[str, Any]) -> str:
+    """Return what is wrong with a table in the brackets of several, or the other way round; "" for another problem."""
+    name, found = problem["loc"][-1], problem.get("input")
+    if problem["type"] == "tuple_type" and isinstance(found, Mapping):
+        return f"expected tables in two brackets each, [[{name}]], found one in single brackets. Write [[{name}]]."
+    several = isinstance(found, list) and all(isinstance(one, Mapping) for one in found)
+    if problem["type"] in ("model_type", "model_attributes_type") and several and isinstance(name, str):
+        return f"expected one table in single brackets, [{name}], found two brackets, [[{name}]]. Write [{name}]."
+    return ""
+
+
+def _way(problems: Sequence[Mapping[str, Any]], found: Any) -> str:
+    """Return advice for a number in quotes, and for decimals with a comma in a list."""
+    if isinstance(found, str) and all(one["type"] in ("float_type", "int_type", "bool_type") for one in problems):
+        return " Write it without quotes" + (", with a point." if _DECIMAL_COMMA.fullmatch(found.strip()) else ".")
+    first = problems[0]
+    if (
+        first["type"] == "too_long"
+        and isinstance(found, (list, tuple))
+        and len(found) == 2 * first["ctx"]["max_length"]
+    ):
+        return " A comma separates values: write decimals with a point, such as 0.5."
+    return ""
 
 
 def _follows_from_another(problem: Mapping[str, Any]) -> bool:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import problems
+from lfpiv.experiment import problems, toml_mistakes
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -70,14 +70,19 @@ def validated(values: Mapping[str, Any], path: Path, model: type[Model]) -> Mode
 def read_text(path: Path) -> str:
     """Read a small text file in UTF-8; raise InputError for anything else, such as a pipe, a device or an image."""
     content = _read_bytes(path)
+    if b"\0" in content and content[:2] not in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        found = "bytes of value 0, as UTF-16 text or an image has"
+        raise InputError(f"{path}: expected a TOML text file in UTF-8, found {found}. Save it as UTF-8.")
     try:
         return content.decode("utf-8-sig")  # editors on Windows may write a byte order mark
     except UnicodeDecodeError as error:
         if error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
             found = "UTF-16"
         else:
-            line = error.object[: error.start].count(b"\n") + 1
-            found = f"the byte {error.object[error.start]:#04x} in line {line}, as Latin-1 text or an image has"
+            line = error.object[: error.start].count(b"\n")
+            shown = problems.short(error.object.splitlines()[line].decode("utf-8", "replace").strip())
+            byte = f"the byte {error.object[error.start]:#04x} in line {line + 1}"
+            found = f"{byte}, as Latin-1 text or an image has, `{shown}`"
         raise InputError(f"{path}: expected a TOML text file in UTF-8, found {found}. Save it as UTF-8.") from None
 
 
@@ -116,11 +121,11 @@ def parse(text: str, path: Path) -> dict[str, Any]:
     if _DOTTED.search(text):
         raise InputError(deep)
     try:
-        values = tomllib.loads(text)
+        values = tomllib.loads(text if text.endswith("\n") else text + "\n")  # places in the last line are exact
     except RecursionError:
         raise InputError(deep) from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: expected TOML, found a mistake: {error}.") from None
+        raise InputError(f"{path}: {toml_mistakes.explain(text, error)}") from None
     except ValueError:  # Python refuses to convert some thousand digits
         raise InputError(f"{path}: expected whole numbers below 2^63, found one of thousands of digits.") from None
     level: list[Any] = [values]

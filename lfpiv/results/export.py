@@ -8,28 +8,25 @@ from __future__ import annotations
 import enum
 import logging
 import math
-import os
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from pyevtk.hl import imageToVTK
-from pyevtk.vtk import VtkGroup
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.settings import Series
-from lfpiv.files import state_origin, writing
-from lfpiv.geometry.grid import AXES
+from lfpiv.files import writing
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.records import read_object
-from lfpiv.results import datasets, image_identity, netcdf, particles, provenance, stores
+from lfpiv.results import image_identity, left_out, netcdf, paraview, particles, pivpy_planes, provenance, stores
 from lfpiv.results import tables as csv_tables
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
+from lfpiv.results.left_out import LeftOut
 from lfpiv.results.reader import open_results
-from lfpiv.results.stacked_files import INSTANT, PAIR, TIME_ATTRIBUTES, StackedFiles
+from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
 from lfpiv.velocity import derived
 from lfpiv.version import versions
 
@@ -37,8 +34,6 @@ log = logging.getLogger(__name__)
 
 FOLDER = "export"
 """Default folder of exports inside the folder of the run."""
-
-_MM_PER_M = 1000.0
 
 
 class Format(enum.Enum):
@@ -114,6 +109,67 @@ def export_results(
     >>> (folder / "export" / "pair_0000.csv").read_text().splitlines()[0][:39]
     'x [mm],y [mm],z [mm],u [m/s],v [m/s],w '
     """
+    return export(folder, to, out=out, pairs=pairs, depth_mm=depth_mm, interval_s=interval_s, progress=progress).files
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Files that an export wrote, and what they leave out."""
+
+    files: list[Path]
+    """The files to open: the collections for "vti" and "vtp", otherwise all written files."""
+    left_out: tuple[LeftOut, ...]
+
+
+def export(
+    folder: str | Path,
+    to: str,
+    *,
+    out: str | Path | None = None,
+    pairs: tuple[int, int | None] | None = None,
+    depth_mm: float | None = None,
+    interval_s: float | None = None,
+    progress: Progress | None = None,
+) -> Exported:
+    """Export as `export_results`; return the files together with what they leave out, which is logged too."""
+    form = _checked_form(to, depth_mm, interval_s)
+    tables = _particles(Path(folder), pairs, required=form is Format.VTP)
+    files = StackedFiles(Path(folder), pairs)
+    if interval_s is not None and files.dimension == INSTANT:
+        raise InputError("interval: expected for image pairs only; the times of a time series are known. Leave it out.")
+    results = open_results(folder, pairs=pairs)
+    planes = results["z"].values if depth_mm is None else _nearest(results["z"], depth_mm)
+    target = Path(folder) / FOLDER if out is None else Path(out)
+    unfit = _unfit_volumes(results, _folder(Path(folder), files)) if form is Format.VTI else frozenset()
+    omitted = tuple(left_out.of_export(to.lower(), results, with_particles=bool(tables), unfit_volumes=sorted(unfit)))
+    for one in omitted:
+        log.log(logging.WARNING if one.is_loss else logging.INFO, "%s", one)
+    made = make_writable(target)
+
+    def step(fraction: float) -> None:
+        (progress or ignore_progress)("export", fraction)
+
+    try:
+        with writing(target):
+            if form is Format.VTI:
+                written = _write_vti(results, _folder(Path(folder), files), target, interval_s, step, unfit)
+            elif form in (Format.NETCDF, Format.ZARR):
+                written = _write_stacked(form, files, target, interval_s, step)
+            elif form is Format.CSV:
+                written = _write_tables(results, tables, target, step)
+            elif form is Format.VTP:
+                written = _write_vtp(tables, target, _times_by_number(results, interval_s))
+            else:
+                written = _write_pivpy(results, planes, target, interval_s, step)
+            return Exported(written, omitted)
+    finally:
+        for path in made:
+            if path.is_dir() and not any(path.iterdir()):
+                path.rmdir()
+
+
+def _checked_form(to: str, depth_mm: float | None, interval_s: float | None) -> Format:
+    """Return the format of a name; refuse arguments that do not fit it."""
     try:
         form = Format[to.upper()]
     except (KeyError, AttributeError):
@@ -123,43 +179,7 @@ def export_results(
         raise InputError(f"depth: expected with pivpy only, whose files are planes, found it with {to}. Leave it out.")
     if interval_s is not None and not (math.isfinite(interval_s) and interval_s > 0):
         raise InputError(f"interval: expected a time above 0 s between pairs, found {interval_s!r}.")
-    tables = _particles(Path(folder), pairs, required=form is Format.VTP)
-    files = StackedFiles(Path(folder), pairs)
-    if interval_s is not None and files.dimension == INSTANT:
-        raise InputError("interval: expected for image pairs only; the times of a time series are known. Leave it out.")
-    results = open_results(folder, pairs=pairs)
-    planes = results["z"].values if depth_mm is None else _nearest(results["z"], depth_mm)
-    target = Path(folder) / FOLDER if out is None else Path(out)
-    made = make_writable(target)
-
-    def step(fraction: float) -> None:
-        (progress or ignore_progress)("export", fraction)
-
-    try:
-        with writing(target):
-            if form is Format.VTI:
-                return _write_vti(results, _folder(Path(folder), files), target, interval_s, step)
-            if form in (Format.NETCDF, Format.ZARR):
-                write = stores.write_netcdf if form is Format.NETCDF else stores.write_zarr
-                path = target / ("vectors.nc" if form is Format.NETCDF else "vectors.zarr")
-                write(files, path, {"versions": versions()}, interval_s, step)
-                return [path]
-            if form is Format.CSV:
-                written, of_particles = _write_csv(results, target, step), _write_particle_csv(tables, target)
-                columns = {name: {"units": unit} for name, unit in particles.PARTICLE_UNITS.items()}
-                described = dict.fromkeys(written, csv_tables.columns_of(results))
-                csv_tables.describe(described | dict.fromkeys(of_particles, columns), target)
-                return written + of_particles
-            if form is Format.VTP:
-                times = dict(
-                    zip(results[files.dimension].values.tolist(), _times(results, interval_s).tolist(), strict=True)
-                )
-                return _write_vtp(tables, target, times)
-            return _write_pivpy(results, planes, target, interval_s, step)
-    finally:
-        for path in made:
-            if path.is_dir() and not any(path.iterdir()):
-                path.rmdir()
+    return form
 
 
 def _folder(path: Path, files: StackedFiles) -> Folder:
@@ -189,6 +209,11 @@ def _times(results: xr.Dataset, interval_s: float | None) -> np.ndarray:
     return results["pair"].values * (1.0 if interval_s is None else interval_s)
 
 
+def _times_by_number(results: xr.Dataset, interval_s: float | None) -> dict[int, float]:
+    """Return the time of each pair or instant by its number."""
+    return dict(zip(results[_along(results)].values.tolist(), _times(results, interval_s).tolist(), strict=True))
+
+
 def _along(results: xr.Dataset) -> str:
     """Return the dimension over the results, which is also the first part of the files' names."""
     return INSTANT if INSTANT in results.dims else PAIR
@@ -214,42 +239,45 @@ def _each_pair(results: xr.Dataset, progress: StepProgress) -> Iterator[tuple[in
 
 
 def _write_vti(
-    results: xr.Dataset, folder: Folder, target: Path, interval_s: float | None, progress: StepProgress
+    results: xr.Dataset,
+    folder: Folder,
+    target: Path,
+    interval_s: float | None,
+    progress: StepProgress,
+    unfit: Collection[Path],
 ) -> list[Path]:
-    times = dict(zip(results[_along(results)].values.tolist(), _times(results, interval_s).tolist(), strict=True))
+    times = _times_by_number(results, interval_s)
     collections: dict[str, dict[Path, float]] = {}
-    mismatched: list[Path] = []
     for pair, vectors in _each_pair(results, progress):
         path = target / f"{_stem(results, pair)}.vti"
-        _write_image(_vector_arrays(vectors), vectors, path)
+        paraview.write_image(_vector_arrays(vectors), vectors, path)
         collections.setdefault("vectors", {})[path] = times[pair]
         for frame, name in enumerate(FRAME_NAMES if folder.series is None else FRAME_NAMES[:1]):
             stored = folder.volume(pair, frame)
-            if not stored.is_file():
-                continue
-            if not _same_origin(stored, folder.vectors(pair)):
-                mismatched.append(stored)
+            if not stored.is_file() or stored in unfit:
                 continue
             volume = netcdf.read_volume(stored)
             path = target / f"volume_{pair:04d}_{name}.vti"
             if folder.series is not None:
                 path = target / f"volume_{pair:06d}.vti"
-            _write_image({"intensity": volume.values}, volume, path)
+            paraview.write_image({"intensity": volume.values}, volume, path)
             kind = f"volumes_{name}" if folder.series is None else "volumes"
             collections.setdefault(kind, {})[path] = times[pair]
-    if mismatched:
-        log.warning(
-            "%s%s: not exported, made with other settings or images than the vectors. Run `lfpiv run` with "
-            "--keep-volumes for volumes that fit",
-            mismatched[0],
-            f" and {len(mismatched) - 1} other volumes" if len(mismatched) > 1 else "",
-        )
     written = []
     for name, files in collections.items():
         path = target / f"{name}.pvd"
-        _write_collection(files, path)
+        paraview.write_collection(files, path)
         written.append(path)
     return written
+
+
+def _unfit_volumes(results: xr.Dataset, folder: Folder) -> frozenset[Path]:
+    """Return the stored volumes that were made from other settings or images than the vectors."""
+    frames = range(len(FRAME_NAMES) if folder.series is None else 1)
+    stored = (
+        (pair, folder.volume(pair, frame)) for pair in results[_along(results)].values.tolist() for frame in frames
+    )
+    return frozenset(path for pair, path in stored if path.is_file() and not _same_origin(path, folder.vectors(pair)))
 
 
 def _same_origin(volume: Path, vectors: Path) -> bool:
@@ -265,7 +293,7 @@ def _vector_arrays(vectors: xr.Dataset) -> dict[str, Any]:
         "velocity": tuple(vectors[name].values for name in "uvw"),
         "displacement": tuple(vectors[f"displacement_{axis}"].values for axis in "xyz"),
     }
-    if min(vectors.sizes[axis] for axis in AXES) >= 3:
+    if not left_out.too_few(vectors):
         curl = derived.vorticity(vectors)
         arrays["vorticity"] = tuple(curl[f"vorticity_{axis}"].values for axis in "xyz")
         arrays["q_criterion"] = derived.q_criterion(vectors).values
@@ -275,39 +303,38 @@ def _vector_arrays(vectors: xr.Dataset) -> dict[str, Any]:
     return arrays
 
 
-def _write_image(arrays: dict[str, Any], places: xr.Dataset | xr.DataArray, path: Path) -> None:
-    """Write point data on an even grid [mm] as VTK image data."""
-    axes = [np.asarray(places[axis], float) for axis in "xyz"]
-    steps = [(axis[-1] - axis[0]) / (len(axis) - 1) if len(axis) > 1 else math.nan for axis in axes]
-    single = next((step for step in steps if math.isfinite(step)), 1.0)  # thickness of a single layer
-    spacing = tuple(float(step if math.isfinite(step) else single) for step in steps)
-
-    def ordered(values: np.ndarray) -> np.ndarray:
-        kind = np.uint8 if values.dtype == bool else np.float32
-        return np.ascontiguousarray(values, kind).transpose(2, 1, 0)  # VTK order (x, y, z), x fastest
-
-    points = {
-        name: tuple(map(ordered, item)) if isinstance(item, tuple) else ordered(item) for name, item in arrays.items()
-    }
-    with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as scratch:
-        origin = tuple(float(axis[0]) for axis in axes)
-        written = imageToVTK(str(Path(scratch) / "image"), origin=origin, spacing=spacing, pointData=points)
-        state_origin(Path(written))
-        os.replace(written, path)
-
-
-def _write_collection(files: dict[Path, float], path: Path) -> None:
-    """Write a ParaView collection of files, with relative paths, and their times."""
-    with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as scratch:
-        group = VtkGroup(str(Path(scratch) / "collection"))
-        for file, time in files.items():
-            group.addFile(str(Path(scratch) / file.name), sim_time=time)
-        group.save()
-        state_origin(Path(scratch) / "collection.pvd")
-        os.replace(Path(scratch) / "collection.pvd", path)
-
-
 # -- NetCDF, text, pivpy -----------------------------------------------------------------------------------------------
+
+
+def _write_stacked(
+    form: Format, files: StackedFiles, target: Path, interval_s: float | None, progress: StepProgress
+) -> list[Path]:
+    write = stores.write_netcdf if form is Format.NETCDF else stores.write_zarr
+    path = target / ("vectors.nc" if form is Format.NETCDF else "vectors.zarr")
+    write(files, path, {"versions": versions()}, interval_s, progress)
+    return [path]
+
+
+def _write_tables(results: xr.Dataset, tables: dict[int, Path], target: Path, progress: StepProgress) -> list[Path]:
+    written, of_particles = _write_csv(results, target, progress), _write_particle_csv(tables, target)
+    columns = {name: {"units": unit} for name, unit in particles.PARTICLE_UNITS.items()}
+    described = dict.fromkeys(written, csv_tables.columns_of(results))
+    csv_tables.describe(described | dict.fromkeys(of_particles, columns), target)
+    return written + of_particles
+
+
+def _write_pivpy(
+    results: xr.Dataset, depths: np.ndarray, target: Path, interval_s: float | None, progress: StepProgress
+) -> list[Path]:
+    return pivpy_planes.write_planes(
+        results,
+        depths,
+        target,
+        times=_times(results, interval_s),
+        known_interval=interval_s is not None,
+        files=[f"{_stem(results, number)}.nc" for number in results[_along(results)].values.tolist()],
+        progress=progress,
+    )
 
 
 def _write_csv(results: xr.Dataset, target: Path, progress: StepProgress) -> list[Path]:
@@ -343,52 +370,5 @@ def _write_vtp(tables: dict[int, Path], target: Path, times: dict[int, float]) -
         particles.write_vtp(particles.read_particles(path), written)
         files[written] = times.get(number, float(number))
     collection = target / "particles.pvd"
-    _write_collection(files, collection)
+    paraview.write_collection(files, collection)
     return [collection]
-
-
-def _write_pivpy(
-    results: xr.Dataset, depths: np.ndarray, target: Path, interval_s: float | None, progress: StepProgress
-) -> list[Path]:
-    written = []
-    for number, depth in enumerate(depths):
-        progress(number / len(depths))
-        path = target / f"plane_z{depth:+.3f}mm.nc"
-        datasets.write_dataset(_plane(results.sel(z=depth), interval_s), path)
-        written.append(path)
-    progress(1.0)
-    return written
-
-
-def _plane(results: xr.Dataset, interval_s: float | None) -> xr.Dataset:
-    """Return one plane of vectors in pivpy's form: dims y, x, t, velocities in mm/s because lengths are in mm."""
-    dims, along = ("y", "x", "t"), _along(results)
-    names = {"u": "u", "v": "v", "w": "velocity_z"}  # pivpy keeps derived scalars in w
-    variables: dict[str, Any] = {}
-    for name, variable in names.items():
-        values = results[name].transpose("y", "x", along).values.astype(float) * _MM_PER_M
-        standard = {"standard_name": f"{name}_velocity"} if name == variable else {}
-        text = f"velocity along {derived.COMPONENTS[name]}"
-        variables[variable] = (dims, values, {"units": "mm/s", "long_name": text, **standard})
-    flags = results["valid"].transpose("y", "x", along).values.astype(float)
-    if "masked" in results:
-        flags[results["masked"].transpose("y", "x", along).values] = -1
-    text = "1: measured, 0: replaced, -1: masked"
-    variables["chc"] = (dims, flags, {"standard_name": "validity_flag", "long_name": text})
-    time = {"units": "frame", "long_name": "number of the pair"}
-    if interval_s is not None:
-        time = {"units": "s", "long_name": stores.PAIR_TIME_ATTRIBUTES["long_name"]}
-    elif along == INSTANT:
-        time = {"units": "s", "long_name": TIME_ATTRIBUTES["long_name"]}
-    coordinates = {
-        "x": ("x", results["x"].values, {"units": "mm"}),
-        "y": ("y", results["y"].values, {"units": "mm"}),
-        "t": ("t", _times(results, interval_s).astype(float), time),
-        "z": ((), float(results["z"]), {"units": "mm", "long_name": "depth of the plane"}),
-    }
-    attributes = {
-        "delta_t": float(results.attrs["dt_s"]),
-        "files": [f"{_stem(results, number)}.nc" for number in results[along].values.tolist()],
-        "pivpy_schema_version": "1",
-    }
-    return xr.Dataset(variables, coordinates, attributes)

@@ -90,6 +90,8 @@ def run(
     with open_run(experiment, out, device, progress, pairs) as current:
         read = unchanged.look_at(current.experiment)
         checked = _check(current, current.unfinished(volumes=keep_volumes), workers, scheduler)
+        if checked.failed is None and checked.todo.ahead():
+            rig.tell_vectors(current.experiment)
         calibrated = rig.calibrate(current)
         before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
         if not current.has_light_of(before):
@@ -171,6 +173,8 @@ def correlate(
                 f"{current.folder.volume(first, 0)}: expected the two volumes of {current.experiment.name_of(first)} "
                 "made with the present settings, found none. Run `lfpiv reconstruct` first."
             )
+        if known:
+            rig.tell_vectors(current.experiment)
         calibration = rig.with_standing_light(current, calibrated.calibration)
         work = rig.pair_work(current, None, keep_volumes=False, calibration=calibration)
         done = Invocation(tried=_sequential(current, work, todo))

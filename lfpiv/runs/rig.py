@@ -195,6 +195,16 @@ def prepare(run: Run, board: Calibration) -> tuple[Run, Prepared]:
     return run, Prepared(board=board, calibration=calibration, self_calibration=self_calibration)
 
 
+def tell_vectors(experiment: Experiment) -> None:
+    """Log how many vectors a run will measure along each axis, and what too few of them leave out."""
+    from lfpiv.velocity import vector_grid
+
+    grid, correlation = experiment.grid, experiment.correlation
+    log.info("%s", vector_grid.sentence(correlation, grid.shape, grid.voxel_mm))
+    for warning in vector_grid.warnings(correlation, grid.shape):
+        log.warning("%s", warning.sentence)
+
+
 def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
     """Build the weights and check the cameras by the first pairs of `todo`."""
     from lfpiv.calibration.coverage import require_seen, warn_outside

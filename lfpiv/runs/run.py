@@ -18,6 +18,7 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from lfpiv.errors import InputError
+from lfpiv.experiment import recorded
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
@@ -237,9 +238,11 @@ class Run:
         Raises
         ------
         InputError
-            If the first pair cannot be used and no finished pair shows that the experiment file is right.
+            If more pairs are stated than there are, or if the first pair cannot be used and no finished pair shows that
+            the experiment file is right.
         """
         known = todo.ahead()
+        self._tell_missing(known)
         bad = dict(check_pairs(self.experiment, [pair for pair in known if not self.has_volumes(pair)]))
         whole = todo.whole and len(bad) == len(known)
         if bad and known[0] in bad and not self._has_results():
@@ -257,6 +260,25 @@ class Run:
             names = name_pairs(list(bad), self.experiment.noun)
             log.error("%d %ss have images that cannot be used: %s", len(bad), self.experiment.noun, names)
         return None
+
+    def _tell_missing(self, known: Sequence[int]) -> None:
+        """Refuse a run on pairs beyond the last one with images; log missing images that `known` does not tell of."""
+        absent = recorded.missing(self.experiment)
+        if absent is None:
+            return
+        first, end = self.numbers.start, absent.pairs_at_end
+        beyond = any(pair in self.numbers and not self._is_stored(pair) for pair in end)
+        if beyond or (absent.counts_from_one and first == self.experiment.numbers.start):
+            some = f" To do the {self.experiment.noun}s that are there, use --pairs {first}:{end.start}."
+            raise InputError(absent.message() + (some if beyond and first < end.start else ""))
+        told = set(known)
+        within = (pair for gap in absent.gaps for pair in gap if pair in self.numbers and pair not in told)
+        if end or any(not self._is_stored(pair) for pair in within):
+            log.warning("%s", absent.message())
+
+    def _is_stored(self, pair: int) -> bool:
+        """Return whether there is a file with the vectors of a pair."""
+        return self.folder.vectors(pair).is_file()
 
     def _has_results(self) -> bool:
         """Return whether some pair of the experiment is finished; of many pairs with files the first are examined."""

@@ -32,6 +32,7 @@ from lfpiv.runs.invocation import Calibrated, Invocation
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.runs.refinement import Refinement
+from lfpiv.velocity import vector_grid
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import Code, Gathering, Warning, from_list, gather
 
@@ -300,6 +301,7 @@ def _warnings(
     """Collect all warnings by their sentences, each once."""
     found = [
         *rig_warnings(calibrated.calibration, experiment.grid),
+        *vector_grid.warnings(experiment.correlation, experiment.grid.shape),
         *guard.warnings(experiment, contents.guard),
         *refinement.warnings(experiment, contents.refinement),
         *map(Warning.from_json, weights.get("warnings", ())),

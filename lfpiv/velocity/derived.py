@@ -21,6 +21,9 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES
 
+LEAST_VECTORS = 3
+"""Least number of vectors along an axis for derivatives."""
+
 COMPONENTS = {"u": "x", "v": "y", "w": "z"}
 """Velocity components and the axes they point along."""
 
@@ -225,8 +228,8 @@ def _check(vectors: xr.Dataset) -> None:
     """Raise ValueError if vectors cannot be differentiated."""
     check_velocity(vectors)
     for axis in AXES:
-        if vectors.sizes[axis] < 3:
-            raise ValueError(f"vectors: expected at least 3 along {axis}, found {vectors.sizes[axis]}.")
+        if vectors.sizes[axis] < LEAST_VECTORS:
+            raise ValueError(f"vectors: expected at least {LEAST_VECTORS} along {axis}, found {vectors.sizes[axis]}.")
         steps = np.diff(np.asarray(vectors[axis], float))
         if not ((steps > 0).all() or (steps < 0).all()):
             raise ValueError(f"vectors: expected coordinates {axis} that rise or fall throughout, found others.")

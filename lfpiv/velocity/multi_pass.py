@@ -167,7 +167,7 @@ def correlate_passes(
     reach = peak_reach(first, second, settings.windows[-1])
     coarse = max(settings.overlap, COARSE_OVERLAP)
     overlaps = [coarse] * last + [settings.overlap]
-    windows = _cover(shape, settings.windows[0], overlaps[0])
+    windows = Windows.overlapping(shape, settings.windows[0], overlaps[0])
     volumes, fluid = pair.given(windows.window)
     given = PassInput(
         windows=windows,
@@ -227,15 +227,10 @@ class UndeformedPair:
         return None if self.solid is None else deform.spline_coefficients(self.solid.astype(np.float32))
 
 
-def _cover(shape: Triple, window: Triple, overlap: float) -> Windows:
-    """Return the windows that cover a volume with a given overlap."""
-    return Windows.covering(shape, window, triple(max(1, round(edge * (1 - overlap))) for edge in window))
-
-
 def _deform(pair: UndeformedPair, before: Pass, window: Triple, overlap: float) -> PassInput:
     """Deform both volumes by the field of the pass before, and lay out the windows of the next one."""
     shape = triple(before.given.volumes[0].shape)
-    windows = _cover(shape, window, overlap)
+    windows = Windows.overlapping(shape, window, overlap)
     predictor = Predictor.between(before.given.centres, before.next_guess, shape)
     volumes, fluid = pair.deformed(predictor, window)
     return PassInput(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv.velocity.settings import Triple
-from lfpiv_kernels.correlation.correlate import window_grid
+from lfpiv.velocity.settings import Triple, triple
+from lfpiv_kernels.correlation.plan import window_grid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +28,11 @@ class Windows:
         """Return the windows that cover a volume, with equal margins at both ends."""
         origin, count = window_grid(shape, window, step)
         return cls(window=window, origin=origin, step=step, count=count)
+
+    @classmethod
+    def overlapping(cls, shape: Triple, window: Triple, overlap: float) -> Windows:
+        """Return the windows that cover a volume, each of which shares a part with its neighbours."""
+        return cls.covering(shape, window, triple(max(1, round(edge * (1 - overlap))) for edge in window))
 
     def means(self, values: np.ndarray) -> np.ndarray:
         """Return the mean over each window, shape (z, y, x); of flags the share. `values` has the volume's shape."""

@@ -59,6 +59,7 @@ class Code(enum.Enum):
     NOT_FOLLOWED = "not_followed"
     REPEATED = "repeated"
     UNSEEDED = "unseeded"
+    FEW_VECTORS = "few_vectors"
     CROWDED = "crowded"
     UNLINKED = "unlinked"
     # the run
@@ -219,6 +220,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.UNSEEDED: (
         "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
         "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"
+    ),
+    Code.FEW_VECTORS: (
+        "few vectors: {counts}; derivatives need {least:.0f} along each axis, so report, exports and lfpiv.derived are "
+        "without vorticity, Q-criterion, divergence and strain rate. They need {advice} (correlation.windows, "
+        "volume.size_mm, volume.voxel_mm)"
     ),
     Code.CROWDED: (
         "the image of a particle overlaps those of {crowding:.2g} others by half or more ({limit:g} is the limit; "

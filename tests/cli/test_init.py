@@ -86,6 +86,15 @@ def test_an_experiment_whose_images_exist_is_complete(tiny_experiment, capfd):
     assert [camera.optics for camera in made.cameras] == [camera.optics for camera in given.cameras]
 
 
+def test_it_tells_how_many_vectors_a_run_measures(tmp_path, capfd):
+    assert call(tmp_path / "thick.toml", *EXAMPLE) == 0
+    said = capfd.readouterr().out
+    assert "a run measures 9 x 9 x 4 vectors (x, y, z)" in said and "warning" not in said
+    assert call(tmp_path / "thin.toml", *EXAMPLE, "--size", "6x6x1.5") == 0
+    said = capfd.readouterr().out
+    assert "9 x 9 x 1 vectors" in said and "warning: few vectors: 1 along z" in said and "vorticity" in said
+
+
 def test_an_existing_file_is_kept(tmp_path, capfd):
     path = tmp_path / "experiment.toml"
     path.write_text("mine")

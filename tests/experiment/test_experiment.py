@@ -131,7 +131,7 @@ BAD_KEYS = {
         "centre_mm = [0.0, 0.0, 1000.0]",
         ["volume.centre_mm", "behind the lens"],
     ),
-    "no TOML": ("pairs = 2", "pairs = = 2", ["TOML", "line"]),
+    "no TOML": ("pairs = 2", "pairs = = 2", ["line", "`pairs = = 2`", "expected"]),
     "microlens unit": (
         "microlens_focal_length_mm = 0.8",
         "microlens_focal_length_mm = 800.0",

@@ -3,6 +3,7 @@
 import csv
 import json
 import logging
+import os
 import types
 from pathlib import Path
 
@@ -102,7 +103,8 @@ def test_volumes_of_other_settings_are_not_exported(tmp_path, caplog):
     }
     listed = (tmp_path / "out" / "volumes_b.pvd").read_text()
     assert "volume_0003_b.vti" in listed and "volume_0001_b.vti" not in listed
-    assert "pair_0001_a.nc and 3 other volumes: not exported" in caplog.text and "--keep-volumes" in caplog.text
+    names = "pair_0001_a.nc, pair_0001_b.nc, pair_0002_a.nc, pair_0002_b.nc"
+    assert f"{names}: left out, made with other settings" in caplog.text and "--keep-volumes" in caplog.text
 
 
 def test_one_netcdf_holds_all_pairs(run, tmp_path):
@@ -203,7 +205,7 @@ def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(export.os, "replace", full)  # of `export` and of `files`: the last step of every writer
+    monkeypatch.setattr(os, "replace", full)  # the last step of every writer
     for name in ("old", "new"):
         with pytest.raises(StorageError, match=r"(?i)cannot be written: no space left"):
             lfpiv.export_results(folder, to, out=tmp_path / name)
@@ -234,3 +236,32 @@ def test_the_command_writes_and_prints_the_path(run, tmp_path, capfd):
         assert commands.call(["export", *wrong]) == 2
         message = capfd.readouterr().err
         assert message.count("\n") == 1 and word in message
+
+
+THIN = (2, 5, 1)
+
+
+@pytest.mark.parametrize("to", [form.name.lower() for form in export.Format if form.name != "VTP"])
+def test_what_an_export_leaves_out_is_logged_and_in_the_result(to, tmp_path, capfd):
+    """Everything that a file lacks of the vectors and their derivatives is named, and nothing that it has."""
+    if to == "zarr":
+        pytest.importorskip("zarr")
+    write_run(tmp_path, [0], shape=THIN)
+    assert commands.call(["export", str(tmp_path), "--to", to, "--json"]) == 0
+    said = capfd.readouterr()
+    result = json.loads(said.out)
+    named = {name: one["why"] for one in result["left_out"] for name in one["what"]}
+    if to == "vti":
+        assert set(named) == {"vorticity", "q_criterion"} and "2 along z" in named["vorticity"]
+        assert "1 along x" in named["vorticity"] and "along y" not in named["vorticity"]
+        image = next((tmp_path / "export").glob("*.vti")).read_bytes()
+        assert b"vorticity" not in image and b"velocity" in image
+    elif to == "pivpy":
+        assert set(named) == set(netcdf.VECTOR_UNITS) - {"u", "v", "w", "valid"}
+    else:
+        assert not named
+    assert all(name in said.err for name in named)
+
+
+def test_nothing_is_left_out_of_images_of_enough_vectors(run, tmp_path):
+    assert not export.export(run[0], "vti", out=tmp_path).left_out

@@ -395,3 +395,20 @@ def test_a_bad_image_of_the_calibration_is_bad_input(small_run, tmp_path, capfd)
     damage(plane)
     assert commands.call(["run", str(experiment), "--out", str(tmp_path / "out")]) == 2
     assert Path(plane).name in capfd.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_more_pairs_than_there_are_images_are_refused_before_any_work(small_run, tmp_path, capfd, no_report):
+    """A selection of those that are there is done, with a warning of the others."""
+    experiment, out = small_run.images(tmp_path / "data"), tmp_path / "out"
+    experiment.write_text(experiment.read_text().replace(f"pairs = {PAIRS}", f"pairs = {PAIRS + 3}"))
+    assert commands.call(["run", str(experiment), "--out", str(out)]) == 2
+    (said,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("lfpiv: ")]
+    for words in (f"particles.pairs: expected the images of {PAIRS + 3} pairs", f"found those of {PAIRS}"):
+        assert words in said, said
+    assert f"State particles.pairs = {PAIRS}" in said and f"--pairs 0:{PAIRS}" in said and not out.exists()
+    out = small_run.results(tmp_path / "finished")
+    (out / "vectors" / "pair_0001.nc").unlink()
+    assert commands.call(["run", str(experiment), "--out", str(out), "--pairs", f"0:{PAIRS}"]) == 0
+    said = capfd.readouterr().err
+    assert f"WARNING {experiment}: particles.pairs: expected the images of {PAIRS + 3} pairs" in said
+    assert "vectors (x, y, z)" in said.split("image pairs")[0], "the number of vectors is told before the work"

@@ -39,6 +39,11 @@ def header(image: ImagePath) -> None:
         raise ValueError("the file is empty")
 
 
+def in_order(image: ImagePath) -> bool:
+    """Return whether the images of a file are numbered without gaps: not known before it is decoded."""
+    return False
+
+
 def read(image: ImagePath) -> np.ndarray:
     """Read one frame of a DaVis image buffer.
 

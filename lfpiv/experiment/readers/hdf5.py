@@ -14,7 +14,7 @@ import weakref
 import h5py
 import numpy as np
 
-from lfpiv.experiment.readers.source import Header, ImagePath, NotOneImage, require_plausible
+from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage, require_plausible
 from lfpiv.experiment.readers.stack import OPEN_STACKS, OpenFiles
 
 MOST_LINKS = 16
@@ -54,7 +54,7 @@ class Hdf5Images:
         else:
             found = self._only_dataset()
         if found is None:
-            raise NotOneImage(f"no dataset {name[:80]!r}; name one behind the file, such as #images[0]")
+            raise NoSuchImage(f"no dataset {name[:80]!r}; name one behind the file, such as #images[0]")
         return found, self._number(found, number)
 
     @staticmethod
@@ -71,7 +71,7 @@ class Hdf5Images:
         if number is None and shape[0] != 1:
             raise NotOneImage(f"{shape[0]} images; name one behind the file: #{name}[0] to #{name}[{shape[0] - 1}]")
         if (number or 0) >= shape[0]:
-            raise NotOneImage(f"{shape[0]} images in the dataset {name}, none of number {number}; they count from 0")
+            raise NoSuchImage(f"{shape[0]} images in the dataset {name}, none of number {number}; they count from 0")
         return number or 0
 
     def _dataset(self, name: str) -> h5py.Dataset | None:
@@ -129,6 +129,12 @@ def header(image: ImagePath) -> Header:
     opened = _open_files.get(image, Hdf5Images)  # named, so that it stays open here
     dataset, _ = opened.find(image.part)
     return _checked(dataset)
+
+
+def in_order(image: ImagePath) -> bool:
+    """Return whether an image is one of a dataset of images, which are numbered from 0 without gaps."""
+    opened = _open_files.get(image, Hdf5Images)
+    return opened.find(image.part)[1] is not None
 
 
 def read(image: ImagePath) -> np.ndarray:

@@ -27,6 +27,10 @@ class NotOneImage(Exception):
     """The file holds something other than the one single-channel image asked for; the text names what it holds."""
 
 
+class NoSuchImage(NotOneImage):
+    """The file holds no image of the number or name asked for."""
+
+
 class CannotRead(Exception):
     """The file cannot be read by this installation or with these settings; the text is a sentence and the way out."""
 

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from lfpiv.experiment.readers.source import Header, ImagePath, NotOneImage
+from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage
 
 Opened = TypeVar("Opened")
 
@@ -86,7 +86,7 @@ class Stack(ABC):
         if not (part.isascii() and part.isdigit() and len(part) < 18):
             raise NotOneImage(f"a part called {part[:80]!r}; name one by number, counted from 0 (#0)")
         if not self.holds(int(part)):
-            raise NotOneImage(f"{self._counted()}, none of them #{part}; they count from 0")
+            raise NoSuchImage(f"{self._counted()}, none of them #{part}; they count from 0")
         return int(part)
 
     def _counted(self) -> str:
@@ -164,3 +164,7 @@ class StackReader:
         """Return the pixels of an image."""
         stack = _stacks.get(image, self.open_file)
         return stack.read(stack.number(image.part))
+
+    def in_order(self, image: ImagePath) -> bool:
+        """Return whether the images of the file are numbered from 0 without gaps: they are."""
+        return True

@@ -23,6 +23,9 @@ class Reader(Protocol):
     def header(self, image: ImagePath) -> Header | None:
         """Check an image without decoding it; return its header, None where that takes decoding."""
 
+    def in_order(self, image: ImagePath) -> bool:
+        """Return whether the images of the file are numbered from 0 without gaps."""
+
     def read(self, image: ImagePath) -> np.ndarray:
         """Return the pixels of an image [counts], shape (rows, columns), of the stored type."""
 
