@@ -42,6 +42,9 @@ SHOWN = (
 )
 """Figure, title, factor and decimals of the columns of the table of methods."""
 
+LEAST_TIMED = 2
+"""Least number of pairs whose time is shown: the first one compiles kernels."""
+
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -85,6 +88,8 @@ def rows_markdown(rows: Rows) -> str:
     lines = []
     for row in rows:
         cells = [_cell(row["figures"], key, factor, digits) for key, _, factor, digits in SHOWN]
+        if row["pairs"] < LEAST_TIMED:
+            cells[-1] = "–"
         lines.append((f"`{row['case']}`", STYLES[row["method"]][0], str(row["pairs"]), *cells))
     return markdown_table(("case", "method", "pairs", *(title for _, title, _, _ in SHOWN)), lines)
 

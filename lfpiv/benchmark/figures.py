@@ -192,7 +192,7 @@ VECTOR_FIGURES = (
         unit="voxel",
         text="Root mean square of what is left of the error when that mean is subtracted.",
     ),
-    Figure(key="seconds", title="time", unit="s", text="Computing time of a pair, as stated."),
+    Figure(key="seconds", title="time", unit="s", text="Computing time of a pair, as stated; median of the pairs."),
     Figure(key="memory", title="memory", unit="MiB", text="Largest memory, as stated."),
 )
 """Figures of vectors."""

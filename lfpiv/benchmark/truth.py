@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -18,6 +19,8 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.simulation.flows import average_truth, window_mean
 from lfpiv.simulation.scene import Scene
 
+ABOUT = "benchmark.json"
+"""File in which a case of the benchmark says what it is."""
 FOLDER = "truth"
 """Folder of the truth in a data set."""
 SAMPLES = 40
@@ -48,6 +51,8 @@ class Truth:
     folder: Path
     numbers: tuple[int, ...]
     """Numbers of the pairs, or of the first instants of a time series."""
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """What a case of the benchmark says of itself: version, name, checksums; empty for other data sets."""
 
     @property
     def is_series(self) -> bool:
@@ -159,13 +164,15 @@ class Truth:
         return found.positions_mm + (frame - 0.5) * found.displacement_mm, found.intensity
 
 
-def open_truth(folder: str | Path) -> Truth:
+def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
     """Open the truth of a simulated data set.
 
     Parameters
     ----------
     folder : str or Path
         The data set, or its folder `FOLDER`.
+    apart : str or Path, optional
+        Folder of the truth where the data set does not hold it.
 
     Returns
     -------
@@ -174,9 +181,9 @@ def open_truth(folder: str | Path) -> Truth:
     Raises
     ------
     InputError
-        If the folder has no truth, or it is damaged.
+        If the folder has no truth, it is damaged, or it is that of another case.
     """
-    given = Path(folder)
+    given = Path(folder if apart is None else apart)
     place = given if (given / "spec.json").is_file() else given / FOLDER
     spec, particles = place / "spec.json", place / "particles.npz"
     for path in (spec, particles):
@@ -194,7 +201,22 @@ def open_truth(folder: str | Path) -> Truth:
         raise InputError(f"{place}: expected the truth of a simulated data set, found it damaged ({text}).") from None
     if not numbers:
         raise InputError(f"{particles}: expected particles with displacements, found none.")
-    return Truth(scene=scene, folder=place, numbers=numbers)
+    about, data = _about(place), _about(Path(folder))
+    if apart is not None and about.get("images_sha256") != data.get("images_sha256"):
+        raise InputError(
+            f"{place}: expected the truth of the images in {folder} ({data.get('case', 'of no case')}), found that of "
+            f"others ({about.get('case', 'of no case')})."
+        )
+    return Truth(scene=scene, folder=place, numbers=numbers, about=about)
+
+
+def _about(folder: Path) -> dict[str, Any]:
+    """Return what a case of the benchmark says of itself; nothing for another data set."""
+    try:
+        found = json.loads((folder / ABOUT).read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _number(name: str) -> int:
