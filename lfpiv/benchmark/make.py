@@ -47,6 +47,9 @@ ABOUT = "benchmark.json"
 TRUTH = "truth"
 """Folder of the truth in that of a data set."""
 
+TRACERS = "tracers.npz"
+"""Copy of the file of tracers in a truth."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
@@ -78,7 +81,7 @@ def make(
     Parameters
     ----------
     cases : sequence of str
-        Names of cases, or "all" for those that need no file of tracers.
+        Names of cases, or "all"; without a file of tracers that leaves out the cases that need one.
     out : path
         Folder of the data set; of several cases, the folder in which each has one of its name.
     truth : path, optional
@@ -100,7 +103,7 @@ def make(
     InputError
         If a case is unknown, a file of tracers is missing or unsuitable, or a folder is not empty or not writable.
     """
-    chosen = _chosen(cases)
+    chosen = _chosen(cases, with_tracers=tracers is not None)
     many = len(chosen) > 1 or ALL in cases
     scenes = [scene_of(case, seed=seed, tracers=tracers if case.tracers else None) for case in chosen]
     if tracers is not None and not any(case.tracers for case in chosen):
@@ -110,18 +113,19 @@ def make(
         folder = Path(out) / case.name if many else Path(out)
         apart = folder / TRUTH if truth is None else Path(truth) / case.name if many else Path(truth)
         places.append((folder, apart))
-    report, made = progress or ignore_progress, []
-    for case, scene, (folder, apart) in zip(chosen, scenes, places, strict=True):
-        made.append(_make_or_keep(case, scene, folder, apart, lambda _, done, name=case.name: report(name, done)))
-    return made
+    report = progress or ignore_progress
+    return [
+        _make_or_keep(case, scene, folder, apart, report)
+        for case, scene, (folder, apart) in zip(chosen, scenes, places, strict=True)
+    ]
 
 
-def _chosen(cases: Sequence[str]) -> list[Case]:
+def _chosen(cases: Sequence[str], *, with_tracers: bool) -> list[Case]:
     """Return the cases of some names, each once, in the order of the list."""
     known = case_list().case
     wanted = {case_of(name).name for name in cases if name != ALL}
     if ALL in cases:
-        wanted |= {case.name for case in known if case.tracers is None}
+        wanted |= {case.name for case in known if with_tracers or case.tracers is None}
     if not wanted:
         raise InputError(f"expected the name of a case, or {ALL}; found none. The cases are {', '.join(names())}.")
     return [case for case in known if case.name in wanted]
@@ -132,8 +136,8 @@ def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress:
     if known is not None:
         log.info("%s: made before, kept", case.name)
         return known
-    if truth != folder / TRUTH and folder.resolve() in truth.resolve().parents:
-        raise InputError(f"--truth {truth}: expected a folder outside {folder}, found one in it. Name another one.")
+    if truth != folder / TRUTH and _overlap(folder.resolve(), truth.resolve()):
+        raise InputError(f"--truth {truth}: expected a folder outside {folder}, not around it. Name another one.")
     for place in (folder, truth):
         if place.exists() and not (place.is_dir() and not any(place.iterdir())):
             raise InputError(f"{place}: expected an empty or absent folder to write to, found files. Name another one.")
@@ -142,13 +146,20 @@ def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress:
         truth.parent.mkdir(parents=True, exist_ok=True)
         scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
         try:
-            made = _write(case, scene, scratch / "data", folder, truth, progress)
+            made = _write(case, scene, scratch / "data", folder, truth, lambda _, done: progress(case.name, done))
             if truth != folder / TRUTH:
                 _move(scratch / "data" / TRUTH, truth)
             os.replace(scratch / "data", folder)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
+    if made.verdict == "differs":
+        log.warning("%s: images or truth differ from the recorded ones: %s", case.name, made.reason or "same versions")
     return made
+
+
+def _overlap(one: Path, other: Path) -> bool:
+    """Return whether one of two folders is the other, or lies in it."""
+    return one == other or one in other.parents or other in one.parents
 
 
 def _move(source: Path, target: Path) -> None:
@@ -180,6 +191,8 @@ def _write(case: Case, scene: Scene, data: Path, folder: Path, truth: Path, prog
     write_dataset(flow_truth(scene), inside / FLOW_FILE)
     with np.load(inside / "particles.npz") as arrays:
         write_particles(dict(arrays), inside / PARTICLES_FILE)
+    if isinstance(scene.flow, Tracers):
+        keep_tracers(Path(scene.flow.file), inside)
     found = fingerprint.fingerprint_of(data, inside)
     verdict, reason = _verdict(case, scene, found)
     public = _about(case, scene) | {"images_sha256": found.images_sha256}
@@ -188,6 +201,22 @@ def _write(case: Case, scene: Scene, data: Path, folder: Path, truth: Path, prog
     secret = {"seed": scene.seed, "truth_sha256": found.truth_sha256, "verdict": verdict, "reason": reason}
     write_json(public | secret | {"versions": versions()}, inside / ABOUT)
     return Made(case=case.name, folder=folder, truth=truth, verdict=verdict, reason=reason)
+
+
+def keep_tracers(file: Path, truth: Path) -> None:
+    """Copy a file of tracers into a truth, whose scene then names it relative to its own folder.
+
+    Parameters
+    ----------
+    file : Path
+        The file of tracers.
+    truth : Path
+        Folder of the truth, with ``spec.json``.
+    """
+    shutil.copyfile(file, truth / TRACERS)
+    spec = json.loads((truth / "spec.json").read_text("utf-8"))
+    spec["flow"]["file"] = TRACERS
+    (truth / "spec.json").write_text(json.dumps(spec, indent=1) + "\n", "utf-8")
 
 
 def _about(case: Case, scene: Scene) -> dict[str, Any]:

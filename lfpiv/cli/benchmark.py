@@ -33,9 +33,7 @@ def _list() -> None:
 
 
 def _make(
-    cases: Annotated[
-        list[str], typer.Argument(metavar="CASE", help="Names of cases, or all: those that need no --tracers.")
-    ],
+    cases: Annotated[list[str], typer.Argument(metavar="CASE", help="Names of cases, or all.")],
     out: Annotated[
         Path,
         typer.Option("--out", "-o", metavar="DIR", help="Folder of the case; of several, each has one in it."),

@@ -14,7 +14,7 @@ import tifffile
 import xarray as xr
 
 from lfpiv.benchmark import cases, fingerprint, plain_truth
-from lfpiv.benchmark.make import make
+from lfpiv.benchmark.make import keep_tracers, make
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
 from lfpiv.experiment.opening import open_experiment
@@ -131,6 +131,16 @@ def test_instants_without_partner_have_no_displacement_in_the_table(tmp_path):
     assert rows[0][5] == "0.1000000" and rows[2][5:8] == ["", "", ""]
 
 
+def test_tracers_go_with_the_truth_and_no_path_of_the_machine_does(tmp_path):
+    file, truth = tmp_path / "rayleigh.npz", tmp_path / "truth"
+    np.savez(file, positions=np.zeros((2, 3, 3)))
+    truth.mkdir()
+    (truth / "spec.json").write_text(json.dumps({"name": "dns", "flow": {"kind": "tracers", "file": str(file)}}))
+    keep_tracers(file, truth)
+    assert json.loads((truth / "spec.json").read_text())["flow"] == {"kind": "tracers", "file": "tracers.npz"}
+    assert (truth / "tracers.npz").read_bytes() == file.read_bytes()
+
+
 def test_a_complete_case_is_kept_and_another_is_refused(made):
     before = {path: path.stat().st_mtime_ns for path in made.folder.rglob("*")}
     (again,) = make(["trial"], made.folder, truth=made.truth)
@@ -151,8 +161,9 @@ def test_an_interrupted_case_leaves_nothing(tmp_path):
 
 
 def test_folders_that_cannot_be_are_refused_before_work(tmp_path):
-    with pytest.raises(InputError, match="outside"):
-        make(["trial"], tmp_path / "data", truth=tmp_path / "data" / "secret")
+    for out, truth in (("data", "data/secret"), ("data", "data"), ("secret/data", "secret")):
+        with pytest.raises(InputError, match="outside"):
+            make(["trial"], tmp_path / out, truth=tmp_path / truth)
     with pytest.raises(InputError, match="expected the name of a case, or all"):
         make([], tmp_path / "data")
     with pytest.raises(InputError, match="needs none"):
