@@ -129,6 +129,7 @@ def _panel(case: str, rows: Rows, number: int) -> str:
     axes.set_yscale("log")
     axes.set_ylim(0.01, 10)
     axes.set_yticks((0.01, 0.1, 1.0, 10.0), ("0.01", "0.1", "1", "10"))
+    axes.tick_params(which="minor", colors=svg.INK)
     axes.set_xlim(0, 100)
     svg.style(axes, title=case, xlabel="part of the region [%]", ylabel="error [voxel]", legend=number == 0)
     return svg.to_svg(figure, f"Error not exceeded in a part of the measurable region, case {case}, by each method")

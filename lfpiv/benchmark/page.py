@@ -125,6 +125,7 @@ def completeness_panel(scores: Sequence[Score]) -> str:
     positive = np.concatenate([one.curve.bound[one.curve.bound > 0] for one in scores])
     if len(positive):
         axes.set_yscale("log")
+        axes.tick_params(which="minor", colors=svg.INK)
         axes.set_ylim(max(np.percentile(positive, 1), 1e-4), 1.3 * positive.max())
     svg.style(axes, xlabel="part of the region [%]", ylabel="error [voxel]", legend=len(scores) > 1)
     return svg.to_svg(figure, "Error not exceeded in a part of the measurable region; the table has the numbers")

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from lfpiv.benchmark.plain_truth import WINDOW_VOXEL
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import Grid
-from lfpiv.simulation.flows import average_truth, window_mean
+from lfpiv.simulation.flows import Tracers, average_truth, window_mean
 from lfpiv.simulation.scene import Scene
 
 ABOUT = "benchmark.json"
@@ -195,6 +195,9 @@ def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
             )
     try:
         scene = Scene.model_validate(json.loads(spec.read_text("utf-8")))
+        if isinstance(scene.flow, Tracers):  # an absolute path stays as it is
+            flow = scene.flow.model_copy(update={"file": str(place.absolute() / scene.flow.file)})
+            scene = scene.model_copy(update={"flow": flow})
         with np.load(particles, allow_pickle=False) as stored:
             numbers = tuple(sorted({_number(name) for name in stored.files if name.endswith("_displacement_mm")}))
     except (ValidationError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:

@@ -242,6 +242,8 @@ def test_the_command_prints_a_table_and_writes_page_and_json(truth, tmp_path, ca
     assert "completeness [%]" in shown and "slope z" in shown
     text = page.read_text("utf-8")
     assert text.count("<svg") >= 9 and "Kähler" in text and "<script" not in text
+    drawn = text[text.index("<main>") :]
+    assert "#000000" not in drawn and "nan" not in drawn  # ink is the page's, light or dark
     assert commands.call(["benchmark", "score", data, str(path), "--json", "--out", str(numbers)]) == 0
     printed = json.loads(capfd.readouterr().out)
     assert printed == json.loads(numbers.read_text("utf-8"))
@@ -313,7 +315,10 @@ def test_without_the_file_of_the_flow_the_particles_are_the_truth(tmp_path):
     path = both_pairs(truth, tmp_path / "result")
     assert score_of(truth, path).figures["error"].value < ROUNDING
     spec = tmp_path / "data" / "truth" / "spec.json"
-    spec.write_text(spec.read_text("utf-8").replace("tracers.npz", "absent.npz"), "utf-8")
+    spec.write_text(spec.read_text("utf-8").replace(str(tmp_path / "tracers.npz"), "with_truth.npz"), "utf-8")
+    (tmp_path / "tracers.npz").rename(spec.with_name("with_truth.npz"))
+    assert not any("true particles" in note for note in score_of(open_truth(tmp_path / "data"), path).notes)
+    spec.write_text(spec.read_text("utf-8").replace("with_truth.npz", "absent.npz"), "utf-8")
     score = score_of(open_truth(tmp_path / "data"), path)
     assert values_of(score)["error"] == pytest.approx(0, abs=1e-6)
     assert any("mean of the true particles" in note for note in score.notes)
