@@ -23,6 +23,8 @@ ABOUT = "benchmark.json"
 """File in which a case of the benchmark says what it is."""
 FOLDER = "truth"
 """Folder of the truth in a data set."""
+SLACK_VOXEL = 0.5
+"""Distance by which a vector may lie outside the measurable region [voxel]: programs place windows differently."""
 SAMPLES = 40
 """Sample points of the measurable region along its longest edge."""
 FLOW, PARTICLES = "the flow", "true particles"
@@ -84,10 +86,14 @@ class Truth:
         x, y, z = (min(WINDOW_VOXEL * self.voxel_mm, size / 2) for size in self.scene.volume.size_mm)
         return x, y, z
 
-    def inside(self, points_mm: np.ndarray, margin_windows: float = 0.0) -> np.ndarray:
-        """Return which points (n, 3) lie in the fluid, this many reference windows away from the faces, shape (n,)."""
+    def inside(self, points_mm: np.ndarray, margin_windows: float = 0.0, slack_voxel: float = 0.0) -> np.ndarray:
+        """Return which points (n, 3) lie in the fluid, shape (n,).
+
+        They are at least `margin_windows` reference windows, less `slack_voxel`, away from the faces of the volume.
+        """
         half = np.asarray(self.scene.volume.size_mm) / 2 - margin_windows * np.asarray(self.reference_window_mm)
-        near = np.all(np.abs(points_mm - self.scene.volume.centre_mm) <= half + 1e-6 * self.voxel_mm, axis=1)
+        half += (slack_voxel + 1e-6) * self.voxel_mm
+        near = np.all(np.abs(points_mm - self.scene.volume.centre_mm) <= half, axis=1)
         if self.scene.wall is not None:
             near[near] = ~self.scene.solid(points_mm[near])
         fluid: np.ndarray = near

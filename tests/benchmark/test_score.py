@@ -120,6 +120,12 @@ def test_hiding_bad_vectors_does_not_lower_the_error_at_equal_completeness(truth
     assert np.isnan(less["error_at_90"]) and np.isfinite(shown["error_at_90"])
 
 
+def test_a_lattice_a_little_off_is_scored_in_full(truth, tmp_path):
+    axes = [axis + 0.4 * truth.voxel_mm for axis in known_truth.grid_axes(truth)]
+    found = score_of(truth, both_pairs(truth, tmp_path / "result", axes=axes))
+    assert found.sample.scored.all() and values_of(found)["completeness"] > 0.95
+
+
 def test_a_missing_pair_counts_as_not_measured_unless_it_is_not_scored(truth, tmp_path):
     path = known_truth.write_pairs(tmp_path / "result", [known_truth.true_vectors(truth, 0)])
     assert values_of(score_of(truth, path))["completeness"] == pytest.approx(0.5)
