@@ -112,8 +112,12 @@ VECTOR_FIGURES = (
             key=f"error_at_{round(100 * part)}",
             title=f"error in {round(100 * part)} %",
             unit="voxel",
-            text=f"Error that is not exceeded in {round(100 * part)} % of the measurable region; what has no vector "
-            "counts as larger than any error, so nothing is gained by leaving out difficult vectors.",
+            text=f"Error that is not exceeded in {round(100 * part)} % of the measurable region"
+            + (
+                "; a gap counts as larger than any error, so nothing is gained by leaving out difficult vectors."
+                if part == PARTS[0]
+                else "."
+            ),
         )
         for part in PARTS
     ),
@@ -192,7 +196,7 @@ VECTOR_FIGURES = (
         unit="voxel",
         text="Root mean square of what is left of the error when that mean is subtracted.",
     ),
-    Figure(key="seconds", title="time", unit="s", text="Computing time of a pair, as stated."),
+    Figure(key="seconds", title="time", unit="s", text="Computing time of a pair, as stated; median of the pairs."),
     Figure(key="memory", title="memory", unit="MiB", text="Largest memory, as stated."),
 )
 """Figures of vectors."""

@@ -63,7 +63,9 @@ def write_page(truth: Truth, scores: Sequence[Score], path: Path) -> None:
     """
     labels = [one.label for one in scores]
     table = markup.table(
-        ["", *labels], ([title, *cells] for title, cells in rows(scores)), caption="figures of merit of each result"
+        ["", *labels],
+        ([title, *(text.replace(" ± ", "\u00a0±\u00a0") for text in cells)] for title, cells in rows(scores)),
+        caption="figures of merit of each result",
     )
     body = [
         f"<h1>{markup.escape(truth.scene.name)}: {markup.escape(', '.join(labels))}</h1>",
@@ -72,7 +74,7 @@ def write_page(truth: Truth, scores: Sequence[Score], path: Path) -> None:
             "the standard error: of a bootstrap over blocks of vectors, or of the mean over pairs or instants.",
             "quiet",
         ),
-        "".join(markup.paragraph(f"{one.label}: {note}.", "quiet") for one in scores for note in one.notes),
+        "".join(markup.paragraph(f"{text}.", "quiet") for text in noted(scores)),
         table,
         "<h2>Errors over completeness</h2>",
         markup.figure(
@@ -81,8 +83,8 @@ def write_page(truth: Truth, scores: Sequence[Score], path: Path) -> None:
         ),
         "<h2>Where errors are</h2>",
         markup.figure(
-            [map_panel(one) for one in scores],
-            "Length of the error in the middle of the depth, first pair. Crosses: no valid vector.",
+            [map_panel(one, _top(scores)) for one in scores],
+            "Length of the error in the middle of the depth, first pair, same colours. Crosses: no valid vector.",
         ),
         "<h2>Measured and true displacements</h2>",
         markup.figure(
@@ -123,13 +125,27 @@ def completeness_panel(scores: Sequence[Score]) -> str:
     positive = np.concatenate([one.curve.bound[one.curve.bound > 0] for one in scores])
     if len(positive):
         axes.set_yscale("log")
+        axes.tick_params(which="minor", colors=svg.INK)
         axes.set_ylim(max(np.percentile(positive, 1), 1e-4), 1.3 * positive.max())
     svg.style(axes, xlabel="part of the region [%]", ylabel="error [voxel]", legend=len(scores) > 1)
     return svg.to_svg(figure, "Error not exceeded in a part of the measurable region; the table has the numbers")
 
 
-def map_panel(score: Score) -> str:
-    """Draw the errors of the first pair's vectors in the middle of the depth."""
+def noted(scores: Sequence[Score]) -> Iterator[str]:
+    """Yield what was assumed, with the names of the results unless it is the same for all."""
+    for note in dict.fromkeys(note for one in scores for note in one.notes):
+        labels = [one.label for one in scores if note in one.notes]
+        yield note if len(labels) == len(scores) else f"{', '.join(labels)}: {note}"
+
+
+def _top(scores: Sequence[Score]) -> float:
+    """Return the error at the end of the colours of maps: few vectors of any result exceed it [voxel]."""
+    lengths = np.concatenate([one.sample.length[one.sample.scored] for one in scores])
+    return float(np.percentile(lengths, 98)) or 1.0
+
+
+def map_panel(score: Score, top: float) -> str:
+    """Draw the errors of the first pair's vectors in the middle of the depth, colours up to `top` [voxel]."""
     pair, truth = next(one for one in score.sample.pairs if len(one.kept)), score.sample.truth
     x, y, z = pair.positions_mm.T
     depths = np.unique(np.round(z, 6))
@@ -139,7 +155,6 @@ def map_panel(score: Score) -> str:
     length = np.linalg.norm(pair.error, axis=1)
     good, bad = near & pair.kept, near & ~pair.kept
     figure, (axes,) = svg.new_panel(3.0)
-    top = float(np.percentile(length[pair.kept], 98)) if pair.kept.any() else 1.0
     shown = axes.scatter(x[good], y[good], c=length[good], cmap="viridis", vmin=0, vmax=top, marker="s", s=_side(good))
     axes.scatter(x[bad], y[bad], color=svg.INK, marker="x", s=9, lw=0.7)
     axes.set_aspect("equal")

@@ -11,7 +11,7 @@ import numpy as np
 from lfpiv import metrics
 from lfpiv.benchmark import figures
 from lfpiv.benchmark.measured import MeasuredField, lattice_of, represented_by
-from lfpiv.benchmark.truth import Truth
+from lfpiv.benchmark.truth import SLACK_VOXEL, Truth
 
 NAN = float("nan")
 
@@ -77,7 +77,7 @@ def pair_errors(measured: MeasuredField, truth: Truth) -> PairErrors:
         true_point=point[known] / voxel,
         sigma=spread[use][known] / voxel,
         kept=kept[known],
-        scored=(kept & truth.inside(places, 0.5))[known],
+        scored=(kept & truth.inside(places, 0.5, SLACK_VOXEL))[known],
         interior=truth.inside(places, 1.0)[known],
         size=np.where(kept, size[use], 0.0)[known],
         outside=int(measured.finite.sum() - use.sum()),
@@ -126,7 +126,7 @@ class Sample:
         self.error = self.measured - self.true
         self.length_point = joined(np.linalg.norm(one.measured - one.true_point, axis=1) for one in pairs)
         places = joined(one.positions_mm for one in pairs)
-        self.measurable = truth.inside(places, 0.5)
+        self.measurable = truth.inside(places, 0.5, SLACK_VOXEL)
         self.block = _blocks(places, joined(np.full(len(one.kept), one.number) for one in pairs), truth)
 
     @property

@@ -163,7 +163,8 @@ def score_fields(
     found["completeness"] = _mean_of([one.completeness for one in pairs])
     found["divergence"] = _mean_of([divergence(one, truth) for one in pairs if one.scored.any()])
     found |= {key: _exact(value) for key, value in in_time(pairs).items()}
-    found["seconds"] = _mean_of([one.seconds for one in fields if one.seconds is not None])
+    times = [one.seconds for one in fields if one.seconds is not None]
+    found["seconds"] = _exact(float(np.median(times)) if times else np.nan)
     found["memory"] = _exact(max((one.memory_mib for one in fields if one.memory_mib is not None), default=np.nan))
     if first.is_particles:
         found |= _particle_figures(truth, by_number, numbers)
@@ -204,6 +205,8 @@ def report(truth: Truth, scores: Sequence[Score]) -> dict[str, Any]:
     scene = truth.scene
     return {
         "case": scene.name,
+        "benchmark": truth.about.get("benchmark"),
+        "truth_sha256": truth.about.get("truth_sha256"),
         "source": SOURCE,
         "voxel_mm": truth.voxel_mm,
         "dt_s": scene.dt_s,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -15,11 +16,15 @@ from pydantic import ValidationError
 from lfpiv.benchmark.plain_truth import WINDOW_VOXEL
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import Grid
-from lfpiv.simulation.flows import average_truth, window_mean
+from lfpiv.simulation.flows import Tracers, average_truth, window_mean
 from lfpiv.simulation.scene import Scene
 
+ABOUT = "benchmark.json"
+"""File in which a case of the benchmark says what it is."""
 FOLDER = "truth"
 """Folder of the truth in a data set."""
+SLACK_VOXEL = 0.5
+"""Distance by which a vector may lie outside the measurable region [voxel]: programs place windows differently."""
 SAMPLES = 40
 """Sample points of the measurable region along its longest edge."""
 FLOW, PARTICLES = "the flow", "true particles"
@@ -48,6 +53,8 @@ class Truth:
     folder: Path
     numbers: tuple[int, ...]
     """Numbers of the pairs, or of the first instants of a time series."""
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """What a case of the benchmark says of itself: version, name, checksums; empty for other data sets."""
 
     @property
     def is_series(self) -> bool:
@@ -79,10 +86,14 @@ class Truth:
         x, y, z = (min(WINDOW_VOXEL * self.voxel_mm, size / 2) for size in self.scene.volume.size_mm)
         return x, y, z
 
-    def inside(self, points_mm: np.ndarray, margin_windows: float = 0.0) -> np.ndarray:
-        """Return which points (n, 3) lie in the fluid, this many reference windows away from the faces, shape (n,)."""
+    def inside(self, points_mm: np.ndarray, margin_windows: float = 0.0, slack_voxel: float = 0.0) -> np.ndarray:
+        """Return which points (n, 3) lie in the fluid, shape (n,).
+
+        They are at least `margin_windows` reference windows, less `slack_voxel`, away from the faces of the volume.
+        """
         half = np.asarray(self.scene.volume.size_mm) / 2 - margin_windows * np.asarray(self.reference_window_mm)
-        near = np.all(np.abs(points_mm - self.scene.volume.centre_mm) <= half + 1e-6 * self.voxel_mm, axis=1)
+        half += (slack_voxel + 1e-6) * self.voxel_mm
+        near = np.all(np.abs(points_mm - self.scene.volume.centre_mm) <= half, axis=1)
         if self.scene.wall is not None:
             near[near] = ~self.scene.solid(points_mm[near])
         fluid: np.ndarray = near
@@ -140,8 +151,9 @@ class Truth:
 
     @cached_property
     def peak_mm(self) -> float:
-        """Largest displacement in the measurable region, over all pairs [mm]."""
-        lengths = [np.linalg.norm(self.displacement(one, self.samples_mm)[0], axis=1) for one in self.numbers]
+        """Largest displacement at sample points of the measurable region, over all pairs [mm]."""
+        points = self.samples_mm[::8]
+        lengths = [np.linalg.norm(self.displacement(one, points)[0], axis=1) for one in self.numbers]
         return float(np.nanmax(np.concatenate(lengths)))
 
     def particles(self, number: int) -> TrueParticles:
@@ -159,13 +171,15 @@ class Truth:
         return found.positions_mm + (frame - 0.5) * found.displacement_mm, found.intensity
 
 
-def open_truth(folder: str | Path) -> Truth:
+def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
     """Open the truth of a simulated data set.
 
     Parameters
     ----------
     folder : str or Path
         The data set, or its folder `FOLDER`.
+    apart : str or Path, optional
+        Folder of the truth where the data set does not hold it.
 
     Returns
     -------
@@ -174,9 +188,9 @@ def open_truth(folder: str | Path) -> Truth:
     Raises
     ------
     InputError
-        If the folder has no truth, or it is damaged.
+        If the folder has no truth, it is damaged, or it is that of another case.
     """
-    given = Path(folder)
+    given = Path(folder if apart is None else apart)
     place = given if (given / "spec.json").is_file() else given / FOLDER
     spec, particles = place / "spec.json", place / "particles.npz"
     for path in (spec, particles):
@@ -187,6 +201,9 @@ def open_truth(folder: str | Path) -> Truth:
             )
     try:
         scene = Scene.model_validate(json.loads(spec.read_text("utf-8")))
+        if isinstance(scene.flow, Tracers):  # an absolute path stays as it is
+            flow = scene.flow.model_copy(update={"file": str(place.absolute() / scene.flow.file)})
+            scene = scene.model_copy(update={"flow": flow})
         with np.load(particles, allow_pickle=False) as stored:
             numbers = tuple(sorted({_number(name) for name in stored.files if name.endswith("_displacement_mm")}))
     except (ValidationError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
@@ -194,7 +211,22 @@ def open_truth(folder: str | Path) -> Truth:
         raise InputError(f"{place}: expected the truth of a simulated data set, found it damaged ({text}).") from None
     if not numbers:
         raise InputError(f"{particles}: expected particles with displacements, found none.")
-    return Truth(scene=scene, folder=place, numbers=numbers)
+    about, data = _about(place), _about(Path(folder))
+    if apart is not None and about.get("images_sha256") != data.get("images_sha256"):
+        raise InputError(
+            f"{place}: expected the truth of the images in {folder} ({data.get('case', 'of no case')}), found that of "
+            f"others ({about.get('case', 'of no case')})."
+        )
+    return Truth(scene=scene, folder=place, numbers=numbers, about=about)
+
+
+def _about(folder: Path) -> dict[str, Any]:
+    """Return what a case of the benchmark says of itself; nothing for another data set."""
+    try:
+        found = json.loads((folder / ABOUT).read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _number(name: str) -> int:

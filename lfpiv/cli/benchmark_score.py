@@ -103,7 +103,7 @@ def score(
             number=number, seconds=seconds,
         )  # fmt: skip
         options = ScoreOptions(reading=reading, pairs=selected, outlier_voxel=outlier, volumes=volumes)
-        opened = open_truth(truth or data)
+        opened = open_truth(data, truth)
         scores = score_results(
             opened, results, options, labels=label or (), progress=lambda done: progress("score", done)
         )
@@ -146,7 +146,7 @@ def _edges(text: str) -> tuple[float, float, float] | None:
 
 def print_scores(scores: Sequence[Score], out: Path | None) -> None:
     """Print a table of the figures, a column for each result, and what was assumed."""
-    from lfpiv.benchmark.page import rows
+    from lfpiv.benchmark.page import noted, rows
 
     lines = [["", *(one.label[:WIDEST] for one in scores)], *([title, *cells] for title, cells in rows(scores))]
     widths = [max(len(line[column]) for line in lines) for column in range(len(scores) + 1)]
@@ -156,8 +156,7 @@ def print_scores(scores: Sequence[Score], out: Path | None) -> None:
             *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)),
         ]
         terminal.say("  ".join(cells).rstrip())
-    for one in scores:
-        for note in one.notes:
-            terminal.say(f"{one.label}: {note}")
+    for note in noted(scores):
+        terminal.say(note)
     if out is not None:
         terminal.say(f"written: {out}")

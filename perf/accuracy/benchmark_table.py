@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmark_methods import METHODS, Volumes, measure, prepared
+from benchmark_methods import METHODS, Prepared, Volumes, measure, prepared
 
 from lfpiv import files
 from lfpiv.benchmark.cases import case_list, case_of
 from lfpiv.benchmark.make import make
 from lfpiv.benchmark.score import CURVE, Score, ScoreOptions, score_results
-from lfpiv.benchmark.truth import open_truth
+from lfpiv.benchmark.truth import Truth, open_truth
 from lfpiv.benchmark.volumes import read_volume
 from lfpiv.calibration.camera import load_calibration
 from lfpiv.calibration.cameras import calibrate
@@ -46,20 +46,24 @@ def measure_case(name: str, methods: Sequence[str], cache: Path, pairs: int) -> 
     """Measure the first pairs of a case by several methods; return a row of each."""
     folder = cache / name
     make([name], folder / "data")
-    truth = open_truth(folder / "data")
-    experiment, stored = open_experiment(folder / "data" / "experiment.toml"), folder / "calibration.h5"
-    if not stored.exists():
-        calibrate(experiment).save(stored)
-    case = prepared(prepare(experiment, load_calibration(stored)), truth)
+    truth, case = open_truth(folder / "data"), None
     rows = []
     for method in methods:
-        out = folder / method
         for pair in truth.numbers[:pairs]:
-            if not (out / "vectors" / f"pair_{pair:04d}.nc").exists():
-                measure(case, method, pair, out, shared_volumes(folder, method, pair))
+            if not (folder / method / "vectors" / f"pair_{pair:04d}.nc").exists():
+                case = case or _prepared(folder, truth)
+                measure(case, method, pair, folder / method, shared_volumes(folder, method, pair))
         rows.append(row_of(name, method, score_method(folder, method, pairs)))
         print(rows[-1]["case"], method, {key: rows[-1]["figures"][key]["value"] for key in KEPT[:9]}, flush=True)
     return rows
+
+
+def _prepared(folder: Path, truth: Truth) -> Prepared:
+    """Return a case ready to be measured; its calibration is kept."""
+    experiment, stored = open_experiment(folder / "data" / "experiment.toml"), folder / "calibration.h5"
+    if not stored.exists():
+        calibrate(experiment).save(stored)
+    return prepared(prepare(experiment, load_calibration(stored)), truth)
 
 
 def shared_volumes(folder: Path, method: str, pair: int) -> Volumes | None:

@@ -120,6 +120,12 @@ def test_hiding_bad_vectors_does_not_lower_the_error_at_equal_completeness(truth
     assert np.isnan(less["error_at_90"]) and np.isfinite(shown["error_at_90"])
 
 
+def test_a_lattice_a_little_off_is_scored_in_full(truth, tmp_path):
+    axes = [axis + 0.4 * truth.voxel_mm for axis in known_truth.grid_axes(truth)]
+    found = score_of(truth, both_pairs(truth, tmp_path / "result", axes=axes))
+    assert found.sample.scored.all() and values_of(found)["completeness"] > 0.95
+
+
 def test_a_missing_pair_counts_as_not_measured_unless_it_is_not_scored(truth, tmp_path):
     path = known_truth.write_pairs(tmp_path / "result", [known_truth.true_vectors(truth, 0)])
     assert values_of(score_of(truth, path))["completeness"] == pytest.approx(0.5)
@@ -242,6 +248,8 @@ def test_the_command_prints_a_table_and_writes_page_and_json(truth, tmp_path, ca
     assert "completeness [%]" in shown and "slope z" in shown
     text = page.read_text("utf-8")
     assert text.count("<svg") >= 9 and "Kähler" in text and "<script" not in text
+    drawn = text[text.index("<main>") :]
+    assert "#000000" not in drawn and "nan" not in drawn  # ink is the page's, light or dark
     assert commands.call(["benchmark", "score", data, str(path), "--json", "--out", str(numbers)]) == 0
     printed = json.loads(capfd.readouterr().out)
     assert printed == json.loads(numbers.read_text("utf-8"))
@@ -280,3 +288,55 @@ def test_options_of_one_result_are_not_used_silently_for_none(truth, tmp_path):
         score_of(truth, path, pairs=(7, None))
     with pytest.raises(InputError, match="expected it in mm or m"):
         score_of(truth, path, reading=ReadOptions(units={"position": "voxel"}))
+
+
+def test_instants_of_a_series_are_scored_midway_in_time(tmp_path):
+    scene = known_truth.known_scene(particles={"count": 300, "instants": 4})
+    truth = known_truth.write_truth(tmp_path / "data", scene)
+    assert truth.numbers == (0, 1, 2) and truth.noun == "instant"
+    datasets = [known_truth.true_vectors(truth, number) for number in truth.numbers]
+    empty = datasets[0].where(False)  # the last instant has no partner
+    both = xr.concat([*datasets, empty], "instant").assign_coords(instant=[0, 1, 2, 3])
+    both.to_netcdf(tmp_path / "series.nc", engine="h5netcdf")
+    score = score_of(truth, tmp_path / "series.nc")
+    assert values_of(score)["error"] < ROUNDING and values_of(score)["completeness"] == pytest.approx(1)
+    assert [one["number"] for one in score.instants] == [0, 1, 2]
+    rows = []
+    for number in truth.numbers:
+        true = truth.particles(number)
+        rows.append(np.column_stack([np.full(len(true.intensity), number), true.positions_mm, true.displacement_mm]))
+    names = ["instant", *(f"{name} [mm]" for name in ("x", "y", "z", "dx", "dy", "dz"))]
+    pd.DataFrame(np.concatenate(rows), columns=names).to_csv(tmp_path / "tracks.csv", index=False)
+    found = values_of(score_of(truth, tmp_path / "tracks.csv"))
+    assert found["found"] == 1 and found["false"] == 0 and found["matched_error"] < 1e-6
+    assert found["error"] < 0.02  # a curved path is not the flow at its middle
+
+
+def test_without_the_file_of_the_flow_the_particles_are_the_truth(tmp_path):
+    rng = np.random.default_rng(6)
+    start = rng.uniform(0, 1, (400, 3))
+    np.savez(tmp_path / "tracers.npz", t0=start, t1=start + (0.02, 0.0, -0.01))
+    flow = {"kind": "tracers", "file": str(tmp_path / "tracers.npz"), "size_mm": known_truth.SIZE_MM, "as_given": True}
+    truth = known_truth.write_truth(tmp_path / "data", known_truth.known_scene(flow=flow))
+    path = both_pairs(truth, tmp_path / "result")
+    assert score_of(truth, path).figures["error"].value < ROUNDING
+    spec = tmp_path / "data" / "truth" / "spec.json"
+    spec.write_text(spec.read_text("utf-8").replace(str(tmp_path / "tracers.npz"), "with_truth.npz"), "utf-8")
+    (tmp_path / "tracers.npz").rename(spec.with_name("with_truth.npz"))
+    assert not any("true particles" in note for note in score_of(open_truth(tmp_path / "data"), path).notes)
+    spec.write_text(spec.read_text("utf-8").replace("with_truth.npz", "absent.npz"), "utf-8")
+    score = score_of(open_truth(tmp_path / "data"), path)
+    assert values_of(score)["error"] == pytest.approx(0, abs=1e-6)
+    assert any("mean of the true particles" in note for note in score.notes)
+
+
+def test_the_truth_of_another_case_is_refused(truth, tmp_path):
+    data, apart = tmp_path / "data", tmp_path / "apart"
+    shutil.copytree(truth.folder, apart)
+    data.mkdir()
+    for folder, digest in ((data, "a"), (apart, "b")):
+        (folder / "benchmark.json").write_text(json.dumps({"case": digest, "images_sha256": digest}), "utf-8")
+    with pytest.raises(InputError, match="found that of others"):
+        open_truth(data, apart)
+    (data / "benchmark.json").write_text(json.dumps({"case": "b", "images_sha256": "b"}), "utf-8")
+    assert open_truth(data, apart).about["case"] == "b"

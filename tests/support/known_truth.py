@@ -8,6 +8,7 @@ from support import scenes
 
 from lfpiv.benchmark.truth import open_truth
 from lfpiv.simulation.particles import lit_particles
+from lfpiv.simulation.series import place_series
 from lfpiv.simulation.truth import write_scene
 
 SIZE_MM, VOXEL_MM, DT_S = (4.0, 4.0, 3.0), 0.1, 1e-3
@@ -30,7 +31,9 @@ def write_truth(folder, scene=None):
     """Write the truth of a scene as the simulator does, without images; return the opened truth."""
     scene = scene or known_scene()
     (folder / "truth").mkdir(parents=True)
-    write_scene(scene, [lit_particles(scene, pair) for pair in range(scene.particles.pairs)], folder / "truth")
+    series = scene.particles.instants is not None
+    placed = place_series(scene) if series else [lit_particles(scene, pair) for pair in range(scene.particles.pairs)]
+    write_scene(scene, placed, folder / "truth")
     return open_truth(folder)
 
 
