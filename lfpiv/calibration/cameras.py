@@ -8,51 +8,42 @@ Errors of the board that the labels of all cameras show are corrected before.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from lfpiv.calibration import checks
-from lfpiv.calibration.board.board import agreeing_dots, measure_board
+from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
-from lfpiv.calibration.board.planes import Planes
 from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
-from lfpiv.calibration.quality import CalibrationQuality, LensArrayQuality
-from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens, thin_lens_model
+from lfpiv.calibration.measured_camera import (
+    KeptCameras,
+    Measured,
+    Sensor,
+    decode,
+    fit_lens,
+    input_errors,
+    label_std,
+    measure_or_load,
+)
+from lfpiv.calibration.quality import CalibrationQuality
+from lfpiv.calibration.thin_lens_model import ThinLensModel, thin_lens_model
 from lfpiv.calibration.training import Training, TrainingSettings, train
 from lfpiv.calibration.virtual_samples import sampler_between_dots
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment
-from lfpiv.geometry.optics import LensLattice
 from lfpiv.geometry.orientation import Orientation
-from lfpiv.lightfield.decoder import LightFieldDecoder
-from lfpiv.lightfield.lens_array import find_lens_array
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.warn import Warning, collected
+from lfpiv.warn import collected
 
 log = logging.getLogger(__name__)
-
-MODEL_ERROR_PITCH = 0.002
-"""Error that all labels of a dot share, beside their standard errors [microlens pitch]."""
-
-
-class KeptCameras(Protocol):
-    """Keeps what the images of each camera show, so that an interrupted calibration goes on from there."""
-
-    def load(self, name: str) -> CalibratedCamera | None:
-        """Return a camera that was kept; None if there is none that fits the experiment."""
-
-    def keep(self, camera: CalibratedCamera) -> None:
-        """Keep a camera: its decoder, the labels of its dots and the thin lens fitted to them."""
 
 
 def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> Calibration:
@@ -87,7 +78,7 @@ def calibrate_or_continue(
     measured = {}
     for number, setup in enumerate(experiment.cameras):
         step = part_of(whole, 0.75 * number / count, 0.75 * (number + 1) / count)
-        measured[setup.name] = _measure_or_load(experiment, setup, kept, step)
+        measured[setup.name] = measure_or_load(experiment, setup, kept, step)
     errors = _fit_board(experiment, measured)
     cameras = {}
     for number, setup in enumerate(experiment.cameras):
@@ -125,7 +116,7 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
     cameras = {}
     for setup in experiment.cameras:
         with collected() as warnings:
-            sensor = _decode(experiment, setup)
+            sensor = decode(experiment, setup)
         cameras[setup.name] = CalibratedCamera(
             name=setup.name,
             optics=setup.optics,
@@ -148,49 +139,6 @@ def _stated(experiment: Experiment, setup: CameraSetup) -> Orientation:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Sensor:
-    """Microlens array and decoder of one camera, from its white image."""
-
-    lattice: LensLattice
-    decoder: LightFieldDecoder
-    quality: LensArrayQuality
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Measured:
-    """What the white and board images of one camera show."""
-
-    sensor: _Sensor
-    dots: BoardDots
-    """Labels, with the points of the board as stated."""
-    lens: ThinLensModel
-    """Thin lens fitted to them."""
-    warnings: tuple[Warning, ...] = ()
-
-    def as_camera(self, setup: CameraSetup) -> CalibratedCamera:
-        """Return the camera with the thin lens as its mapping, to be stored."""
-        return CalibratedCamera(
-            name=setup.name,
-            optics=setup.optics,
-            lattice=self.sensor.lattice,
-            decoder=self.sensor.decoder,
-            baseline=self.lens,
-            report=self.sensor.quality,
-            warnings=self.warnings,
-            dots=self.dots,
-        )
-
-    @classmethod
-    def of_camera(cls, camera: CalibratedCamera) -> _Measured | None:
-        """Return what `as_camera` made a camera of; None for another one."""
-        lens, dots, quality = camera.baseline, camera.dots, camera.report
-        if lens is None or dots is None or quality is None or camera.network is not None:
-            return None
-        sensor = _Sensor(lattice=camera.lattice, decoder=camera.decoder, quality=quality)
-        return cls(sensor=sensor, dots=dots, lens=lens, warnings=camera.warnings)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Mapping:
     """Ray mapping of one camera, fitted to the labels of its dots."""
 
@@ -206,44 +154,7 @@ class _Mapping:
     """Mean error on the held-out dots at their stated places [microlens pitch]."""
 
 
-def _measure_or_load(
-    experiment: Experiment, setup: CameraSetup, kept: KeptCameras | None, step: StepProgress
-) -> _Measured:
-    """Return what the images of a camera show, from an interrupted calibration if it kept that."""
-    camera = None if kept is None else kept.load(setup.name)
-    if camera is not None and (known := _Measured.of_camera(camera)) is not None:
-        log.info("%s: dots measured before, kept", setup.name)
-        step(1.0)
-        return known
-    with collected() as warnings:
-        found = _measure_camera(experiment, setup, step)
-    found = replace(found, warnings=tuple(warnings))
-    if kept is not None:
-        kept.keep(found.as_camera(setup))
-    return found
-
-
-def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> _Measured:
-    sensor = _decode(experiment, setup)
-    step(0.2)
-    dots = _measure_dots(experiment, setup, sensor.decoder, step)
-    lens = _fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
-    step(1.0)
-    return _Measured(sensor=sensor, dots=dots, lens=lens)
-
-
-def _fit_lens(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> ThinLensModel:
-    with _input_errors(f"{experiment.path}: labels of camera {setup.name!r}"):
-        std = _label_std(dots, pitch_mm)
-        return fit_thin_lens(dots.points_mm, dots.pupil_mm, dots.array_mm, setup.optics, std=std)
-
-
-def _label_std(dots: BoardDots, pitch_mm: float) -> np.ndarray:
-    std: np.ndarray = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch_mm)
-    return std
-
-
-def _fit_board(experiment: Experiment, measured: Mapping[str, _Measured]) -> BoardErrors:
+def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> BoardErrors:
     """Fit the errors of the board to the labels of all cameras, and warn of planes far from where they should be."""
     board = DotBoard.from_settings(experiment.board)
     cameras = [
@@ -275,14 +186,14 @@ def _log_board(errors: BoardErrors) -> None:
 
 
 def _calibrate_camera(
-    experiment: Experiment, setup: CameraSetup, measured: _Measured, errors: BoardErrors, step: StepProgress
+    experiment: Experiment, setup: CameraSetup, measured: Measured, errors: BoardErrors, step: StepProgress
 ) -> CalibratedCamera:
     sensor, dots, lens = measured.sensor, measured.dots, measured.lens
     stated_mm = dots.points_mm
     if errors.corrected:
         corrected = errors.points_mm(DotBoard.from_settings(experiment.board), dots.dot)
         dots = replace(dots, points_mm=corrected)
-        lens = _fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
+        lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
     checks.check_pupil(experiment, setup, dots, lens)
     mapping = _fit_mapping(experiment, setup, dots, stated_mm, lens, sensor.lattice.pitch_mm)
     step(0.9)
@@ -311,50 +222,6 @@ def _calibrate_camera(
     )
 
 
-def _decode(experiment: Experiment, setup: CameraSetup) -> _Sensor:
-    """Find the microlens array in the white image and make the decoder."""
-    white, dark, optics = experiment.white(setup.name), experiment.dark(setup.name), setup.optics
-    with _input_errors(f"{setup.white_path}: white_image of camera {setup.name!r}"):
-        array = find_lens_array(white, dark, nominal_pitch_px=optics.microimage_pitch_px, layout=optics.layout)
-        lattice = array.lattice(optics)
-        decoder = LightFieldDecoder.from_white(optics, lattice, white, dark)
-    checks.check_white(setup, white, dark, decoder)
-    quality = LensArrayQuality(
-        lens_array_rms_px=float(array.rms_px),
-        lens_array_pitch_px=float(array.pitch_px),
-        lens_array_rotation_deg=float(array.rotation_deg),
-        lenses=len(array.centres_px),
-    )
-    return _Sensor(lattice=lattice, decoder=decoder, quality=quality)
-
-
-def _measure_dots(
-    experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, step: StepProgress
-) -> BoardDots:
-    board, dark = experiment.board, experiment.dark(setup.name)
-    images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
-    checks.check_light(experiment, setup, decoder, images, dark)
-    step(0.2)
-    place = f"{experiment.path}: board.images of camera {setup.name!r}"
-    with _input_errors(place):
-        try:
-            dots = measure_board(
-                images,
-                decoder,
-                DotBoard.from_settings(board),
-                orientation=setup.orientation,
-                estimator=experiment.network.estimator,
-                dark=dark,
-            )
-        except np.linalg.LinAlgError:
-            raise InputError(
-                "expected images of the board's dots, found blobs that no camera sees as a board. Check that these are "
-                "board images, and check the numbers in [board]."
-            ) from None
-    checks.check_planes(experiment, setup, dots)
-    return dots
-
-
 def _fit_mapping(
     experiment: Experiment,
     setup: CameraSetup,
@@ -365,7 +232,7 @@ def _fit_mapping(
 ) -> _Mapping:
     """Leave out dots that disagree with their neighbours, and train the network."""
     settings, place = experiment.network, f"{experiment.path}: labels of camera {setup.name!r}"
-    std = _label_std(dots, pitch_mm)
+    std = label_std(dots, pitch_mm)
     residual = dots.array_mm - lens(dots.points_mm, dots.pupil_mm)
     typical_residual = float(np.median(np.linalg.norm(residual, axis=1))) / pitch_mm
     nominal = checks.compare_with_nominal(setup, lens, typical_residual)
@@ -373,7 +240,7 @@ def _fit_mapping(
     baseline = lens if settings.baseline == "thin_lens" else None
     points, pupil, std = dots.points_mm[agreeing], dots.pupil_mm[agreeing], std[agreeing]
     target = (dots.array_mm if baseline is None else residual)[agreeing]
-    with _input_errors(place):
+    with input_errors(place):
         training = train(
             np.hstack([points, pupil]),
             target,
@@ -405,7 +272,7 @@ def _disagreeing_per_plane(dots: BoardDots, agreeing: np.ndarray, dots_per_plane
     return np.bincount(np.unique(dots.dot[~agreeing]) // dots_per_plane, minlength=len(dots.found))
 
 
-def _quality(sensor: _Sensor, dots: BoardDots, mapping: _Mapping, rejected: int) -> CalibrationQuality:
+def _quality(sensor: Sensor, dots: BoardDots, mapping: _Mapping, rejected: int) -> CalibrationQuality:
     training = mapping.training
     return CalibrationQuality(
         **vars(sensor.quality),
@@ -427,12 +294,3 @@ def _quality(sensor: _Sensor, dots: BoardDots, mapping: _Mapping, rejected: int)
         blur_px=dots.blur_px,
         response_share=dots.response_share,
     )
-
-
-@contextlib.contextmanager
-def _input_errors(place: str) -> Iterator[None]:
-    """Raise every ValueError as an InputError that names the file and the camera."""
-    try:
-        yield
-    except ValueError as error:
-        raise InputError(f"{place}: {error}") from None

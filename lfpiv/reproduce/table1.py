@@ -13,8 +13,8 @@ import numpy as np
 
 from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
-from lfpiv.calibration.cameras import MODEL_ERROR_PITCH
 from lfpiv.calibration.levenberg_marquardt import Trainer, levenberg_marquardt
+from lfpiv.calibration.measured_camera import MODEL_ERROR_PITCH
 from lfpiv.calibration.network import sigma_nor
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
 from lfpiv.calibration.training import TrainingSettings, train

@@ -1,0 +1,179 @@
+"""Measure what the white and board images of one camera show: its microlens array, its dots, and a thin lens.
+
+A calibration that is interrupted goes on from the cameras that were measured (`KeptCameras`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from lfpiv.calibration import checks
+from lfpiv.calibration.board.board import measure_board
+from lfpiv.calibration.board.dots import BoardDots, DotBoard
+from lfpiv.calibration.board.planes import Planes
+from lfpiv.calibration.camera import CalibratedCamera
+from lfpiv.calibration.quality import LensArrayQuality
+from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens
+from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.geometry.optics import LensLattice
+from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.lens_array import find_lens_array
+from lfpiv.progress import StepProgress
+from lfpiv.warn import Warning, collected
+
+log = logging.getLogger(__name__)
+
+MODEL_ERROR_PITCH = 0.002
+"""Error that all labels of a dot share, beside their standard errors [microlens pitch]."""
+
+
+class KeptCameras(Protocol):
+    """Keeps what the images of each camera show, so that an interrupted calibration goes on from there."""
+
+    def load(self, name: str) -> CalibratedCamera | None:
+        """Return a camera that was kept; None if there is none that fits the experiment."""
+
+    def keep(self, camera: CalibratedCamera) -> None:
+        """Keep a camera: its decoder, the labels of its dots and the thin lens fitted to them."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sensor:
+    """Microlens array and decoder of one camera, from its white image."""
+
+    lattice: LensLattice
+    decoder: LightFieldDecoder
+    quality: LensArrayQuality
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measured:
+    """What the white and board images of one camera show."""
+
+    sensor: Sensor
+    dots: BoardDots
+    """Labels, with the points of the board as stated."""
+    lens: ThinLensModel
+    """Thin lens fitted to them."""
+    warnings: tuple[Warning, ...] = ()
+
+    def as_camera(self, setup: CameraSetup) -> CalibratedCamera:
+        """Return the camera with the thin lens as its mapping, to be stored."""
+        return CalibratedCamera(
+            name=setup.name,
+            optics=setup.optics,
+            lattice=self.sensor.lattice,
+            decoder=self.sensor.decoder,
+            baseline=self.lens,
+            report=self.sensor.quality,
+            warnings=self.warnings,
+            dots=self.dots,
+        )
+
+    @classmethod
+    def of_camera(cls, camera: CalibratedCamera) -> Measured | None:
+        """Return what `as_camera` made a camera of; None for another one."""
+        lens, dots, quality = camera.baseline, camera.dots, camera.report
+        if lens is None or dots is None or quality is None or camera.network is not None:
+            return None
+        sensor = Sensor(lattice=camera.lattice, decoder=camera.decoder, quality=quality)
+        return cls(sensor=sensor, dots=dots, lens=lens, warnings=camera.warnings)
+
+
+def measure_or_load(
+    experiment: Experiment, setup: CameraSetup, kept: KeptCameras | None, step: StepProgress
+) -> Measured:
+    """Return what the images of a camera show, from an interrupted calibration if it kept that."""
+    camera = None if kept is None else kept.load(setup.name)
+    if camera is not None and (known := Measured.of_camera(camera)) is not None:
+        log.info("%s: dots measured before, kept", setup.name)
+        step(1.0)
+        return known
+    with collected() as warnings:
+        found = _measure_camera(experiment, setup, step)
+    found = replace(found, warnings=tuple(warnings))
+    if kept is not None:
+        kept.keep(found.as_camera(setup))
+    return found
+
+
+def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> Measured:
+    sensor = decode(experiment, setup)
+    step(0.2)
+    dots = _measure_dots(experiment, setup, sensor.decoder, step)
+    lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
+    step(1.0)
+    return Measured(sensor=sensor, dots=dots, lens=lens)
+
+
+def fit_lens(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> ThinLensModel:
+    """Fit a thin lens to the labels of a camera, weighted by their standard deviations."""
+    with input_errors(f"{experiment.path}: labels of camera {setup.name!r}"):
+        std = label_std(dots, pitch_mm)
+        return fit_thin_lens(dots.points_mm, dots.pupil_mm, dots.array_mm, setup.optics, std=std)
+
+
+def label_std(dots: BoardDots, pitch_mm: float) -> np.ndarray:
+    """Return the standard deviation of the labels [mm], shape (n,), the error that a dot's labels share included."""
+    std: np.ndarray = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch_mm)
+    return std
+
+
+def decode(experiment: Experiment, setup: CameraSetup) -> Sensor:
+    """Find the microlens array in the white image and make the decoder."""
+    white, dark, optics = experiment.white(setup.name), experiment.dark(setup.name), setup.optics
+    with input_errors(f"{setup.white_path}: white_image of camera {setup.name!r}"):
+        array = find_lens_array(white, dark, nominal_pitch_px=optics.microimage_pitch_px, layout=optics.layout)
+        lattice = array.lattice(optics)
+        decoder = LightFieldDecoder.from_white(optics, lattice, white, dark)
+    checks.check_white(setup, white, dark, decoder)
+    quality = LensArrayQuality(
+        lens_array_rms_px=float(array.rms_px),
+        lens_array_pitch_px=float(array.pitch_px),
+        lens_array_rotation_deg=float(array.rotation_deg),
+        lenses=len(array.centres_px),
+    )
+    return Sensor(lattice=lattice, decoder=decoder, quality=quality)
+
+
+def _measure_dots(
+    experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, step: StepProgress
+) -> BoardDots:
+    board, dark = experiment.board, experiment.dark(setup.name)
+    images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
+    checks.check_light(experiment, setup, decoder, images, dark)
+    step(0.2)
+    place = f"{experiment.path}: board.images of camera {setup.name!r}"
+    with input_errors(place):
+        try:
+            dots = measure_board(
+                images,
+                decoder,
+                DotBoard.from_settings(board),
+                orientation=setup.orientation,
+                estimator=experiment.network.estimator,
+                dark=dark,
+            )
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "expected images of the board's dots, found blobs that no camera sees as a board. Check that these are "
+                "board images, and check the numbers in [board]."
+            ) from None
+    checks.check_planes(experiment, setup, dots)
+    return dots
+
+
+@contextlib.contextmanager
+def input_errors(place: str) -> Iterator[None]:
+    """Raise every ValueError as an InputError that names the file and the camera."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"{place}: {error}") from None
