@@ -131,7 +131,9 @@ def coarsened(experiment: Experiment) -> Experiment:
     cx, cy, cz = grid.centre_mm.tolist()
     coarse = Grid.from_extent(centre_mm=(cx, cy, cz), size_mm=(max(x, edge), max(y, edge), max(z, edge)), voxel_mm=edge)
     solid = None if experiment.solid is None else np.ascontiguousarray(experiment.solid[coarse.nearest_in(grid)])
-    smart = experiment.smart.model_copy(update={"iterations": ITERATIONS, "motion_passes": 0})
+    # particles are smaller than these voxels: their size, measured for the sieve and the limit, would say nothing
+    measured = {key: 0.0 for key in ("sieve_voxel", "intensity_cap") if getattr(experiment.smart, key) == "auto"}
+    smart = experiment.smart.model_copy(update={"iterations": ITERATIONS, "motion_passes": 0, **measured})
     return replace(experiment, grid=coarse, solid=solid, smart=smart)
 
 
