@@ -221,6 +221,8 @@ def merged(tables: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
     result = dict(tables)
     for key, value in changes.items():
         old = result.get(key)
-        whole = not (isinstance(value, Mapping) and isinstance(old, Mapping)) or "kind" in value
-        result[key] = value if whole else merged(old, value)
+        if isinstance(value, Mapping) and isinstance(old, Mapping) and "kind" not in value:
+            result[key] = merged(old, value)
+        else:
+            result[key] = value
     return result

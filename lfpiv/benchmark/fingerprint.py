@@ -36,7 +36,7 @@ TRUTH_TOLERANCE_MM = 1e-6
 
 BLOCK_TOLERANCE = (0.3, 0.003)
 """Largest difference of a block's mean within rounding: absolute [count], and relative. Another draw of the noise stays
-below a third of it; another draw of the particles exceeds it in most blocks."""
+below a tenth of it; another draw of the particles exceeds it in most blocks."""
 
 Verdict = Literal["identical", "equal within rounding", "differs", "not compared"]
 
