@@ -175,7 +175,7 @@ def name(number):
     return f"instant_{FIRST + number:06d}.nc"
 
 
-def test_a_new_image_concerns_the_one_before_the_rest_of_its_segment_and_what_it_leads_into(made, small_run, tmp_path):
+def test_a_new_image_concerns_one_before_the_rest_of_its_segment_and_what_it_leads_into(made, small_run, tmp_path):
     file = write_series(small_run, tmp_path / "data")
     work = at(changed(made[1], tmp_path / "out", instants=INSTANTS, keep_volumes=True), file)
 
