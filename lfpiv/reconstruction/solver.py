@@ -268,10 +268,10 @@ class PreparedInstant:
         state = State(guess, momentum, self.solver._steps(self.column_sum, self.lit, self.sieve))
         count = settings.iterations if iterations is None else iterations
         history, subsets = _History(settings, count), self.solver.subsets
-        steps = self.solver._subset_steps(self.column_sum, self.recordings, self.sieve) if len(subsets) > 1 else ()
+        epochs = count - min(whole_passes, -(-count // 2)) if len(subsets) > 1 else 0
+        steps = self.solver._subset_steps(self.column_sum, self.recordings, self.sieve) if epochs else ()
         with self.equations.locked():
             if steps:
-                epochs = count - min(whole_passes, -(-count // 2))
                 state = self._solve_subsets(state, steps, history, epochs, progress)
             volume, stop = self._solve_whole(state, history, progress)
         if stop is SmartStop.DIVERGED:
@@ -315,8 +315,7 @@ class PreparedInstant:
         progress: Callable[[float], None] | None,
     ) -> State:
         """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
-        if epochs:
-            history.append(self.equations.compare(self.sieve(state.coefficients)))  # exact, as all steps begin here
+        history.append(self.equations.compare(self.sieve(state.coefficients)))  # exact, as all steps begin here
         subsets, resting = self.solver.subsets, RestingVoxels(self.equations)
         states = iterate_epochs(
             self.equations, state, self.sieve, subsets=subsets, steps=steps, epochs=epochs, resting=resting
