@@ -20,7 +20,7 @@ GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.4, 2.4, 2.0
 VOXEL_MM = GRID.voxel_mm
 BLOB = 0.7  # standard deviation of the particles [voxel]
 FLOW = Swirl(peak_mm=0.15, core_mm=1.3, axial_mm=0.08)
-INSTANTS = 5
+INSTANTS = 8
 ITERATIONS = 14
 SETTINGS = PLAIN | {"subsets": "auto"}
 CORRELATION = {"windows": (16, 12, 12), "smoothing_voxel": 0.5, "intensity_power": 0.5}
@@ -28,7 +28,7 @@ CORRELATION = {"windows": (16, 12, 12), "smoothing_voxel": 0.5, "intensity_power
 TOLERANCE_SPLINE = 0.1  # cubic splines flatten blobs of 0.7 voxel by 5 to 10 %; particles that rest are 0.6 off
 TOLERANCE_F32 = 1e-4  # powers and sums of float32 volumes
 UNBLURRED = 0.5  # error left of points by five steps of Richardson and Lucy, the hardest case; 0.40 here
-GAIN = 0.85  # 1 - Q left by 0.3 times the iterations; 0.74 here
+GAIN = 0.85  # 1 - Q left by fewer than half of the iterations
 
 
 def blobs(positions):
@@ -97,7 +97,7 @@ def test_volumes_gain_by_fewer_iterations_if_the_flow_is_known(solver, series):
     assert [one.start for one in done] == [Start.FIRST] * 2 + [Start.PREDICTED] * (INSTANTS - 2)
     most = np.ceil(sequence.ITERATION_SHARE * ITERATIONS)
     assert all(one.found.iterations <= most for one in done[2:])
-    for number in (2, INSTANTS - 1):
+    for number in (INSTANTS - 4, INSTANTS - 1):  # with three instants after it, and with none
         corrected, alone = exact.correct(done, number), solver.smart.solve(images[number])
         assert corrected.iterations < ITERATIONS / 2
         lost = [1 - metrics.reconstruction_quality(one.volume, blobs(positions[number])) for one in (alone, corrected)]
