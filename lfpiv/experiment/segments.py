@@ -1,8 +1,8 @@
 """Segments of a time series: instants that are reconstructed one after the other, each from the one before.
 
 Segments begin at fixed numbers of instants, whatever pairs a run is asked for. A few instants are reconstructed before
-the first one of a segment, only to lead into it. So the volume of an instant depends on its own images and on those of
-a known range of instants before it, and on nothing else.
+the first one of a segment, only to lead into it, and a few after the last one, to correct the last ones. So the volume
+of an instant depends on its own images and on those of a known range of instants beside it, and on nothing else.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ SEGMENT = 32
 """Number of instants of a segment. The number of its first one is a multiple of it."""
 LEAD_IN = 6
 """Largest number of instants before a segment that lead into it."""
+REACH = 3
+"""Largest number of instants before and after an instant by which it is corrected."""
 
 
 def segment_of(instant: int) -> int:
@@ -27,3 +29,13 @@ def followed(series: Series, instant: int) -> range:
     """
     start = max(segment_of(instant) * SEGMENT - LEAD_IN, series.first)
     return range(start, instant + 1)
+
+
+def depended_on(series: Series, instant: int) -> list[int]:
+    """Return the other instants on whose images an instant depends: those it follows, and those that correct it."""
+    return [*followed(series, instant)[:-1], *corrected_by(series, instant)]
+
+
+def corrected_by(series: Series, instant: int) -> range:
+    """Return the instants after one by which it is corrected, as far as the series has them."""
+    return range(instant + 1, min(instant + REACH, series.numbers[-1]) + 1)

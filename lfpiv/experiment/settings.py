@@ -88,7 +88,8 @@ class Smart(Table):
     """Number of times the motion is measured and both frames are reconstructed again from their common light along it;
     0 reconstructs each frame separately."""
     predict: Flag = False
-    """Whether an instant of a time series starts from the one before, moved by the flow, and takes fewer iterations."""
+    """Whether an instant of a time series starts from the one before, moved by the flow, and is corrected by those
+    beside it; it takes fewer iterations."""
 
     def of_one_frame(self, refinement: float = 1.0) -> dict[str, Any]:
         """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame.

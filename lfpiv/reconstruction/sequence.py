@@ -1,4 +1,4 @@
-"""`SequenceSolver`: SMART along a time series, where each instant starts from the one before, moved by the flow.
+"""`SequenceSolver`: SMART along a time series, where each instant learns from those before and after it.
 
 Images of two cameras hardly distinguish particles from ghosts: SMART keeps what its first guess holds. Particles move
 with the flow, and a ghost moves with the flow only where all particles on its lines of sight move alike. So the volume
@@ -8,6 +8,9 @@ iterations. This is the sequential form of motion tracking enhancement [1]_, [2]
 The guess is the product of powers M^p F^(1 - p) of the moved volume M and the guess F from the images, with the
 exponent p = `PERSISTENCE` where the flow is known, and 0 elsewhere. SMART multiplies its first guess, so what the
 images do not determine is forgotten by the factor p in each instant. Particles that enter through a face come from F.
+
+So the volumes go forward in time. Afterwards each is corrected by those of the instants on both sides of it
+(`lfpiv.reconstruction.fixed_lag`), which changes no other one.
 
 .. [1] M. Novara, K. J. Batenburg, F. Scarano, "Motion tracking-enhanced MART for tomographic PIV", Meas. Sci. Technol.
    21 (2010) 035401, doi:10.1088/0957-0233/21/3/035401.
@@ -19,38 +22,46 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from lfpiv.experiment.settings import Correlation
+from lfpiv.experiment.settings import DEFAULT_WINDOWS, Correlation
+from lfpiv.reconstruction.fixed_lag import ITERATIONS as CORRECTIONS
+from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
 from lfpiv.reconstruction.motion import LEAST_VALID
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import MotionField
-from lfpiv.reconstruction.sieve import Sieve
-from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.reconstruction.sieve import coefficients
+from lfpiv.reconstruction.solver import PreparedInstant, SmartSolver
 from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.settings import cut_windows
 from lfpiv_kernels.correlation import deform
 
-PERSISTENCE = 0.8
+PERSISTENCE = 0.9
 """Exponent of the moved volume in the first guess."""
-FLOW_MEMORY = 0.5
+FLOW_MEMORY = 0.7
 """Weight of the flow known before in the flow that moves the next instant."""
-ITERATION_SHARE = 0.3
-"""Iterations of an instant that starts from the one before, as a share of those of one that starts from its images."""
+FIRST_SHARE = 0.5
+"""Iterations of an instant that starts from its images, as a share of those of an instant by itself."""
+ITERATION_SHARE = 0.2
+"""Iterations of an instant that starts from the one before, as a share of those of an instant by itself."""
 DIMMEST = 0.05
 """Least light of the moved volume in the first guess, as a share of the guess's mean."""
 FAINTEST = 1e-6
 """Least light of a voxel in the first guess, as a share of the brightest one. SMART can raise it; it cannot raise 0."""
 
-UNBLURRED = 5
-"""Steps that undo the sieve's blur of the moved volume."""
-
 LEAST_AGREEMENT = 0.9
 """Largest misfit of a prediction, as a share of the misfit of particles in other places."""
+
+WINDOWS = (*DEFAULT_WINDOWS[:-1], 8, 8)
+"""Windows in which the flow is measured where none are stated [voxel], cut to the volume. They are smaller than those
+of vectors: the motion within them is not resolved, and the scatter of few particles is averaged over the instants."""
+OVERLAP = 0.6
+"""Overlap of these windows."""
 
 Correlate = Callable[[xr.DataArray, xr.DataArray, Mapping[str, Any]], xr.Dataset]
 """Takes two volumes and settings of `correlate`; returns the vectors between them."""
@@ -61,6 +72,7 @@ class Start(enum.Enum):
 
     FIRST = "the flow is not known yet"
     PREDICTED = "started from the instant before, moved by the flow"
+    UNRESOLVED = "the flow varies too much from vector to vector to move particles by it: reconstructed by itself"
     MISSED = "the instant before, moved by the flow, fits the images no better than particles in other places"
 
 
@@ -80,12 +92,16 @@ class Before:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solved:
-    """One instant of a sequence."""
+    """One instant of a sequence, from its images and the instants before it."""
 
+    prepared: PreparedInstant | None
+    """The images; None once they are not needed any more."""
     found: Reconstruction
     start: Start
     flow: xr.Dataset | None = None
     """Displacement from one instant to the next, as it was known before this instant."""
+    vectors: xr.Dataset | None = None
+    """Displacement between the two instants before this one; None if it was not measured."""
     misfit_ratio: float = math.nan
     """Misfit of a prediction that missed over that of particles in other places; NaN for other starts."""
 
@@ -105,9 +121,10 @@ class SequenceSolver:
     Parameters
     ----------
     smart : SmartSolver
-        Solver of each instant. One that starts from the instant before has at most `ITERATION_SHARE` of its iterations.
+        Solver of each instant. One that starts from the instant before has `ITERATION_SHARE` of its iterations.
     correlation : mapping, optional
-        Settings of `correlate`, which measures the flow; default: those of an experiment without such a table.
+        Settings of `correlate`, which measures the flow; default: those of an experiment without such a table. Windows
+        that are None are `WINDOWS`.
     correlate : callable, optional
         Replaces `lfpiv.correlate`, for a caller that has the vectors already.
     """
@@ -130,7 +147,7 @@ class SequenceSolver:
         floor: float | Mapping[str, float] | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Solved:
-        """Reconstruct an instant; arguments as of `SmartSolver.solve`.
+        """Reconstruct an instant from its images and the one before; arguments as of `SmartSolver.solve`.
 
         `before` is what is known at the instant before; None reconstructs the instant from its images alone.
 
@@ -139,38 +156,79 @@ class SequenceSolver:
         ValueError
             If `SmartSolver.solve` or `correlate` refuse their arguments.
         """
-        flow = None if before is None else self._flow(before)
+        prepared = self.smart.prepare(images, floor=floor)
+        flow, vectors = (None, None) if before is None else self._flow(before)
+
+        def solved(start: Start, share: float, first: np.ndarray | None = None, ratio: float = math.nan) -> Solved:
+            if share == 1:
+                found = prepared.solve(progress=progress)
+            else:
+                count = math.ceil(share * self.smart.settings.iterations)
+                found = prepared.solve(iterations=count, whole_passes=0, first=first, progress=progress)
+            return Solved(prepared=prepared, found=found, start=start, flow=flow, vectors=vectors, misfit_ratio=ratio)
+
         if before is None or flow is None:
-            return Solved(found=self.smart.solve(images, floor=floor, progress=progress), start=Start.FIRST)
-
-        def tried(first: np.ndarray | None) -> Reconstruction:
-            return self.smart.solve(images, floor=floor, iterations=0, first=first)
-
-        plain = tried(None)
-        guess = predicted_guess(before.volume, plain, flow)
-        misfit = tried(guess).misfit[0]
+            return solved(Start.FIRST, FIRST_SHARE)
+        if roughness(flow) > ROUGHEST:
+            return solved(Start.UNRESOLVED, 1)
+        plain = prepared.solve(iterations=0)
+        predicted = solved(Start.PREDICTED, ITERATION_SHARE, predicted_guess(before.volume, plain, flow))
+        misfit = predicted.found.misfit[0]
         if not misfit < plain.misfit[0]:
-            chance = tried(predicted_guess(_exchanged(before.volume), plain, flow)).misfit[0]
+            chance = prepared.misfit(predicted_guess(_exchanged(before.volume), plain, flow))
             if not misfit < LEAST_AGREEMENT * chance:
-                found = self.smart.solve(images, floor=floor, progress=progress)
-                ratio = misfit / chance if chance > 0 else 1.0
-                return Solved(found=found, start=Start.MISSED, flow=flow, misfit_ratio=ratio)
-        count = math.ceil(ITERATION_SHARE * self.smart.settings.iterations)
-        found = self.smart.solve(images, floor=floor, iterations=count, first=guess, progress=progress)
-        return Solved(found=found, start=Start.PREDICTED, flow=flow)
+                return solved(Start.MISSED, FIRST_SHARE, ratio=misfit / chance if chance > 0 else 1.0)
+        return predicted
 
-    def _flow(self, before: Before) -> xr.Dataset | None:
-        """Return the displacement by which the next instant is predicted; None if it is not known."""
+    def correct(
+        self, trail: Sequence[Solved], at: int, progress: Callable[[float], None] | None = None
+    ) -> Reconstruction:
+        """Reconstruct one instant again from those before and after it.
+
+        Parameters
+        ----------
+        trail : sequence of Solved
+            Successive instants that show the same particles, at most `lfpiv.experiment.segments.REACH` on each side.
+        at : int
+            Index of the instant in `trail`.
+        progress : callable, optional
+            Called with the finished fraction.
+
+        Returns
+        -------
+        Reconstruction
+            If the flow between the instants is not known well enough, the one by `SmartSolver.solve`, from its images.
+        """
+        own = trail[at]
+        assert own.prepared is not None
+        alone = own.found if own.start is Start.UNRESOLVED else None
+        flows = [one.vectors for one in trail[2:] if one.vectors is not None]
+        if not flows and trail[-1].flow is not None:
+            flows = [trail[-1].flow]
+        flow = mean_flow(flows) if flows else None
+        others = {} if flow is None else _within_reach(trail, at, roughness(flow))
+        if flow is None or not others:
+            return alone or own.prepared.solve(progress=progress)
+        guess = agreed_guess(own.found, others, flow)
+        after = own.prepared.solve(iterations=CORRECTIONS, whole_passes=1, first=guess, progress=progress)
+        return own.found.continued_by(after)
+
+    def _flow(self, before: Before) -> tuple[xr.Dataset | None, xr.Dataset | None]:
+        """Return the displacement by which the next instant is predicted, and the last one measured, if known."""
         if before.earlier is None:
-            return before.flow
-        found = self._correlate(before.earlier, before.measured, self.correlation)
+            return before.flow, None
+        settings = self.correlation
+        if settings.get("windows") is None:
+            windows = cut_windows(WINDOWS, before.measured.shape)
+            settings = {**settings, "windows": windows, "overlap": OVERLAP}
+        found = self._correlate(before.earlier, before.measured, settings)
         if found.attrs["valid_fraction"] < LEAST_VALID * found.attrs["measurable_fraction"]:
-            return before.flow
+            return before.flow, None
         if before.flow is None:
-            return found
+            return found, found
         names = [f"displacement_{axis}" for axis in "zyx"]
         mean = {name: FLOW_MEMORY * before.flow[name] + (1 - FLOW_MEMORY) * found[name] for name in names}
-        return found.assign(mean)
+        return found.assign(mean), found
 
 
 def predicted_guess(volume: np.ndarray, plain: Reconstruction, flow: xr.Dataset) -> np.ndarray:
@@ -206,24 +264,15 @@ def predicted_guess(volume: np.ndarray, plain: Reconstruction, flow: xr.Dataset)
     return guess
 
 
+def _within_reach(trail: Sequence[Solved], at: int, rough: float) -> dict[int, np.ndarray]:
+    """Return the volumes of other instants from which particles are moved to one, by the number of steps to it."""
+    steps = {number: at - number for number in range(len(trail)) if number != at}
+    return {step: trail[number].found.volume for number, step in steps.items() if abs(step) * rough <= ROUGHEST}
+
+
 def _exchanged(volume: np.ndarray) -> np.ndarray:
     """Return a volume (z, y, x) with its quarters exchanged along y and x: the same particles in other places."""
     return np.roll(volume, (volume.shape[1] // 2, volume.shape[2] // 2), (1, 2))
-
-
-def coefficients(volume: np.ndarray, sieve_voxel: float) -> np.ndarray:
-    """Return coefficients c >= 0 of a sieve G with G c near a volume (z, y, x): c <- c G (E / G c), `UNBLURRED` times.
-
-    These are the steps of Richardson and Lucy; they keep the light. SMART takes its first guess as coefficients.
-    """
-    if sieve_voxel == 0:
-        return volume
-    nz, ny, nx = volume.shape
-    sieve, flat = Sieve(sieve_voxel, (nz, ny, nx)), volume.ravel()
-    found, least = flat, np.float32(FAINTEST * volume.max())
-    for _ in range(UNBLURRED):
-        found = found * sieve(flat / np.maximum(sieve(found), least))
-    return found.reshape(volume.shape)
 
 
 def _correlate(first: xr.DataArray, second: xr.DataArray, settings: Mapping[str, Any]) -> xr.Dataset:

@@ -20,6 +20,10 @@ TRUNCATE = 3.5
 """Reach of the sieve's Gaussian [standard deviation]."""
 SMOOTHING_TRUNCATE = 3.0
 """Reach of the Gaussian that smooths between iterations [standard deviation]."""
+UNBLURRED = 5
+"""Steps that undo the sieve's blur of a volume."""
+FAINTEST = 1e-6
+"""Least light of a voxel that blurred coefficients are divided by, as a share of the brightest one."""
 
 
 @dataclass(frozen=True)
@@ -63,3 +67,18 @@ class Smoothing:
     @cached_property
     def _blur(self) -> GaussianBlur:
         return GaussianBlur(self.sigma_voxel, self.shape, truncate=SMOOTHING_TRUNCATE, border="nearest")
+
+
+def coefficients(volume: np.ndarray, sieve_voxel: float) -> np.ndarray:
+    """Return coefficients c >= 0 of a sieve G with G c near a volume (z, y, x): c <- c G (E / G c), `UNBLURRED` times.
+
+    These are the steps of Richardson and Lucy; they keep the light. SMART takes its first guess as coefficients.
+    """
+    if sieve_voxel == 0:
+        return volume
+    nz, ny, nx = volume.shape
+    sieve, flat = Sieve(sieve_voxel, (nz, ny, nx)), volume.ravel()
+    found, least = flat, np.float32(FAINTEST * volume.max())
+    for _ in range(UNBLURRED):
+        found = found * sieve(flat / np.maximum(sieve(found), least))
+    return found.reshape(volume.shape)

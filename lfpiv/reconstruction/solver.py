@@ -110,102 +110,25 @@ class SmartSolver:
 
         `iterations` replaces that of the settings.
         """
+        prepared = self.prepare(images, floor=floor)
+        return prepared.solve(iterations=iterations, first=first, progress=progress)
+
+    def prepare(
+        self, images: Mapping[str, np.ndarray], *, floor: float | Mapping[str, float] | None = None
+    ) -> PreparedInstant:
+        """Measure what SMART needs to know of the images of one instant; arguments and exceptions as of `solve`."""
         settings, stored = self.settings, self.weights.stored
-        count = settings.iterations if iterations is None else iterations
         images = checked_images(self.weights, images)
         sieve = Sieve(self._sieve_voxel(images), stored.shape)
         cap = self._intensity_cap(images, sieve)
         recordings = record(self.weights, images, floor=floor, floor_share=settings.floor_share, intensity_cap=cap)
-        cameras = [self._equation(name, one) for name, one in recordings.items()]
-        norm = _norm(cameras)
-        equations = ImageEquations(cameras)
         gains = (np.float32(one.camera_gain) for one in recordings.values())
         column_sum = sum(gain * own for gain, own in zip(gains, self.weights.camera_sums, strict=True))
         lit = column_sum > LEAST_COLUMN_SUM * column_sum.max()
         if self.solid is not None:
             lit &= stored.store(~self.solid) > 0
-        if first is None:
-            guess = multiplicative_guess(cameras, [one.peak for one in recordings.values()], column_sum, lit)
-        else:
-            guess = checked_guess(first, stored) * lit
-        if settings.active_share > 0:
-            guess[guess < settings.active_share * guess.max()] = 0.0
-        momentum = Momentum(guess) if settings.accelerate else None
-        state = State(guess, momentum, self._steps(column_sum, lit, sieve))
-        history = _History(settings, count)
-        subset_steps = self._subset_steps(column_sum, recordings, sieve) if len(self.subsets) > 1 else ()
-        with equations.locked():
-            if subset_steps:
-                state = self._solve_subsets(equations, state, sieve, subset_steps, history, progress)
-            volume, stop = self._solve_whole(equations, state, sieve, lit, history, progress)
-        if stop is SmartStop.DIVERGED:
-            log.warning("SMART: %s", stop.value)
-        last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
-        return Reconstruction(
-            grid=self.weights.grid,
-            volume=self._without_solid(stored.restore(volume)),
-            solid=self.solid,
-            views=self._views,
-            residual=tuple(float(np.sqrt(squares)) / norm for squares in history.squares),
-            misfit=tuple(history.divergence),
-            stop=stop or last,
-            floor={name: one.floor for name, one in recordings.items()},
-            camera_gain={name: one.camera_gain for name, one in recordings.items()},
-            light_outside={name: one.light_outside for name, one in recordings.items()},
-            sieve_voxel=sieve.sigma_voxel,
-            intensity_cap=cap,
-            settings=settings,
-        )
-
-    def _solve_subsets(
-        self,
-        equations: ImageEquations,
-        state: State,
-        sieve: Sieve,
-        steps: Sequence[Step],
-        history: _History,
-        progress: Callable[[float], None] | None,
-    ) -> State:
-        """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
-        epochs = history.iterations - min(WHOLE_PASSES, -(-history.iterations // 2))
-        if epochs:
-            history.append(equations.compare(sieve(state.coefficients)))  # exact, as all steps begin here
-        resting = RestingVoxels(equations)
-        states = iterate_epochs(
-            equations, state, sieve, subsets=self.subsets, steps=steps, epochs=epochs, resting=resting
-        )
-        for state, misfit in states:  # noqa: B007 - the last state is the result
-            if history.epochs:
-                history.append(misfit)
-            history.epochs += 1
-            if progress is not None:
-                progress(history.epochs / (history.iterations + 1))
-            if history.settled(len(self.subsets)):
-                break
-        resting.wake()
-        return state
-
-    def _solve_whole(
-        self,
-        equations: ImageEquations,
-        state: State,
-        sieve: Sieve,
-        lit: np.ndarray,
-        history: _History,
-        progress: Callable[[float], None] | None,
-    ) -> tuple[np.ndarray, SmartStop | None]:
-        """Iterate over all rays in the iterations that are left. Return the last volume, and why it stopped early."""
-        smooth = Smoothing(self.settings.smoothing_voxel, self.weights.stored.shape, lit)
-        left, done = history.iterations - history.epochs, history.epochs
-        states = iterate(equations, state, sieve, iterations=left, smooth=smooth)
-        for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
-            history.append(misfit)
-            if progress is not None:
-                progress((done + number + 1) / (history.iterations + 1))
-            stop = history.early_stop
-            if stop is not None:
-                break
-        return volume, stop
+        equations = ImageEquations([self._equation(name, one) for name, one in recordings.items()])
+        return PreparedInstant(self, recordings, equations, sieve, cap, column_sum, lit)
 
     @cached_property
     def subsets(self) -> tuple[Subset, ...]:
@@ -309,6 +232,123 @@ class SmartSolver:
         plain = SmartStep(size, sieve)
         sharpened = self.settings.accelerate and sieve.sigma_voxel > 0
         return (SharpenedStep(unblurred, sieve.shape), plain) if sharpened else (plain,)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedInstant:
+    """Images of one instant with all that SMART needs to know of them. Made by `SmartSolver.prepare`."""
+
+    solver: SmartSolver
+    recordings: Mapping[str, Recording]
+    equations: ImageEquations
+    sieve: Sieve
+    intensity_cap: float
+    column_sum: np.ndarray
+    """Sum of the weights of each voxel, in stored order."""
+    lit: np.ndarray
+    """Voxels that some camera sees and that hold fluid, in stored order."""
+
+    def solve(
+        self,
+        *,
+        iterations: int | None = None,
+        whole_passes: int = WHOLE_PASSES,
+        first: np.ndarray | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> Reconstruction:
+        """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
+
+        `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes.
+        """
+        settings, stored = self.solver.settings, self.solver.weights.stored
+        guess = self._from_images.copy() if first is None else checked_guess(first, stored) * self.lit
+        if settings.active_share > 0:
+            guess[guess < settings.active_share * guess.max()] = 0.0
+        momentum = Momentum(guess) if settings.accelerate else None
+        state = State(guess, momentum, self.solver._steps(self.column_sum, self.lit, self.sieve))
+        count = settings.iterations if iterations is None else iterations
+        history, subsets = _History(settings, count), self.solver.subsets
+        epochs = count - min(whole_passes, -(-count // 2)) if len(subsets) > 1 else 0
+        steps = self.solver._subset_steps(self.column_sum, self.recordings, self.sieve) if epochs else ()
+        with self.equations.locked():
+            if steps:
+                state = self._solve_subsets(state, steps, history, epochs, progress)
+            volume, stop = self._solve_whole(state, history, progress)
+        if stop is SmartStop.DIVERGED:
+            log.warning("SMART: %s", stop.value)
+        last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
+        norm = _norm(self.equations.cameras)
+        return Reconstruction(
+            grid=self.solver.weights.grid,
+            volume=self.solver._without_solid(stored.restore(volume)),
+            solid=self.solver.solid,
+            views=self.solver._views,
+            residual=tuple(float(np.sqrt(squares)) / norm for squares in history.squares),
+            misfit=tuple(history.divergence),
+            stop=stop or last,
+            floor={name: one.floor for name, one in self.recordings.items()},
+            camera_gain={name: one.camera_gain for name, one in self.recordings.items()},
+            light_outside={name: one.light_outside for name, one in self.recordings.items()},
+            sieve_voxel=self.sieve.sigma_voxel,
+            intensity_cap=self.intensity_cap,
+            settings=settings,
+        )
+
+    def misfit(self, first: np.ndarray) -> float:
+        """Return the misfit of a first guess, shape (z, y, x) [counts]; raise ValueError as `solve`."""
+        guess = checked_guess(first, self.solver.weights.stored) * self.lit
+        with self.equations.locked():
+            return self.equations.compare(self.sieve(guess)).divergence
+
+    @cached_property
+    def _from_images(self) -> np.ndarray:
+        """First guess from the images alone, in stored order."""
+        peaks = [one.peak for one in self.recordings.values()]
+        return multiplicative_guess(self.equations.cameras, peaks, self.column_sum, self.lit)
+
+    def _solve_subsets(
+        self,
+        state: State,
+        steps: Sequence[Step],
+        history: _History,
+        epochs: int,
+        progress: Callable[[float], None] | None,
+    ) -> State:
+        """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
+        history.append(self.equations.compare(self.sieve(state.coefficients)))  # exact, as all steps begin here
+        subsets, resting = self.solver.subsets, RestingVoxels(self.equations)
+        states = iterate_epochs(
+            self.equations, state, self.sieve, subsets=subsets, steps=steps, epochs=epochs, resting=resting
+        )
+        for state, misfit in states:  # noqa: B007 - the last state is the result
+            if history.epochs:
+                history.append(misfit)
+            history.epochs += 1
+            if progress is not None:
+                progress(history.epochs / (history.iterations + 1))
+            if history.settled(len(subsets)):
+                break
+        resting.wake()
+        return state
+
+    def _solve_whole(
+        self,
+        state: State,
+        history: _History,
+        progress: Callable[[float], None] | None,
+    ) -> tuple[np.ndarray, SmartStop | None]:
+        """Iterate over all rays in the iterations that are left. Return the last volume, and why it stopped early."""
+        smooth = Smoothing(self.solver.settings.smoothing_voxel, self.sieve.shape, self.lit)
+        left, done = history.iterations - history.epochs, history.epochs
+        states = iterate(self.equations, state, self.sieve, iterations=left, smooth=smooth)
+        for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
+            history.append(misfit)
+            if progress is not None:
+                progress((done + number + 1) / (history.iterations + 1))
+            stop = history.early_stop
+            if stop is not None:
+                break
+        return volume, stop
 
 
 def _norm(cameras: Sequence[CameraEquation]) -> float:

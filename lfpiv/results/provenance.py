@@ -25,9 +25,9 @@ from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
 
-IMAGES, IMAGES_BEFORE = "images", "images_before"
-"""Parts of a stamp: the images of a result, and those of the instants before it from which it follows."""
-OF_PAIR = (IMAGES, IMAGES_BEFORE)
+IMAGES, IMAGES_BESIDE = "images", "images_beside"
+"""Parts of a stamp: the images of a result, and those of the instants beside it on which it depends."""
+OF_PAIR = (IMAGES, IMAGES_BESIDE)
 """Parts of a stamp that differ from pair to pair of a run."""
 
 
@@ -88,7 +88,7 @@ class Stamp:
                 found += [] if new.agree(old) else [name]
                 continue
             new = files.plain(new)
-            if old == new or (name in (IMAGES, IMAGES_BEFORE) and new is None):
+            if old == new or (name in (IMAGES, IMAGES_BESIDE) and new is None):
                 continue
             if isinstance(old, dict) and isinstance(new, dict):
                 gone = {IMAGES} if new.get("images", ()) is None else set()

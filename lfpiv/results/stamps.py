@@ -16,10 +16,10 @@ import numpy as np
 from lfpiv import files
 from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
 from lfpiv.experiment.readers.source import split
-from lfpiv.experiment.segments import followed
+from lfpiv.experiment.segments import depended_on
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.results.image_identity import CondensedImages, Images, content_hash, look_at
-from lfpiv.results.provenance import IMAGES_BEFORE, OF_PAIR, Stamp
+from lfpiv.results.provenance import IMAGES_BESIDE, OF_PAIR, Stamp
 from lfpiv.version import __version__
 
 
@@ -179,12 +179,12 @@ def of_pair(
     )
     of_vectors["step"] = experiment.series.step
     if experiment.in_sequence:
-        before = [_images_before(experiment, instant.number) for instant in experiment.pair_frames(pair)]
+        beside = [_images_beside(experiment, instant.number) for instant in experiment.pair_frames(pair)]
         first, second = (
-            Stamp({**stamp.parts, IMAGES_BEFORE: images}) for stamp, images in zip((first, second), before, strict=True)
+            Stamp({**stamp.parts, IMAGES_BESIDE: images}) for stamp, images in zip((first, second), beside, strict=True)
         )
-        both = [state for images in before if images is not None for state in images.states]
-        of_vectors[IMAGES_BEFORE] = None if None in before else CondensedImages(tuple(both))
+        both = [state for images in beside if images is not None for state in images.states]
+        of_vectors[IMAGES_BESIDE] = None if None in beside else CondensedImages(tuple(both))
     return PairStamps(
         volumes=(first, second),
         vectors=Stamp(of_pair | of_vectors),
@@ -210,11 +210,11 @@ def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp |
     return None if tracking is None else Stamp(of_vectors | {"tracking": tracking.model_dump()})
 
 
-def _images_before(experiment: Experiment, instant: int) -> Images | None:
-    """Return the images from which an instant of a sequence follows; None if one is missing."""
+def _images_beside(experiment: Experiment, instant: int) -> Images | None:
+    """Return the images of other instants on which one of a sequence depends; None if one is missing."""
     assert experiment.series is not None
     name = experiment.frames[0]
-    frames = (Frame(number, name) for number in followed(experiment.series, instant)[:-1])
+    frames = (Frame(number, name) for number in depended_on(experiment.series, instant))
     sources = [image for frame in frames for image in experiment.frame_images(frame)]
     return look_at(sources, experiment.path.parent, condensed=True)
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.experiment.experiment import Experiment
     from lfpiv.reconstruction.sequence import Before
+    from lfpiv.runs.pair_volumes import Followed
     from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
@@ -64,8 +65,11 @@ class InstantWork(Protocol):
     def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
         """Reconstruct one instant."""
 
-    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
+    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
         """Reconstruct one instant from the one before; return it and what the next one needs."""
+
+    def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one of successive instants again from those before and after it."""
 
     def write(self, write: Callable[[], None], *, large: bool = False) -> None:
         """Start to write a result of the present pair."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import LEAST_BYTES_PER_VOXEL
+from lfpiv.experiment.segments import REACH
 from lfpiv.files import MIB, size_text
 
 if TYPE_CHECKING:
@@ -75,12 +76,14 @@ def worker_bytes(experiment: Experiment) -> int:
 def _sequence_bytes(experiment: Experiment, pixels: int) -> int:
     """Estimate the memory of the instants that a process holds beyond a pair, to reconstruct others from them [byte].
 
-    These are the instants between those of a pair, with their images, and the three volumes of a prediction.
+    These are the instants between those of a pair, with their images, those that correct one and that one, the later of
+    them with their images twice, and the three volumes of a prediction.
     """
     if not experiment.in_sequence or experiment.series is None:
         return 0
     between = experiment.series.step - 1
-    return BYTES_PER_VALUE * ((between + 3) * experiment.grid.size + between * pixels)
+    volumes, images = between + 2 * REACH + 4, between + 2 * (REACH + 1)
+    return BYTES_PER_VALUE * (volumes * experiment.grid.size + images * pixels)
 
 
 def run_bytes(experiment: Experiment, weights: int, workers: int) -> int:

@@ -33,7 +33,7 @@ from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.instants import Instants, failure
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
 from lfpiv.runs.pair_vectors import LastVectors, measure_vectors, without_unmeasured
-from lfpiv.runs.pair_volumes import Reconstructor, reconstruction_s
+from lfpiv.runs.pair_volumes import Followed, Reconstructor, reconstruction_s
 from lfpiv.runs.particles import track
 from lfpiv.runs.sequences import SequentialInstants
 from lfpiv.runs.side_threads import ReadAhead, Writer
@@ -263,7 +263,7 @@ class PairWork:
         self.writer.wait_large()
         return self.reconstructor.instant(light, progress)
 
-    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
+    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
         """Reconstruct one instant of a series from the one before; return it and what the next one needs.
 
         Raises
@@ -275,8 +275,18 @@ class PairWork:
         self._log(instant, light.warnings)
         self.writer.wait_large()
         found, coming = self.reconstructor.follow(light, before, progress)
-        self._log(instant, found.record.warnings[len(light.warnings) :])
+        self._log(instant, found.light.warnings[len(light.warnings) :])
         return found, coming
+
+    def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one of successive instants again from those before and after it.
+
+        Raises
+        ------
+        InputError
+            If its images cannot be reconstructed.
+        """
+        return self.reconstructor.correct(trail, at, progress)
 
     def _log(self, pair: int, warnings: Iterable[Warning]) -> None:
         """Log the first warning of each code about a pair or an instant."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -24,20 +24,35 @@ from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS
 from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.motion import PairSolver
-from lfpiv.reconstruction.sequence import Before, SequenceSolver, Start
+from lfpiv.reconstruction.sequence import Before, SequenceSolver, Solved, Start
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.runs.guard import with_guard
 from lfpiv.runs.pair_vectors import LastVectors
 from lfpiv.runs.refinement import refined
-from lfpiv.runs.sequences import restarted
 from lfpiv.velocity.settings import FIRST_SEARCH
+from lfpiv.warn import Code, Warning
 
 if TYPE_CHECKING:
     from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Followed:
+    """An instant of a sequence that was reconstructed from its images and from the instants before it."""
+
+    light: FrameLight
+    """Its images, with a warning more if the instant was not where it was predicted."""
+    solved: Solved
+    seconds: float
+    """Time of the reconstruction [s]."""
+
+    def finished(self) -> Followed:
+        """Return it without its images: its volume still corrects others."""
+        return replace(self, light=replace(self.light, images={}), solved=replace(self.solved, prepared=None))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,27 +130,38 @@ class Reconstructor:
         log.info("instant %d: reconstructed in %.1f s", number, seconds)
         return self._frame(found.to_dataarray(), light, seconds)
 
-    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[FrameVolume, Before]:
-        """Reconstruct one instant of a series from the one before; raise as `pair`.
+    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
+        """Reconstruct one instant of a series from the one before, and return it with what the next one needs.
 
-        Returns
-        -------
-        volume : FrameVolume
-            Its record has a warning more than `light` if the instant was not where it was predicted.
-        before : Before
-            What the next instant needs.
+        Raises
+        ------
+        InputError
+            As `pair`.
         """
         number, start = light.frame.number, time.perf_counter()
         try:
             solved = self.sequence.solve(light.images, before, floor=light.noise, progress=progress)
         except ValueError as error:
             raise InputError(f"instant {number}: {error}") from error
-        seconds = time.perf_counter() - start
-        log.info("instant %d: reconstructed in %.1f s; %s", number, seconds, solved.start.value)
-        found = self._frame(solved.found.to_dataarray(), light, seconds)
         if solved.start is Start.MISSED:
-            found = restarted(found, solved.misfit_ratio, number)
-        return found, solved.before(found.volume, before)
+            missed = Warning(code=Code.NOT_FOLLOWED, figures={"ratio": solved.misfit_ratio}, instants=(number,))
+            light = replace(light, warnings=(*light.warnings, missed))
+        measured = _as_written(solved.found.to_dataarray(), self.experiment.grid)
+        seconds = time.perf_counter() - start
+        log.info("instant %d: %s, in %.1f s", number, solved.start.value, seconds)
+        return Followed(light=light, solved=solved, seconds=seconds), solved.before(measured, before)
+
+    def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one of successive instants again from those before and after it; raise as `pair`."""
+        own, start = trail[at], time.perf_counter()
+        number = own.light.frame.number
+        try:
+            found = self.sequence.correct([one.solved for one in trail], at, progress)
+        except ValueError as error:
+            raise InputError(f"instant {number}: {error}") from error
+        seconds = own.seconds + time.perf_counter() - start
+        log.info("instant %d: reconstructed in %.1f s with %d instants beside it", number, seconds, len(trail) - 1)
+        return self._frame(found.to_dataarray(), own.light, seconds)
 
     def volumes(
         self, images: Sequence[Mapping[str, np.ndarray]], noise: Sequence[Mapping[str, float]]

@@ -1,7 +1,8 @@
 """Volumes of a time series whose instants are reconstructed one after the other, each from the one before.
 
 `SequentialInstants` goes along the pairs k, k + 1, k + 2, ... of a stretch and holds the instants from the first to the
-second one of the present pair. The instants of a segment are always reconstructed from the same beginning
+second one of the present pair. Each is corrected by the few instants before and after it, so images are read ahead. The
+instants of a segment are always reconstructed from the same beginning
 (`lfpiv.experiment.segments`), so the numbers do not depend on the pairs that are asked for, on the processes, or on
 interruptions. A process that begins within a segment reconstructs the segment's instants up to there again.
 """
@@ -13,13 +14,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from lfpiv.errors import StorageError
+from lfpiv.experiment import segments
 from lfpiv.experiment.experiment import Frame
-from lfpiv.experiment.segments import followed, segment_of
+from lfpiv.experiment.segments import corrected_by, followed, segment_of
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.reconstruction.sequence import Before
-from lfpiv.results.pair_files import FrameVolume, PairFiles, VolumeFile
+from lfpiv.reconstruction.sequence import Before, Start
+from lfpiv.results.pair_files import PairFiles, VolumeFile
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.runs.instants import Failure, Instant, Instants, InstantWork, failure
+from lfpiv.runs.pair_volumes import Followed
 from lfpiv.warn import Code, Warning
 
 log = logging.getLogger(__name__)
@@ -46,7 +49,7 @@ class SequentialInstants(Instants):
         self.work.require_weights(file)
         segment = segment_of(file.frame.number)
         if segment not in self.sequences:
-            self.sequences[segment] = _Sequence(self.work)
+            self.sequences[segment] = _Sequence(self.work, segment)
         return self._handed_on(file, self.sequences[segment].reach(file.frame, progress))
 
     def clear(self) -> None:
@@ -60,14 +63,21 @@ class _Sequence:
     """The instants of one segment, as far as they are reconstructed."""
 
     work: InstantWork
-    last: int | None = None
-    """The last instant that was reconstructed or failed."""
+    segment: int
+    done: int | None = None
+    """The last instant that is finished."""
+    last: int = -1
+    """The last instant that was followed or failed; some are ahead of the finished ones, to correct these."""
     before: Before | None = None
     """What the next instant starts from; None if it starts from its images alone."""
     fingerprints: dict[str, bytes] = field(default_factory=dict)
     """Hash of the last instant's images by camera; empty if it failed."""
+    trail: dict[int, Followed | Failure] = field(default_factory=dict)
+    """Instants that were followed or failed and that correct others, or will be corrected."""
+    beginnings: set[int] = field(default_factory=set)
+    """Instants whose particles are not those of the instant before, as far as one knows."""
     ahead: dict[int, Instant | Failure] = field(default_factory=dict)
-    """Instants that were reconstructed before a pair asked for them."""
+    """Instants that were finished before a pair asked for them."""
 
     def forget(self, first: int) -> None:
         """Forget the instants before one that no pair asks for any more."""
@@ -77,31 +87,80 @@ class _Sequence:
         """Reconstruct instants up to one and return that one; raise Failure if it failed."""
         if frame.number not in self.ahead:
             assert self.work.experiment.series is not None
-            whole = followed(self.work.experiment.series, frame.number)
-            if self.last is None or self.last >= frame.number:
-                self.last, self.before, self.fingerprints = whole[0] - 1, None, {}
-            coming = whole[whole.index(self.last) + 1 :] if self.last in whole else whole
+            series = self.work.experiment.series
+            whole = followed(series, frame.number)
+            if self.done is None or self.done >= frame.number:
+                self.done = self.last = whole[0] - 1
+                self.before, self.fingerprints, self.trail, self.beginnings = None, {}, {}, set()
+            coming = range(self.done + 1, frame.number + 1)
             for place, number in enumerate(coming):
                 step = part_of(progress, place / len(coming), (place + 1) / len(coming))
-                self.ahead[number] = self._advance(Frame(number, frame.name), step)
+                self._finish(Frame(number, frame.name), corrected_by(series, number), step)
         found = self.ahead.pop(frame.number)
         if isinstance(found, Failure):
             raise found.with_traceback(None)
         return found
 
-    def _advance(self, frame: Frame, progress: StepProgress) -> Instant | Failure:
-        """Reconstruct the next instant. After one that fails, the sequence begins anew."""
+    def _finish(self, frame: Frame, later: range, progress: StepProgress) -> None:
+        """Finish the next instant, after it and those later ones that correct it were followed."""
+        number = frame.number
+        coming = range(self.last + 1, later.stop)
+        for place, one in enumerate(coming):
+            step = part_of(progress, place / (len(coming) + 1), (place + 1) / (len(coming) + 1))
+            self.trail[one] = self._follow(Frame(one, frame.name), step)
+        self.done = number
+        if segment_of(number) == self.segment:  # the others lead into it
+            step = part_of(progress, len(coming) / (len(coming) + 1), 1.0)
+            self.ahead[number] = self._corrected(frame, step)
+        own = self.trail[number]
+        if isinstance(own, Followed):
+            self.trail[number] = own.finished()
+        self.trail = {one: found for one, found in self.trail.items() if one > number - segments.REACH}
+
+    def _follow(self, frame: Frame, progress: StepProgress) -> Followed | Failure:
+        """Reconstruct the next instant from the one before. After one that fails, the sequence begins anew."""
         self.last = frame.number
         try:
             light = self._checked(self.work.light_again(frame))
-            volume, self.before = self.work.follow(light, self.before, progress)
+            if self.before is None:
+                self.beginnings.add(frame.number)
+            found, self.before = self.work.follow(light, self.before, progress)
         except StorageError:
             raise
         except Exception as error:  # an error in one instant must not end the series
             self.before, self.fingerprints = None, {}
             return failure(error)
+        if found.solved.start in (Start.MISSED, Start.UNRESOLVED):
+            self.beginnings.add(frame.number)
         self.fingerprints = dict(light.fingerprints)
-        return Instant(frame, volume, light)
+        return found
+
+    def _corrected(self, frame: Frame, progress: StepProgress) -> Instant | Failure:
+        """Correct an instant by those beside it that show the same particles."""
+        own = self.trail[frame.number]
+        if isinstance(own, Failure):
+            return own
+        trail, at = self._beside(frame.number)
+        try:
+            return Instant(frame, self.work.correct(trail, at, progress), own.light)
+        except StorageError:
+            raise
+        except Exception as error:  # an error in one instant must not end the series
+            return failure(error)
+
+    def _beside(self, number: int) -> tuple[list[Followed], int]:
+        """Return the instants by which one is corrected, with that one, and its index among them."""
+
+        def known(one: int) -> bool:
+            return isinstance(self.trail.get(one), Followed)
+
+        first = last = number
+        while first > number - segments.REACH and first not in self.beginnings and known(first - 1):
+            first -= 1
+        while last < number + segments.REACH and last + 1 not in self.beginnings and known(last + 1):
+            last += 1
+        found = (self.trail[one] for one in range(first, last + 1))
+        return [one for one in found if isinstance(one, Followed)], number - first
 
     def _checked(self, light: FrameLight) -> FrameLight:
         """Return the light of the next instant, with a warning if an image is that of the instant before."""
@@ -113,9 +172,3 @@ class _Sequence:
         figures = {"camera": " and ".join(same), "before": number - 1}
         repeated = Warning(code=Code.REPEATED, figures=figures, instants=(number,))
         return replace(light, warnings=(*light.warnings, repeated))
-
-
-def restarted(volume: FrameVolume, ratio: float, instant: int) -> FrameVolume:
-    """Return the volume of an instant that was not where it was predicted, with a warning in its record."""
-    missed = Warning(code=Code.NOT_FOLLOWED, figures={"ratio": ratio}, instants=(instant,))
-    return replace(volume, record=replace(volume.record, warnings=(*volume.record.warnings, missed)))

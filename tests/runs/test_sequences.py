@@ -28,6 +28,7 @@ INSTANTS = 7
 def short_segments(monkeypatch):
     monkeypatch.setattr(segments, "SEGMENT", 3)
     monkeypatch.setattr(segments, "LEAD_IN", 1)
+    monkeypatch.setattr(segments, "REACH", 1)
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +50,14 @@ def at(work, file):
 
 @pytest.fixture
 def solved(monkeypatch):
-    """Count the reconstructions, without first guesses alone."""
-    counts, solve = Counter(), SmartSolver.solve
+    """Count the instants that are reconstructed."""
+    counts, prepare = Counter(), SmartSolver.prepare
 
     def counted(self, *arguments, **settings):
-        counts["volumes"] += settings.get("iterations") != 0
-        return solve(self, *arguments, **settings)
+        counts["volumes"] += 1
+        return prepare(self, *arguments, **settings)
 
-    monkeypatch.setattr(SmartSolver, "solve", counted)
+    monkeypatch.setattr(SmartSolver, "prepare", counted)
     return counts
 
 
@@ -78,6 +79,7 @@ def reference(made, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(segments, "SEGMENT", 3)
         patch.setattr(segments, "LEAD_IN", 1)
+        patch.setattr(segments, "REACH", 1)
         work = changed(made[1], tmp_path_factory.mktemp("reference"), instants=INSTANTS, keep_volumes=True)
         assert [outcome.reason for outcome in sequential(work)] == [""] * (INSTANTS - 1)
     return work.folder.path
@@ -113,6 +115,8 @@ def test_an_instant_follows_from_the_beginning_of_its_segment(first, instants, d
     assert found[-1] == instant and found[0] >= first
     begins = instant - instant % segments.SEGMENT
     assert found[0] == max(begins - segments.LEAD_IN, first)
+    later = min(instant + segments.REACH, first + instants - 1)
+    assert segments.depended_on(series, instant) == [one for one in range(found[0], later + 1) if one != instant]
 
 
 def test_the_numbers_are_those_of_one_process_for_any_beginning(made, reference, tmp_path, solved):
@@ -123,7 +127,7 @@ def test_the_numbers_are_those_of_one_process_for_any_beginning(made, reference,
     solved.clear()
     shutil.rmtree(tmp_path / "out")
     sequential(changed(work, tmp_path / "out", instants=INSTANTS))
-    assert solved["volumes"] == INSTANTS + 2, "two instants lead in"
+    assert solved["volumes"] == INSTANTS + 4, "two instants lead in, and two correct the last ones of their segments"
 
 
 def warnings_of(folder):
@@ -171,7 +175,7 @@ def name(number):
     return f"instant_{FIRST + number:06d}.nc"
 
 
-def test_a_new_image_concerns_the_rest_of_its_segment_and_what_it_leads_into(made, small_run, tmp_path):
+def test_a_new_image_concerns_one_before_the_rest_of_its_segment_and_what_it_leads_into(made, small_run, tmp_path):
     file = write_series(small_run, tmp_path / "data")
     work = at(changed(made[1], tmp_path / "out", instants=INSTANTS, keep_volumes=True), file)
 
@@ -186,11 +190,11 @@ def test_a_new_image_concerns_the_rest_of_its_segment_and_what_it_leads_into(mad
     path = file.parent / f"run/left/{FIRST + 2:05d}.tif"  # the last one of its segment
     content = path.read_bytes()
     path.unlink()
-    assert frames()[FIRST + 5].parts[provenance.IMAGES_BEFORE] is None and not changed_since()
+    assert frames()[FIRST + 5].parts[provenance.IMAGES_BESIDE] is None and not changed_since()
     path.write_bytes(content)  # as a copy
     assert not changed_since()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    assert changed_since() == [5, 6, 7, 8]
+    assert changed_since() == [4, 5, 6, 7, 8]
 
 
 def test_after_a_bad_or_repeated_image_the_sequence_begins_anew(made, small_run, tmp_path):

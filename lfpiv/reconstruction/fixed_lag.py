@@ -1,0 +1,116 @@
+"""Correct the volumes of a time series by those before and after each: a smoother of fixed lag.
+
+`lfpiv.reconstruction.sequence` follows particles forward in time, so that a volume holds what the instants before it
+show. The instants after it show as much again. Here the volumes of a few instants on each side are moved along the
+flow to the present one, as in simultaneous motion tracking enhancement [1]_. Particles are in all of them. A ghost
+moves with the mean of the particles whose lines of sight cross in it, so it is elsewhere in most of them.
+
+The guess is E ((G E_1 ... G E_n)^(1 / n) / G E)^S, with E the present volume, E_1 to E_n those of all instants moved to
+it, the present one included, and G a Gaussian of the size of a particle. So a volume keeps its own particles in their
+places, and only their brightness changes: the mean of moved volumes itself would draw displacements to the flow by
+which they were moved. Few iterations follow.
+
+.. [1] K. P. Lynch, F. Scarano, "An efficient and accurate approach to MTE-MART for time-resolved tomographic PIV", Exp.
+   Fluids 56 (2015) 66, doi:10.1007/s00348-015-1934-6.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import xarray as xr
+from scipy import ndimage
+
+from lfpiv.reconstruction.result import Reconstruction
+from lfpiv.reconstruction.shared_light import FAINTEST, LARGEST_GAIN, SMOOTHING_VOXEL, MotionField
+from lfpiv.reconstruction.sieve import coefficients
+from lfpiv_kernels.correlation import deform
+
+SHARPNESS = 1.0
+"""Exponent S of the mean's ratio to the volume."""
+DARK_SHARE = 0.005
+"""Light added to all volumes before their ratio is taken, as a share of the smoothed volume's brightness,
+sum E^2 / sum E."""
+ROUGHEST = 0.18
+"""Largest roughness of a displacement by which particles are moved [voxel]."""
+ITERATIONS = 2
+"""Iterations that follow. The last one is over all rays."""
+
+
+def agreed_guess(own: Reconstruction, others: Mapping[int, np.ndarray], flow: xr.Dataset) -> np.ndarray:
+    """Return the guess of an instant from its volume and those of the instants beside it.
+
+    Parameters
+    ----------
+    own : Reconstruction
+        The instant from its images and the instants before it.
+    others : mapping of int to ndarray, shape (z, y, x)
+        Number of instants from each to the present one, negative for later ones -> its volume.
+    flow : Dataset
+        From `mean_flow`: displacement from one instant to the next [voxel of the vectors' volumes].
+
+    Returns
+    -------
+    ndarray, shape (z, y, x), float32
+        Coefficients of the sieve of `own`, with the light of its volume; zero where that is zero.
+    """
+    volume, light = own.volume, float(own.volume.sum(dtype=np.float64))
+    blurred = _blurred(volume)
+    if not light > 0:
+        return volume
+    dark = np.float32(DARK_SHARE * np.square(blurred, dtype=np.float64).sum() / blurred.sum(dtype=np.float64))
+    logarithm, ratio = np.log(blurred + dark), np.zeros_like(volume)
+    inside = deform.spline_coefficients(np.ones_like(volume))
+    for steps, other in others.items():
+        motion = MotionField(own.to_dataarray(), times(flow, steps))
+        field = motion.displacement(-1)
+        moved = np.maximum(motion.carried(deform.spline_coefficients(other), field), 0)
+        total = float(moved.sum(dtype=np.float64))
+        if total > 0:
+            there = np.clip(motion.carried(inside, field), 0, 1)
+            trust = motion.trust * np.where(there > 0.5, there, 0)
+            ratio += trust * (np.log(_blurred(moved * np.float32(light / total)) + dark) - logarithm)
+    gain = np.minimum(np.exp(np.float32(SHARPNESS / (len(others) + 1)) * ratio), np.float32(LARGEST_GAIN))
+    guess = coefficients(volume, own.sieve_voxel) * gain
+    np.maximum(guess, FAINTEST * guess.max(), out=guess, where=volume > 0)
+    guess *= np.float32(light / guess.sum(dtype=np.float64))
+    return guess
+
+
+def mean_flow(flows: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return the mean of displacements from one instant to the next, over those that are valid.
+
+    A vector of the mean is valid if one of them is. Where none is, it is the mean of the replaced ones.
+    """
+    valid = np.array([flow["valid"].values for flow in flows], bool)
+    weights = np.where(valid.any(0), valid, True)
+    mean = {}
+    for name in (f"displacement_{axis}" for axis in "zyx"):
+        values = np.array([flow[name].values for flow in flows])
+        mean[name] = flows[0][name].copy(data=np.where(weights, values, 0).sum(0) / weights.sum(0))
+    return flows[0].assign(mean | {"valid": flows[0]["valid"].copy(data=valid.any(0))})
+
+
+def roughness(flow: xr.Dataset) -> float:
+    """Return the root mean square second difference of displacements between neighbouring vectors [voxel].
+
+    Windows do not resolve how the flow varies within them, and neither does a linear interpolation between vectors. A
+    particle is off its predicted place by about twice this (docs/notebook/reconstruction.md). 0 for fewer than three
+    vectors along each axis.
+    """
+    field = np.stack([flow[f"displacement_{axis}"].values for axis in "zyx"], -1)
+    curved = [np.diff(field, 2, axis=axis) for axis in range(3) if field.shape[axis] > 2]
+    squares = [float(np.nanmean(part**2)) for part in curved if np.isfinite(part).any()]
+    return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
+
+
+def times(flow: xr.Dataset, steps: int) -> xr.Dataset:
+    """Return a flow of which each displacement is `steps` as long."""
+    return flow.assign({f"displacement_{axis}": steps * flow[f"displacement_{axis}"] for axis in "zyx"})
+
+
+def _blurred(volume: np.ndarray) -> np.ndarray:
+    blurred: np.ndarray = ndimage.gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant")
+    return blurred
