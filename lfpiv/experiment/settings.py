@@ -59,7 +59,8 @@ class Smart(Table):
     iterations: Steps = 14
     """Largest number of SMART iterations, passes over all rays; without `subsets` some 40 are needed."""
     subsets: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SUBSETS)] | Literal["auto"] = "auto"
-    """Number of ordered subsets of the rays: 1 for plain SMART, the number of cameras or twice that; "auto" chooses."""
+    """Number of ordered subsets of the rays: 1 for plain SMART, the number of cameras or twice that; "auto" chooses,
+    and goes on with fewer where the subsets contradict each other."""
     relaxation: Annotated[float, Field(strict=True, gt=0, le=3)] = 1.0
     """Relaxation mu of Eq. 5; values near 3 diverge."""
     normalisation: Literal["column", "paper"] = "column"

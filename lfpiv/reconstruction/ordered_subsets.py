@@ -8,14 +8,24 @@ over the subset and N is the number of subsets. Momentum goes on from subset to 
 Different subsets ask for slightly different volumes, so their steps end in a cycle around the solution. Steps become
 shorter from epoch to epoch, and the last passes take all rays: there the misfit falls in every pass [2]_.
 
+What the volume cannot explain widens that cycle: particles that are not equally bright in all cameras, light of no
+particle, particles smaller than voxels. Each subset then undoes what the others did, and the volume keeps the errors of
+single subsets. The exponents g_n of the subsets in an epoch show it. With <a, b> = sum_j c_j a_j b_j, the agreement
+|sum_n g_n|^2 / sum_n |g_n|^2 is N where all of N subsets ask for the same, 1 where their exponents are independent, and
+0 where they cancel. Below `CONFLICT` the following epochs take larger subsets. Stochastic gradient methods enlarge
+their samples by such a test of norms [3]_.
+
 .. [1] D. Kim, S. Ramani, J. A. Fessler, "Combining ordered subsets and momentum for accelerated X-ray CT image
    reconstruction", IEEE Trans. Med. Imaging 34 (2015) 167-178, doi:10.1109/TMI.2014.2350962.
 .. [2] S. Ahn, J. A. Fessler, "Globally convergent image reconstruction for emission tomography using relaxed ordered
    subsets algorithms", IEEE Trans. Med. Imaging 22 (2003) 613-626, doi:10.1109/TMI.2003.812251.
+.. [3] R. H. Byrd, G. M. Chin, J. Nocedal, Y. Wu, "Sample size selection in optimization methods for machine learning",
+   Math. Program. 134 (2012) 127-155, doi:10.1007/s10107-012-0572-5.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -28,12 +38,16 @@ from lfpiv.reconstruction.smart import ImageEquations, Misfit, State
 from lfpiv.reconstruction.steps import Step
 from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
 
+log = logging.getLogger(__name__)
+
 SUBSET_MOMENTUM = 0.94
 """Largest exponent of the momentum from subset to subset: a memory of four passes over four subsets."""
 WHOLE_PASSES = 2
 """Passes over all rays after the last epoch, at most half of all passes."""
 SHORTENING = 0.05
 """Steps of epoch k are 1 / (1 + k SHORTENING) as long as those of the first one."""
+CONFLICT = 0.5
+"""Agreement of subsets below which the next epochs take larger ones: half that of independent exponents."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +58,55 @@ class Subset:
     """Index of the camera."""
     lenses: int
     """Lenses through which the rays go, ``projector.EVEN``, ``ODD`` or ``ALL``."""
+
+
+@dataclass(frozen=True)
+class Partition:
+    """All rays, divided into subsets."""
+
+    subsets: tuple[Subset, ...]
+    """The subsets in their order."""
+    steps: tuple[Step, ...]
+    """Step of each subset."""
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """What an epoch leaves."""
+
+    state: State
+    misfit: Misfit
+    """Sum of the subsets' misfits, each before its own step: no exact misfit of any volume."""
+    subsets: int
+    """Number of subsets of the epoch."""
+
+
+class Agreement:
+    """Measure whether the subsets of an epoch ask for the same change.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (voxel,), float32
+        Coefficients c before the epoch, the weights of <a, b> = sum_j c_j a_j b_j.
+    """
+
+    def __init__(self, coefficients: np.ndarray):
+        self._weight = coefficients
+        self._sum = np.zeros_like(coefficients)
+        self._squares = 0.0
+
+    def add(self, exponent: np.ndarray) -> None:
+        """Add the exponent of a subset, shape (voxel,), float32."""
+        self._sum += exponent
+        self._squares += self._square(exponent)
+
+    @property
+    def value(self) -> float:
+        """|sum_n g_n|^2 / sum_n |g_n|^2, from 0 to the number of subsets; 1 where all exponents are 0."""
+        return self._square(self._sum) / self._squares if self._squares > 0 else 1.0
+
+    def _square(self, exponent: np.ndarray) -> float:
+        return float((self._weight * exponent * exponent).sum(dtype=np.float64))
 
 
 def subsets_of(cameras: int, halves: bool) -> tuple[Subset, ...]:
@@ -67,14 +130,11 @@ def iterate_epochs(
     state: State,
     sieve: Sieve,
     *,
-    subsets: Sequence[Subset],
-    steps: Sequence[Step],
+    partitions: Sequence[Partition],
     epochs: int,
     resting: RestingVoxels | None = None,
-) -> Iterator[tuple[State, Misfit]]:
-    """Iterate over the subsets; yield the state after each epoch, and the sum of its subsets' misfits.
-
-    The misfit of a subset is that before its own step, so the sum is no exact misfit of any volume.
+) -> Iterator[Epoch]:
+    """Iterate over the subsets; yield what each epoch leaves. End early where one subset is left.
 
     Parameters
     ----------
@@ -84,23 +144,32 @@ def iterate_epochs(
         Where to start. Its steps are kept for whole passes, its momentum starts anew.
     sieve : Sieve
         Sieve G, E = G c.
-    subsets, steps : sequence
-        The subsets in their order, and the step of each.
+    partitions : sequence of Partition
+        The one to begin with, and those that follow it one by one where subsets conflict.
     epochs : int
-        Number of epochs.
+        Largest number of epochs.
     resting : RestingVoxels, optional
         Lets dark voxels rest. Default: all voxels take part in all epochs.
     """
     coefficients, momentum = state.coefficients, Momentum(state.coefficients, largest=SUBSET_MOMENTUM)
+    partition, following = partitions[0], list(partitions[1:])
     for epoch in range(epochs):
         misfit, length = Misfit(0.0, 0.0), np.float32(1 / (1 + SHORTENING * epoch))
         active = None if resting is None else resting.active_in(epoch, sieve(coefficients))
         if active is not None:
             momentum = momentum.stopped(coefficients, active == 0)
-        for subset, step in zip(subsets, steps, strict=True):
+        agreement = Agreement(coefficients) if following else None
+        for subset, step in zip(partition.subsets, partition.steps, strict=True):
             volume = sieve(coefficients) if active is None else sieve(coefficients) * active
             misfit += equations.compare_subset(subset.camera, subset.lenses, volume)
             exponent = equations.back_project_subset(subset.camera, subset.lenses, volume)
+            if agreement is not None:
+                agreement.add(exponent)
             exponent *= length
             coefficients, momentum = momentum.extrapolate(step(coefficients, exponent, active))
-        yield State(coefficients, momentum, state.steps), misfit
+        yield Epoch(State(coefficients, momentum, state.steps), misfit, len(partition.subsets))
+        if agreement is not None and agreement.value < CONFLICT:
+            log.debug("epoch %d: agreement of the subsets %.2f, larger subsets follow", epoch + 1, agreement.value)
+            partition = following.pop(0)
+            if len(partition.subsets) == 1:
+                return

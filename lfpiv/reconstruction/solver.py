@@ -14,7 +14,7 @@ from lfpiv.geometry.volume import checked_mask
 from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
 from lfpiv.reconstruction.momentum import Momentum
-from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Subset, iterate_epochs, step_sizes, subsets_of
+from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Partition, Subset, iterate_epochs, step_sizes, subsets_of
 from lfpiv.reconstruction.particle_size import UNLIKE, ParticleSizer
 from lfpiv.reconstruction.recording import Recording, checked_images, record
 from lfpiv.reconstruction.resting_voxels import RestingVoxels
@@ -46,12 +46,18 @@ class _History:
     iterations: int
     squares: list[float] = field(default_factory=list)
     divergence: list[float] = field(default_factory=list)
-    epochs: int = 0
-    """Number of iterations over subsets, which come first. Their misfits are sums over subsets, so not quite exact."""
+    subsets: list[int] = field(default_factory=list)
+    """Number of subsets of each iteration over subsets. These come first. Their misfits are sums over the subsets'
+    pixels, so not quite exact."""
 
     def append(self, misfit: Misfit) -> None:
         self.squares.append(misfit.squares)
         self.divergence.append(misfit.divergence)
+
+    @property
+    def epochs(self) -> int:
+        """Number of iterations over subsets."""
+        return len(self.subsets)
 
     @property
     def early_stop(self) -> SmartStop | None:
@@ -64,12 +70,13 @@ class _History:
             return SmartStop.CONVERGED
         return None
 
-    def settled(self, subsets: int) -> bool:
-        """Return whether the last epoch of so many subsets hardly lowered the misfit, or made it no number."""
-        if len(self.divergence) < 2:
+    @property
+    def settled(self) -> bool:
+        """Whether the last epoch hardly lowered the misfit of the same subsets, or made it no number."""
+        if self.settings.tolerance == 0 or self.epochs < 2 or self.subsets[-1] != self.subsets[-2]:
             return False
         before, after = self.divergence[-2:]
-        return not before - after >= subsets * self.settings.tolerance * before if self.settings.tolerance else False
+        return not before - after >= self.subsets[-1] * self.settings.tolerance * before
 
 
 class SmartSolver:
@@ -132,7 +139,7 @@ class SmartSolver:
 
     @cached_property
     def subsets(self) -> tuple[Subset, ...]:
-        """The ordered subsets; one without any.
+        """The ordered subsets to begin with; one without any.
 
         Raises
         ------
@@ -158,21 +165,32 @@ class SmartSolver:
         even, odd, every = (len(projector.see_only(lenses)) for lenses in (EVEN, ODD, ALL))
         return min(even, odd) > 0 and even + odd >= LEAST_ALONE * every
 
-    def _subset_steps(
-        self, column_sum: np.ndarray, recordings: Mapping[str, Recording], sieve: Sieve
-    ) -> tuple[Step, ...]:
-        """Return the step of each subset."""
+    def _partitions(self, column_sum: np.ndarray, recordings: Mapping[str, Recording], sieve: Sieve) -> list[Partition]:
+        """Return the subsets to begin with, and the whole cameras that may follow if "auto" began with halves."""
+        first, cameras = self.subsets, len(self.weights.cameras)
+        may_grow = self.settings.subsets == AUTO and len(first) > cameras
+        in_turn = [first, subsets_of(cameras, False)] if may_grow else [first]
+        return [self._partition(subsets, column_sum, recordings, sieve) for subsets in in_turn]
+
+    def _partition(
+        self, subsets: tuple[Subset, ...], column_sum: np.ndarray, recordings: Mapping[str, Recording], sieve: Sieve
+    ) -> Partition:
+        """Return the subsets with the step of each."""
         names = list(self.weights.cameras)
         sums = (
             np.float32(recordings[names[one.camera]].camera_gain)
-            * self.weights.sums_of_lenses(names[one.camera], one.lenses)
-            for one in self.subsets
+            * (
+                self.weights.camera_sums[one.camera]
+                if one.lenses == ALL
+                else self.weights.sums_of_lenses(names[one.camera], one.lenses)
+            )
+            for one in subsets
         )
         sizes = step_sizes(column_sum, list(sums), column_sum > LEAST_COLUMN_SUM * column_sum.max())
         mu = np.float32(self.settings.relaxation)
         if sieve.sigma_voxel > 0:
-            return tuple(SharpenedStep(mu * size, sieve.shape) for size in sizes)
-        return tuple(SmartStep(mu * size, sieve) for size in sizes)
+            return Partition(subsets, tuple(SharpenedStep(mu * size, sieve.shape) for size in sizes))
+        return Partition(subsets, tuple(SmartStep(mu * size, sieve) for size in sizes))
 
     def _without_solid(self, volume: np.ndarray) -> np.ndarray:
         """Return a volume (z, y, x) without the light that the sieve spreads into the solid."""
@@ -267,12 +285,11 @@ class PreparedInstant:
         momentum = Momentum(guess) if settings.accelerate else None
         state = State(guess, momentum, self.solver._steps(self.column_sum, self.lit, self.sieve))
         count = settings.iterations if iterations is None else iterations
-        history, subsets = _History(settings, count), self.solver.subsets
-        epochs = count - min(whole_passes, -(-count // 2)) if len(subsets) > 1 else 0
-        steps = self.solver._subset_steps(self.column_sum, self.recordings, self.sieve) if epochs else ()
+        history = _History(settings, count)
+        epochs = count - min(whole_passes, -(-count // 2)) if len(self.solver.subsets) > 1 else 0
         with self.equations.locked():
-            if steps:
-                state = self._solve_subsets(state, steps, history, epochs, progress)
+            if epochs:
+                state = self._solve_subsets(state, history, epochs, progress)
             volume, stop = self._solve_whole(state, history, progress)
         if stop is SmartStop.DIVERGED:
             log.warning("SMART: %s", stop.value)
@@ -309,24 +326,24 @@ class PreparedInstant:
     def _solve_subsets(
         self,
         state: State,
-        steps: Sequence[Step],
         history: _History,
         epochs: int,
         progress: Callable[[float], None] | None,
     ) -> State:
         """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
         history.append(self.equations.compare(self.sieve(state.coefficients)))  # exact, as all steps begin here
-        subsets, resting = self.solver.subsets, RestingVoxels(self.equations)
-        states = iterate_epochs(
-            self.equations, state, self.sieve, subsets=subsets, steps=steps, epochs=epochs, resting=resting
-        )
-        for state, misfit in states:  # noqa: B007 - the last state is the result
+        resting = RestingVoxels(self.equations)
+        partitions = self.solver._partitions(self.column_sum, self.recordings, self.sieve)
+        for epoch in iterate_epochs(
+            self.equations, state, self.sieve, partitions=partitions, epochs=epochs, resting=resting
+        ):
+            state = epoch.state
             if history.epochs:
-                history.append(misfit)
-            history.epochs += 1
+                history.append(epoch.misfit)
+            history.subsets.append(epoch.subsets)
             if progress is not None:
                 progress(history.epochs / (history.iterations + 1))
-            if history.settled(len(subsets)):
+            if history.settled:
                 break
         resting.wake()
         return state

@@ -96,7 +96,8 @@ def reconstruct(
         Number of ordered subsets of the rays, each of which makes a step (`lfpiv.reconstruction.ordered_subsets`): 1
         for SMART as above, the number of cameras, or twice that. An iteration is a pass over all subsets; the last
         two iterations, at most half of them, are SMART's own. "auto": twice the number of cameras for one or two of
-        them, the number of cameras for more; 1 without `accelerate`, with smoothing, or with "paper".
+        them, until the subsets contradict each other, then the number of cameras, as for more of them; 1 without
+        `accelerate`, with smoothing, or with "paper".
     first : ndarray, shape (z, y, x), optional
         First guess, to continue an iteration or to start from your own; with a sieve, of c. Finite and >= 0. Voxels
         that are zero stay zero and cost no time.

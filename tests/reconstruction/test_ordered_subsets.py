@@ -118,11 +118,96 @@ def test_epochs_equal_their_dense_twin(weights):
     sums = [dense[one.camera][seen].sum(0).astype(np.float32) for one, seen in zip(subsets, pixels, strict=True)]
     sizes = ordered_subsets.step_sizes(column_sum, sums, np.ones(len(first), bool))
     state = State(first.copy(), momentum.Momentum(first.copy()), ())
-    steps = [SmartStep(size, sieve) for size in sizes]
+    partition = ordered_subsets.Partition(subsets, tuple(SmartStep(size, sieve) for size in sizes))
     with equations.locked():
-        epochs = ordered_subsets.iterate_epochs(equations, state, sieve, subsets=subsets, steps=steps, epochs=3)
-        found = [after.coefficients for after, _ in epochs][-1]
+        epochs = ordered_subsets.iterate_epochs(equations, state, sieve, partitions=[partition], epochs=3)
+        found = [epoch.state.coefficients for epoch in epochs][-1]
     np.testing.assert_allclose(found, twin, atol=TOLERANCE_TWIN * twin.max())
+
+
+def test_agreement_is_the_number_of_subsets_for_one_will_and_nothing_for_opposite_ones():
+    rng = np.random.default_rng(7)
+    weight = rng.uniform(0, 2, 10_000).astype(np.float32)
+    exponents = rng.normal(size=(4, weight.size)).astype(np.float32)
+
+    def agreement(*each):
+        found = ordered_subsets.Agreement(weight)
+        for exponent in each:
+            found.add(exponent)
+        return found.value
+
+    assert agreement(*[exponents[0]] * 4) == pytest.approx(4, rel=1e-6)
+    assert agreement(exponents[0], -exponents[0]) == 0
+    assert agreement(*exponents) == pytest.approx(1, abs=0.05)  # independent: 3 standard deviations are 0.03
+    assert agreement(*np.zeros_like(exponents)) == 1
+    dark = np.where(np.arange(weight.size) < 10, np.float32(1e3), 0)  # where the volume is dark, nothing counts
+    weight[:10] = 0
+    assert agreement(exponents[0] + dark, exponents[0] - dark) == pytest.approx(2, rel=1e-6)
+
+
+def epochs_of(weights, images, partitions, epochs):
+    """Numbers of subsets of the epochs, from an even volume on; `partitions` are tuples of subsets."""
+    names, even_gain = list(weights.cameras), {name: weights.gain(name) for name in weights.cameras}
+    equations = ImageEquations(
+        [
+            CameraEquation(image=images[name], gain=even_gain[name], floor=0.5, projector=weights.projector(name))
+            for name in names
+        ]
+    )
+    sieve, lit = Sieve(0.0, weights.stored.shape), np.ones(weights.grid.size, bool)
+    made = []
+    for subsets in partitions:
+        sums = [weights.sums_of_lenses(names[one.camera], one.lenses) for one in subsets]
+        sizes = ordered_subsets.step_sizes(weights.camera_sums.sum(0), sums, lit)
+        made.append(ordered_subsets.Partition(subsets, tuple(SmartStep(size, sieve) for size in sizes)))
+    first = np.full(weights.grid.size, 1e3, np.float32)
+    state = State(first, momentum.Momentum(first), ())
+    with equations.locked():
+        found = list(ordered_subsets.iterate_epochs(equations, state, sieve, partitions=made, epochs=epochs))
+    return [epoch.subsets for epoch in found]
+
+
+def test_subsets_that_conflict_are_followed_by_larger_ones(weights):
+    """Images of a volume are explained by all subsets, images of noise by none."""
+    rng = np.random.default_rng(8)
+    halves, cameras, one = (
+        ordered_subsets.subsets_of(2, True), ordered_subsets.subsets_of(2, False), ordered_subsets.subsets_of(1, False)
+    )  # fmt: skip
+    truth = rng.uniform(500, 2e3, weights.grid.shape).astype(np.float32)
+    explained = {name: image.reshape(-1) for name, image in weights(truth).items()}
+    noise = {name: rng.exponential(20, image.size).astype(np.float32) for name, image in explained.items()}
+    assert epochs_of(weights, explained, [halves, cameras], 4) == [4, 4, 4, 4]
+    found = epochs_of(weights, noise, [halves, cameras], 6)
+    assert len(found) == 6 and found[0] == 4 and found[-1] == 2 and found == sorted(found, reverse=True)
+    assert epochs_of(weights, noise, [halves], 6) == [4] * 6
+    assert epochs_of(weights, noise, [halves, one], 6) == [4] * found.count(4)
+
+
+def unlike_bright(weights, truth, deviation):
+    """Images of voxels whose brightness differs from camera to camera, by a log-normal factor."""
+    rng = np.random.default_rng(9)
+    return {
+        name: weights(truth * rng.lognormal(0, deviation, truth.shape).astype("f4"))[name] for name in weights.cameras
+    }
+
+
+def test_auto_takes_larger_subsets_where_cameras_contradict_each_other(volume_of_blobs):
+    weights, truth, images = volume_of_blobs
+    unlike = unlike_bright(weights, truth, 1.2)
+    keywords = {"iterations": 14, "sieve_voxel": 0.6}
+    auto, four = (plain_steps.reconstruct(weights, images, subsets=number, **keywords) for number in ("auto", 4))
+    np.testing.assert_array_equal(auto, four)
+    auto, four = (plain_steps.reconstruct(weights, unlike, subsets=number, **keywords) for number in ("auto", 4))
+    quality = [lfpiv.metrics.reconstruction_quality(volume, truth) for volume in (auto, four)]
+    assert quality[0] > quality[1] + 0.005  # 0.535, 0.524
+
+
+def test_a_change_of_the_subsets_is_no_stop_by_tolerance(volume_of_blobs):
+    """The sum of the misfits hardly falls from the last epoch of halves to the first one of whole cameras."""
+    weights, truth, _ = volume_of_blobs
+    images, keywords = unlike_bright(weights, truth, 0.7), {"iterations": 12, "sieve_voxel": 0.6, "subsets": "auto"}
+    found, never = (plain_steps.reconstruct(weights, images, tolerance=value, **keywords) for value in (0.01, 0.0))
+    assert found.attrs["misfit"] == never.attrs["misfit"]
 
 
 def test_sums_of_lenses_are_those_of_the_dense_weights(weights):
@@ -174,9 +259,10 @@ def test_a_stop_by_tolerance_is_one_of_whole_passes(volume_of_blobs):
     assert 0 <= misfit[-2] - misfit[-1] < 3e-3 * misfit[-2]
 
 
-def test_subsets_do_not_depend_on_the_threads(volume_of_blobs, monkeypatch):
+@pytest.mark.parametrize("subsets", [4, "auto"])
+def test_subsets_do_not_depend_on_the_threads(volume_of_blobs, monkeypatch, subsets):
     weights, _, images = volume_of_blobs
-    device, keywords = runtime.device(), {"sieve_voxel": 0.6, "subsets": 4}
+    device, keywords = runtime.device(), {"sieve_voxel": 0.6, "subsets": subsets}
     before = plain_steps.reconstruct(weights, images, 4, **keywords)
     monkeypatch.setattr(runtime, "device", lambda: dataclasses.replace(device, threads=1))
     np.testing.assert_array_equal(plain_steps.reconstruct(weights, images, 4, **keywords).values, before.values)
