@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -73,6 +73,11 @@ class Reconstructor:
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
             mask=refined(with_guard(self.experiment, self.guard), self.refinement).solid,
         )
+
+    def with_intensity_cap(self, cap: float) -> Reconstructor:
+        """Return the same reconstruction whose limit of the counts does not depend on the images."""
+        smart = self.experiment.smart.model_copy(update={"intensity_cap": cap})
+        return replace(self, experiment=self.experiment.model_copy(update={"smart": smart}))
 
     @cached_property
     def sequence(self) -> SequenceSolver:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lfpiv.velocity.damping import DAMPING, Damping, Simulated, estimate_damping
+from lfpiv.velocity.damping import DAMPING, Damping
+from lfpiv.velocity.damping_estimate import Simulated, estimate_damping
 from lfpiv.velocity.likeness import compare
 
 SHAPE = (6, 6, 6)
@@ -54,7 +55,7 @@ def test_harder_pairs_correct_nothing(how):
     alike, harder = damping(recorded), damping(recorded, **how)
     assert all(axis.applied for axis in alike.axes.values())
     assert harder.likeness.harder and not any(axis.applied for axis in harder.axes.values())
-    assert all(axis.used_slope == 1.0 and axis.used_offset == 0.0 for axis in harder.axes.values())
+    assert all(axis.used_gain == 1.0 and axis.used_offset == 0.0 for axis in harder.axes.values())
     assert all(axis.pull > 0 for axis in harder.axes.values())
     assert Damping.from_json(json.loads(json.dumps(harder.to_json()))) == harder
 
