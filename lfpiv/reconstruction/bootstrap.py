@@ -22,7 +22,7 @@ from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.likely_flow import LikelyFlow
 from lfpiv.reconstruction.particle_light import LightField
 from lfpiv.reconstruction.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
-from lfpiv.reconstruction.unresolved_flow import UnresolvedFlow, needed_rms
+from lfpiv.reconstruction.unresolved_flow import STRONGEST, UnresolvedFlow, needed_rms
 from lfpiv.velocity.damping import Damping, displacement
 from lfpiv.velocity.damping_estimate import Simulated, estimate_damping
 from lfpiv.velocity.imposed_field import ImposedField
@@ -139,14 +139,15 @@ class _Bootstrap:
         like = self._vectors[imitated]
         flow = ImposedField(like, self._flow(imitated, alike))
         self._waves.append(self._needed_waves(flow, alike))
+        log.debug("simulated pair %d: unresolved waves of %.2f voxel", number, self._waves[-1])
         waves = UnresolvedFlow(like, self._waves[-1], np.random.default_rng([SEED, number, 1]))
         moved = self._pair.images(lambda points: flow(points) + waves(points), np.random.default_rng([SEED, number]))
         found = self._measure(moved, (self._noise, self._noise))
-        return Simulated(vectors=found, imposed=flow.window_means + waves.window_means())
+        return Simulated(vectors=found, imposed=flow.window_means + waves.window_means)
 
     def _needed_waves(self, flow: ImposedField, alike: Sequence[Simulated]) -> float:
-        """Return the root mean square of the unresolved waves, at most that of the flow's fluctuations [voxel]."""
-        largest = float(flow.window_means.std((0, 1, 2)).mean())
+        """Return the root mean square of the unresolved waves of the next pair [voxel]."""
+        largest = STRONGEST * float(np.sqrt(flow.window_means.var((0, 1, 2)).mean()))
         deviations = [random_deviation([one.vectors]) for one in alike]
         known = list(zip(self._waves[len(self._waves) - len(alike) :], deviations, strict=True))
         known = [(waves, deviation) for waves, deviation in known if deviation is not None]
