@@ -5,9 +5,8 @@ field, imaged through the calibrated mappings with noise, and measured with the 
 leaves of the imposed displacement is the damping (`lfpiv.velocity.damping`).
 
 A measured field has errors, and its fluctuations are damped already. So the simulated flow has the amplitudes with
-which simulated vectors have the power of the recorded ones (`LikelyFlow`), and waves too short for windows, with which
-simulated vectors err as recorded ones do (`UnresolvedFlow`). A pilot pair, moved by the measured field, makes the
-start.
+which simulated vectors have the power of the recorded ones (`LikelyFlow`). A pilot pair, moved by the measured field,
+makes the start.
 """
 
 from __future__ import annotations
@@ -22,11 +21,9 @@ from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.likely_flow import LikelyFlow
 from lfpiv.reconstruction.particle_light import LightField
 from lfpiv.reconstruction.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
-from lfpiv.reconstruction.unresolved_flow import STRONGEST, UnresolvedFlow, needed_rms
 from lfpiv.velocity.damping import Damping, displacement
 from lfpiv.velocity.damping_estimate import Simulated, estimate_damping
 from lfpiv.velocity.imposed_field import ImposedField
-from lfpiv.velocity.likeness import random_deviation
 from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
@@ -118,9 +115,6 @@ class _Bootstrap:
         self._vectors = vectors
         self._fields = [displacement(one) for one in vectors]
         self._flow = LikelyFlow(self._fields)
-        self._random = random_deviation(vectors)
-        self._waves: list[float] = []
-        """Root mean square of the unresolved waves of each simulated pair [voxel]."""
 
     def run(self, pairs: int, progress: StepProgress) -> Damping:
         """Simulate the pilot and the pairs; return the damping of the pairs."""
@@ -136,22 +130,10 @@ class _Bootstrap:
 
     def _simulate(self, number: int, imitated: int, alike: Sequence[Simulated]) -> Simulated:
         """Simulate and measure one pair with the flow of a recorded one, made with simulated pairs so far."""
-        like = self._vectors[imitated]
-        flow = ImposedField(like, self._flow(imitated, alike))
-        self._waves.append(self._needed_waves(flow, alike))
-        log.debug("simulated pair %d: unresolved waves of %.2f voxel", number, self._waves[-1])
-        waves = UnresolvedFlow(like, self._waves[-1], np.random.default_rng([SEED, number, 1]))
-        moved = self._pair.images(lambda points: flow(points) + waves(points), np.random.default_rng([SEED, number]))
-        found = self._measure(moved, (self._noise, self._noise))
-        return Simulated(vectors=found, imposed=flow.window_means + waves.window_means)
-
-    def _needed_waves(self, flow: ImposedField, alike: Sequence[Simulated]) -> float:
-        """Return the root mean square of the unresolved waves of the next pair [voxel]."""
-        largest = STRONGEST * float(np.sqrt(flow.window_means.var((0, 1, 2)).mean()))
-        deviations = [random_deviation([one.vectors]) for one in alike]
-        known = list(zip(self._waves[len(self._waves) - len(alike) :], deviations, strict=True))
-        known = [(waves, deviation) for waves, deviation in known if deviation is not None]
-        return 0.0 if self._random is None else needed_rms(self._random, known, largest)
+        flow = ImposedField(self._vectors[imitated], self._flow(imitated, alike))
+        frames = self._pair.images(flow, np.random.default_rng([SEED, number]))
+        found = self._measure(frames, (self._noise, self._noise))
+        return Simulated(vectors=found, imposed=flow.window_means)
 
 
 def evenly_spread(pairs: Sequence[int], count: int) -> list[int]:

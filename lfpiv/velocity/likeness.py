@@ -90,12 +90,6 @@ def compare(recorded: Sequence[xr.Dataset], simulated: Sequence[xr.Dataset]) -> 
     return Likeness(invalid_share=invalid, deviation_voxel=random)
 
 
-def random_deviation(pairs: Sequence[xr.Dataset]) -> float | None:
-    """Return the mean over octants of the median random standard deviation [voxel]; None if none is stated."""
-    known = [random for one in pairs for _, random in _octant_figures(one) if np.isfinite(random)]
-    return float(np.mean(known)) if known else None
-
-
 def usable(vectors: xr.Dataset) -> np.ndarray:
     """Return True where all of a window is fluid that can be measured, shape (z, y, x).
 
