@@ -60,7 +60,7 @@ class AxisDamping:
     """Damping of one component of the displacement."""
 
     slope: float
-    """Slope of measured on true fluctuations."""
+    """Slope of measured on true fluctuations in recorded pairs."""
     slope_error: float
     """Its standard error, with the doubt that simulated pairs unlike the recorded ones raise."""
     offset: float

@@ -1,4 +1,14 @@
-"""`estimate_damping`: the damping of fluctuations and the offset of each component, from simulated pairs."""
+"""`estimate_damping`: the damping of fluctuations and the offset of each component, from simulated pairs.
+
+Simulated pairs are never quite as hard to measure as recorded ones: a field from vectors lacks what windows do not
+show. The same ghosts make the random errors that correlation statistics state and the damping. So the damping of
+recorded pairs, 1 - S, is that of simulated ones times the ratio of their random deviations, as a ratio estimator [1]_
+takes it from what is known of both. The standard error holds the whole change once more.
+
+References
+----------
+.. [1] W. G. Cochran, "Sampling Techniques", 3rd edition, Wiley, 1977, chapter 6.
+"""
 
 from __future__ import annotations
 
@@ -69,11 +79,10 @@ def _of_axis(pairs: Sequence[Simulated], axis: str, likeness: Likeness | None) -
     errors = np.concatenate([_scaled_errors(pair, axis, slope, offset) for pair in pairs])
     squares = sum(below for pair in sums for below, _ in pair)
     fluctuation = np.sqrt(squares / sum(len(away) for pair in parts for away, _, _ in pair))
-    doubt = 0.0 if likeness is None else likeness.doubt * abs(slope - 1)
     rests = np.concatenate([error - offset - (slope - 1) * away for pair in parts for away, _, error in pair])
     found = AxisDamping(
         slope=slope,
-        slope_error=float(np.hypot(slope_error, doubt)),
+        slope_error=slope_error,
         offset=offset,
         offset_error=offset_error,
         fluctuation=float(fluctuation),
@@ -81,7 +90,26 @@ def _of_axis(pairs: Sequence[Simulated], axis: str, likeness: Likeness | None) -
         scatter=float(np.sqrt(np.mean(rests**2))),
         alike=likeness is None or not likeness.harder,
     )
-    return _with_coherence(found, pairs, axis)
+    found = _with_coherence(found, pairs, axis)
+    return found if likeness is None else _of_recorded(found, likeness)
+
+
+def _of_recorded(found: AxisDamping, likeness: Likeness) -> AxisDamping:
+    """Return the damping of recorded pairs, given that of simulated ones and the ratio of their random errors."""
+    ratio, taken = likeness.errors_ratio, 1 - found.slope
+    slope = 1 - ratio * taken
+    if not slope > 0:
+        return replace(found, slope_error=UNKNOWN)
+    restored = ratio * found.slope / slope  # what is added to vectors, over what was added to simulated ones
+    gain = 1 + (found.noise_gain - 1) * restored
+    return replace(
+        found,
+        slope=slope,
+        slope_error=float(np.hypot(ratio * found.slope_error, likeness.doubt * taken)),
+        scatter=ratio * found.scatter,
+        scatter_unbiased=ratio * gain * found.scatter,
+        coherent_slope=None if found.coherent_slope is None else found.coherent_slope * slope / found.slope,
+    )
 
 
 def _with_coherence(found: AxisDamping, pairs: Sequence[Simulated], axis: str) -> AxisDamping:
