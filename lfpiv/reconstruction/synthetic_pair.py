@@ -122,7 +122,7 @@ class RecordedImages:
         )
         return replace(found, brightness_log_sd=self._brightness_log_sd(images, found))
 
-    def _brightness_log_sd(self, images: Sequence[Images], particles: RecordedParticles) -> float:
+    def _brightness_log_sd(self, images: Sequence[Mapping[str, np.ndarray]], particles: RecordedParticles) -> float:
         """Return the standard deviation of the logarithm of the particles' brightness; 0 if they are about equal."""
         imager, equal = ParticleImager(self.weights, particles.sigma_voxel), []
         for number in range(REFERENCES):

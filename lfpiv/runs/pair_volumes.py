@@ -77,7 +77,7 @@ class Reconstructor:
     def with_intensity_cap(self, cap: float) -> Reconstructor:
         """Return the same reconstruction whose limit of the counts does not depend on the images."""
         smart = self.experiment.smart.model_copy(update={"intensity_cap": cap})
-        return replace(self, experiment=self.experiment.model_copy(update={"smart": smart}))
+        return replace(self, experiment=replace(self.experiment, smart=smart))
 
     @cached_property
     def sequence(self) -> SequenceSolver:

@@ -133,7 +133,8 @@ class AxisDamping:
         if self.coherence:
             return (1 - self.slope) / (self.coherent_slope or self.slope) * weighted(displacement, self.coherence)
         mean = displacement.mean() if used is None or not used.any() else displacement[used].mean()
-        return (1 / self.slope - 1) * (displacement - mean)
+        whole: np.ndarray = (1 / self.slope - 1) * (displacement - mean)
+        return whole
 
     @property
     def used_offset(self) -> float:
