@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -51,24 +51,24 @@ class ParticleImager:
         self._cameras = {name: (PackedCamera.of(camera), camera) for name, camera in weights.cameras.items()}
         self._forms = weights.forms
 
-    def __call__(self, positions_mm: np.ndarray, light: np.ndarray | Mapping[str, np.ndarray]) -> Images:
+    def __call__(self, positions_mm: np.ndarray, light: np.ndarray) -> Images:
         """Return the image of every camera without noise, shape (rows, columns), float32.
 
         Parameters
         ----------
         positions_mm : ndarray, shape (particle, 3)
             Centres (x, y, z) [mm].
-        light : ndarray, shape (particle,), or mapping of str to such
-            Light of each particle, in all cameras or by camera, in the unit of the images divided by the weights.
+        light : ndarray, shape (particle,)
+            Light of each particle, in the unit of the images divided by the weights.
         """
         images = {}
         for name, (packed, camera) in self._cameras.items():
-            image, own = np.zeros(camera.optics.sensor_shape, np.float32), _of_camera(light, name)
+            image = np.zeros(camera.optics.sensor_shape, np.float32)
             part = np.empty(image.size, np.float32)
             for some in self._batches(len(positions_mm)):
                 models = _shifted(ray_models(camera, positions_mm[some], self._edge_mm), self._steps)
                 cubes = Projector(blocks_of(packed, [models], self._forms[name]))
-                values = (own[some, None] * self._light).astype(np.float32).ravel()
+                values = (light[some, None] * self._light).astype(np.float32).ravel()
                 image += cubes.project(values, part).reshape(image.shape)
             images[name] = np.multiply(image, camera.gain, out=image)
         return images
@@ -78,10 +78,6 @@ class ParticleImager:
         step = max(1, CUBES // len(self._light))
         for first in range(0, count, step):
             yield slice(first, first + step)
-
-
-def _of_camera(light: np.ndarray | Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    return light if isinstance(light, np.ndarray) else light[name]
 
 
 def _shifted(models: np.ndarray, steps: np.ndarray) -> np.ndarray:

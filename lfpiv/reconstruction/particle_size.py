@@ -182,11 +182,11 @@ class ParticleSizer:
             for name, sub_apertures in known.items():
                 same, next_lens = sub_apertures.covariances(images[name]).sum(1)
                 ratios[name].append(next_lens / same if same > 0 else 0.0)
-                equal[name].append(brightness_skewness(sub_apertures.cumulants(images[name])))
+                equal[name].append(_skewness(sub_apertures.cumulants(images[name])))
         self._ratios = {name: np.maximum.accumulate(values) for name, values in ratios.items()}
         """Covariance one lens away over that at the same lens for each of `WIDTHS_VOXEL`, rising."""
         self._equal = equal
-        """`brightness_skewness` of equal particles for each of `WIDTHS_VOXEL`."""
+        """`_skewness` of equal particles for each of `WIDTHS_VOXEL`."""
 
     def size(self, images: Mapping[str, np.ndarray]) -> float | None:
         """Estimate the size of the particles: the Gaussian of voxels whose images are as wide as the measured ones.
@@ -253,11 +253,11 @@ class ParticleSizer:
             products = cumulants[1]
             equal = float(np.interp(variance, np.square(WIDTHS_VOXEL), known))
             if equal > 0 and products.mean() > SIGNIFICANCE * products.std() / len(products) ** 0.5:
-                scatters.append(brightness_skewness(cumulants) / equal)
+                scatters.append(_skewness(cumulants) / equal)
         return float(np.mean(scatters)) if scatters else None
 
 
-def brightness_skewness(cumulants: np.ndarray) -> float:
-    """Return mean times third cumulant over the square of the covariance, of cumulants; 0 without light."""
+def _skewness(cumulants: np.ndarray) -> float:
+    """Return mean times third cumulant over the square of the covariance, 0 without light."""
     light, second, third = cumulants.sum(1)
     return float(light * third / second**2) if second > 0 else 0.0

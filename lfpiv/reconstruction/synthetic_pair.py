@@ -7,24 +7,19 @@ The number follows from the covariance of sub-aperture images (`lfpiv.reconstruc
 noise does not enter: of n equal particles at random places it is n k b^2 and the mean light n m b, with k and m
 properties of the rig. Their ratio gives n. Images of a known number of particles give k / m^2. Of particles of unlike
 brightness it is the number of equal ones with the same mean and variance of light, n <b>^2 / <b^2>.
-
-How unlike bright they are follows from the third cumulant of the sub-aperture images, <b> <b^3> / <b^2>^2 over that of
-simulated equal particles, whose light depends on the place as well. Brightness is drawn from a log-normal distribution
-with that ratio, which is exp(s^2) for the standard deviation s of its logarithm. Images of one camera do not tell what
-differs between particles from what differs between cameras, so that half of the variance s^2 is taken for each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from lfpiv.geometry.grid import Grid
 from lfpiv.reconstruction.particle_images import ParticleImager
-from lfpiv.reconstruction.particle_size import LIT_SHARE, UNLIKE, SubApertures, brightness_skewness
+from lfpiv.reconstruction.particle_size import LIT_SHARE, SubApertures
 from lfpiv.weights.operator import Images, Weights
 
 Displacement = Callable[[np.ndarray], np.ndarray]
@@ -58,23 +53,6 @@ class RecordedParticles:
     """Camera name -> standard deviation of the background [counts]."""
     full: Mapping[str, float]
     """Camera name -> brightest count; synthetic images are limited to it."""
-    brightness_log_sd: float = 0.0
-    """Standard deviation of the logarithm of the particles' brightness in a camera."""
-
-    @property
-    def drawn_density(self) -> float:
-        """Number of particles of unlike brightness per voxel."""
-        return self.density * float(np.exp(self.brightness_log_sd**2))
-
-    def brightness(self, count: int, cameras: Iterable[str], rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draw the brightness of particles in each camera, of mean 1, each of shape (particle,)."""
-        if self.brightness_log_sd == 0:
-            return {name: np.ones(count) for name in cameras}
-        half = self.brightness_log_sd / np.sqrt(2)  # standard deviation of half of the variance
-        own, found = half * rng.standard_normal(count), {}
-        for name in cameras:
-            found[name] = np.exp(own + half * rng.standard_normal(count) - half**2)
-        return found
 
 
 class RecordedImages:
@@ -113,31 +91,13 @@ class RecordedImages:
         sigma = float(np.sqrt(np.mean(np.square(sigmas))))
         for name, ratios in recorded.items():
             shares.append(ratios.sum() / np.exp(np.interp(sigma, SIGMAS_VOXEL, np.log(known[name].sum(1)))))
-        found = RecordedParticles(
+        return RecordedParticles(
             density=1 / (float(np.mean(shares)) * self.weights.grid.size),
             sigma_voxel=sigma,
             light={name: float(np.mean([self._light(name, one[name]) for one in images])) for name in self._seen},
             noise=dict(noise),
             full={name: float(max(one[name].max() for one in images)) for name in self._seen},
         )
-        return replace(found, brightness_log_sd=self._brightness_log_sd(images, found))
-
-    def _brightness_log_sd(self, images: Sequence[Mapping[str, np.ndarray]], particles: RecordedParticles) -> float:
-        """Return the standard deviation of the logarithm of the particles' brightness; 0 if they are about equal."""
-        imager, equal = ParticleImager(self.weights, particles.sigma_voxel), []
-        for number in range(REFERENCES):
-            places = random_places(self.weights.grid, particles.density * self.weights.grid.size, _drawn(number))
-            equal.append(imager(places, self.light(places)))
-        ratios = []
-        for name, known in self._sub_apertures.items():
-            recorded, simulated = (
-                brightness_skewness(np.sum([known.cumulants(one[name]) for one in some], axis=0))
-                for some in (images, equal)
-            )
-            if simulated > 0:
-                ratios.append(recorded / simulated)
-        ratio = float(np.mean(ratios)) if ratios else 1.0
-        return float(np.sqrt(np.log(ratio))) if ratio > UNLIKE else 0.0
 
     @cached_property
     def _references(self) -> dict[str, np.ndarray]:
@@ -149,7 +109,7 @@ class RecordedImages:
         for size, sigma in enumerate(SIGMAS_VOXEL):
             imager = ParticleImager(self.weights, sigma)
             for number in range(REFERENCES):
-                places = random_places(grid, count, _drawn(number))
+                places = random_places(grid, count, np.random.default_rng([DRAWS, number]))
                 for name, image in imager(places, self.light(places)).items():
                     found[name][size] += count * self._ratios(name, image) / REFERENCES
         return found
@@ -167,10 +127,6 @@ class RecordedImages:
         """Return the pixels of a camera that see the volume, shape (rows, columns)."""
         pixels: np.ndarray = self._seen[name]
         return pixels
-
-
-def _drawn(number: int) -> np.random.Generator:
-    return np.random.default_rng([DRAWS, number])
 
 
 def random_places(grid: Grid, count: float, rng: np.random.Generator) -> np.ndarray:
@@ -205,10 +161,9 @@ class SyntheticPair:
         rng : Generator
             Determines places and noise.
         """
-        grid, at = self.recorded.weights.grid, self.recorded.light
-        middle = random_places(grid, self.particles.drawn_density * grid.size, rng)
-        brightness = self.particles.brightness(len(middle), self.particles.light, rng)
-        moved, light = displacement(middle), {name: at(middle) * one for name, one in brightness.items()}
+        grid = self.recorded.weights.grid
+        middle = random_places(grid, self.particles.density * grid.size, rng)
+        moved, light = displacement(middle), self.recorded.light(middle)
         first, second = (self.imager(middle + sign * moved / 2, light) for sign in (-1, 1))
         scale = {name: 2 * total / self._sum(name, first, second) for name, total in self.particles.light.items()}
         return self._noisy(first, scale, rng), self._noisy(second, scale, rng)

@@ -66,38 +66,6 @@ def test_number_and_size_of_particles_are_found_under_noise(weights, count, sigm
     assert found.noise == NOISE
 
 
-@pytest.mark.parametrize("log_sd", [0.0, 0.6])
-def test_how_unlike_bright_particles_are_is_found_and_drawn(weights, log_sd):
-    exact = RecordedParticles(
-        density=80 / GRID.size,
-        sigma_voxel=0.7,
-        light={"cam1": 1e6, "cam2": 1e6},
-        noise=NOISE,
-        full={},
-        brightness_log_sd=log_sd,
-    )
-    imager, instants = ParticleImager(weights, 0.7), []
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        places = random_places(GRID, exact.drawn_density * GRID.size, rng)
-        light = {name: 4e4 * one for name, one in exact.brightness(len(places), NOISE, rng).items()}
-        instants.append(
-            {name: image + 2 * rng.standard_normal(image.shape) for name, image in imager(places, light).items()}
-        )
-    found = RecordedImages(weights, even).particles(instants, NOISE)
-    assert abs(found.brightness_log_sd - log_sd) < 0.15
-    assert abs(found.density / exact.density - 1) < 0.25
-
-
-def test_drawn_brightness_differs_between_particles_and_between_cameras():
-    particles = RecordedParticles(density=1, sigma_voxel=1, light={}, noise={}, full={}, brightness_log_sd=0.8)
-    first, second = particles.brightness(40_000, ("a", "b"), np.random.default_rng(0)).values()
-    for one in (first, second):
-        assert abs(one.mean() - 1) < 0.03 and abs(np.log(one).std() - 0.8) < 0.02
-    assert abs(np.corrcoef(np.log(first), np.log(second))[0, 1] - 0.5) < 0.02
-    assert abs(particles.drawn_density / np.mean(first**2) - 1) < 0.1  # of equal ones with the same variance of light
-
-
 def test_images_without_particles_say_so(weights):
     rng = np.random.default_rng(0)
     noise = {name: rng.standard_normal(camera.optics.sensor_shape) for name, camera in weights.cameras.items()}
