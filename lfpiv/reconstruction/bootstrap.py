@@ -21,7 +21,8 @@ from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.likely_flow import LikelyFlow
 from lfpiv.reconstruction.particle_light import LightField
 from lfpiv.reconstruction.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
-from lfpiv.velocity.damping import Damping, Simulated, displacement, estimate_damping
+from lfpiv.velocity.damping import Damping, displacement
+from lfpiv.velocity.damping_estimate import Simulated, estimate_damping
 from lfpiv.velocity.imposed_field import ImposedField
 from lfpiv.weights.operator import Weights
 

@@ -17,12 +17,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import fft
 
-from lfpiv.velocity.damping import Simulated, displacement
+from lfpiv.velocity.damping import displacement
+from lfpiv.velocity.damping_estimate import Simulated
+from lfpiv.velocity.modes import field_of, modes_of, shells_of
 
-SHELL_WIDTH = 0.1
-"""Width of the shells of wave numbers whose modes share slope and power of errors [1 / distance of windows]."""
 SLOPES = (0.5, 1.2)
 """Limits of the slope of all modes."""
 SHELL_SPREAD = 0.2
@@ -40,9 +39,9 @@ class LikelyFlow:
 
     def __init__(self, measured: Sequence[np.ndarray]):
         self._levels = [field.mean((0, 1, 2)) for field in measured]
-        self._shells = _shells(measured[0].shape[:3])
+        self._shells = shells_of(measured[0].shape[:3])
         self._counts = np.maximum(np.bincount(self._shells.ravel()), 1)[:, None]
-        modes = np.stack([_modes(field) for field in measured])
+        modes = np.stack([modes_of(field) for field in measured])
         self._pairs = len(modes)
         self._mean = modes.mean(0)
         self._others = modes - self._mean
@@ -67,7 +66,7 @@ class LikelyFlow:
         if simulated:
             for_steady, for_other = self.gains(simulated)
             steady, other = for_steady * steady, for_other * other
-        flow: np.ndarray = self._levels[pair] + fft.idctn(steady + other, axes=(0, 1, 2), norm="ortho")
+        flow: np.ndarray = self._levels[pair] + field_of(steady + other)
         return flow
 
     def gains(self, simulated: Sequence[Simulated]) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +92,7 @@ class LikelyFlow:
 
     def _slopes_and_errors(self, simulated: Sequence[Simulated]) -> tuple[np.ndarray, np.ndarray]:
         """Return the slope and the power of the errors of a mode of each shell, shape (shell, 3)."""
-        pairs = [(_modes(one.imposed), _modes(displacement(one.vectors))) for one in simulated]
+        pairs = [(modes_of(one.imposed), modes_of(displacement(one.vectors))) for one in simulated]
         imposed = np.mean([self._sums(exact * exact) for exact, _ in pairs], axis=0)
         products = np.mean([self._sums(exact * found) for exact, found in pairs], axis=0)
         found = np.mean([self._sums(found * found) for _, found in pairs], axis=0)
@@ -114,16 +113,3 @@ def _errors(slope: np.ndarray, imposed: np.ndarray, products: np.ndarray, found:
     """Return the power of what a slope leaves of the modes found, from sums of products of modes."""
     errors: np.ndarray = np.maximum(found - 2 * slope * products + slope**2 * imposed, 0)
     return errors
-
-
-def _modes(field: np.ndarray) -> np.ndarray:
-    """Return the discrete cosine transform of the fluctuations of a field (z, y, x, 3)."""
-    modes: np.ndarray = fft.dctn(field - field.mean((0, 1, 2)), axes=(0, 1, 2), norm="ortho")
-    return modes
-
-
-def _shells(shape: tuple[int, ...]) -> np.ndarray:
-    """Return the number of the shell of each mode, by its wave number."""
-    waves = np.meshgrid(*(np.arange(count) / (2 * count) for count in shape), indexing="ij")
-    shells: np.ndarray = (np.sqrt(sum(wave**2 for wave in waves)) / SHELL_WIDTH).astype(int)
-    return shells

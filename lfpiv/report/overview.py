@@ -206,7 +206,7 @@ def _damping(damping: DampingFigures | None) -> str:
         return "not measured" + (f": {damping.reason}" if damping is not None else "")
     slopes = ", ".join(
         f"{axis} {found.slope:.3f} ± {found.slope_error:.3f}"
-        f"{'' if found.applied or not found.alike else ' (not significant)'}"
+        f"{'' if found.applied or not found.alike else ' (not taken off)'}"
         for axis, found in sorted(damping.axes.items())
     )
     offsets = ", ".join(

@@ -127,6 +127,10 @@ class AxisDamping(_Figures):
     applied: bool
     alike: bool = True
     """False if simulated pairs are harder to measure than recorded ones."""
+    raw_error: float | None = None
+    """Expected root mean square error of raw vectors [voxel]; None in older summaries."""
+    unbiased_error: float | None = None
+    """The same of vectors without damping [voxel]."""
 
 
 class DampingFigures(_Figures):

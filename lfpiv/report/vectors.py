@@ -259,15 +259,25 @@ def damping_table(damping: DampingFigures | None) -> str:
             f"{COMPONENTS[axis]}, along {axis}",
             f"{number(found.slope, 3)} ± {number(found.slope_error, 3)}",
             f"{number(found.offset, 3)} ± {number(found.offset_error, 3)}",
-            "taken off" if found.applied else "not significant",
+            number(found.raw_error, 3),
+            number(found.unbiased_error, 3),
+            "taken off" if found.applied else "not taken off",
         ]
         for axis, found in sorted(damping.axes.items())
     ]
     text = (
-        "Slope of measured on true fluctuations, and their offset, from "
+        "Slope of measured on true fluctuations, their offset, and the expected root mean square errors of raw vectors "
+        "and of those without damping, from "
         f"{markup.count(damping.simulated, 'simulated pair')}. This page shows the raw vectors; open_results has both."
     )
-    titles = ["component", "slope", "offset [voxel]", "by open_results"]
+    titles = [
+        "component",
+        "slope",
+        "offset [voxel]",
+        "raw error [voxel]",
+        "unbiased error [voxel]",
+        "by open_results",
+    ]
     return (
         "<h3>Damping by ghosts</h3>"
         + markup.table(titles, rows, caption="Damping by ghosts of each component")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
@@ -103,11 +104,14 @@ def sentence(damping: Damping, axis: str) -> str:
     """Return the damping along an axis as a sentence."""
     found = damping.axes[axis]
     used = "taken off" if found.applied else "not significant" if found.fluctuation else "no fluctuations"
+    if found.significant and found.amplifies:
+        used = "not taken off, since that would raise the error"
     if not found.alike:
         used = "not taken off, since simulated pairs are harder to measure than recorded ones"
     return (
         f"damping by ghosts along {axis}: slope of measured on true fluctuations {found.slope:.3f} +- "
-        f"{found.slope_error:.3f}, offset {found.offset:+.3f} +- {found.offset_error:.3f} voxel; {used}"
+        f"{found.slope_error:.3f}, offset {found.offset:+.3f} +- {found.offset_error:.3f} voxel; {used}; "
+        f"expected error {found.raw_error:.3f} voxel raw, {found.unbiased_error:.3f} without damping"
     )
 
 
@@ -120,11 +124,13 @@ def _measure(work: PairWork, pairs: list[int], progress: StepProgress) -> Dampin
         frames += [work.light_again(frame) for frame in work.experiment.pair_frames(pair)]
     noise = {name: sum(frame.noise[name] for frame in frames) / len(frames) for name in frames[0].noise}
     first = work.reconstructor.solver.smart.solve(frames[0].images, floor=frames[0].noise)
+    # simulated particles are alike, so that their images would choose another limit
+    as_recorded = work.reconstructor.with_intensity_cap(first.intensity_cap)
     return measure_damping(
         work.weights,
         vectors,
         [frame.images for frame in frames],
-        work.measure,
+        partial(work.measure, reconstructor=as_recorded),
         pairs=work.experiment.simulated_pairs,
         noise=noise,
         volume=first.volume,

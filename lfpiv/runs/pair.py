@@ -293,15 +293,22 @@ class PairWork:
         found = [warning.of_pair(pair) for warning in warnings]
         self.log_first(found if self.experiment.series is None else [warning.by_instant() for warning in found])
 
-    def measure(self, images: Sequence[Mapping[str, np.ndarray]], noise: Sequence[Mapping[str, float]]) -> xr.Dataset:
+    def measure(
+        self,
+        images: Sequence[Mapping[str, np.ndarray]],
+        noise: Sequence[Mapping[str, float]],
+        reconstructor: Reconstructor | None = None,
+    ) -> xr.Dataset:
         """Return the vectors of the images of two frames, measured as those of the experiment; nothing is written.
+
+        `reconstructor` replaces that of the pairs.
 
         Raises
         ------
         ValueError
             If the images cannot be reconstructed.
         """
-        first, second = self.reconstructor.volumes(images, noise)
+        first, second = (reconstructor or self.reconstructor).volumes(images, noise)
         return measure_vectors(first, second, self.experiment, self.between)
 
     def vectors_between(self, pair: int, volumes: PairVolumes) -> xr.Dataset:

@@ -89,6 +89,11 @@ class Reconstructor:
             mask=refined(with_guard(self.experiment, self.guard), self.refinement).solid,
         )
 
+    def with_intensity_cap(self, cap: float) -> Reconstructor:
+        """Return the same reconstruction whose limit of the counts does not depend on the images."""
+        smart = self.experiment.smart.model_copy(update={"intensity_cap": cap})
+        return replace(self, experiment=replace(self.experiment, smart=smart))
+
     @cached_property
     def sequence(self) -> SequenceSolver:
         """SMART along a series, made once."""

@@ -62,12 +62,17 @@ class Likeness:
         return larger or self.invalid_share.exceeds(FEWER_VALID)
 
     @property
-    def doubt(self) -> float:
-        """Share of the damping that is in doubt, since it grows with the random standard deviation."""
+    def errors_ratio(self) -> float:
+        """Random standard deviation of recorded pairs over that of simulated ones; 1 if none is stated."""
         random = self.deviation_voxel
         if random is None or not min(random.recorded, random.simulated) > 0:
-            return 0.0
-        return float(abs(np.log(random.simulated / random.recorded)))
+            return 1.0
+        return random.recorded / random.simulated
+
+    @property
+    def doubt(self) -> float:
+        """Share of the damping that is in doubt, since it grows with the random standard deviation."""
+        return float(abs(np.log(self.errors_ratio)))
 
     def __str__(self) -> str:
         random = self.deviation_voxel

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.reconstruction.likely_flow import LikelyFlow
-from lfpiv.velocity.damping import Simulated
+from lfpiv.velocity.damping_estimate import Simulated
 
 SLOPE, NOISE = 0.8, 0.15
 

@@ -427,10 +427,11 @@ def test_the_flow_comes_before_volumes_and_calibration_is_folded(text):
 
 def test_damping_is_tabulated(reported):
     axis = {"slope": 0.87, "slope_error": 0.01, "offset": 0.0, "offset_error": 0.02, "applied": True}
+    axis |= {"raw_error": 0.123, "unbiased_error": 0.111}
     damping = {"axes": {"x": axis, "z": axis | {"applied": False}}, "simulated": 16}
     text = vectors.damping_table(figures(reported.summary | {"damping": damping}).damping)
     assert "Damping by ghosts" in text and text.count("0.870 ± 0.010") == 2
-    assert "taken off" in text and "not significant" in text
+    assert ">taken off" in text and "not taken off" in text and text.count("0.123") == text.count("0.111") == 2
     assert vectors.damping_table(None) == ""
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import lfpiv
-from lfpiv.experiment.settings import Bootstrap
+from lfpiv.experiment.settings import Bootstrap, Smart
 from lfpiv.results import datasets, netcdf, stored_damping
 from lfpiv.results.folder import Folder
-from lfpiv.runs import pipeline
+from lfpiv.runs import bootstrap, pipeline
 from lfpiv.velocity.damping import AxisDamping, Damping
 
 AXIS = AxisDamping(slope=0.8, slope_error=0.02, offset=0.1, offset_error=0.01, fluctuation=0.5, uncertainty_factor=1.2)
@@ -67,6 +67,22 @@ def test_it_is_measured_once_and_again_if_lost_or_damaged(simulated, caplog):
     pipeline.run(experiment, out)
     again = json.loads(path.read_text())
     assert again["damping"] == json.loads(before)["damping"]  # the same seeds, vectors and images
+
+
+@pytest.mark.slow
+def test_simulated_images_get_the_limit_of_the_counts_of_recorded_ones(small_run, tmp_path, monkeypatch):
+    experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+    with experiment.open("a") as file:
+        file.write("\n[bootstrap]\npairs = 3\n")
+    seen = []
+
+    def refuse(weights, vectors, images, measure, **options):
+        seen.append(measure.keywords["reconstructor"].solver.smart)
+        raise ValueError("nothing is simulated")
+
+    monkeypatch.setattr(bootstrap, "measure_damping", refuse)
+    assert pipeline.run(experiment, out)["damping"]["reason"] == "nothing is simulated"
+    assert Smart().intensity_cap == "auto" and isinstance(seen[0].settings.intensity_cap, float)
 
 
 def with_damping(small_run, folder, **parts):

@@ -7,7 +7,8 @@ import pytest
 import xarray as xr
 
 from lfpiv.records import RecordError
-from lfpiv.velocity.damping import ATTRIBUTE, DAMPING, AxisDamping, Damping, Simulated, estimate_damping
+from lfpiv.velocity.damping import ATTRIBUTE, DAMPING, AxisDamping, Damping
+from lfpiv.velocity.damping_estimate import Simulated, estimate_damping
 
 SHAPE = (5, 6, 7)
 VOXEL_MM, DT_S = 0.1, 1e-3
@@ -107,9 +108,9 @@ def axis_of(**changed):
     ],
 )
 def test_what_is_not_significant_is_not_corrected(changed):
-    assert axis_of().applied and axis_of().used_slope == 0.8
+    assert axis_of().applied and axis_of().used_gain == 1 / 0.8
     left = axis_of(**changed)
-    assert not left.applied and left.used_slope == 1.0 and left.pull_left == left.pull > 0
+    assert not left.applied and left.used_gain == 1.0 and left.pull_left == left.pull > 0
     assert axis_of(offset_error=0.06).used_offset == 0.0 and axis_of().used_offset == 0.1
 
 
@@ -159,3 +160,33 @@ def test_the_error_of_a_slope_is_that_of_pairs_where_these_scatter_more():
     few, enough = (estimate_damping(pairs[:count]).axes["x"] for count in (3, 4))
     scatter = np.std([0.6, 0.7, 0.9, 1.0], ddof=1) / np.sqrt(4)
     assert abs(enough.slope_error / scatter - 1) < 0.1 and few.slope_error < scatter
+
+
+def waves(rng, shape=(10, 12, 14)):
+    """Flow of long waves only."""
+    z, y, x = (np.arange(count) / count for count in shape)
+    phases = rng.uniform(0, 2 * np.pi, 3)
+    wave = [np.sin(2 * np.pi * (z[:, None, None] + y[:, None] + x) + phase) for phase in phases]
+    return 2.0 + 0.8 * np.stack(wave, -1)
+
+
+def test_short_errors_are_not_amplified_and_the_slope_is_one():
+    rng = np.random.default_rng(5)
+    pairs = []
+    for _ in range(6):
+        imposed = waves(rng)
+        pairs.append(Simulated(vectors=vectors_of(damped(imposed, rng, noise=0.3)), imposed=imposed))
+    found = estimate_damping(pairs)
+    exact = waves(rng)
+    whole = found.unbiased(vectors_of(damped(exact, rng, noise=0.3)))
+    for number, axis in enumerate("zyx"):
+        known, true = found.axes[axis], exact[..., number] - exact[..., number].mean()
+        assert known.applied and len(known.coherence) > 5
+        unbiased = whole[f"displacement_unbiased_{axis}"].values
+        assert abs(float((unbiased * true).sum() / (true**2).sum()) - 1) < 0.03
+        error = (unbiased - exact[..., number]).std()
+        assert abs(error / known.unbiased_error - 1) < 0.1
+        assert known.unbiased_error < 0.95 * 0.3 / SLOPES[axis]  # as division by the slope would leave it
+        raw = (whole[f"displacement_{axis}"].values - exact[..., number]).std()
+        assert abs(raw / known.raw_error - 1) < 0.1
+        assert {"raw_error", "unbiased_error"} <= set(found.to_json()["axes"][axis])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lfpiv.velocity.damping import DAMPING, Damping, Simulated, estimate_damping
+from lfpiv.velocity.damping import DAMPING, Damping
+from lfpiv.velocity.damping_estimate import Simulated, estimate_damping
 from lfpiv.velocity.likeness import compare
 
 SHAPE = (6, 6, 6)
@@ -54,7 +55,7 @@ def test_harder_pairs_correct_nothing(how):
     alike, harder = damping(recorded), damping(recorded, **how)
     assert all(axis.applied for axis in alike.axes.values())
     assert harder.likeness.harder and not any(axis.applied for axis in harder.axes.values())
-    assert all(axis.used_slope == 1.0 and axis.used_offset == 0.0 for axis in harder.axes.values())
+    assert all(axis.used_gain == 1.0 and axis.used_offset == 0.0 for axis in harder.axes.values())
     assert all(axis.pull > 0 for axis in harder.axes.values())
     assert Damping.from_json(json.loads(json.dumps(harder.to_json()))) == harder
 
@@ -62,6 +63,12 @@ def test_harder_pairs_correct_nothing(how):
 def test_easier_pairs_still_correct_but_leave_a_doubt():
     recorded = several(0, 8)
     alike, easier = damping(recorded), damping(recorded, deviation=0.08)
+    alone = damping(())  # not compared: the damping of the simulated pairs themselves
+    for axis in "xyz":
+        taken = 1 - np.array([one.axes[axis].slope for one in (alone, alike, easier)])
+        assert abs(taken[1] / taken[0] - 1) < 0.05  # in proportion to the random errors of recorded pairs
+        assert abs(taken[2] / alike.likeness.errors_ratio / taken[0] - 0.1 / 0.08) < 0.1
+        assert abs(easier.axes[axis].raw_error / alike.axes[axis].raw_error - 1) < 0.2
     assert not easier.likeness.harder and easier.axes["x"].applied
     assert abs(easier.likeness.doubt - np.log(0.1 / 0.08)) < 0.05
     assert easier.axes["x"].slope_error > 2 * alike.axes["x"].slope_error
