@@ -34,6 +34,8 @@ TELLING = 0.25
 """Share of the particles, the brightest ones, that tell the error of the model."""
 LEAST_TELLING = 3
 """Least number of particles that tell the error of the model."""
+LEFT_RATIO = 2.0
+"""Light that a particle must have beside brighter ones, over what the usual error of the model leaves of them."""
 MISFIT_RATIO = 8.0
 """Light that a particle's pixels lack, relative to the error of the model, above which it is none."""
 LACKING_SIGMA = 5.0
@@ -164,7 +166,7 @@ def confirmed(normal: Normal, found: Signals, error: float, part: float = 1.0) -
         Part of the limits that applies.
     """
     by_noise = found.light > part * SIGNIFICANCE * found.error
-    by_others = found.strength > part * error * unexplained(normal, found)
+    by_others = found.strength > part * LEFT_RATIO * error * unexplained(normal, found)
     good: np.ndarray = ((by_noise & by_others) | ~found.seen).all(1)
     return good
 
