@@ -130,11 +130,12 @@ def _crowding(normal: Normal) -> float:
 def _hidden(normal: Normal) -> float:
     """Return the share of particles that too few cameras see without another one's image over half of theirs."""
     first, second, overlap = overlaps(normal)
-    free = np.ones(normal.light.shape, bool)
+    count, cameras = normal.light.shape
+    free = np.ones((count, cameras), bool)
     for one in (first, second):
         particle, camera = np.nonzero(overlap > 0.5)
         free[one[particle], camera] = False
-    return float((free.sum(1) < min(2, free.shape[1])).mean())
+    return float((free.sum(1) < min(2, cameras)).mean())
 
 
 def _microlenses(cameras: Mapping[str, CalibratedCamera], grid: Grid) -> float:
