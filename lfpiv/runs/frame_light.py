@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +48,8 @@ class FrameLight:
     """Warnings about the images; from `pair_light` those about both frames are with the first one."""
     seconds: float
     """Time that reading and checking took [s]."""
+    clipped: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Pixels at the end of the sensor's range, shape (rows, columns), bool; empty where they are not known."""
 
 
 def read_darks(experiment: Experiment) -> dict[str, np.ndarray | None]:
@@ -74,6 +76,7 @@ def frame_light(
     start = time.perf_counter()
     label = frame.name if experiment.series is None else None
     images, noise, structure, fingerprints, warnings = {}, {}, {}, {}, list[Warning]()
+    clipped = {}
     for name, camera in cameras.items():
         raw = experiment.particle_image(name, *frame) if read is None else read(name, frame)
         dark = darks[name]
@@ -83,6 +86,7 @@ def frame_light(
         if camera.standing is not None:
             light, noise[name] = camera.standing.subtract(light, noise[name], experiment.frames.index(frame.name))
         images[name] = light
+        clipped[name] = image_checks.saturated_pixels(raw)
         structure[name] = seen_structure(light, camera.decoder)
         fingerprints[name] = image_checks.fingerprint(raw)
         judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
@@ -98,6 +102,7 @@ def frame_light(
         fingerprints=fingerprints,
         warnings=tuple(warnings),
         seconds=time.perf_counter() - start,
+        clipped=clipped,
     )
 
 

@@ -141,6 +141,11 @@ class PairWork:
         return ReadAhead(self.experiment)
 
     @cached_property
+    def recent(self) -> dict[Frame, FrameLight]:
+        """Light of the frames that were read last, so that particles are found without reading the images again."""
+        return {}
+
+    @cached_property
     def writer(self) -> Writer:
         """Thread that writes results."""
         return Writer()
@@ -222,6 +227,8 @@ class PairWork:
                 "settings, found none. Run `lfpiv reconstruct` first."
             )
         light = pair_light(self.experiment, self.cameras, self.darks, files.pair, self.images.image)
+        for one in light:
+            self._keep(one)
         self.writer.wait_large()
         self._log(files.pair, [warning for frame in light for warning in frame.warnings])
         return self.reconstructor.pair(light, files.pair, progress)
@@ -249,7 +256,19 @@ class PairWork:
         """Read the images of an instant, also if its volume is known; raise InputError if that is not possible."""
         if not self.cameras:
             raise InputError(f"instant {instant.number}: no image is read in this step.")
-        return frame_light(self.experiment, self.cameras, self.darks, instant, self.images.image)
+        if (known := self.recent.get(instant)) is not None:
+            return known
+        light = frame_light(self.experiment, self.cameras, self.darks, instant, self.images.image)
+        self._keep(light)
+        return light
+
+    def _keep(self, light: FrameLight) -> None:
+        """Keep the light of the two latest frames if particles are to be found in them."""
+        if self.experiment.tracking is not None:
+            self.recent.pop(light.frame, None)
+            self.recent[light.frame] = light
+            for frame in list(self.recent)[:-2]:
+                del self.recent[frame]
 
     def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
         """Reconstruct one instant of a series.

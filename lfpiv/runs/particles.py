@@ -13,8 +13,9 @@ from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.linking import link_particles
 from lfpiv.warn import Code, Warning
 
-CROWDED, CROWDED_ONE = 0.7, 0.15
-"""Mean number of overlapping neighbours of a particle above which particles are mixed up; the second for one camera."""
+HIDDEN, HIDDEN_ONE = 0.5, 0.14
+"""Share of particles that fewer than two cameras see alone above which particles are mixed up; the second of those that
+a single camera does not see alone."""
 LEAST_LINKED = 0.65
 """Least share of the found particles that are linked, without a warning. Ghosts in two frames have no partners."""
 LEAST_FOUND = 20
@@ -45,7 +46,7 @@ def track(
         Doubts whether particles can be told apart.
     """
     first, second = (
-        search.find(frame.images, volume, noise=frame.noise)
+        search.find(frame.images, volume, noise=frame.noise, clipped=frame.clipped or None)
         for frame, volume in zip(light, volumes.volumes, strict=True)
     )
     table = link_particles(first, second, vectors, dt_s=float(vectors.attrs["dt_s"]))
@@ -53,11 +54,11 @@ def track(
 
 
 def crowded_warnings(table: xr.Dataset, cameras: int) -> list[Warning]:
-    """Return a warning if images of particles overlap too much for particles to be told apart."""
-    crowding, limit = float(np.max(table.attrs["crowding"])), CROWDED_ONE if cameras == 1 else CROWDED
-    if crowding <= limit:
+    """Return a warning if too few cameras see particles alone for particles to be told apart."""
+    share, limit = float(np.max(table.attrs["hidden"])), HIDDEN_ONE if cameras == 1 else HIDDEN
+    if share <= limit:
         return []
-    figures = {"crowding": crowding, "limit": limit, "per_microlens": float(np.mean(table.attrs["per_microlens"]))}
+    figures = {"share": share, "limit": limit, "per_microlens": float(np.mean(table.attrs["per_microlens"]))}
     return [Warning(code=Code.CROWDED, figures=figures)]
 
 

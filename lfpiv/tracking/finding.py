@@ -21,36 +21,29 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import is_finite, lies_in
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import checked_images
-from lfpiv.tracking import candidates
+from lfpiv.tracking import candidates, confirmation
 from lfpiv.tracking.found import FoundParticles
 from lfpiv.tracking.particle_images import ParticleImages
-from lfpiv.tracking.refinement import Cloud, Normal, Scene, diagonal_blocks, light_scatter, overlaps, refine, rendered
+from lfpiv.tracking.refinement import Cloud, Normal, Scene, light_scatter, overlaps, refine, rendered
+from lfpiv.tracking.surroundings import surroundings, whole_pixels
 from lfpiv.weights.operator import Weights
 
 DEFAULTS = Tracking()
 """Settings of the search where none are stated."""
-SIGNIFICANCE = 5.0
-"""Least light of a particle in each camera that sees it [standard error]."""
-MERGED_VOXEL = 0.8
-"""Distance below which two candidates are one particle [voxel]."""
-MERGED_OVERLAP = 0.75
-"""Overlap of their images in all cameras above which two candidates are one particle."""
-MERGED_SIGMA = 3.0
-"""The same [standard error of their distance]."""
 MARGIN_VOXEL = 12.0
 """How far outside the grid of the weights particles may lie that only explain light [voxel]."""
 FOUND_MARGIN_VOXEL = 0.5
 """How far outside the grid of the weights found particles may lie [voxel]."""
-SEEN = 0.3
-"""Least root of a camera's information about a particle's light, relative to the largest one, for the camera to see
-it."""
-FIRST_STEPS, STEPS, LAST_STEPS = 4, 4, 4
-"""Iterations of the first round, of the later rounds, and after the last one."""
+STEPS, LAST_STEPS = 4, 4
+"""Iterations of a round, and after the last one."""
 EARLY = 0.5
-"""Part of the limits of light that applies after the very first iteration."""
-LEFT_SHARE = 0.03
-"""Least light of a candidate in the residual images, as a share of the typical particle's: one of two particles that
-were found as one leaves little there."""
+"""Part of the limits of light that applies after the first iteration of a round."""
+CANDIDATE = 0.3
+"""Least light of a candidate, relative to that of a particle that is just significant: a volume spreads light."""
+PROBES = 30
+"""Number of candidates that tell how much light is significant."""
+DARK_SHARE = 0.3
+"""Largest light of particles in a pixel that shows the background [noise]."""
 SIZED_ROUNDS = 2
 """Rounds after which the particles' size is fitted."""
 OUTLIER_SIGMA = 5.0
@@ -78,6 +71,7 @@ def find_particles(
     volume: xr.DataArray | None = None,
     *,
     noise: float | Mapping[str, float] | None = None,
+    clipped: Mapping[str, np.ndarray] | None = None,
     sigma_voxel: float | None = None,
     rounds: int = DEFAULTS.rounds,
     weakest: float = DEFAULTS.weakest,
@@ -96,6 +90,9 @@ def find_particles(
         SMART volume of the same images, whose peaks are the first candidates. Default: it is reconstructed.
     noise : float or mapping of str to float, optional
         Standard deviation of the background [counts]. Default: root mean square of an image's negative counts.
+    clipped : mapping of str to ndarray, optional
+        Camera name -> pixels at the end of the sensor's range, shape (rows, columns), bool. They only tell that light
+        is not less. Default: none.
     sigma_voxel : float, optional
         Standard deviation of the particles [voxel]. Default: it is fitted to the images.
     rounds : int
@@ -119,19 +116,30 @@ def find_particles(
     if sigma_voxel is not None and not (is_finite(sigma_voxel) and sigma_voxel > 0):
         raise ValueError(f"sigma_voxel: expected a size > 0 [voxel], got {sigma_voxel!r}.")
     search = ParticleSearch(weights, sigma_voxel=sigma_voxel, rounds=rounds, weakest=weakest)
-    return search.find(images, volume, noise=noise)
+    return search.find(images, volume, noise=noise, clipped=clipped)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _State:
     """Particles that are being refined."""
 
     model: ParticleImages
     scene: Scene
     cloud: Cloud
-    scatter: float
+    images: Mapping[str, np.ndarray]
+    """Images as they were given [counts]."""
+    noise: Mapping[str, float]
+    """Noise of the images where they do not show it [counts]."""
+    whole: Mapping[str, np.ndarray]
+    """Pixels of each camera inside a microimage, shape (rows, columns), bool."""
+    standing: Mapping[str, np.ndarray]
+    """Standing light that was subtracted from the images of some cameras [counts], 0 where none stands."""
     largest_voxel: float
     """Largest size of the particles [voxel]."""
+    scatter: float = START_SCATTER
+    """Relative scatter of light between the cameras."""
+    error: float = 0.0
+    """Relative error of the model of a particle's image."""
     normal: Normal | None = None
 
     def refine(self, steps: int) -> None:
@@ -139,6 +147,20 @@ class _State:
         for _ in range(steps):
             self.cloud, self.normal = refine(self.model, self.scene, self.cloud, iterations=1, scatter=self.scatter)
             self.scene = self.scene.calibrated(self.normal.model)
+
+    def surround(self) -> None:
+        """Measure the background again, where the model of the particles is dark."""
+        assert self.normal is not None
+        counts, variance = [], []
+        for number, (name, image) in enumerate(self.images.items()):
+            span = slice(*self.model.first_pixel[number : number + 2])
+            model = self.normal.model[span].reshape(image.shape)
+            dark = model < DARK_SHARE * np.sqrt(self.scene.read_variance[span]).reshape(image.shape)
+            unlit = self.whole[name] & dark
+            level, deviation = surroundings(image - model, self.noise[name], unlit, self.standing.get(name))
+            counts.append((image - level).reshape(-1))
+            variance.append(np.square(deviation).reshape(-1))
+        self.scene = replace(self.scene, counts=np.concatenate(counts), read_variance=np.concatenate(variance))
 
 
 @dataclass
@@ -161,6 +183,12 @@ class ParticleSearch:
             sigma_voxel=self.sigma_voxel or USUAL_SIGMA_VOXEL,
         )
         self._sizer: ParticleSizer | None = None
+        self._whole: dict[str, np.ndarray] = {}
+        self._standing: dict[str, np.ndarray] = {}
+        for name, camera in self.weights.cameras.items():
+            self._whole[name] = whole_pixels(camera.optics, camera.lattice)
+            if (standing := getattr(camera, "standing", None)) is not None:
+                self._standing[name] = np.where(standing.region, np.maximum(*standing.light), 0)
 
     @property
     def _nothing(self) -> Cloud:
@@ -176,89 +204,123 @@ class ParticleSearch:
         volume: xr.DataArray | None = None,
         *,
         noise: float | Mapping[str, float] | None = None,
+        clipped: Mapping[str, np.ndarray] | None = None,
     ) -> FoundParticles:
         """Find the particles of one instant; arguments and exceptions as of `find_particles`."""
         images = checked_images(self.weights, images)
-        deviation = _noise(images, noise)
-        scene = _scene(images, deviation)
-        model = self.images if self.sigma_voxel is not None else self.images.of_size(self._first_size(images))
-        if volume is None:
-            volume = candidates.reconstructed(self.weights, images, deviation, candidates.FIRST_ITERATIONS)
-        cloud = self._nothing if volume is None else candidates.volume_peaks(self.weights, volume)
-        state = _State(model, scene, cloud, START_SCATTER, LARGEST_RATIO * model.sigma_voxel)
+        state = self._start(images, volume, _noise(images, noise), _clipped(images, clipped))
         for number in range(self.rounds):
             before = len(state.cloud)
             if number:
-                state.cloud = state.cloud.joined(self._new(state, deviation))
+                state.cloud = state.cloud.joined(self._new(state))
                 if len(state.cloud) == before:
                     break
-            if not len(state.cloud):
-                break
-            state.refine(1)
-            if number == 0:
-                state.cloud = self._pruned(state, EARLY)
-            if len(state.cloud):
-                state.refine(FIRST_STEPS - 1 if number == 0 else STEPS - 1)
-                state.cloud = self._pruned(state)
-            if not len(state.cloud):
-                break
-            state.refine(1)
-            assert state.normal is not None
-            state.scatter = light_scatter(state.normal, state.cloud.light, state.scatter)
-            if self.sigma_voxel is None and number < SIZED_ROUNDS:
-                _fit_size(state)
-            state.refine(1)
-            if number and len(state.cloud) == before:
+            if not self._round(state, number) or (number and len(state.cloud) == before):
                 break
         if len(state.cloud):
             if self.sigma_voxel is None:
                 _fit_size(state)
             state.refine(LAST_STEPS)
-            state.cloud = self._pruned(state)
+            state.cloud = self._confirmed(state)
         if len(state.cloud):
             state.refine(2)
-        every = FoundParticles.of(self.weights.cameras, self._grid, state.model, state.scene, state.cloud, state.normal)
+        every = FoundParticles.of(
+            self.weights.cameras, self._grid, state.model, state.scene, state.cloud, state.normal, state.scatter
+        )
         return every[lies_in(every.positions_mm, self.weights.grid, FOUND_MARGIN_VOXEL)]
+
+    def _start(
+        self,
+        images: Mapping[str, np.ndarray],
+        volume: xr.DataArray | None,
+        noise: Mapping[str, float],
+        clipped: np.ndarray | None,
+    ) -> _State:
+        """Return the first candidates: peaks of the volume, or of one that is reconstructed."""
+        scene = _scene(images, noise, clipped, self._whole, self._standing)
+        model = self.images if self.sigma_voxel is not None else self.images.of_size(self._first_size(images))
+        if volume is None:
+            dark = self._by_camera(scene.counts)
+            volume = candidates.reconstructed(self.weights, dark, noise, candidates.FIRST_ITERATIONS)
+        cloud = self._nothing if volume is None else candidates.volume_peaks(self.weights, volume)
+        cloud = cloud[cloud.light[:, 0] > CANDIDATE * _faint(model, scene, cloud)]
+        largest = LARGEST_RATIO * model.sigma_voxel
+        return _State(
+            model=model,
+            scene=scene,
+            cloud=cloud,
+            images=images,
+            noise=noise,
+            whole=self._whole,
+            standing=self._standing,
+            largest_voxel=largest,
+        )
+
+    def _round(self, state: _State, number: int) -> bool:
+        """Refine and confirm the particles once; return whether any are left."""
+        if not len(state.cloud):
+            return False
+        state.refine(1)
+        state.cloud = self._confirmed(state, EARLY, fits=False)
+        if not len(state.cloud):
+            return False
+        state.surround()
+        state.refine(STEPS - 1)
+        state.cloud = self._confirmed(state)
+        if not len(state.cloud):
+            return False
+        state.refine(1)
+        assert state.normal is not None
+        state.scatter = light_scatter(state.normal, state.cloud.light, state.scatter)
+        if self.sigma_voxel is None and number < SIZED_ROUNDS:
+            _fit_size(state)
+        state.surround()
+        state.refine(1)
+        return True
 
     def _first_size(self, images: Mapping[str, np.ndarray]) -> float:
         self._sizer = self._sizer or ParticleSizer(self.weights)
         found = self._sizer.size(images)
         return found * self.weights.grid.voxel_mm / self._grid.voxel_mm if found else USUAL_SIGMA_VOXEL
 
-    def _new(self, state: _State, noise: Mapping[str, float]) -> Cloud:
-        """Return candidates from the light that the particles leave."""
-        cloud, first = state.cloud, self.images.first_pixel
-        left = state.scene.counts - (0 if state.normal is None else state.normal.model)
-        images = {
-            name: left[first[number] : first[number + 1]].reshape(camera.optics.sensor_shape)
+    def _by_camera(self, counts: np.ndarray) -> dict[str, np.ndarray]:
+        """Return a vector over the pixels of all cameras as images."""
+        first = self.images.first_pixel
+        return {
+            name: counts[first[number] : first[number + 1]].reshape(camera.optics.sensor_shape)
             for number, (name, camera) in enumerate(self.weights.cameras.items())
         }
-        volume = candidates.reconstructed(self.weights, images, noise, candidates.RESIDUAL_ITERATIONS)
+
+    def _new(self, state: _State) -> Cloud:
+        """Return candidates from the light that the particles leave."""
+        assert state.normal is not None
+        left = self._by_camera(state.scene.residual(state.normal.model))
+        volume = candidates.reconstructed(self.weights, left, state.noise, candidates.RESIDUAL_ITERATIONS)
         if volume is None:
             return self._nothing
-        return candidates.volume_peaks(self.weights, volume, LEFT_SHARE * candidates.typical(cloud.light.mean(1)))
+        faint = _faint(state.model, state.scene, state.cloud)
+        least = max(CANDIDATE * faint, self.weakest * candidates.typical(state.cloud.light.mean(1)))
+        return candidates.volume_peaks(self.weights, volume, least)
 
-    def _pruned(self, state: _State, part: float = 1.0) -> Cloud:
+    def _confirmed(self, state: _State, part: float = 1.0, *, fits: bool = True) -> Cloud:
         """Return the particles that all cameras which see them confirm, those closer than one particle's size merged.
 
-        `part` is the part of the limits that applies.
+        `part` is the part of the limits of light that applies. With `fits`, particles whose images the model does not
+        fit are removed, so that their light may give others.
         """
         cloud, normal = state.cloud, state.normal
         assert normal is not None
         good = lies_in(cloud.positions_mm, self.weights.grid, MARGIN_VOXEL)
-        own = diagonal_blocks(normal.matrix, normal.right.shape)
-        size = np.sqrt(np.maximum(np.einsum("pii->pi", own), 1e-30))
-        inverse = np.linalg.pinv(own / size[:, :, None] / size[:, None, :], hermitian=True)
-        error = np.sqrt(np.maximum(np.einsum("pii->pi", inverse), 0)) / size
-        least = self.weakest * candidates.typical(cloud.light[good].mean(1)) if good.any() else 0.0
-        seen = size[:, 3:] > SEEN * np.maximum(size[:, 3:].max(1), 1e-30)[:, None]
-        good &= ((cloud.light > part * np.maximum(SIGNIFICANCE * error[:, 3:], least)) | ~seen).all(1)
-        first, second, overlap = overlaps(normal)
-        same = (overlap > MERGED_OVERLAP).all(1) & good[first] & good[second]
-        apart = (cloud.positions_mm[first] - cloud.positions_mm[second]) / state.model.voxel_mm
-        variance = np.square(error[first, :3]) + np.square(error[second, :3])
-        same |= (np.square(apart) / (MERGED_VOXEL**2 + MERGED_SIGMA**2 * variance)).sum(1) < 1
-        return _merged(cloud, np.stack([first, second], axis=1)[same], good)
+        found = confirmation.signals(normal, state.scatter)
+        misfit, lacking = confirmation.misfits(state.model, state.scene, cloud, normal)
+        state.error = confirmation.model_error(misfit, found)
+        good &= confirmation.confirmed(normal, found, state.error, part)
+        if fits:
+            good &= confirmation.fitting(lacking, state.error, found)
+        if good.any():
+            least = part * self.weakest * candidates.typical(cloud.light[good].mean(1))
+            good &= ((cloud.light > least) | ~found.seen).all(1)
+        return confirmation.merged(normal, cloud, good, found.position_error, state.model.voxel_mm)
 
 
 def _noise(images: Mapping[str, np.ndarray], noise: float | Mapping[str, float] | None) -> dict[str, float]:
@@ -272,23 +334,40 @@ def _noise(images: Mapping[str, np.ndarray], noise: float | Mapping[str, float] 
     return {name: float(given[name]) for name in images}
 
 
-def _scene(images: Mapping[str, np.ndarray], noise: Mapping[str, float]) -> Scene:
-    counts = np.concatenate([image.reshape(-1) for image in images.values()])
-    variance = [np.full(image.size, max(noise[name], 0.3) ** 2, np.float32) for name, image in images.items()]
-    return Scene(counts=counts, read_variance=np.concatenate(variance))
+def _clipped(images: Mapping[str, np.ndarray], clipped: Mapping[str, np.ndarray] | None) -> np.ndarray | None:
+    """Return the clipped pixels of all cameras as one vector."""
+    if clipped is None:
+        return None
+    for name, image in images.items():
+        if name not in clipped or np.shape(clipped[name]) != image.shape or np.asarray(clipped[name]).dtype != bool:
+            raise ValueError(f"clipped: expected a mask of the image's shape {image.shape} for camera {name!r}.")
+    return np.concatenate([np.asarray(clipped[name]).reshape(-1) for name in images])
 
 
-def _merged(cloud: Cloud, pairs: np.ndarray, good: np.ndarray) -> Cloud:
-    """Replace pairs of candidates that cannot be told apart by one at the middle of their light; keep the good ones."""
-    light, positions, kept = cloud.light.copy(), cloud.positions_mm.copy(), good.copy()
-    for a, b in pairs[np.argsort(-light[pairs].mean(2).max(1), kind="stable")] if len(pairs) else ():
-        if kept[a] and kept[b]:
-            bright, dark = (a, b) if light[a].mean() >= light[b].mean() else (b, a)
-            share = light[dark].mean() / (light[dark] + light[bright]).mean()
-            positions[bright] += share * (positions[dark] - positions[bright])
-            light[bright] += light[dark]
-            kept[dark] = False
-    return Cloud(positions_mm=positions, light=light)[kept]
+def _scene(
+    images: Mapping[str, np.ndarray],
+    noise: Mapping[str, float],
+    clipped: np.ndarray | None,
+    whole: Mapping[str, np.ndarray],
+    standing: Mapping[str, np.ndarray],
+) -> Scene:
+    """Return the scene above the background that images without a model of their particles show."""
+    found = {name: surroundings(image, noise[name], whole[name], standing.get(name)) for name, image in images.items()}
+    counts = np.concatenate([(image - found[name][0]).reshape(-1) for name, image in images.items()])
+    variance = np.concatenate([np.square(deviation).reshape(-1) for _, deviation in found.values()])
+    return Scene(counts=counts, read_variance=variance, clipped=clipped)
+
+
+def _faint(model: ParticleImages, scene: Scene, cloud: Cloud) -> float:
+    """Return the light of a particle that is just significant above the background [counts]."""
+    some = cloud.positions_mm[np.linspace(0, len(cloud) - 1, PROBES).astype(int)] if len(cloud) else cloud.positions_mm
+    errors = []
+    for camera, own in enumerate(model.lists(some)):
+        variance = scene.read_variance[own.pixel + model.first_pixel[camera]]
+        particle = np.repeat(np.arange(len(some)), np.diff(own.first))
+        information = np.bincount(particle, np.square(own.values[:, 3]) / variance, minlength=len(some))
+        errors.append(1 / np.sqrt(np.maximum(information, 1e-30)))
+    return confirmation.SIGNIFICANCE * float(np.median(np.min(errors, axis=0))) if len(some) else 0.0
 
 
 def _fit_size(state: _State) -> None:
@@ -311,7 +390,7 @@ def _better_size(state: _State) -> ParticleImages:
     for power in (-1, 0, 1):
         other = state.model.of_size(state.model.sigma_voxel * SIZE_STEP**power)
         moved, _ = refine(other, scene, cloud, iterations=1, scatter=state.scatter)
-        left = scene.counts - rendered(other, other.lists(moved.positions_mm), moved.light)
+        left = scene.residual(rendered(other, other.lists(moved.positions_mm), moved.light))
         chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2)[lit].sum(dtype=np.float64)))
     below, here, above = chi2
     curvature, slope = below - 2 * here + above, (below - above) / 2

@@ -10,6 +10,7 @@ import numpy as np
 
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import lies_in
+from lfpiv.tracking.confirmation import signals
 from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Normal, Scene, covariances, overlaps
 
@@ -38,15 +39,22 @@ class FoundParticles:
     """Share of the images' squared light, noise subtracted, that the particles explain."""
     crowding: float
     """Mean number of particles whose images overlap the image of one by half or more."""
+    hidden: float
+    """Share of the particles that fewer than two cameras (with one camera: none) see without another particle's image
+    over half of theirs or more."""
     per_microlens: float
     """Particles per microlens of the volume's x-y face."""
+    signal_to_noise: np.ndarray
+    """Light over its standard error in the camera where this is least, of those that see a particle; shape
+    (particle,)."""
 
     def __len__(self) -> int:
         return len(self.positions_mm)
 
     def __getitem__(self, chosen: np.ndarray) -> FoundParticles:
         """Return some of the particles, with the figures of all."""
-        arrays = {name: getattr(self, name)[chosen] for name in ("positions_mm", "errors_mm", "light", "residual")}
+        names = ("positions_mm", "errors_mm", "light", "residual", "signal_to_noise")
+        arrays = {name: getattr(self, name)[chosen] for name in names}
         return replace(self, **arrays)
 
     @classmethod
@@ -58,8 +66,12 @@ class FoundParticles:
         scene: Scene,
         cloud: Cloud,
         normal: Normal | None,
+        scatter: float,
     ) -> FoundParticles:
-        """Return the particles with their figures. `grid` is the volume that their density refers to."""
+        """Return the particles with their figures.
+
+        `grid` is the volume that their density refers to, `scatter` that of light between cameras.
+        """
         count = len(cloud)
         if normal is None or not count:
             empty = np.zeros((0, 3))
@@ -72,11 +84,13 @@ class FoundParticles:
                 voxel_mm=grid.voxel_mm,
                 explained=0.0,
                 crowding=0.0,
+                hidden=0.0,
                 per_microlens=0.0,
+                signal_to_noise=np.zeros(0),
             )
         errors = np.sqrt(np.maximum(np.einsum("pii->pi", covariances(normal))[:, :3], 0)) * grid.voxel_mm
         residual = _residuals(model, scene, cloud, normal)
-        left = scene.counts - normal.model
+        left = scene.residual(normal.model)
         noise = float(scene.variance(normal.model).sum(dtype=np.float64))
         whole = float(np.square(scene.counts, dtype=np.float64).sum()) - noise
         explained = 1 - (float(np.square(left, dtype=np.float64).sum()) - noise) / whole if whole > 0 else 0.0
@@ -89,12 +103,14 @@ class FoundParticles:
             voxel_mm=grid.voxel_mm,
             explained=float(np.clip(explained, 0, 1)),
             crowding=_crowding(normal),
+            hidden=_hidden(normal),
             per_microlens=int(lies_in(cloud.positions_mm, grid).sum()) / _microlenses(cameras, grid),
+            signal_to_noise=signals(normal, scatter).ratio,
         )
 
 
 def _residuals(model: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal) -> np.ndarray:
-    square = np.square(scene.counts - normal.model) / scene.variance(normal.model)
+    square = np.square(scene.residual(normal.model)) / scene.variance(normal.model)
     above, below = np.zeros(len(cloud)), np.zeros(len(cloud))
     for camera, own in enumerate(model.lists(cloud.positions_mm)):
         particle = np.repeat(np.arange(len(cloud)), np.diff(own.first))
@@ -109,6 +125,17 @@ def _crowding(normal: Normal) -> float:
     """Return the mean number of other particles whose images overlap a particle's by half or more, in any camera."""
     _, _, overlap = overlaps(normal)
     return float(2 * (overlap > 0.5).any(1).sum() / max(len(normal.right), 1))
+
+
+def _hidden(normal: Normal) -> float:
+    """Return the share of particles that too few cameras see without another one's image over half of theirs."""
+    first, second, overlap = overlaps(normal)
+    count, cameras = normal.light.shape
+    free = np.ones((count, cameras), bool)
+    for one in (first, second):
+        particle, camera = np.nonzero(overlap > 0.5)
+        free[one[particle], camera] = False
+    return float((free.sum(1) < min(2, cameras)).mean())
 
 
 def _microlenses(cameras: Mapping[str, CalibratedCamera], grid: Grid) -> float:

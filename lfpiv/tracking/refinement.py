@@ -66,6 +66,8 @@ class Scene:
     """Images without background [counts], shape (pixel,), float32."""
     read_variance: np.ndarray
     """Variance of the background [counts^2], shape (pixel,), float32."""
+    clipped: np.ndarray | None = None
+    """Pixels at the end of the sensor's range, which show the least light only, shape (pixel,), bool; None for none."""
     counts_per_photon: float = 0.0
     """Variance over mean of light, model errors included [counts]."""
 
@@ -74,9 +76,20 @@ class Scene:
         variance: np.ndarray = self.read_variance + np.float32(self.counts_per_photon) * np.maximum(model, 0)
         return variance
 
+    def residual(self, model: np.ndarray) -> np.ndarray:
+        """Return what a model of the images leaves [counts]; a clipped pixel agrees with any more light."""
+        left: np.ndarray = self.counts - model
+        if self.clipped is not None:
+            left[self.clipped & (left < 0)] = 0
+        return left
+
+    def known(self, model: np.ndarray) -> np.ndarray:
+        """Return the pixels that tell how much light there is, bool: not clipped ones where a model has more."""
+        return np.ones(model.shape, bool) if self.clipped is None else ~(self.clipped & (model > self.counts))
+
     def calibrated(self, model: np.ndarray) -> Scene:
         """Return the scene with the variance over mean that the residuals of lit pixels show."""
-        lit = model > 3 * np.sqrt(self.read_variance)
+        lit = (model > 3 * np.sqrt(self.read_variance)) & self.known(model)
         if not lit.any():
             return self
         excess = np.square(self.counts[lit] - model[lit]) / CHI2_MEDIAN - self.read_variance[lit]
@@ -95,6 +108,8 @@ class Normal:
     """Images of the particles [counts], shape (pixel,)."""
     chi2: float
     """Weighted sum of squares of the residuals."""
+    light: np.ndarray
+    """Light of the particles at which the equations hold [counts], shape (particle, camera)."""
 
 
 def linearise(images: ParticleImages, scene: Scene, cloud: Cloud, scatter: float) -> Normal:
@@ -103,14 +118,14 @@ def linearise(images: ParticleImages, scene: Scene, cloud: Cloud, scatter: float
     size = 3 + cameras
     lists = images.lists(cloud.positions_mm)
     model = rendered(images, lists, cloud.light)
-    residual = scene.counts - model
+    residual = scene.residual(model)
     variance = scene.variance(model)
-    weight = 1 / (variance + np.square(residual) / ROBUST_SIGMA**2)
-    prior, pull = _prior(cloud.light, scatter)
+    weight = scene.known(model) / (variance + np.square(residual) / ROBUST_SIGMA**2)
+    held, pull = prior(cloud.light, scatter)
     right = np.zeros((count, size))
     right[:, 3:] = pull
     diagonal = np.arange(count)
-    matrix = sparse.bsr_array((prior, diagonal, np.arange(count + 1)), shape=(count * size, count * size))
+    matrix = sparse.bsr_array((held, diagonal, np.arange(count + 1)), shape=(count * size, count * size))
     for camera, own in enumerate(lists):
         span = slice(*images.first_pixel[camera : camera + 2])
         pairs = pair_blocks(own, weight[span], residual[span])
@@ -129,7 +144,7 @@ def linearise(images: ParticleImages, scene: Scene, cloud: Cloud, scatter: float
     matrix = sparse.bsr_array(matrix)
     matrix.sum_duplicates()
     chi2 = float((np.square(residual, dtype=np.float64) / variance).sum())
-    return Normal(matrix=matrix, right=right, model=model, chi2=chi2)
+    return Normal(matrix=matrix, right=right, model=model, chi2=chi2, light=cloud.light)
 
 
 def rendered(images: ParticleImages, lists: list[ImageLists], light: np.ndarray) -> np.ndarray:
@@ -141,7 +156,7 @@ def rendered(images: ParticleImages, lists: list[ImageLists], light: np.ndarray)
     return np.concatenate(parts).astype(np.float32)
 
 
-def _prior(light: np.ndarray, scatter: float) -> tuple[np.ndarray, np.ndarray]:
+def prior(light: np.ndarray, scatter: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the blocks and the right-hand side that hold the light of the cameras together."""
     count, cameras = light.shape
     blocks = np.zeros((count, 3 + cameras, 3 + cameras))

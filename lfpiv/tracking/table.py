@@ -30,7 +30,7 @@ def link_table(
     Dataset
         Over ``particle``: ``x``, ``y``, ``z`` midway between the frames [mm], ``u``, ``v``, ``w`` [m/s],
         ``displacement_x``, ``_y``, ``_z`` and ``uncertainty_x``, ``_y``, ``_z``, their standard errors [voxel],
-        ``intensity`` [counts], ``residual``, ``valid``. Attributes: figures of both frames.
+        ``intensity`` [counts], ``residual``, ``signal_to_noise``, ``valid``. Attributes: figures of both frames.
     """
     a, b = links.T if len(links) else (np.zeros(0, int), np.zeros(0, int))
     voxel_mm = first.voxel_mm
@@ -47,6 +47,8 @@ def link_table(
     data["intensity"] = ((first.light[a] + second.light[b]) / 2, "counts", "light of the particle, mean of the cameras")
     residual = np.sqrt((np.square(first.residual[a]) + np.square(second.residual[b])) / 2)
     data["residual"] = (residual, "1", "root mean square of the weighted residuals of its pixels; 1 for noise alone")
+    ratio = np.minimum(first.signal_to_noise[a], second.signal_to_noise[b])
+    data["signal_to_noise"] = (ratio, "1", "light over its standard error, least of the cameras and frames")
     data["valid"] = (np.asarray(valid, bool), "1", "true: agrees with its neighbours")
     return xr.Dataset(
         {name: (PARTICLE, values, {"units": unit, "long_name": text}) for name, (values, unit, text) in data.items()},
@@ -60,6 +62,7 @@ def link_table(
             "valid_links": int(np.sum(valid)),
             "explained": [first.explained, second.explained],
             "crowding": [first.crowding, second.crowding],
+            "hidden": [first.hidden, second.hidden],
             "per_microlens": [first.per_microlens, second.per_microlens],
             "sigma_voxel": [first.sigma_voxel, second.sigma_voxel],
         },

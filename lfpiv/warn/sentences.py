@@ -227,9 +227,9 @@ SENTENCES: Mapping[Code, str] = {
         "volume.size_mm, volume.voxel_mm)"
     ),
     Code.CROWDED: (
-        "the image of a particle overlaps those of {crowding:.2g} others by half or more ({limit:g} is the limit; "
-        "{per_microlens:.2g} particles per microlens were found): some particles are missed and some found are none. "
-        "Rely on the correlation, or use less seeding"
+        "too few cameras see {share:percent} % of the particles without the image of another one over half of theirs "
+        "({limit:percent} % is the limit; {per_microlens:.2g} particles per microlens were found): some particles are "
+        "missed and some found are none. Rely on the correlation, or use less seeding"
     ),
     Code.UNLINKED: (
         "{share:percent} % of the particles found in a frame have a partner in the other one (usual are more than "

@@ -24,7 +24,9 @@ def table(shift, count=5):
             voxel_mm=0.1,
             explained=0.9,
             crowding=0.1,
+            hidden=0.1,
             per_microlens=0.05,
+            signal_to_noise=np.full(count, 30.0),
         )
         for place in (at, at + shift)
     )

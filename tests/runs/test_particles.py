@@ -7,14 +7,14 @@ from lfpiv.runs.particles import crowded_warnings, unlinked_warnings
 from lfpiv.warn import Code
 
 
-def table(*, linked=40, crowding=0.1):
-    attributes = {"found": [50, 50], "linked": linked, "crowding": [crowding, 0.0], "per_microlens": [0.05, 0.05]}
+def table(*, linked=40, hidden=0.1):
+    attributes = {"found": [50, 50], "linked": linked, "hidden": [hidden, 0.0], "per_microlens": [0.05, 0.05]}
     return xr.Dataset(attrs=attributes)
 
 
-@pytest.mark.parametrize(("crowding", "cameras", "expected"), [(0.5, 2, 0), (0.9, 2, 1), (0.5, 1, 1)])
-def test_overlapping_images_are_told(crowding, cameras, expected):
-    found = crowded_warnings(table(crowding=crowding), cameras)
+@pytest.mark.parametrize(("hidden", "cameras", "expected"), [(0.4, 2, 0), (0.6, 2, 1), (0.4, 1, 1)])
+def test_overlapping_images_are_told(hidden, cameras, expected):
+    found = crowded_warnings(table(hidden=hidden), cameras)
     assert [warning.code for warning in found] == [Code.CROWDED] * expected
 
 

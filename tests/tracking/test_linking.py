@@ -21,7 +21,9 @@ def cloud(positions_mm, light=None, error_mm=0.001):
         voxel_mm=VOXEL_MM,
         explained=1.0,
         crowding=0.0,
+        hidden=0.0,
         per_microlens=0.05,
+        signal_to_noise=np.full(count, 30.0),
     )
 
 
