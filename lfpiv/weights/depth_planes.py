@@ -7,6 +7,10 @@ apart, at the places where its line of sight meets the planes: W = V R with the 
 the optics per node. It needs a third of the weights, and of the time of a projection. `choose_planes` takes the widest
 distance of planes with which images of voxels agree with their own footprints.
 
+Across the line of sight nothing is interpolated, because images of voxels change fast there. So nodes lie whole voxels
+aside from one another, along the lattice direction next to the line of sight: 0 or 45 degrees from an axis. Where the
+two differ by more than some degrees, no distance serves, and the weights of all voxels are stored.
+
 .. [1] P. Lacroute, M. Levoy, "Fast volume rendering using a shear-warp factorization of the viewing transformation",
    SIGGRAPH 1994, 451-458, doi:10.1145/192161.192283.
 """
@@ -44,9 +48,6 @@ FEWEST_VOXELS = 100_000
 """Voxels of a volume from which on nodes are used. The weights of smaller ones take little time and memory."""
 SEEDS = (1, 2, 3, 4)
 """Seeds of the samples of voxels whose images are compared."""
-WHOLE_SLOPE = 0.05
-"""Largest difference of a slope from a whole number at which that number is taken: shifts then need no interpolation
-across the line of sight."""
 
 
 @dataclass(frozen=True)
@@ -56,49 +57,36 @@ class NodeGrid:
     stored: StoredGrid
     axes: tuple[int, int, int]
     """Axes of the volume in memory that count rows, layers and columns; layers lie across the line of sight."""
-    slopes: tuple[float, float]
-    """Rows and columns by which the line of sight moves from one layer to the next."""
+    slopes: tuple[int, int]
+    """Rows and columns by which nodes move from one layer to the next."""
     distance: int
     """Layers from one plane to the next."""
 
     @classmethod
     def of(cls, stored: StoredGrid, camera: CalibratedCamera, distance: int) -> NodeGrid:
-        """Lay nodes along the line of sight to the middle of the grid."""
+        """Lay nodes along the lattice direction next to the line of sight to the middle of the grid."""
         sight = line_of_sight(camera, stored.grid.centre_mm)
         along = np.array([sight[2 - axis] for axis in stored.order])
         layers = int(np.argmax(np.abs(along)))
         rows, columns = (axis for axis in range(3) if axis != layers)
-        slopes = along[[rows, columns]] / along[layers]
-        whole = np.rint(slopes)
-        row, column = np.where(np.abs(slopes - whole) <= WHOLE_SLOPE, whole, slopes).tolist()
+        row, column = np.rint(along[[rows, columns]] / along[layers]).astype(int).tolist()
         return cls(stored, (rows, layers, columns), (row, column), distance)
 
     @cached_property
     def shares(self) -> PlaneShares:
         """How voxels are shared among the nodes."""
-        voxels = [self.stored.shape[axis] for axis in self.axes]
-        layer, planes = np.arange(voxels[1]), self._planes
-        place = (layer - self._first_layer) / self.distance
-        plane = np.clip(np.floor(place).astype(int) - 1, 0, planes - TAPS)
-        depth = np.stack(_lagrange(place - plane - 1), axis=-1)
-        gap = self._first_layer + self.distance * (plane[:, None] + np.arange(TAPS)) - layer[:, None]
-        moved = gap[..., None] * np.array(self.slopes)  # (layer, plane, axis)
-        whole = np.floor(moved)
-        across = np.stack(_lagrange(moved - whole), axis=-1)
-        places = whole[..., None] + np.arange(-1, TAPS - 1)
-        used = (across != 0) & (depth != 0)[..., None, None]
-        low = np.where(used, places, np.inf).min((0, 1, 3))
-        high = np.where(used, places, -np.inf).max((0, 1, 3))
-        rows, columns = (voxels[axis] + int(high[k] - low[k]) for k, axis in enumerate((0, 2)))
+        rows, layers, columns = (self.stored.shape[axis] for axis in self.axes)
+        place = (np.arange(layers) - self._first_layer) / self.distance
+        plane = np.clip(np.floor(place).astype(int) - 1, 0, self._planes - TAPS)
+        share = np.stack(_lagrange(place - plane - 1), axis=-1)
+        low, high = self._aside
         return PlaneShares(
             axes=self.axes,
             voxels=self.stored.shape,
-            nodes=(rows, planes, columns),
+            nodes=(rows + high[0] - low[0], self._planes, columns + high[1] - low[1]),
             plane=plane.astype(np.int32),
-            depth=depth.astype(np.float32),
-            shift=(whole - 1 - low).astype(np.int32),
-            across=np.where(used, across, 0).astype(np.float32),
-            before=(int(-low[0]), int(-low[1])),
+            share=share.astype(np.float32),
+            shift=(self._moved(plane) - low).astype(np.int32),
         )
 
     @property
@@ -110,6 +98,19 @@ class NodeGrid:
     def _first_layer(self) -> int:
         """Layer of the first plane, below 0."""
         return (self.stored.shape[self.axes[1]] - 1 - (self._planes - 1) * self.distance) // 2
+
+    def _moved(self, plane: np.ndarray) -> np.ndarray:
+        """Return the rows and columns from each layer's voxels to their nodes on four planes, shape (layer, 4, 2)."""
+        gap = self._first_layer + self.distance * (plane[:, None] + np.arange(TAPS)) - np.arange(len(plane))[:, None]
+        moved: np.ndarray = gap[..., None] * np.array(self.slopes)
+        return moved
+
+    @property
+    def _aside(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Rows and columns by which nodes lie aside of their voxels: the least and the largest ones."""
+        reach = 2 * self.distance
+        row, column = (reach * abs(slope) for slope in self.slopes)
+        return (-row, -column), (row, column)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -128,11 +129,11 @@ class NodeGrid:
 
     def positions_mm(self, steps: np.ndarray) -> np.ndarray:
         """Return places (x, y, z) [mm] by indices along rows, planes and columns, shape (node, 3)."""
-        before = self.shares.before
+        low, _ = self._aside
         along = np.empty(np.shape(steps))
-        along[:, self.axes[0]] = steps[:, 0] - before[0]
+        along[:, self.axes[0]] = steps[:, 0] + low[0]
         along[:, self.axes[1]] = self._first_layer + self.distance * steps[:, 1]
-        along[:, self.axes[2]] = steps[:, 2] - before[1]
+        along[:, self.axes[2]] = steps[:, 2] + low[1]
         return self.stored.positions_mm(along)
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:

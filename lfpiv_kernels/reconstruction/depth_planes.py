@@ -1,8 +1,6 @@
 """Warp: voxels on planes across a camera's line of sight, and back: the factor R of the weights W = V R.
 
-A voxel is shared among four planes, and on each among four rows and four columns of nodes, at the place where its line
-of sight meets the plane. The shares are those of cubic Lagrange interpolation. Along the line of sight they suit what
-the pupil's rays do between planes; across it a shift by a whole number of voxels needs no interpolation. Each thread
+A voxel is shared among the nodes of four planes, where its line of sight meets them. Each thread
 writes a row of nodes or of voxels, so that results do not depend on the number of threads. The loops are C++, see
 ``depth_planes.h``. Twin:
 `PlaneShares.nodes_of`, voxel by voxel.
@@ -26,9 +24,8 @@ TAPS: int = native.constant("depth_planes.h", "TAPS")
 class PlaneShares:
     """Places and shares of voxels on planes of nodes.
 
-    The voxel in row a, layer z and column b has nodes in plane ``plane[z] + n``, row ``a + shift[z, n, 0] + i`` and column
-    ``b + shift[z, n, 1] + j`` with n, i, j from 0 to 3, and there the share
-    ``depth[z, n] * across[z, n, 0, i] * across[z, n, 1, j]``.
+    The voxel in row a, layer z and column b has the share ``share[z, n]`` in plane ``plane[z] + n``, n from 0 to 3, at
+    row ``a + shift[z, n, 0]`` and column ``b + shift[z, n, 1]``.
     """
 
     axes: tuple[int, int, int]
@@ -39,14 +36,10 @@ class PlaneShares:
     """Rows, planes and columns of nodes."""
     plane: np.ndarray
     """First plane of each layer, shape (layer,), int32."""
-    depth: np.ndarray
+    share: np.ndarray
     """Share of a layer on its planes, shape (layer, 4), float32."""
     shift: np.ndarray
-    """Rows and columns from a voxel to its first node, shape (layer, 4, 2), int32."""
-    across: np.ndarray
-    """Shares along rows and columns, shape (layer, 4, 2, 4), float32."""
-    before: tuple[int, int] = (0, 0)
-    """Rows and columns of nodes before the first voxel."""
+    """Rows and columns from a voxel to its nodes, shape (layer, 4, 2), int32."""
 
     @property
     def size(self) -> int:
@@ -57,14 +50,10 @@ class PlaneShares:
         """Return the nodes of a voxel and its shares, shapes (node,); shares of zero are left out."""
         place = np.unravel_index(voxel, self.voxels)
         row, layer, column = (int(place[axis]) for axis in self.axes)
-        share = self.depth[layer, :, None, None] * self.across[layer, :, 0, :, None] * self.across[layer, :, 1, None, :]
-        tap = np.arange(TAPS)
-        rows = row + self.shift[layer, :, 0, None, None] + tap[:, None]
-        columns = column + self.shift[layer, :, 1, None, None] + tap
-        planes = self.plane[layer] + tap[:, None, None]
-        node = (rows * self.nodes[1] + planes) * self.nodes[2] + columns
-        lit = share != 0
-        return np.broadcast_to(node, share.shape)[lit], share[lit].astype(np.float64)
+        rows, columns = row + self.shift[layer, :, 0], column + self.shift[layer, :, 1]
+        node = (rows * self.nodes[1] + self.plane[layer] + np.arange(TAPS)) * self.nodes[2] + columns
+        lit = self.share[layer] != 0
+        return node[lit], self.share[layer, lit].astype(np.float64)
 
 
 @wp.struct
@@ -72,9 +61,8 @@ class PlaneMap:
     """`PlaneShares` on the device."""
 
     plane: wp.array(dtype=int)
-    depth: wp.array(dtype=float)
+    share: wp.array(dtype=float)
     shift: wp.array(dtype=int)
-    across: wp.array(dtype=float)
     rows: int
     layers: int
     columns: int
@@ -132,8 +120,7 @@ class DepthPlanes:
         self._map = PlaneMap()
         for name, array in (("plane", shares.plane), ("shift", shares.shift)):
             setattr(self._map, name, to_device(np.ascontiguousarray(array, np.int32).ravel()))
-        for name, array in (("depth", shares.depth), ("across", shares.across)):
-            setattr(self._map, name, to_device(np.ascontiguousarray(array, np.float32).ravel()))
+        self._map.share = to_device(np.ascontiguousarray(shares.share, np.float32).ravel())
         self._map.rows, self._map.layers, self._map.columns = rows, layers, columns
         self._map.row_stride = layers * columns if self._moved else strides[shares.axes[0]]
         self._map.layer_stride = columns if self._moved else strides[shares.axes[1]]
@@ -151,7 +138,7 @@ class DepthPlanes:
 
     def collect(self, nodes: np.ndarray) -> np.ndarray:
         """Return the adjoint's sum R^T nodes, shape (voxel,), float32."""
-        volume = np.zeros(int(np.prod(self.shares.voxels)), np.float32)
+        volume = np.empty(int(np.prod(self.shares.voxels)), np.float32)
         out = to_device(volume, float)
         launch(Call(_collect, self._map.rows * self._map.layers, [self._map, to_device(nodes, float)], [out]))
         found = out.numpy()

@@ -385,8 +385,9 @@ class Projector:
         """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur several times."""
         if self.planes is None:
             return self.blocks.entries(voxel)
-        parts = [(share, *self.blocks.entries(int(node))) for node, share in zip(*self.planes.nodes_of(voxel))]
-        return np.concatenate([rays for _, rays, _ in parts]), np.concatenate([own * share for share, _, own in parts])
+        nodes, shares = self.planes.nodes_of(voxel)
+        rays, weights = zip(*(self.blocks.entries(int(node)) for node in nodes), strict=True)
+        return np.concatenate(rays), np.concatenate([own * share for own, share in zip(weights, shares, strict=True)])
 
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32. With planes: a weighted mean of its nodes'."""
