@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 import lfpiv
 from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.geometry.grid import Grid
-from lfpiv.weights.choice import compare_with_count
+from lfpiv.weights.checks import compare_with_count
 from lfpiv.weights.counting import COUNT_POINTS
 from lfpiv.weights.operator import COUNT_SAMPLES_ONE
 from lfpiv_kernels import runtime

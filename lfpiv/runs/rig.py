@@ -198,7 +198,7 @@ def prepare(run: Run, board: Calibration) -> tuple[Run, Prepared]:
 def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
     """Build the weights and check the cameras by the first pairs of `todo`."""
     from lfpiv.calibration.coverage import require_seen, warn_outside
-    from lfpiv.weights.choice import compare_with_count
+    from lfpiv.weights.checks import compare_with_count
     from lfpiv.weights.operator import build_weights
 
     experiment, compute, finest = run.experiment, run.experiment.compute, run.reconstructed_experiment

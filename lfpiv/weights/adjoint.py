@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
-    from lfpiv.weights.operator import Weights
+    from lfpiv.geometry.grid import Grid
+    from lfpiv.weights.stored_grid import StoredGrid
+    from lfpiv_kernels.reconstruction.projector import Projector
+
+
+class Forward(Protocol):
+    """What the adjoint needs of the operator."""
+
+    cameras: dict[str, CalibratedCamera]
+    stored: StoredGrid
+
+    @property
+    def grid(self) -> Grid:
+        """The voxels."""
+
+    def projector(self, name: str) -> Projector:
+        """Return one camera's weights."""
+
+    def __call__(self, volume: np.ndarray, out: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+        """Project a volume."""
 
 
 class Adjoint:
     """The adjoint of `Weights`; ``adjoint.T`` is the operator itself."""
 
-    def __init__(self, weights: Weights):
+    def __init__(self, weights: Forward):
         self.T = weights
 
     def __call__(self, images: Mapping[str, np.ndarray], out: np.ndarray | None = None) -> np.ndarray:

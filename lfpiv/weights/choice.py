@@ -27,7 +27,6 @@ from lfpiv_kernels.reconstruction.projector import Blocks
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
-    from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
 
@@ -176,23 +175,6 @@ def warn_of_errors(counted: CountedVoxels, form: str, errors: Sequence[float], *
         figures = {"form": form, "mean": float(np.mean(errors)), "worst": max(errors), "cause": cause}
         figures |= {"aim_mean": AIM_MEAN, "aim_worst": AIM_WORST, "bent_pitch": bent, "wide_pitch": wide}
         warn(log, Warning(code=Code.WEIGHTS_DIFFER, subject=camera.name, figures=figures))
-
-
-def compare_with_count(weights: Weights) -> dict[str, list[float]]:
-    """Compare stored weights with counted rays in a few random voxels of every camera.
-
-    Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
-
-    Returns
-    -------
-    dict of str to list of float
-        Camera name -> relative L2 difference per voxel that the camera sees, the noise of the count subtracted.
-    """
-    errors = {name: weights.counted(name).errors(weights.projector(name)) for name in weights.cameras}
-    for name, some in errors.items():
-        if name not in weights.profile_errors and weights.method == "footprint":
-            warn_of_errors(weights.counted(name), weights.forms[name], some, requested=True)
-    return errors
 
 
 def _bent(camera: CalibratedCamera, centres_mm: np.ndarray) -> float:

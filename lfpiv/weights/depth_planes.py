@@ -42,6 +42,8 @@ DISTANCES = (8, 7, 6, 5, 4, 3, 2)
 """Distances of planes that are tried, widest first [layer of voxels]."""
 LARGEST_ERROR = 0.015
 """Largest root mean square of the relative L2 differences of interpolated images from those of the voxels."""
+WORST_ERROR = 0.03
+"""Largest of these differences."""
 LEAST_GAIN = 1.5
 """Least ratio of voxels to nodes with which nodes are used."""
 FEWEST_VOXELS = 100_000
@@ -184,8 +186,9 @@ def choose_planes(stored: StoredGrid, camera: CalibratedCamera, form: str, cuts:
         nodes = NodeGrid.of(stored, camera, distance)
         if LEAST_GAIN * nodes.size > stored.grid.size:
             continue
-        error = float(np.sqrt(np.mean(np.square(interpolation_errors(nodes, camera, sample, form, cuts)))))
-        if error <= LARGEST_ERROR:
+        errors = interpolation_errors(nodes, camera, sample, form, cuts)
+        error = float(np.sqrt(np.mean(np.square(errors))))
+        if error <= LARGEST_ERROR and max(errors) <= WORST_ERROR:
             text = "%s: weights of %d nodes for %d voxels, planes %d layers apart: images differ by %.1f %%"
             log.info(text, camera.name, nodes.size, stored.grid.size, distance, 100 * error)
             return nodes

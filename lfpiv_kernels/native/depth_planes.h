@@ -11,7 +11,7 @@ constexpr int TAPS = 4;
 
 /// How voxels (row a, layer z, column b) become nodes (row, plane, column), see ``depth_planes.py``.
 struct PlaneMap {
-    const int* plane;     // first plane of each layer
+    const int* plane;    // first plane of each layer
     const float* share;  // of each layer on each of its planes
     const int* shift;    // rows, then columns, from a voxel to its node, per layer and plane
     int rows, layers, columns;

@@ -11,8 +11,8 @@ import lfpiv
 from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
 from lfpiv.weights import depth_planes
+from lfpiv.weights.checks import estimate_memory
 from lfpiv.weights.depth_planes import LARGEST_ERROR, NodeGrid, choose_planes, interpolation_errors, line_of_sight
-from lfpiv.weights.estimate import estimate_memory
 from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes

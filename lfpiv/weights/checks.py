@@ -1,4 +1,4 @@
-"""How much memory the weights of a grid will need, before any is allocated."""
+"""How much memory the weights of a grid will need, and how far built weights are from counted rays."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 from lfpiv.geometry.grid import Grid
 from lfpiv.weights.blocks import BLOCK_BYTES, CHUNK_VOXELS, VOXEL_BYTES, PackedCamera, sample_blocks
+from lfpiv.weights.choice import warn_of_errors
 from lfpiv.weights.depth_planes import choose_planes
+from lfpiv.weights.operator import Weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.weights.ray_model import MODEL_SIZE
@@ -30,3 +32,20 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
         rays = 4 * (5 + 2) * camera.microimages.size + 24 * runtime.CHUNKS
         total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * places.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
     return int(total)
+
+
+def compare_with_count(weights: Weights) -> dict[str, list[float]]:
+    """Compare stored weights with counted rays in a few random voxels of every camera.
+
+    Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
+
+    Returns
+    -------
+    dict of str to list of float
+        Camera name -> relative L2 difference per voxel that the camera sees, the noise of the count subtracted.
+    """
+    errors = {name: weights.counted(name).errors(weights.projector(name)) for name in weights.cameras}
+    for name, some in errors.items():
+        if name not in weights.profile_errors and weights.method == "footprint":
+            warn_of_errors(weights.counted(name), weights.forms[name], some, requested=True)
+    return errors
