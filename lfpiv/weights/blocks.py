@@ -124,6 +124,10 @@ class Places(Protocol):
         """Their number."""
 
     @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """Voxels of the volume (z, y, x)."""
+
+    @property
     def voxel_mm(self) -> float:
         """Edge of the cube whose weights are stored [mm]."""
 
@@ -154,7 +158,7 @@ def footprint_blocks(
     shape, size = places.shape, places.size
     packed = PackedCamera.of(camera)
     blocks, values = sample_blocks(packed, places, form, cuts)
-    require_numbers(size * blocks, shape)
+    require_numbers(size * blocks, places.volume_shape)
     allow(int(size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)))
     planes = places.models(camera)
 

@@ -125,6 +125,11 @@ class NodeGrid:
         return self.shares.size
 
     @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """Voxels of the grid (z, y, x)."""
+        return self.stored.volume_shape
+
+    @property
     def voxel_mm(self) -> float:
         """Edge of the cubes whose images are stored [mm]."""
         return self.stored.voxel_mm

@@ -59,6 +59,11 @@ class StoredGrid:
         return self.grid.size
 
     @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """Voxels of the grid (z, y, x)."""
+        return self.grid.shape
+
+    @property
     def voxel_mm(self) -> float:
         """Edge of a voxel [mm]."""
         return self.grid.voxel_mm
