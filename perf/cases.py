@@ -18,8 +18,9 @@ from threadpoolctl import threadpool_limits
 import lfpiv
 from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.geometry.grid import Grid
+from lfpiv.weights.checks import compare_with_count
 from lfpiv.weights.counting import COUNT_POINTS
-from lfpiv.weights.operator import COUNT_SAMPLES_ONE, compare_with_count
+from lfpiv.weights.operator import COUNT_SAMPLES_ONE
 from lfpiv_kernels import runtime
 from lfpiv_kernels.correlation import correlate, deform
 from lfpiv_kernels.rays import mapping

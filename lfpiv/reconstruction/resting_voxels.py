@@ -5,6 +5,9 @@ many weights as a bright one. So after the first `ALL` epochs, each epoch lays t
 `LIGHT` of the light of those that still take part. Their light stays in the projections as it is, and their weights
 are not visited. After `CYCLE` such epochs all voxels take part in one. Then the next cycle begins.
 
+Where a camera stores the weights of nodes between voxels (`lfpiv.weights.depth_planes`), none rests: most nodes have
+some bright voxel.
+
 No voxel is lost: one that rests and should be brighter is found in the next epoch of all voxels, or in the last passes,
 in which none rests. The light that the sieve spreads from active voxels into resting ones counts when these wake.
 
@@ -40,6 +43,7 @@ class RestingVoxels:
     def __init__(self, equations: ImageEquations):
         self._equations = equations
         self._active: np.ndarray | None = None
+        self._possible = all(camera.projector.planes is None for camera in equations.cameras)
 
     def active_in(self, epoch: int, volume: np.ndarray) -> np.ndarray | None:
         """Choose the voxels that take part in the next epoch.
@@ -57,7 +61,7 @@ class RestingVoxels:
             1 for voxels that take part, 0 for those that rest, shape (voxel,), float32. None for all.
         """
         few = volume.size < FEWEST_VOXELS
-        if few or epoch < ALL or (epoch - ALL) % (CYCLE + 1) == CYCLE:
+        if few or not self._possible or epoch < ALL or (epoch - ALL) % (CYCLE + 1) == CYCLE:
             self.wake()
             return None
         light = volume if self._active is None else volume * self._active

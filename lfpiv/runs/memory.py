@@ -57,7 +57,7 @@ def weights_bytes(experiment: Experiment) -> int:
 
     Logs the upper limit if the form of the weights is chosen later.
     """
-    from lfpiv.weights.operator import estimate_memory
+    from lfpiv.weights.checks import estimate_memory
 
     cameras, grid, form = _nominal_cameras(experiment), experiment.grid, experiment.compute.weights_form
     weights = estimate_memory(cameras, grid, form)

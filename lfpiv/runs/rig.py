@@ -208,7 +208,8 @@ def tell_vectors(experiment: Experiment) -> None:
 def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
     """Build the weights and check the cameras by the first pairs of `todo`."""
     from lfpiv.calibration.coverage import require_seen, warn_outside
-    from lfpiv.weights.operator import build_weights, compare_with_count
+    from lfpiv.weights.checks import compare_with_count
+    from lfpiv.weights.operator import build_weights
 
     experiment, compute, finest = run.experiment, run.experiment.compute, run.reconstructed_experiment
     calibration, self_calibration = prepared.calibration, prepared.self_calibration

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -19,8 +19,7 @@ from threadpoolctl import threadpool_limits
 from lfpiv.errors import InputError
 from lfpiv.lightfield.microimage_layout import microimage_edge
 from lfpiv.progress import StepProgress
-from lfpiv.weights.ray_fit import grid_models, ray_models
-from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv.weights.ray_fit import ray_models
 from lfpiv_kernels.rays.lattice import Lattice, cell_frame, cell_steps, pack_lattice
 from lfpiv_kernels.reconstruction.projector import Blocks
 from lfpiv_kernels.weights import footprint
@@ -113,15 +112,41 @@ class _Growing:
         return self._array
 
 
+class Places(Protocol):
+    """Voxels, or nodes between them, whose weights are stored."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Numbers along their axes in memory, outermost first."""
+
+    @property
+    def size(self) -> int:
+        """Their number."""
+
+    @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """Voxels of the volume (z, y, x)."""
+
+    @property
+    def voxel_mm(self) -> float:
+        """Edge of the cube whose weights are stored [mm]."""
+
+    def centres_mm(self, index: np.ndarray) -> np.ndarray:
+        """Return the cubes' centres (x, y, z) [mm] by their index, shape (cube, 3)."""
+
+    def models(self, camera: CalibratedCamera) -> Iterator[np.ndarray]:
+        """Yield the ray models, plane by plane of the outermost axis."""
+
+
 def footprint_blocks(
-    stored: StoredGrid,
+    places: Places,
     camera: CalibratedCamera,
     form: str,
     progress: StepProgress,
     allow: Callable[[int], None],
     cuts: Cuts = WHOLE,
 ) -> Blocks:
-    """Integrate the blocks of all voxels of a grid for one camera.
+    """Integrate the blocks of all voxels of a grid, or of nodes, for one camera.
 
     `allow` is called with the estimated memory of the blocks [byte] before they are computed, and may raise.
 
@@ -130,21 +155,19 @@ def footprint_blocks(
     InputError
         If there are more blocks than 32-bit indices can number, before they are computed.
     """
-    size = stored.grid.size
-    plane = size // stored.shape[0]
+    shape, size = places.shape, places.size
     packed = PackedCamera.of(camera)
-    blocks, values = sample_blocks(packed, stored, form, cuts)
-    require_numbers(size * blocks, stored.grid.shape)
+    blocks, values = sample_blocks(packed, places, form, cuts)
+    require_numbers(size * blocks, places.volume_shape)
     allow(int(size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)))
-    outer, middle, inner = (2 - axis for axis in stored.order)
-    planes = grid_models(camera, stored.shape, stored.positions_mm, (outer, middle, inner))
+    planes = places.models(camera)
 
     def batches() -> Iterator[np.ndarray]:
-        step = max(1, CHUNK_VOXELS // plane)
+        step = max(1, CHUNK_VOXELS * shape[0] // size)
         with threadpool_limits(1, "blas"):  # one product per plane is too small for BLAS's own threads
-            for first in range(0, stored.shape[0], step):
+            for first in range(0, shape[0], step):
                 yield np.concatenate(list(islice(planes, step)))
-                progress(min(first + step, stored.shape[0]) / stored.shape[0])
+                progress(min(first + step, shape[0]) / shape[0])
 
     return blocks_of(packed, batches(), form, expected=(int(size * blocks), int(size * values)), cuts=cuts)
 
@@ -159,10 +182,10 @@ def require_numbers(blocks: float, shape: tuple[int, ...]) -> None:
         )
 
 
-def sample_blocks(packed: PackedCamera, stored: StoredGrid, form: str, cuts: Cuts = WHOLE) -> tuple[float, float]:
-    """Return the mean number of blocks and of values per voxel in a sample of a grid's voxels."""
-    sample = np.unique(np.linspace(0, stored.grid.size - 1, SAMPLED_VOXELS).astype(np.int64))
-    model = ray_models(packed.calibrated, stored.centres_mm(sample), stored.grid.voxel_mm)
+def sample_blocks(packed: PackedCamera, places: Places, form: str, cuts: Cuts = WHOLE) -> tuple[float, float]:
+    """Return the mean number of blocks and of values per voxel in a sample of a grid's voxels, or of nodes."""
+    sample = np.unique(np.linspace(0, places.size - 1, SAMPLED_VOXELS).astype(np.int64))
+    model = ray_models(packed.calibrated, places.centres_mm(sample), places.voxel_mm)
     blocks, values = (
         np.concatenate(counts) for counts in zip(*packed.footprints(form, cuts).compute(model), strict=True)
     )

@@ -20,7 +20,7 @@ from lfpiv.weights.ray_fit import fit_rays
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.count import count_rays
-from lfpiv_kernels.reconstruction.projector import Blocks
+from lfpiv_kernels.reconstruction.projector import Blocks, Projector
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
 
 if TYPE_CHECKING:
@@ -113,12 +113,12 @@ def count_voxels(
     return count, total, first_pixel
 
 
-def add_entries(image: np.ndarray, blocks: Blocks, voxel: int) -> None:
+def add_entries(image: np.ndarray, stored: Blocks | Projector, voxel: int) -> None:
     """Add one voxel's stored weights to a sensor image, in place."""
-    ray, weight = blocks.entries(voxel)
-    share = blocks.microimages.share[ray]
+    ray, weight = stored.entries(voxel)
+    share = stored.microimages.share[ray]
     lit = share > 0
-    np.add.at(image.ravel(), blocks.microimages.pixel[ray[lit]], weight[lit] * share[lit])
+    np.add.at(image.ravel(), stored.microimages.pixel[ray[lit]], weight[lit] * share[lit])
 
 
 class CountedVoxels:
@@ -152,13 +152,14 @@ class CountedVoxels:
         for half, start in zip(self._halves, self._corner, strict=True):
             half *= _window(camera.gain, start, half.shape[1:])
 
-    def errors(self, blocks: Blocks, voxels: Sequence[int] | None = None) -> list[float]:
-        """Return the relative L2 difference of blocks from the counts, one per voxel, the counts' noise subtracted.
+    def errors(self, stored: Blocks | Projector, voxels: Sequence[int] | None = None) -> list[float]:
+        """Return the relative L2 difference of weights from the counts, one per voxel, the counts' noise subtracted.
 
-        `voxels` are the indices of the counted voxels in `blocks`; default: their stored indices in the grid.
+        `voxels` are the indices of the counted voxels in `stored`; default: their stored indices in the grid.
         """
         errors = []
-        columns = blocks.microimages.sensor_shape[1]
+        rays = stored.microimages
+        columns = rays.sensor_shape[1]
         for number, voxel in enumerate(self.voxels if voxels is None else voxels):
             first, second = self._halves[number].astype(np.float64)
             mean = (first + second) / 2
@@ -166,11 +167,11 @@ class CountedVoxels:
             if light == 0:
                 continue
             image, corner = np.zeros(mean.shape), self._corner[number]
-            ray, weight = blocks.entries(int(voxel))
-            pixel = blocks.microimages.pixel[ray]
+            ray, weight = stored.entries(int(voxel))
+            pixel = rays.pixel[ray]
             seen = pixel >= 0
             row, column = np.divmod(pixel[seen], columns)
-            weight = weight[seen] * blocks.microimages.share[ray[seen]] * self.camera.gain[row, column]
+            weight = weight[seen] * rays.share[ray[seen]] * self.camera.gain[row, column]
             row, column = row - corner[1], column - corner[0]
             inside = (row >= 0) & (row < image.shape[0]) & (column >= 0) & (column < image.shape[1])
             np.add.at(image, (row[inside], column[inside]), weight[inside])

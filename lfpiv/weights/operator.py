@@ -21,25 +21,21 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.prompt import Card, Shown
+from lfpiv.weights.adjoint import Adjoint, checked_out
 from lfpiv.weights.blocks import (
-    BLOCK_BYTES,
-    CHUNK_VOXELS,
-    VOXEL_BYTES,
     Cuts,
-    PackedCamera,
     footprint_blocks,
     largest_weight,
-    sample_blocks,
 )
 from lfpiv.weights.card import card_of
-from lfpiv.weights.choice import Choice, choose_form, choose_uncounted, memory_check, warn_of_errors
+from lfpiv.weights.choice import Choice, choose_form, choose_uncounted, memory_check
 from lfpiv.weights.counting import CountedVoxels, add_entries, add_window, count_blocks, count_voxels
+from lfpiv.weights.depth_planes import choose_planes
 from lfpiv.weights.even_light import EvenLight, project_even_light
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.weights import footprint
-from lfpiv_kernels.weights.ray_model import MODEL_SIZE
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -137,9 +133,7 @@ class Weights(Shown):
         images = {}
         for name, camera in self.cameras.items():
             projector = self.projector(name)
-            target = (
-                np.empty(camera.optics.sensor_shape, np.float32) if out is None else _checked_out(out, name, camera)
-            )
+            target = np.empty(camera.optics.sensor_shape, np.float32) if out is None else checked_out(out, name, camera)
             projector.project(flat, target.reshape(-1))
             images[name] = np.multiply(target, camera.gain, out=target)
         return images
@@ -176,7 +170,7 @@ class Weights(Shown):
         image = np.zeros(setup.optics.sensor_shape, np.float32)
         index = self.stored.index(voxel)
         if camera in self._projectors:
-            add_entries(image, self._projectors[camera].blocks, index)
+            add_entries(image, self._projectors[camera], index)
         else:  # not counted yet: trace this voxel only
             centre = self.stored.centres_mm(np.array([index]))
             counts, total, corner = count_voxels(setup, centre, self.grid.voxel_mm, samples=COUNT_SAMPLES_ONE)
@@ -318,51 +312,13 @@ class Weights(Shown):
         return self._counted[name]
 
 
-class Adjoint:
-    """The adjoint of `Weights`; ``adjoint.T`` is the operator itself."""
-
-    def __init__(self, weights: Weights):
-        self.T = weights
-
-    def __call__(self, images: Mapping[str, np.ndarray], out: np.ndarray | None = None) -> np.ndarray:
-        """Back-project images: volume[voxel] = sum over cameras and pixels of weight * image.
-
-        Parameters
-        ----------
-        images : mapping of str to ndarray
-            Camera name -> image, shape (rows, columns); every camera of the operator.
-        out : ndarray, shape (z, y, x), float32, optional
-            Volume to overwrite.
-
-        Returns
-        -------
-        ndarray, shape (z, y, x), float32
-
-        Raises
-        ------
-        ValueError
-            If a camera is missing or a shape does not fit.
-        """
-        weights = self.T
-        flat = np.zeros(weights.grid.size, np.float32)
-        for name, camera in weights.cameras.items():
-            image = np.multiply(_checked_image(images, name, camera), camera.gain, dtype=np.float32)
-            weights.projector(name).back_project(image.reshape(-1), flat)
-        volume = weights.stored.restore(flat)
-        if out is None:
-            return volume
-        if out.shape != volume.shape:
-            raise ValueError(f"out: expected shape {volume.shape} (z, y, x), got {out.shape}.")
-        out[:] = volume
-        return out
-
-
 def build_weights(
     calibration: Calibration,
     grid: Grid,
     method: str = DEFAULTS.weights,
     *,
     form: str = DEFAULTS.weights_form,
+    planes: bool = True,
     limit_bytes: float = math.inf,
     progress: StepProgress | None = None,
 ) -> Weights:
@@ -381,6 +337,9 @@ def build_weights(
         How footprints are stored. "profiles": products of a profile along the sensor's columns and one along its rows
         for every voxel and lens (rank 1), small and fast, for straight rays and square microlenses. "pixels": one value
         per pixel, for any optics. "auto": profiles for each camera where they agree with counted rays.
+    planes : bool
+        Store the weights of nodes on planes across each camera's line of sight where that is accurate, see
+        `lfpiv.weights.depth_planes`. False: the weights of every voxel.
     limit_bytes : float
         Memory that the weights may take [byte]; default: no limit.
     progress : callable, optional
@@ -420,57 +379,10 @@ def build_weights(
         chosen, used = choices[name], sum(projector.blocks.nbytes for projector in projectors.values())
         allow = memory_check(name, grid, chosen, limit_bytes - used)
         step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
-        projectors[name] = Projector(footprint_blocks(stored, camera, chosen.form, step, allow, chosen.cuts))
+        nodes = choose_planes(stored, camera, chosen.form, chosen.cuts) if planes else None
+        blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
+        projectors[name] = Projector(blocks, nodes.shares if nodes else None)
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)
     text = "weights of %d voxels on %d cameras: %.0f MiB"
     log.info(text, grid.size, len(cameras), weights.memory_bytes / 2**20)
     return weights
-
-
-def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") -> int:
-    """Estimate the memory that the weights of a grid will need [byte], from a sample of its voxels.
-
-    Nothing large is allocated. The form "auto" is taken for profiles if the microlens layout is square.
-    """
-    runtime.device()
-    total = 0.0
-    stored = StoredGrid(grid, (0, 1, 2))
-    for camera in calibration.cameras.values():
-        chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
-        blocks, values = sample_blocks(PackedCamera.of(camera), stored, chosen)
-        rays = 4 * (5 + 2) * camera.microimages.size + 24 * runtime.CHUNKS
-        total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * grid.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
-    return int(total)
-
-
-def compare_with_count(weights: Weights) -> dict[str, list[float]]:
-    """Compare stored weights with counted rays in a few random voxels of every camera.
-
-    Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
-
-    Returns
-    -------
-    dict of str to list of float
-        Camera name -> relative L2 difference per voxel that the camera sees, the noise of the count subtracted.
-    """
-    errors = {name: weights.counted(name).errors(weights.projector(name).blocks) for name in weights.cameras}
-    for name, some in errors.items():
-        if name not in weights.profile_errors and weights.method == "footprint":
-            warn_of_errors(weights.counted(name), weights.forms[name], some, requested=True)
-    return errors
-
-
-def _checked_image(images: Mapping[str, np.ndarray], name: str, camera: CalibratedCamera) -> np.ndarray:
-    if name not in images:
-        raise ValueError(f"images: camera {name!r} is missing; found {', '.join(images) or 'none'}.")
-    image = np.asarray(images[name])
-    if image.shape != camera.optics.sensor_shape:
-        raise ValueError(f"images[{name!r}]: expected shape {camera.optics.sensor_shape}, got {image.shape}.")
-    return image
-
-
-def _checked_out(images: Mapping[str, np.ndarray], name: str, camera: CalibratedCamera) -> np.ndarray:
-    image = _checked_image(images, name, camera)
-    if image is not images[name] or image.dtype != np.float32 or not image.flags.c_contiguous:
-        raise ValueError(f"out[{name!r}]: expected a C-contiguous float32 array to write into.")
-    return image

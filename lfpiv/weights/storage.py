@@ -21,13 +21,14 @@ from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
 from lfpiv.weights.operator import Weights
 from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels.reconstruction.depth_planes import PlaneShares
 from lfpiv_kernels.reconstruction.projector import Blocks, Projector
 from lfpiv_kernels.weights.microimages import Microimages
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 _HEADER = "weights.json"
 _HASHED_BYTES = 1 << 24
 """Size of the pieces in which arrays are hashed [byte]."""
@@ -82,6 +83,10 @@ def save_weights(weights: Weights, folder: Path) -> str:
                 name: put(f"camera{number}", weights.projector(name).blocks)
                 for number, name in enumerate(weights.cameras)
             },
+            "planes": {
+                name: put(f"planes{number}", weights.projector(name).planes)
+                for number, name in enumerate(weights.cameras)
+            },
         }
         content = digest.hexdigest()
         files.write_json(header | {"content": content}, folder / _HEADER)
@@ -120,12 +125,16 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
         arrays: dict[str, np.ndarray] = {}
         camera_sums = _map(folder, header["camera_sums"], arrays)
         blocks = {name: _take(Blocks, folder, entry, arrays) for name, entry in header["cameras"].items()}
+        planes = {
+            name: None if entry is None else _take(PlaneShares, folder, entry, arrays)
+            for name, entry in header["planes"].items()
+        }
         if content not in (None, _content(arrays)):
             raise ValueError("weights of another run")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
     stored = StoredGrid(grid, _tuple(header["order"]))
-    projectors = {name: Projector(part) for name, part in blocks.items()}
+    projectors = {name: Projector(part, planes[name]) for name, part in blocks.items()}
     return Weights(stored, cameras, projectors, header["method"], camera_sums=np.array(camera_sums))
 
 

@@ -6,7 +6,7 @@ image across the sensor's rows is the outermost one. `StoredGrid` picks that ord
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfpiv.geometry.grid import Grid
+from lfpiv.weights.ray_fit import grid_models
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -51,6 +52,26 @@ class StoredGrid:
         """Voxel counts, outermost axis first."""
         outer, middle, inner = (self.grid.shape[axis] for axis in self.order)
         return outer, middle, inner
+
+    @property
+    def size(self) -> int:
+        """Number of voxels."""
+        return self.grid.size
+
+    @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """Voxels of the grid (z, y, x)."""
+        return self.grid.shape
+
+    @property
+    def voxel_mm(self) -> float:
+        """Edge of a voxel [mm]."""
+        return self.grid.voxel_mm
+
+    def models(self, camera: CalibratedCamera) -> Iterator[np.ndarray]:
+        """Yield the ray models of the voxels, plane by plane of the outermost axis, see `grid_models`."""
+        outer, middle, inner = (2 - axis for axis in self.order)
+        return grid_models(camera, self.shape, self.positions_mm, (outer, middle, inner))
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
         """Return centres (x, y, z) [mm] of voxels by their stored index, shape (voxel, 3)."""

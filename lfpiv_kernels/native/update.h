@@ -51,7 +51,8 @@ LFPIV_INLINE void compare(const PixelRun& run, const float* image, const float* 
     double squares = 0.0, divergence = 0.0;
     run.for_pixels([&](int start, int count) {
         float model[PixelRun::GROUP], square[PixelRun::GROUP], term[PixelRun::GROUP];
-        for (int k = 0; k < count; ++k) model[k] = held[start + k] + run.collect(rays_out, start + k);
+        for (int k = 0; k < count; ++k)
+            model[k] = max(held[start + k] + run.collect(rays_out, start + k), 0.0f);  // interpolation may undershoot
         for (int k = 0; k < count; ++k) {
             const Misfit misfit = compare_pixel(image[start + k], gain[start + k], floor, model[k]);
             model[k] = misfit.correction, square[k] = misfit.square, term[k] = misfit.divergence;

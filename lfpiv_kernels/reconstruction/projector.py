@@ -18,6 +18,7 @@ import warp as wp
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch, load, to_device
+from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes, PlaneShares
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
@@ -225,15 +226,20 @@ class Projector:
     write the same ray, and results do not depend on the number of threads. The light of a ray that voxels of two parts
     light lies in both parts and is added up.
 
+    With `planes` the blocks are those of nodes on planes across the line of sight: voxels -> nodes -> rays, and back.
+
     `project` and `back_project` may be called from several threads, which take turns. A caller of `scatter` and
     `gather` that needs the light on the rays in between calls them inside `reserved`.
 
     Arrays in and out are float32, C-contiguous and flat. On the CPU they are used in place.
     """
 
-    def __init__(self, blocks: Blocks):
+    def __init__(self, blocks: Blocks, planes: PlaneShares | None = None):
         self._turn, self._reserved = threading.RLock(), False
         self.blocks = blocks
+        self.planes = planes
+        """How voxels are shared among the nodes whose weights `blocks` are; None if these are the voxels."""
+        self._planes = None if planes is None else DepthPlanes(planes)
         self._on_cpu = runtime.device().form == "cpu"
         self._matrix = Matrix()
         for name in ("first_block", "first_value", "ray", "height", "width", "scale"):
@@ -257,6 +263,11 @@ class Projector:
         ]
         self.map = self._map_rays()
 
+    @property
+    def microimages(self) -> Microimages:
+        """Where the rays lie in memory."""
+        return self.blocks.microimages
+
     def _find_spans(self) -> list[tuple[int, int]]:
         """Return the first ray that each part of the voxels can touch, and the end of its rays."""
         voxels, rays = len(self.blocks.scale), self.blocks.microimages
@@ -274,7 +285,7 @@ class Projector:
 
     def _map_rays(self) -> RayMap:
         """Return the map between pixels and the rays that voxels light."""
-        self.scatter(np.ones(len(self.blocks.scale), np.float32))
+        self._scatter(np.ones(len(self.blocks.scale), np.float32), ALL)
         starts, two = [start for start, _ in self._spans], self.lens_sets == 2
         return RayMap(self.blocks.microimages, self.rays.numpy(), self._places, starts, two_sets=two)
 
@@ -301,6 +312,10 @@ class Projector:
 
     def scatter(self, volume: np.ndarray, lenses: int = ALL) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
+        self._scatter(volume if self._planes is None else self._planes.spread(volume), lenses)
+
+    def _scatter(self, volume: np.ndarray, lenses: int) -> None:
+        """Do as `scatter` with the light of what `blocks` are of."""
         voxels = to_device(volume, float)
         if not self._on_cpu:
             self.rays.zero_()
@@ -320,6 +335,15 @@ class Projector:
 
         Voxels whose `active`, shape (voxel,), float32, is zero do not change.
         """
+        if self._planes is None:
+            return self._gather(out, active, lenses)
+        every = active is None or bool(active.all())
+        lit = None if every else self._planes.spread((active != 0).astype(np.float32), absolute=True)
+        found = self._planes.collect(self._gather(np.zeros(self._planes.shares.size, np.float32), lit, lenses))
+        return np.add(out, found, out=out, where=True if every else active != 0)
+
+    def _gather(self, out: np.ndarray, active: np.ndarray | None, lenses: int) -> np.ndarray:
+        """Do as `gather` for what `blocks` are of."""
         volume, device = to_device(out, float), runtime.device().warp
         mask = to_device(np.ones_like(out) if active is None else active, float)
 
@@ -357,9 +381,19 @@ class Projector:
         rays = self.map.rays if lenses == ALL else self.map.of_lenses[lenses]
         return self.map.pixel[rays.start : rays.end]
 
+    def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur several times."""
+        if self.planes is None:
+            return self.blocks.entries(voxel)
+        nodes, shares = self.planes.nodes_of(voxel)
+        rays, weights = zip(*(self.blocks.entries(int(node)) for node in nodes), strict=True)
+        return np.concatenate(rays), np.concatenate([own * share for own, share in zip(weights, shares, strict=True)])
+
     def count_lit(self) -> np.ndarray:
-        """Count the rays that each voxel lights, shape (voxel,), int32."""
+        """Count the rays that each voxel lights, shape (voxel,), int32. With planes: a weighted mean of its nodes'."""
         count = wp.zeros(len(self.blocks.scale), dtype=int, device=runtime.device().warp)
         share = to_device(self.blocks.microimages.share, float)
         launch(Call(_count_lit, len(count), [self._matrix, share], [count]))
-        return count.numpy()
+        if self._planes is None:
+            return count.numpy()
+        return np.rint(np.maximum(self._planes.collect(count.numpy().astype(np.float32)), 0)).astype(np.int32)

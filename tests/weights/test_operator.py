@@ -13,9 +13,9 @@ from lfpiv.warn import collected
 from lfpiv.weights import blocks as weightblocks
 from lfpiv.weights import counting
 from lfpiv.weights.blocks import WHOLE, PackedCamera, blocks_of
+from lfpiv.weights.checks import compare_with_count, estimate_memory
 from lfpiv.weights.choice import choose_cuts, choose_form, form_errors
 from lfpiv.weights.counting import CountedVoxels, add_entries, count_voxels
-from lfpiv.weights.operator import compare_with_count, estimate_memory
 from lfpiv.weights.ray_fit import NEAR_PITCH, grid_models, ray_models
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import native, reference, runtime

@@ -1,0 +1,51 @@
+"""How much memory the weights of a grid will need, and how far built weights are from counted rays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from lfpiv.geometry.grid import Grid
+from lfpiv.weights.blocks import BLOCK_BYTES, CHUNK_VOXELS, VOXEL_BYTES, PackedCamera, sample_blocks
+from lfpiv.weights.choice import warn_of_errors
+from lfpiv.weights.depth_planes import choose_planes
+from lfpiv.weights.operator import Weights
+from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels import runtime
+from lfpiv_kernels.weights.ray_model import MODEL_SIZE
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import Calibration
+
+
+def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") -> int:
+    """Estimate the memory that the weights of a grid will need [byte], from a sample of its voxels.
+
+    Nothing large is allocated. The form "auto" is taken for profiles if the microlens layout is square.
+    """
+    runtime.device()
+    total = 0.0
+    stored = StoredGrid(grid, (0, 1, 2))
+    for camera in calibration.cameras.values():
+        chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
+        places = choose_planes(stored, camera, chosen) or stored
+        blocks, values = sample_blocks(PackedCamera.of(camera), places, chosen)
+        rays = 4 * (5 + 2) * camera.microimages.size + 24 * runtime.CHUNKS
+        total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * places.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
+    return int(total)
+
+
+def compare_with_count(weights: Weights) -> dict[str, list[float]]:
+    """Compare stored weights with counted rays in a few random voxels of every camera.
+
+    Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
+
+    Returns
+    -------
+    dict of str to list of float
+        Camera name -> relative L2 difference per voxel that the camera sees, the noise of the count subtracted.
+    """
+    errors = {name: weights.counted(name).errors(weights.projector(name)) for name in weights.cameras}
+    for name, some in errors.items():
+        if name not in weights.profile_errors and weights.method == "footprint":
+            warn_of_errors(weights.counted(name), weights.forms[name], some, requested=True)
+    return errors

@@ -1,0 +1,148 @@
+"""Warp: voxels on planes across a camera's line of sight, and back: the factor R of the weights W = V R.
+
+A voxel is shared among the nodes of four planes, where its line of sight meets them. Each thread
+writes a row of nodes or of voxels, so that results do not depend on the number of threads. The loops are C++, see
+``depth_planes.h``. Twin:
+`PlaneShares.nodes_of`, voxel by voxel.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import native
+from lfpiv_kernels.launch import Call, launch, to_device
+
+wp.set_module_options(native.options("depth_planes.h", contract="fast"))
+
+TAPS: int = native.constant("depth_planes.h", "TAPS")
+"""Planes, rows and columns among which a voxel is shared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneShares:
+    """Places and shares of voxels on planes of nodes.
+
+    The voxel in row a, layer z and column b has the share ``share[z, n]`` in plane ``plane[z] + n``, n from 0 to 3, at
+    row ``a + shift[z, n, 0]`` and column ``b + shift[z, n, 1]``.
+    """
+
+    axes: tuple[int, int, int]
+    """Axes of the volume in memory that count rows, layers and columns."""
+    voxels: tuple[int, int, int]
+    """Voxels along the axes of the volume in memory."""
+    nodes: tuple[int, int, int]
+    """Rows, planes and columns of nodes."""
+    plane: np.ndarray
+    """First plane of each layer, shape (layer,), int32."""
+    share: np.ndarray
+    """Share of a layer on its planes, shape (layer, 4), float32."""
+    shift: np.ndarray
+    """Rows and columns from a voxel to its nodes, shape (layer, 4, 2), int32."""
+
+    @property
+    def size(self) -> int:
+        """Number of nodes."""
+        return int(np.prod(self.nodes))
+
+    def nodes_of(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nodes of a voxel and its shares, shapes (node,); shares of zero are left out."""
+        place = np.unravel_index(voxel, self.voxels)
+        row, layer, column = (int(place[axis]) for axis in self.axes)
+        rows, columns = row + self.shift[layer, :, 0], column + self.shift[layer, :, 1]
+        node = (rows * self.nodes[1] + self.plane[layer] + np.arange(TAPS)) * self.nodes[2] + columns
+        lit = self.share[layer] != 0
+        return node[lit], self.share[layer, lit].astype(np.float64)
+
+
+@wp.struct
+class PlaneMap:
+    """`PlaneShares` on the device."""
+
+    plane: wp.array(dtype=int)
+    share: wp.array(dtype=float)
+    shift: wp.array(dtype=int)
+    rows: int
+    layers: int
+    columns: int
+    row_stride: int
+    layer_stride: int
+    node_rows: int
+    planes: int
+    node_columns: int
+
+
+@wp.func_native("lfpiv::spread_row(lfpiv::plane_map(map), row, absolute, voxels.data, nodes_out.data);")
+def _spread_row(
+    map: PlaneMap, row: int, absolute: bool, voxels: wp.array(dtype=float), nodes_out: wp.array(dtype=float)
+): ...
+
+
+@wp.func_native("lfpiv::collect_row(lfpiv::plane_map(map), row, nodes.data, voxels_out.data);")
+def _collect_row(map: PlaneMap, row: int, nodes: wp.array(dtype=float), voxels_out: wp.array(dtype=float)): ...
+
+
+@wp.kernel
+def _spread(
+    # in
+    map: PlaneMap,
+    absolute: bool,
+    voxels: wp.array(dtype=float),
+    first_row: int,
+    # out
+    nodes_out: wp.array(dtype=float),
+):
+    _spread_row(map, first_row + wp.tid(), absolute, voxels, nodes_out)
+
+
+@wp.kernel
+def _collect(
+    # in
+    map: PlaneMap,
+    nodes: wp.array(dtype=float),
+    first_row: int,
+    # out
+    voxels_out: wp.array(dtype=float),
+):
+    _collect_row(map, first_row + wp.tid(), nodes, voxels_out)
+
+
+class DepthPlanes:
+    """The linear map R from voxels to the nodes of one camera, and its adjoint, on the running device."""
+
+    def __init__(self, shares: PlaneShares):
+        self.shares = shares
+        rows, layers, columns = (shares.voxels[axis] for axis in shares.axes)
+        strides = {0: shares.voxels[1] * shares.voxels[2], 1: shares.voxels[2], 2: 1}
+        self._moved = shares.axes[2] != 2
+        """Whether columns must be brought together in memory first."""
+        self._map = PlaneMap()
+        for name, array in (("plane", shares.plane), ("shift", shares.shift)):
+            setattr(self._map, name, to_device(np.ascontiguousarray(array, np.int32).ravel()))
+        self._map.share = to_device(np.ascontiguousarray(shares.share, np.float32).ravel())
+        self._map.rows, self._map.layers, self._map.columns = rows, layers, columns
+        self._map.row_stride = layers * columns if self._moved else strides[shares.axes[0]]
+        self._map.layer_stride = columns if self._moved else strides[shares.axes[1]]
+        self._map.node_rows, self._map.planes, self._map.node_columns = shares.nodes
+
+    def spread(self, volume: np.ndarray, *, absolute: bool = False) -> np.ndarray:
+        """Return the nodes' light R volume, shape (node,), float32; with `absolute` the shares count as positive."""
+        nodes = np.empty(self.shares.size, np.float32)
+        if self._moved:
+            volume = np.ascontiguousarray(volume.reshape(self.shares.voxels).transpose(self.shares.axes)).ravel()
+        out = to_device(nodes, float)
+        inputs = [self._map, absolute, to_device(volume, float)]
+        launch(Call(_spread, self.shares.nodes[0] * self.shares.nodes[1], inputs, [out]))
+        return out.numpy()
+
+    def collect(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the adjoint's sum R^T nodes, shape (voxel,), float32."""
+        volume = np.empty(int(np.prod(self.shares.voxels)), np.float32)
+        out = to_device(volume, float)
+        launch(Call(_collect, self._map.rows * self._map.layers, [self._map, to_device(nodes, float)], [out]))
+        found = out.numpy()
+        if self._moved:
+            shape = [self.shares.voxels[axis] for axis in self.shares.axes]
+            found = np.ascontiguousarray(found.reshape(shape).transpose(np.argsort(self.shares.axes))).ravel()
+        return found

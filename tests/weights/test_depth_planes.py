@@ -1,0 +1,211 @@
+"""Weights of nodes on planes across the line of sight: the map R against its twin, its images against footprints."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
+
+import lfpiv
+from lfpiv.reconstruction.resting_voxels import RestingVoxels
+from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
+from lfpiv.weights import depth_planes
+from lfpiv.weights.checks import estimate_memory
+from lfpiv.weights.depth_planes import LARGEST_ERROR, NodeGrid, choose_planes, interpolation_errors, line_of_sight
+from lfpiv.weights.storage import open_weights, save_weights
+from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
+from lfpiv_kernels.reconstruction.projector import EVEN, ODD
+
+TOLERANCE_TWIN = 2e-6  # float32 sums of up to 64 shares
+TOLERANCE_ADJOINT = 1e-5  # as of the operator
+GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.2, 0.8, 1.4), voxel_mm=0.05)
+CAMERAS = {
+    "45": rotation(45),
+    "-44, rolled": rotation(-44, 0.5, 3),
+    "from above": rotation(1, 45),
+}
+
+
+@pytest.fixture
+def for_small_volumes(monkeypatch):
+    """Use nodes however small the volume and the gain are."""
+    monkeypatch.setattr(depth_planes, "FEWEST_VOXELS", 0)
+    monkeypatch.setattr(depth_planes, "LEAST_GAIN", 0.0)
+
+
+@pytest.fixture(scope="module")
+def both(device):
+    """Return the weights of two cameras with nodes and those of all voxels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(depth_planes, "FEWEST_VOXELS", 0)
+        patch.setattr(depth_planes, "LEAST_GAIN", 0.0)
+        nodes = lfpiv.build_weights(two_cameras(), GRID)
+    return nodes, lfpiv.build_weights(two_cameras(), GRID, planes=False)
+
+
+def shares_matrix(shares):
+    matrix = np.zeros((shares.size, int(np.prod(shares.voxels))))
+    for voxel in range(matrix.shape[1]):
+        node, share = shares.nodes_of(voxel)
+        np.add.at(matrix[:, voxel], node, share)
+    return matrix
+
+
+@pytest.mark.parametrize("pose", [*CAMERAS.values(), rotation(2, 1)])
+@pytest.mark.parametrize("order", [*permutations(range(3))])
+def test_voxels_are_shared_among_nodes_as_stated(pose, order, device):
+    stored = StoredGrid(lfpiv.Grid(shape=(9, 7, 8), voxel_mm=0.1, first_centre_mm=(0.0, 0.0, 0.0)), order)
+    nodes = NodeGrid.of(stored, IdealCamera("one", pose), 3)
+    planes, matrix = DepthPlanes(nodes.shares), shares_matrix(nodes.shares)
+    rng = np.random.default_rng(0)
+    volume = rng.standard_normal(stored.size).astype(np.float32)
+    light = rng.standard_normal(nodes.size).astype(np.float32)
+    np.testing.assert_allclose(planes.spread(volume), matrix @ volume, atol=TOLERANCE_TWIN * 10)
+    np.testing.assert_allclose(planes.spread(volume, absolute=True), np.abs(matrix) @ volume, atol=TOLERANCE_TWIN * 10)
+    np.testing.assert_allclose(planes.collect(light), matrix.T @ light, atol=TOLERANCE_TWIN * 10)
+
+
+@pytest.mark.parametrize("pose", CAMERAS.values(), ids=CAMERAS)
+def test_shares_keep_light_and_lie_about_the_voxel_along_its_line_of_sight(pose):
+    camera = IdealCamera("one", pose)
+    stored = StoredGrid.for_cameras(GRID, [camera])
+    nodes = NodeGrid.of(stored, camera, 4)
+    sight = line_of_sight(camera, np.zeros(3))
+    for voxel in np.random.default_rng(1).choice(stored.size, 20):
+        node, share = nodes.shares.nodes_of(int(voxel))
+        away = nodes.centres_mm(node) - stored.centres_mm(np.array([voxel]))
+        assert share.sum() == pytest.approx(1, abs=1e-6)
+        np.testing.assert_allclose(share @ away, 0, atol=1e-6)
+        across = away - (away @ sight)[:, None] * sight
+        assert np.linalg.norm(across, axis=1)[np.abs(share) > 0.2].max() < 2 * GRID.voxel_mm
+        assert len(node) == 1 or np.abs(away @ sight).max() > 3 * GRID.voxel_mm  # else it lies on a plane
+
+
+@pytest.mark.parametrize("pose", CAMERAS.values(), ids=CAMERAS)
+def test_images_between_nodes_are_those_of_voxels(pose, for_small_volumes):
+    camera = IdealCamera("one", pose, lattice=lattice(roll_deg=0.5))
+    stored = StoredGrid.for_cameras(GRID, [camera])
+    nodes = choose_planes(stored, camera, "pixels")
+    voxels = np.random.default_rng(2).choice(stored.size, 40)
+    error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, camera, voxels, "pixels"))))
+    assert error < 1.4 * LARGEST_ERROR  # of other voxels than those by which the distance was chosen
+    wide = NodeGrid.of(stored, camera, 3 * nodes.distance)
+    assert np.mean(interpolation_errors(wide, camera, voxels, "pixels")) > 2 * error
+
+
+def test_operator_with_nodes_is_that_of_all_voxels(both):
+    nodes, every = both
+    assert all(nodes.projector(name).planes is not None for name in nodes.cameras)
+    assert nodes.memory_bytes < 0.7 * every.memory_bytes
+    rng = np.random.default_rng(3)
+    sparse = np.zeros(GRID.shape, np.float32)
+    sparse[tuple(rng.integers(0, n, 40) for n in GRID.shape)] = 1.0
+    blobs = ndimage.gaussian_filter(sparse, 0.9)
+    for volume, largest in ((sparse, 0.02), (blobs, 0.01)):
+        found, expected = nodes(volume), every(volume)
+        for name in nodes.cameras:
+            assert np.linalg.norm(found[name] - expected[name]) < largest * np.linalg.norm(expected[name])
+    images = {name: rng.standard_normal(camera.gain.shape).astype(np.float32) for name, camera in nodes.cameras.items()}
+    volume = rng.standard_normal(GRID.shape).astype(np.float32)
+    projected, back = nodes(volume), nodes.T(images)
+    left = sum(np.vdot(projected[name].astype(float), images[name]) for name in images)
+    assert left == pytest.approx(np.vdot(volume.astype(float), back), rel=TOLERANCE_ADJOINT, abs=1e-3)
+    np.testing.assert_allclose(nodes.column_sum, every.column_sum, rtol=0.01)
+    assert nodes.largest == pytest.approx(every.largest, rel=0.05)
+    apart = np.abs(nodes.affected_pixels / every.affected_pixels - 1)  # a weighted mean of whole numbers
+    assert apart.mean() < 0.04 and apart.max() < 0.4
+
+
+def test_image_of_a_voxel_is_its_projection(both):
+    nodes, _ = both
+    unit = np.zeros(GRID.shape, np.float32)
+    unit[13, 5, 9] = 1.0
+    for name, image in nodes(unit).items():
+        np.testing.assert_allclose(nodes.image(name, (13, 5, 9)), image, atol=1e-6 * image.max())
+
+
+def test_halves_of_the_lenses_add_up(both):
+    projector = both[0].projector("cam1")
+    volume = np.random.default_rng(4).random(GRID.size).astype(np.float32)
+    pixels = np.empty(int(np.prod(projector.microimages.sensor_shape)), np.float32)
+    even, odd, every = (projector.project(volume, pixels.copy(), *lenses) for lenses in ((EVEN,), (ODD,), ()))
+    np.testing.assert_allclose(even + odd, every, atol=1e-5 * every.max())
+
+
+def test_voxels_without_part_do_not_change(both):
+    projector = both[0].projector("cam2")
+    rng = np.random.default_rng(5)
+    active = (rng.random(GRID.size) < 0.02).astype(np.float32)
+    projector.scatter(rng.random(GRID.size).astype(np.float32))
+    every = projector.gather(np.zeros(GRID.size, np.float32))
+    some = projector.gather(np.full(GRID.size, 7.0, np.float32), active)
+    assert (some[active == 0] == 7).all()
+    np.testing.assert_allclose(some[active > 0] - 7, every[active > 0], atol=1e-5 * np.abs(every).max())
+
+
+def test_stored_weights_keep_their_nodes(both, tmp_path):
+    nodes, _ = both
+    content = save_weights(nodes, tmp_path)
+    opened = open_weights(tmp_path, nodes.cameras, content)
+    volume = np.random.default_rng(6).random(GRID.shape).astype(np.float32)
+    for (name, image), again in zip(nodes(volume).items(), opened(volume).values(), strict=True):
+        np.testing.assert_array_equal(again, image, err_msg=name)
+
+
+def test_no_voxel_rests_where_nodes_share_the_weights(both, monkeypatch):
+    monkeypatch.setattr("lfpiv.reconstruction.resting_voxels.FEWEST_VOXELS", 0)
+    volume = np.random.default_rng(7).lognormal(0, 3, GRID.size).astype(np.float32)
+    rested = []
+    for weights in both:
+        equations = ImageEquations(
+            [
+                CameraEquation(image=gain, gain=gain, floor=1.0, projector=weights.projector(name))
+                for name, gain in ((name, weights.gain(name)) for name in weights.cameras)
+            ]
+        )
+        with equations.locked():
+            resting = RestingVoxels(equations)
+            rested.append(any(resting.active_in(epoch, volume) is not None for epoch in range(6)))
+    assert rested == [False, True]
+
+
+@pytest.mark.slow
+def test_volumes_are_as_good_as_with_the_weights_of_all_voxels(both):
+    every = both[1]
+    rng = np.random.default_rng(8)
+    truth = np.zeros(GRID.shape, np.float32)
+    truth[tuple(rng.integers(3, n - 3, 60) for n in GRID.shape)] = 1e4
+    truth = ndimage.gaussian_filter(truth, 0.9)
+    images = {name: image + rng.normal(0, 1, image.shape) for name, image in every(truth).items()}
+    alike = []
+    for weights in both:
+        volume = lfpiv.reconstruct(weights, images, iterations=12, subsets="auto", sieve_voxel=0.8)
+        assert (volume.values >= 0).all()
+        alike.append(np.corrcoef(volume.values.ravel(), truth.ravel())[0, 1])
+    assert alike[0] > alike[1] - 0.01
+
+
+def test_memory_with_nodes_is_estimated():
+    rig = two_cameras(optics=optics(rows=60, columns=80))
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.4, 2.4, 2.4), voxel_mm=0.05)
+    nothing = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=0.05, first_centre_mm=(0.0, 50.0, 0.0))
+    weights = lfpiv.build_weights(rig, grid, form="profiles")
+    assert all(weights.projector(name).planes is not None for name in weights.cameras)
+    estimate = estimate_memory(rig, grid, "profiles") - estimate_memory(rig, nothing, "profiles")
+    assert estimate == pytest.approx(weights.memory_bytes, rel=0.1)
+
+
+def test_voxels_aslant_to_the_line_of_sight_keep_their_own_weights(for_small_volumes):
+    camera = IdealCamera("one", rotation(27, 12))
+    assert choose_planes(StoredGrid.for_cameras(GRID, [camera]), camera, "profiles") is None
+
+
+def test_small_volumes_and_cameras_that_see_nothing_store_all_voxels():
+    camera = IdealCamera("one", rotation(45))
+    assert choose_planes(StoredGrid.for_cameras(GRID, [camera]), camera, "profiles") is None
+    far = lfpiv.Grid(shape=(50, 50, 50), voxel_mm=0.05, first_centre_mm=(0.0, 500.0, 0.0))
+    assert choose_planes(StoredGrid.for_cameras(far, [camera]), camera, "profiles") is None
+    weights = lfpiv.build_weights(IdealRig({"one": camera}), GRID)
+    assert weights.projector("one").planes is None
