@@ -13,7 +13,7 @@ import importlib.resources
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import tifffile
@@ -177,8 +177,3 @@ def other_versions(known: Mapping[str, str]) -> str:
         for name in sorted({*here, *known})
         if here.get(name) != known.get(name)
     )
-
-
-def plain_record(value: Record) -> dict[str, Any]:
-    """Return the content of `FILE` for `json.dumps`."""
-    return value.model_dump(mode="json")
