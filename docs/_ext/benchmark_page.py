@@ -112,26 +112,33 @@ def _cell(stored: Mapping[str, Any], key: str, factor: float, digits: int) -> st
 
 
 def panels(rows: Rows) -> str:
-    """Return a plot of each case as SVG: the error that is not exceeded in a part of the measurable region."""
+    """Return a legend, and a plot of each case: the error that is not exceeded in a part of the measurable region."""
     cases = list(dict.fromkeys(row["case"] for row in rows))
-    return "".join(
-        _panel(case, [row for row in rows if row["case"] == case], number) for number, case in enumerate(cases)
-    )
+    return _legend() + "".join(_panel(case, [row for row in rows if row["case"] == case]) for case in cases)
 
 
-def _panel(case: str, rows: Rows, number: int) -> str:
+def _legend() -> str:
+    figure, (axes,) = svg.new_panel(2.8)
+    for label, colour, line in STYLES.values():
+        axes.plot([], [], color=colour, ls=line, lw=1.6, label=label)
+    axes.axis("off")
+    axes.legend(loc="center", fontsize=svg.TEXT_POINT, labelcolor=svg.INK, frameon=False, handlelength=2.6)
+    return svg.to_svg(figure, "Legend")
+
+
+def _panel(case: str, rows: Rows) -> str:
     figure, (axes,) = svg.new_panel(2.8)
     for row in rows:
-        label, colour, line = STYLES[row["method"]]
+        _, colour, line = STYLES[row["method"]]
         part = [100 * value for value in row["curve"]["part"]]
         error = [float("nan") if value is None else value for value in row["curve"]["error"]]
-        axes.plot(part, error, color=colour, ls=line, lw=1.6, label=label)
+        axes.plot(part, error, color=colour, ls=line, lw=1.6)
     axes.set_yscale("log")
     axes.set_ylim(0.01, 10)
     axes.set_yticks((0.01, 0.1, 1.0, 10.0), ("0.01", "0.1", "1", "10"))
     axes.tick_params(which="minor", colors=svg.INK)
     axes.set_xlim(0, 100)
-    svg.style(axes, title=case, xlabel="part of the region [%]", ylabel="error [voxel]", legend=number == 0)
+    svg.style(axes, title=case, xlabel="part of the region [%]", ylabel="error [voxel]")
     return svg.to_svg(figure, f"Error not exceeded in a part of the measurable region, case {case}, by each method")
 
 
