@@ -1,6 +1,7 @@
 """A run with the table [tracking]: particles beside the vectors, kept, and made anew when their settings change."""
 
 import logging
+import shutil
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ def test_particles_stand_beside_the_vectors_and_follow_their_settings(small_run,
     again, read = [], pair_work.frame_light
     monkeypatch.setattr(pair_work, "frame_light", lambda *given: again.append(1) or read(*given))
     experiment, out = with_tracking(small_run, tmp_path / "data", "rounds = 2\n"), small_run.results(tmp_path / "out")
+    shutil.rmtree(out / "volumes", ignore_errors=True)
     summary = pipeline.run(experiment, out, pairs=(0, 1))
     file = out / "particles" / "pair_0000.nc"
     table = lfpiv.open_particles(out)
