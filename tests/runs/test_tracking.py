@@ -1,12 +1,14 @@
 """A run with the table [tracking]: particles beside the vectors, kept, and made anew when their settings change."""
 
 import logging
+import shutil
 
 import numpy as np
 import pytest
 
 import lfpiv
-from lfpiv.runs import frame_light, pipeline
+from lfpiv.runs import pair as pair_work
+from lfpiv.runs import pipeline
 
 
 def with_tracking(small_run, folder, keys=""):
@@ -18,13 +20,14 @@ def with_tracking(small_run, folder, keys=""):
 
 @pytest.mark.slow
 def test_particles_stand_beside_the_vectors_and_follow_their_settings(small_run, tmp_path, caplog, monkeypatch):
-    seen, measure = [], frame_light.seen_structure
-    monkeypatch.setattr(frame_light, "seen_structure", lambda *given: seen.append(1) or measure(*given))
+    again, read = [], pair_work.frame_light
+    monkeypatch.setattr(pair_work, "frame_light", lambda *given: again.append(1) or read(*given))
     experiment, out = with_tracking(small_run, tmp_path / "data", "rounds = 2\n"), small_run.results(tmp_path / "out")
+    shutil.rmtree(out / "volumes", ignore_errors=True)
     summary = pipeline.run(experiment, out, pairs=(0, 1))
     file = out / "particles" / "pair_0000.nc"
     table = lfpiv.open_particles(out)
-    assert len(seen) == 2 * len(lfpiv.open_experiment(experiment).cameras), "images are read once for both"
+    assert not again, "images are read once, for volumes and particles"
     figures = next(entry for entry in summary["pairs"] if entry["pair"] == 0)["particles"]
     assert figures["linked"] == table.sizes["particle"] > 20
     valid = table["valid"].values
