@@ -127,7 +127,7 @@ class Tracking(Table):
     rounds: Annotated[int, Field(strict=True, ge=1, le=20)] = 5
     """Largest number of rounds in which particles are fitted to the images, removed where a camera does not confirm
     them, and added where light is left."""
-    weakest: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.02
+    weakest: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
     """Least light of a particle in each camera that counts, as a share of the typical particle's."""
 
 
