@@ -287,9 +287,10 @@ class PreparedInstant:
         count = settings.iterations if iterations is None else iterations
         history = _History(settings, count)
         epochs = count - min(whole_passes, -(-count // 2)) if len(self.solver.subsets) > 1 else 0
+        partitions = self.solver._partitions(self.column_sum, self.recordings, self.sieve) if epochs else []
         with self.equations.locked():
-            if epochs:
-                state = self._solve_subsets(state, history, epochs, progress)
+            if partitions:
+                state = self._solve_subsets(state, partitions, history, epochs, progress)
             volume, stop = self._solve_whole(state, history, progress)
         if stop is SmartStop.DIVERGED:
             log.warning("SMART: %s", stop.value)
@@ -326,6 +327,7 @@ class PreparedInstant:
     def _solve_subsets(
         self,
         state: State,
+        partitions: Sequence[Partition],
         history: _History,
         epochs: int,
         progress: Callable[[float], None] | None,
@@ -333,7 +335,6 @@ class PreparedInstant:
         """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
         history.append(self.equations.compare(self.sieve(state.coefficients)))  # exact, as all steps begin here
         resting = RestingVoxels(self.equations)
-        partitions = self.solver._partitions(self.column_sum, self.recordings, self.sieve)
         for epoch in iterate_epochs(
             self.equations, state, self.sieve, partitions=partitions, epochs=epochs, resting=resting
         ):
