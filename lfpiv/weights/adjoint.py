@@ -32,7 +32,7 @@ class Forward(Protocol):
 
 
 class Adjoint:
-    """The adjoint of `Weights`; ``adjoint.T`` is the operator itself."""
+    """The adjoint of `Weights`. Its attribute ``T`` is the operator itself."""
 
     def __init__(self, weights: Forward):
         self.T = weights
