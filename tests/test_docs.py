@@ -270,7 +270,7 @@ def test_every_command_has_its_help_in_the_pages(tables):
 def test_every_extra_is_explained():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
     section = PAGES["docs/install.md"].read_text("utf-8").partition("## Extras")[2].partition("\n## ")[0]
-    assert set(extras) <= set(re.findall(r"^\| `(\w+)`", section, re.MULTILINE))
+    assert set(extras) <= set(re.findall(r"^\| `([\w-]+)`", section, re.MULTILINE))
 
 
 def test_every_public_name_has_its_reference():
