@@ -279,6 +279,7 @@ class PreparedInstant:
         `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes.
         """
         settings, stored = self.solver.settings, self.solver.weights.stored
+        norm = _norm(self.equations.cameras)
         guess = self._from_images.copy() if first is None else checked_guess(first, stored) * self.lit
         if settings.active_share > 0:
             guess[guess < settings.active_share * guess.max()] = 0.0
@@ -295,7 +296,6 @@ class PreparedInstant:
         if stop is SmartStop.DIVERGED:
             log.warning("SMART: %s", stop.value)
         last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
-        norm = _norm(self.equations.cameras)
         return Reconstruction(
             grid=self.solver.weights.grid,
             volume=self.solver._without_solid(stored.restore(volume)),
@@ -371,4 +371,5 @@ class PreparedInstant:
 
 def _norm(cameras: Sequence[CameraEquation]) -> float:
     """Euclidean norm of all images [counts]."""
-    return float(np.sqrt(sum(np.square(camera.image, dtype=np.float64).sum() for camera in cameras)))
+    images = (camera.image.ravel() for camera in cameras)
+    return float(np.sqrt(sum(np.einsum("i,i", image, image, dtype=np.float64) for image in images)))

@@ -82,6 +82,10 @@ class AxisDamping:
     alike: bool = True
     """Whether simulated pairs are not harder to measure than recorded ones; else nothing is corrected."""
 
+    def to_json(self) -> dict[str, Any]:
+        """Return what files and summaries store."""
+        return asdict(self) | {"coherence": list(self.coherence)} | {name: getattr(self, name) for name in _SHOWN}
+
     @property
     def applied(self) -> bool:
         """Whether vectors are corrected."""
@@ -174,7 +178,7 @@ class Damping:
 
     def to_json(self) -> dict[str, Any]:
         """Return the form that files and summaries store."""
-        axes = {name: asdict(axis) | {name: getattr(axis, name) for name in _SHOWN} for name, axis in self.axes.items()}
+        axes = {name: axis.to_json() for name, axis in self.axes.items()}
         likeness = None if self.likeness is None else asdict(self.likeness)
         return {"axes": axes, "simulated": self.simulated, "likeness": likeness}
 
