@@ -24,6 +24,10 @@ POINTS = 1500
 MOST_INSTANTS = 40
 """Most pairs or instants in the table of single ones."""
 _ERROR_DIGITS = 2
+NO_SPREAD = 1e-4
+"""Standard error, relative to its value, up to which it is rounding and not shown."""
+MOST_PLACES = 6
+"""Most decimal places of a figure."""
 
 
 def rows(scores: Sequence[Score]) -> Iterator[tuple[str, list[str]]]:
@@ -43,9 +47,9 @@ def cell(figure: Figure, estimate: Estimate | None) -> str:
         return UNKNOWN
     factor = 100.0 if figure.unit == "%" else 1.0
     value, spread = factor * estimate.value, factor * estimate.standard_error
-    if not (np.isfinite(spread) and spread > 0):
+    if not (np.isfinite(spread) and spread > NO_SPREAD * abs(value)):
         return significant(value, 4)
-    places = max(0, _ERROR_DIGITS - 1 - int(np.floor(np.log10(spread))))
+    places = min(max(0, _ERROR_DIGITS - 1 - int(np.floor(np.log10(spread)))), MOST_PLACES)
     return f"{value:.{places}f} ± {spread:.{places}f}".replace("-", "−")
 
 

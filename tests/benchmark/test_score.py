@@ -11,6 +11,7 @@ from support import known_truth
 
 from lfpiv import metrics
 from lfpiv.benchmark.figures import all_figures, keys_of
+from lfpiv.benchmark.page import cell
 from lfpiv.benchmark.readers import ReadOptions
 from lfpiv.benchmark.score import ScoreOptions, report, score_results
 from lfpiv.benchmark.truth import open_truth
@@ -340,3 +341,18 @@ def test_the_truth_of_another_case_is_refused(truth, tmp_path):
         open_truth(data, apart)
     (data / "benchmark.json").write_text(json.dumps({"case": "b", "images_sha256": "b"}), "utf-8")
     assert open_truth(data, apart).about["case"] == "b"
+
+
+@pytest.mark.parametrize(
+    ("value", "spread", "text"),
+    [
+        (1.02000001, 2e-16, "1.02"),
+        (0.41834, 0.0112, "0.418 ± 0.011"),
+        (1e-17, 1e-18, "0.000000 ± 0.000000"),
+        (0.5, float("nan"), "0.5"),
+        (-0.25, 0.1, "\N{MINUS SIGN}0.25 ± 0.10"),
+    ],
+)
+def test_figures_have_as_many_digits_as_their_error_allows(value, spread, text):
+    slope = next(figure for figure in all_figures() if figure.unit == "1")
+    assert cell(slope, metrics.Estimate(value, spread, value, value)) == text
