@@ -355,4 +355,4 @@ def test_the_truth_of_another_case_is_refused(truth, tmp_path):
 )
 def test_figures_have_as_many_digits_as_their_error_allows(value, spread, text):
     slope = next(figure for figure in all_figures() if figure.unit == "1")
-    assert cell(slope, metrics.Estimate(value, spread, value, value)) == text
+    assert cell(slope, metrics.Estimate(value=value, standard_error=spread, low=value, high=value)) == text
