@@ -50,7 +50,7 @@ def cell(figure: Figure, estimate: Estimate | None) -> str:
     if not (np.isfinite(spread) and spread > NO_SPREAD * abs(value)):
         return significant(value, 4)
     places = min(max(0, _ERROR_DIGITS - 1 - int(np.floor(np.log10(spread)))), MOST_PLACES)
-    return f"{value:.{places}f} ± {spread:.{places}f}".replace("-", "−")
+    return f"{round(value, places) + 0.0:.{places}f} ± {spread:.{places}f}".replace("-", "−")
 
 
 def write_page(truth: Truth, scores: Sequence[Score], path: Path) -> None:
@@ -158,11 +158,11 @@ def map_panel(score: Score, top: float) -> str:
     near = np.abs(z - middle) <= reach
     length = np.linalg.norm(pair.error, axis=1)
     good, bad = near & pair.kept, near & ~pair.kept
-    figure, (axes,) = svg.new_panel(3.0)
+    figure, (axes,) = svg.new_panel(3.7)
     shown = axes.scatter(x[good], y[good], c=length[good], cmap="viridis", vmin=0, vmax=top, marker="s", s=_side(good))
     axes.scatter(x[bad], y[bad], color=svg.INK, marker="x", s=9, lw=0.7)
     axes.set_aspect("equal")
-    svg.colour_bar(figure, shown, axes, "error [voxel]")
+    svg.colour_bar(figure, shown, axes, "error [voxel]", location="bottom")
     svg.style(axes, title=f"{score.label}, z = {middle:.2f} mm", xlabel="x [mm]", ylabel="y [mm]")
     return svg.to_svg(figure, f"Map of the error of {score.label} at z = {middle:.2f} mm")
 
