@@ -15,7 +15,6 @@ import importlib
 import json
 import pkgutil
 import re
-import shutil
 import subprocess
 import sysconfig
 import tempfile
@@ -69,9 +68,9 @@ class Kernel:
 
 
 def assembler() -> str | None:
-    """Return the path of ptxas, from the extra `gpu-check` or the search path; None if there is none."""
+    """Return the path of the extra's ptxas; None without it. Others may be older than the compiler in Warp."""
     installed = Path(sysconfig.get_paths()["purelib"]).glob("nvidia/*/bin/ptxas")
-    return next((str(path) for path in installed), None) or shutil.which("ptxas")
+    return next((str(path) for path in installed), None)
 
 
 def measure(architecture: int) -> Iterator[Kernel]:

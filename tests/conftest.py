@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from threadpoolctl import threadpool_limits
 
 # Tests see the same examples each time. Others: pytest --hypothesis-profile=search --hypothesis-seed=1
 settings.register_profile("suite", derandomize=True, database=None, deadline=None, max_examples=100)
@@ -32,7 +31,10 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Choose the kernels' loops before any test imports them."""
+    """Choose cores and the kernels' loops before any test imports NumPy, whose BLAS counts the cores, and kernels."""
+    if (name := os.environ.get("PYTEST_XDIST_WORKER")) and hasattr(os, "sched_setaffinity"):
+        workers = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+        os.sched_setaffinity(0, share_of_cores(int(name.removeprefix("gw")), workers))
     if config.getoption("--emulate-gpu"):
         os.environ["LFPIV_EMULATE_GPU"] = "1"
 
@@ -48,11 +50,6 @@ def device(request):
     """Start the kernel device once, before any test can choose another."""
     from lfpiv_kernels import runtime
 
-    if (name := os.environ.get("PYTEST_XDIST_WORKER")) and hasattr(os, "sched_setaffinity"):
-        workers = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-        own = share_of_cores(int(name.removeprefix("gw")), workers)
-        os.sched_setaffinity(0, own)
-        threadpool_limits(len(own))  # BLAS counted the cores before; the bits of its sums depend on the number
     return runtime.start(request.config.getoption("--device"))
 
 
