@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 # Tests see the same examples each time. Others: pytest --hypothesis-profile=search --hypothesis-seed=1
 settings.register_profile("suite", derandomize=True, database=None, deadline=None, max_examples=100)
@@ -34,7 +35,9 @@ def pytest_configure(config):
     """Choose cores and the kernels' loops before any test imports NumPy, whose BLAS counts the cores, and kernels."""
     if (name := os.environ.get("PYTEST_XDIST_WORKER")) and hasattr(os, "sched_setaffinity"):
         workers = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-        os.sched_setaffinity(0, share_of_cores(int(name.removeprefix("gw")), workers))
+        own = share_of_cores(int(name.removeprefix("gw")), workers)
+        os.sched_setaffinity(0, own)
+        threadpool_limits(len(own))  # of a BLAS that counted the cores before
     if config.getoption("--emulate-gpu"):
         os.environ["LFPIV_EMULATE_GPU"] = "1"
 

@@ -37,7 +37,7 @@ class UncertaintyCalibration:
     width: float
     """Root mean square of error over standard deviation, 1; larger where uncertainties are stated too small."""
     robust_width: float
-    """Median of |error| over standard deviation, relative to that of a normal distribution, 1."""
+    """Median of the absolute error over the stated standard deviation, relative to that of a normal distribution, 1."""
 
 
 def linear_response(
