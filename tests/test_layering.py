@@ -19,7 +19,19 @@ KERNEL_FILES = sorted((ROOT / "lfpiv_kernels").rglob("*.py"))
 PACKAGE_FILES = sorted((ROOT / "lfpiv").rglob("*.py"))
 ALL_FILES = KERNEL_FILES + PACKAGE_FILES
 
-GROUND = {"geometry", "files", "errors", "hdf5", "records", "warn", "version", "progress", "prompt", "quantities"}
+GROUND = {
+    "geometry",
+    "files",
+    "errors",
+    "hdf5",
+    "records",
+    "warn",
+    "version",
+    "progress",
+    "prompt",
+    "quantities",
+    "settings",
+}
 """Rooms that every room may import, beside `lfpiv_kernels`."""
 FACES = {"__init__", "__main__", "derived", "statistics"}
 """Files that hand public names on: they may import every room, and no room imports them."""
@@ -32,25 +44,27 @@ MAY_IMPORT = {
     "quantities": set(),
     "hdf5": {"errors", "records"},
     "records": set(),
-    "warn": {"errors", "records"},
+    "warn": {"records"},
     "files": {"errors", "version"},
-    "geometry": {"errors"},
+    "geometry": set(),
+    "settings": {"geometry"},
     "experiment": set(),
     "lightfield": set(),
-    "velocity": {"experiment"},
+    "velocity": set(),
     "metrics": set(),
     "calibration": {"lightfield", "experiment"},
     "simulation": {"experiment"},
     "results": {"experiment", "velocity"},
-    "weights": {"calibration", "lightfield", "experiment"},
-    "reconstruction": {"weights", "calibration", "lightfield", "velocity", "experiment"},
-    "tracking": {"reconstruction", "weights", "calibration", "lightfield", "metrics", "experiment"},
+    "weights": {"calibration", "lightfield"},
+    "reconstruction": {"weights", "calibration", "lightfield", "velocity"},
+    "tracking": {"reconstruction", "weights", "calibration", "metrics"},
     "selfcalibration": {"reconstruction", "weights", "calibration"},
     "report": {"results", "calibration", "lightfield", "velocity", "experiment"},
 }
 MAY_IMPORT["runs"] = set(MAY_IMPORT) - GROUND - {"metrics", "simulation"}
+MAY_IMPORT["planning"] = set(MAY_IMPORT) - GROUND - {"metrics", "simulation"}
 MAY_IMPORT["reproduce"] = set(MAY_IMPORT) - GROUND
-MAY_IMPORT["benchmark"] = {"simulation", "metrics", "results", "report", "velocity", "experiment"}
+MAY_IMPORT["benchmark"] = {"simulation", "metrics", "results", "report", "experiment"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT) - GROUND
 """What each room of `lfpiv` may import beside itself and `GROUND`. Rooms of the ground import only what stands here."""
 

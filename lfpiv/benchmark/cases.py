@@ -14,10 +14,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import bounds
-from lfpiv.experiment.bounds import Name, Seed
-from lfpiv.experiment.settings import Table
 from lfpiv.experiment.toml import parse, read_text, validated
+from lfpiv.settings import bounds
+from lfpiv.settings.bounds import Name, Seed
+from lfpiv.settings.table import Table
 from lfpiv.simulation.flows import Tracers
 from lfpiv.simulation.scene import Scene
 

@@ -19,7 +19,7 @@ import numpy as np
 import tifffile
 from pydantic import Field
 
-from lfpiv.experiment.settings import Table
+from lfpiv.settings.table import Table
 from lfpiv.version import versions
 
 FILE = "fingerprints.json"

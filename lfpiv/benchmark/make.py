@@ -27,6 +27,7 @@ from lfpiv.benchmark.plain_truth import (
     write_particles,
 )
 from lfpiv.benchmark.readme import README, readme
+from lfpiv.benchmark.truth import ABOUT, TRUTH
 from lfpiv.errors import InputError
 from lfpiv.files import write_json, writing
 from lfpiv.progress import Progress, ignore_progress
@@ -40,12 +41,6 @@ log = logging.getLogger(__name__)
 
 ALL = "all"
 """Name that stands for all cases that need no further file."""
-
-ABOUT = "benchmark.json"
-"""File of a data set, and of its truth, that says which case it is."""
-
-TRUTH = "truth"
-"""Folder of the truth in that of a data set."""
 
 TRACERS = "tracers.npz"
 """Copy of the file of tracers in a truth."""

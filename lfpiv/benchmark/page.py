@@ -78,7 +78,7 @@ def write_page(truth: Truth, scores: Sequence[Score], path: Path) -> None:
             "the standard error: of a bootstrap over blocks of vectors, or of the mean over pairs or instants.",
             "quiet",
         ),
-        "".join(markup.paragraph(f"{text}.", "quiet") for text in noted(scores)),
+        "".join(markup.paragraph(f"{text[:1].upper()}{text[1:]}.", "quiet") for text in noted(scores)),
         table,
         "<h2>Errors over completeness</h2>",
         markup.figure(

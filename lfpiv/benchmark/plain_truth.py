@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lfpiv.experiment.bounds import Point
+from lfpiv.settings.bounds import Point
 from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.particles import lit_particles
 from lfpiv.simulation.scene import Scene

@@ -21,7 +21,7 @@ from lfpiv.simulation.scene import Scene
 
 ABOUT = "benchmark.json"
 """File in which a case of the benchmark says what it is."""
-FOLDER = "truth"
+TRUTH = "truth"
 """Folder of the truth in a data set."""
 SLACK_VOXEL = 0.5
 """Distance by which a vector may lie outside the measurable region [voxel]: programs place windows differently."""
@@ -177,7 +177,7 @@ def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
     Parameters
     ----------
     folder : str or Path
-        The data set, or its folder `FOLDER`.
+        The data set, or its folder `TRUTH`.
     apart : str or Path, optional
         Folder of the truth where the data set does not hold it.
 
@@ -191,7 +191,7 @@ def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
         If the folder has no truth, it is damaged, or it is that of another case.
     """
     given = Path(folder if apart is None else apart)
-    place = given if (given / "spec.json").is_file() else given / FOLDER
+    place = given if (given / "spec.json").is_file() else given / TRUTH
     spec, particles = place / "spec.json", place / "particles.npz"
     for path in (spec, particles):
         if not path.is_file():

@@ -138,6 +138,39 @@ def _run(
     _end(finished)
 
 
+@_command(
+    "plan",
+    "lfpiv plan experiment.toml",
+    "lfpiv plan experiment.toml --pairs 10000 --workers 4",
+    "lfpiv plan experiment.toml --out results --json",
+)
+def _plan(
+    experiment: ExperimentFile,
+    pairs: Annotated[
+        int | None,
+        typer.Option("--pairs", metavar="N", help="Number of pairs, or of instants of a series; default: all."),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", metavar="W", help="Processes that work side by side; default: 1, one per GPU."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Folder of a run, whose calibration and voxels are taken."),
+    ] = None,
+    device: Device = None,
+) -> None:
+    """Say what a campaign will take: vectors, time, memory and disk, from a short calibration of this machine.
+
+    Nothing is written, and no particle images are needed. The run's own steps are done on parts of the volume.
+    """
+    with _output.progress() as progress:
+        from lfpiv.planning.campaign import plan
+
+        found = plan(experiment, pairs=pairs, workers=workers, out=out, device=device, progress=progress)
+    _output.show(found.to_json(), lambda: terminal.print_card(found))
+
+
 @_command("init", "lfpiv init", f"lfpiv init jet/experiment.toml {init.EXAMPLE}")
 @init.with_options
 def _init(

@@ -52,8 +52,7 @@ def examine(device: str = "auto") -> Iterator[Finding]:
         yield Finding("kernels", str(error), False)
         return
     yield from _cuda()
-    reason = f" ({running.reason})" if running.reason else ""
-    yield Finding("kernels run on", f"{running.kind}, {running.threads} threads{reason}", True)
+    yield Finding("kernels run on", running.sentence, True)
     for name, test in (("ray mapping (Taichi)", _test_mapping), ("correlation (Warp)", _test_correlation)):
         start = time.perf_counter()
         try:

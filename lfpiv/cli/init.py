@@ -274,10 +274,10 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
         If the file exists, an answer is missing or wrong, or the values do not fit each other.
     """
     from lfpiv.experiment.opening import check_tables, grid_of, read_experiment
-    from lfpiv.experiment.settings import ExperimentTable
     from lfpiv.experiment.template import Values, experiment_text
     from lfpiv.experiment.toml import parse, validated
     from lfpiv.files import write_text
+    from lfpiv.settings.experiment import ExperimentTable
     from lfpiv.velocity import vector_grid
 
     if path.exists():

@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from lfpiv.errors import InputError, printable
 from lfpiv.progress import Progress
+from lfpiv.quantities import duration
 from lfpiv.warn import name_pairs
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from lfpiv.cli.init import Written
+    from lfpiv.prompt import Shown
 
 log = logging.getLogger("lfpiv")
 
@@ -158,17 +160,15 @@ def parse_pairs(text: str) -> tuple[int, int | None]:
         raise InputError(f"--pairs: expected A:B, or one number, in whole numbers, found {text!r}.") from None
 
 
-def duration(seconds: float) -> str:
-    """Return a time as text: 40 s, 5 min, 2 h 10 min."""
-    minutes = round(seconds / 60)
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
-
-
 def say(text: str, file: TextIO | None = None, flush: bool = False) -> None:
     """Print a line; control characters of names and files do not reach the terminal."""
     print(printable(text), file=file, flush=flush)
+
+
+def print_card(value: Shown) -> None:
+    """Print a value as the prompt of Python shows it."""
+    for line in value.card().text().splitlines():
+        say(line)
 
 
 def print_run(summary: dict[str, Any], out: Path) -> None:

@@ -13,22 +13,13 @@ from pydantic import ConfigDict
 from lfpiv.errors import InputError
 from lfpiv.experiment import images
 from lfpiv.experiment.readers.source import ImagePath, split
-from lfpiv.experiment.settings import (
-    Board,
-    Bootstrap,
-    Compute,
-    Correlation,
-    Network,
-    RawImages,
-    SelfCalibration,
-    Series,
-    Smart,
-    Tracking,
-)
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.prompt import Card, Shown, count, seconds, times
+from lfpiv.settings.particles import Series
+from lfpiv.settings.processing import Bootstrap, Compute, Correlation, Network, SelfCalibration, Smart, Tracking
+from lfpiv.settings.rig import Board, RawImages
 
 
 @dataclass(frozen=True, kw_only=True)

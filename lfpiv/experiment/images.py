@@ -14,7 +14,7 @@ import numpy as np
 from lfpiv.errors import InputError
 from lfpiv.experiment.readers import davis
 from lfpiv.experiment.readers.source import SUFFIXES, CannotRead, Header, ImagePath, NotOneImage, split
-from lfpiv.experiment.settings import RawImages
+from lfpiv.settings.rig import RawImages
 
 if TYPE_CHECKING:
     from lfpiv.experiment.readers.table import Reader

@@ -13,9 +13,9 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.settings import Box, ExperimentVolume, HalfSpace
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import solid_shares
+from lfpiv.settings.volume import Box, ExperimentVolume, HalfSpace
 
 VARIABLE = "mask"
 """Name of the mask in a file with several variables."""

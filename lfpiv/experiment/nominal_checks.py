@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import bounds
-from lfpiv.experiment.settings import Board
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
+from lfpiv.settings import bounds
+from lfpiv.settings.rig import Board
 
 ANGLE_ERROR_DEG = 10.0
 """Largest error of a nominal angle that a calibration tolerates [degree]."""

@@ -11,21 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import bounds, images, nominal_checks, recorded, scale_checks
+from lfpiv.experiment import images, nominal_checks, recorded, scale_checks
 from lfpiv.experiment.experiment import CameraSetup, Experiment, board_label, check_shape
 from lfpiv.experiment.mask import solid_voxels
 from lfpiv.experiment.patterns import check_length, check_pattern
-from lfpiv.experiment.settings import (
-    SMALLEST_WINDOW,
-    CameraTable,
-    Correlation,
-    ExperimentTable,
-    ExperimentVolume,
-    Particles,
-    RawImages,
-)
 from lfpiv.experiment.toml import parse, read_text, read_toml
 from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.settings import bounds
+from lfpiv.settings.experiment import ExperimentTable
+from lfpiv.settings.particles import Particles
+from lfpiv.settings.processing import SMALLEST_WINDOW, Correlation
+from lfpiv.settings.rig import CameraTable, RawImages
+from lfpiv.settings.volume import ExperimentVolume
 
 DECODED_PIXELS = 100_000_000
 """Largest number of pixels of particle images that are decoded before the work starts [pixel]."""

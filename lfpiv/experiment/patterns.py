@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import bounds
+from lfpiv.settings import bounds
 
 SHOWN_CHARACTERS = 80
 """Most characters of a path pattern in a message."""

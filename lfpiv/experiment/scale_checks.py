@@ -16,8 +16,9 @@ import numpy as np
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup
 from lfpiv.experiment.nominal_checks import field_mm
-from lfpiv.experiment.settings import NominalBoard, Volume
 from lfpiv.geometry.optics import Optics
+from lfpiv.settings.rig import NominalBoard
+from lfpiv.settings.volume import Volume
 
 FEWEST_LENSES_ACROSS = 2.0
 """Least length of a volume's longest edge [microlens]. Less holds no window of a correlation."""

@@ -7,7 +7,7 @@ of an instant depends on its own images and on those of a known range of instant
 
 from __future__ import annotations
 
-from lfpiv.experiment.settings import Series
+from lfpiv.settings.particles import Series
 
 SEGMENT = 32
 """Number of instants of a segment. The number of its first one is a multiple of it."""

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from lfpiv.experiment.bounds import (
+from lfpiv.settings.bounds import (
     Coordinate,
     Count,
     FNumber,
@@ -23,7 +23,8 @@ from lfpiv.experiment.bounds import (
     PathText,
     PixelPitch,
 )
-from lfpiv.experiment.settings import Dots, Table
+from lfpiv.settings.rig import Dots
+from lfpiv.settings.table import Table
 
 COMMENT_COLUMN = 45
 """Column at which comments begin."""

@@ -15,8 +15,7 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots
 from lfpiv.reproduce.rigs import VOXEL_MM, numerical_rig
-from lfpiv.weights.counting import count_voxels
-from lfpiv.weights.operator import COUNT_SAMPLES_ONE
+from lfpiv.weights.counting import PAPER_SAMPLES, count_voxels
 
 TITLE = "Fig. 10: weights of one voxel"
 
@@ -154,7 +153,7 @@ def _counted_images(
     for start in range(0, counts, BATCH):
         draw = int(np.random.default_rng([*seed, start]).integers(2**31))
         centres = np.tile(VOXEL_AT_MM, (min(BATCH, counts - start), 1))
-        windows, rays, corners = count_voxels(camera, centres, VOXEL_MM, samples=COUNT_SAMPLES_ONE, seed=draw)
+        windows, rays, corners = count_voxels(camera, centres, VOXEL_MM, samples=PAPER_SAMPLES, seed=draw)
         for window, number, (column, row) in zip(windows, rays, corners, strict=True):
             image = np.zeros(shape)
             image[row : row + window.shape[0], column : column + window.shape[1]] = window / number

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from lfpiv import metrics
-from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.metrics.particles import PEAK_SHARE
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.weights.operator import Weights
 

@@ -13,12 +13,12 @@ from matplotlib.ticker import MaxNLocator
 from skimage.measure import marching_cubes
 
 from lfpiv import metrics
-from lfpiv.experiment.settings import DEFAULT_WINDOWS, Correlation, Smart
 from lfpiv.geometry.grid import AXES
 from lfpiv.metrics.vector_fields import BELOW_VOXEL
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import angles, page, plots, rigs, store
+from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation, Smart
 from lfpiv.simulation.flows import Ring
 from lfpiv.velocity import derived
 from lfpiv.velocity.cross_correlation import correlate

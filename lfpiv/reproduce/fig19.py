@@ -12,12 +12,12 @@ from matplotlib.ticker import MaxNLocator
 from scipy import ndimage
 
 from lfpiv import metrics
-from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.grid import Grid
 from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots, store
 from lfpiv.reproduce.injector import experimental_rig
 from lfpiv.reproduce.rigs import Rig, reconstruct_images
+from lfpiv.settings.processing import Smart
 
 TITLE = "Figs. 18 and 19: board dots reconstructed at every plane"
 

@@ -11,12 +11,12 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.calibration.coverage import warn_outside
-from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import Grid
 from lfpiv.progress import Progress
 from lfpiv.reproduce import store
 from lfpiv.reproduce.planar_piv import SheetCamera, correlate_frames, sheet_images
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, reconstruct_images, recorded_images, true_field, volume_grid
+from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.simulation.flows import SwirlingJet
 from lfpiv.simulation.scene import Noise
 from lfpiv.simulation.simulator import LEAST_INTENSITY

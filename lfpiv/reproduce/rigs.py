@@ -24,11 +24,11 @@ from lfpiv.calibration.cameras import calibrate, thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import open_experiment
-from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.progress import Progress, StepProgress
 from lfpiv.reconstruction.volume import reconstruct
+from lfpiv.settings.processing import Smart
 from lfpiv.simulation.flows import Ring, window_mean
 from lfpiv.simulation.scene import Scene, true_mapping
 from lfpiv.simulation.simulator import expose, render_camera, simulate

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from lfpiv.experiment.bounds import Thickness
-from lfpiv.experiment.settings import Table
+from lfpiv.settings.bounds import Thickness
+from lfpiv.settings.table import Table
 
 
 class BoardErrors(Table):

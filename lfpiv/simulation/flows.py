@@ -15,8 +15,8 @@ from pydantic import Field, model_serializer, model_validator
 from pydantic_core.core_schema import SerializerFunctionWrapHandler
 from scipy.spatial import cKDTree
 
-from lfpiv.experiment.bounds import Coordinate, Flag, Length, Name, Number, PathText, Point
-from lfpiv.experiment.settings import Table
+from lfpiv.settings.bounds import Coordinate, Flag, Length, Name, Number, PathText, Point
+from lfpiv.settings.table import Table
 from lfpiv.simulation.swirl import injector_profiles
 from lfpiv.simulation.tracers import TracerScaling, TracerSet, load_series, load_tracers, tracers_between
 from lfpiv.simulation.turbulence import CHUNK, TurbulentFlow, checked_points

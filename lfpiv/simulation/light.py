@@ -7,8 +7,8 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, model_validator
 
-from lfpiv.experiment.bounds import Coordinate, Direction, Length, NonNegative
-from lfpiv.experiment.settings import Table
+from lfpiv.settings.bounds import Coordinate, Direction, Length, NonNegative
+from lfpiv.settings.table import Table
 
 Pulses = tuple[NonNegative, NonNegative]
 LogSd = Annotated[float, Field(strict=True, ge=0, le=2)]

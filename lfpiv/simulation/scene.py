@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_serializer, model_validator
 from pydantic_core.core_schema import SerializerFunctionWrapHandler
 
-from lfpiv.experiment import bounds
-from lfpiv.experiment.bounds import (
+from lfpiv.experiment.toml import read_toml
+from lfpiv.settings import bounds
+from lfpiv.settings.bounds import (
     Flag,
     Interval,
     Length,
@@ -23,8 +24,10 @@ from lfpiv.experiment.bounds import (
     Seed,
     Thickness,
 )
-from lfpiv.experiment.settings import Compute, Correlation, Network, NominalBoard, Smart, Table, Volume
-from lfpiv.experiment.toml import read_toml
+from lfpiv.settings.processing import Compute, Correlation, Network, Smart
+from lfpiv.settings.rig import NominalBoard
+from lfpiv.settings.table import Table
+from lfpiv.settings.volume import Volume
 from lfpiv.simulation.board_errors import BoardErrors
 from lfpiv.simulation.flows import Flow, Tracers
 from lfpiv.simulation.image_files import check_pattern

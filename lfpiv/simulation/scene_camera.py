@@ -8,11 +8,12 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from lfpiv.experiment import bounds
-from lfpiv.experiment.bounds import Angle, Coordinate, Direction, Flag, Length, Point, Thickness
-from lfpiv.experiment.settings import NominalCamera, Table
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.geometry.orientation import Orientation, camera_rotation
+from lfpiv.settings import bounds
+from lfpiv.settings.bounds import Angle, Coordinate, Direction, Flag, Length, Point, Thickness
+from lfpiv.settings.rig import NominalCamera
+from lfpiv.settings.table import Table
 from lfpiv.simulation.sensor import Sensor
 from lfpiv_kernels.rendering import real_optics
 

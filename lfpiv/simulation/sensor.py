@@ -8,8 +8,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from lfpiv.experiment.bounds import NonNegative, Positive
-from lfpiv.experiment.settings import Table
+from lfpiv.settings.bounds import NonNegative, Positive
+from lfpiv.settings.table import Table
 
 FULL_SCALE = 4095
 """Largest count of a camera of 12 bits."""

@@ -7,9 +7,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, field_validator
 
-from lfpiv.experiment import bounds
-from lfpiv.experiment.bounds import Direction, Length, Point, Positive
-from lfpiv.experiment.settings import Box, HalfSpace, Solid, Table
+from lfpiv.settings import bounds
+from lfpiv.settings.bounds import Direction, Length, Point, Positive
+from lfpiv.settings.table import Table
+from lfpiv.settings.volume import Box, HalfSpace, Solid
 from lfpiv.simulation.light import Pulses
 
 Edges = Literal["sharp", "gaussian"]

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.bounds import Point
+from lfpiv.settings.bounds import Point
 
 NEIGHBOURS = 16
 """Tracers of each local linear fit."""

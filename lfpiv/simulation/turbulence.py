@@ -17,9 +17,9 @@ from pydantic import Field, model_validator
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import brentq
 
-from lfpiv.experiment import bounds
-from lfpiv.experiment.bounds import Count, Length
-from lfpiv.experiment.settings import Table
+from lfpiv.settings import bounds
+from lfpiv.settings.bounds import Count, Length
+from lfpiv.settings.table import Table
 
 SPECTRUM_NODES = 4000
 """Number of tabulated wave numbers, evenly spaced in their logarithm."""

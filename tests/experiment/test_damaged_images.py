@@ -16,7 +16,7 @@ from support.recordings import write_b16, write_cine, write_mraw
 from lfpiv import InputError
 from lfpiv.experiment import images
 from lfpiv.experiment.opening import check_pairs, read_experiment
-from lfpiv.experiment.settings import RawImages
+from lfpiv.settings.rig import RawImages
 
 SHAPE = (12, 16)
 FRAMES = np.random.default_rng(4).integers(1, 4096, (3, *SHAPE), np.uint16)

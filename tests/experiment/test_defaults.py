@@ -6,9 +6,9 @@ import inspect
 import pytest
 
 import lfpiv
-from lfpiv.experiment.settings import Compute, Correlation, Smart, Tracking
 from lfpiv.reconstruction.motion import PairSolver
 from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.settings.processing import Compute, Correlation, Smart, Tracking
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.velocity.settings import CorrelationSettings
 
@@ -40,6 +40,7 @@ def test_calls_have_the_defaults_of_the_tables(call, table, keys):
 def test_weights_have_the_defaults_of_the_table():
     found, table = defaults(lfpiv.build_weights), Compute()
     assert (found["method"], found["form"]) == (table.weights, table.weights_form)
+    assert found["rays"] == table.count_rays
 
 
 def test_no_setting_of_a_table_is_missing_from_its_call():

@@ -7,8 +7,9 @@ import tifffile
 from lfpiv.errors import InputError
 from lfpiv.experiment import images
 from lfpiv.experiment.opening import open_experiment
-from lfpiv.experiment.settings import Compute, Correlation, ExperimentTable, Network, Smart
 from lfpiv.geometry.orientation import Orientation
+from lfpiv.settings.experiment import ExperimentTable
+from lfpiv.settings.processing import Compute, Correlation, Network, Smart
 
 
 def edit(file, old, new):

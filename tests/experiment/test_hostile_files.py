@@ -16,8 +16,9 @@ from support.mutations import mutated
 import lfpiv
 from lfpiv.errors import LONGEST_MESSAGE, InputError, printable
 from lfpiv.experiment.opening import open_experiment, read_experiment
-from lfpiv.experiment.settings import Box, ExperimentTable, HalfSpace
 from lfpiv.experiment.toml import LARGEST_BYTES
+from lfpiv.settings.experiment import ExperimentTable
+from lfpiv.settings.volume import Box, HalfSpace
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.surfaces import solid
 

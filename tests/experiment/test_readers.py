@@ -18,8 +18,8 @@ from support.recordings import pack_12, write_b16, write_cine, write_mraw
 from lfpiv import InputError
 from lfpiv.experiment import images
 from lfpiv.experiment.readers.source import ImagePath, split
-from lfpiv.experiment.settings import RawImages
 from lfpiv.results import stamps
+from lfpiv.settings.rig import RawImages
 
 COUNT, ROWS, COLUMNS = 5, 12, 20
 LABEL = "particles.images, camera 'left'"

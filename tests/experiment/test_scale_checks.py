@@ -11,9 +11,10 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.experiment.scale_checks import require_scale
-from lfpiv.experiment.settings import NominalBoard, Volume
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
+from lfpiv.settings.rig import NominalBoard
+from lfpiv.settings.volume import Volume
 
 PATH = Path("experiment.toml")
 

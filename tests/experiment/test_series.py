@@ -7,8 +7,8 @@ import pytest
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.opening import open_experiment, read_experiment
-from lfpiv.experiment.settings import Series
 from lfpiv.results.folder import Folder
+from lfpiv.settings.particles import Series
 
 
 def replace(file, old, new):

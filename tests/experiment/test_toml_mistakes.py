@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.settings import ExperimentTable
 from lfpiv.experiment.toml import parse, read_toml, tomllib
 from lfpiv.experiment.toml_values import mistakes
+from lfpiv.settings.experiment import ExperimentTable
 from lfpiv.simulation.scene import Scene
 
 MISTAKES = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from lfpiv.experiment.settings import RawImages
+from lfpiv.settings.rig import RawImages
 
 STACK_SUFFIXES = (".h5", ".hdf5")
 """Suffixes of files whose parts have names with ``/``."""
