@@ -151,8 +151,8 @@ def model_error(misfit: np.ndarray, found: Signals) -> float:
     return float(np.clip(np.sqrt(max(square, 0.0)), *ERROR_RANGE))
 
 
-def confirmed(normal: Normal, found: Signals, error: float, part: float = 1.0) -> np.ndarray:
-    """Return the particles that all cameras which see them confirm, shape (particle,), bool.
+def shown(normal: Normal, found: Signals, error: float, least: float, part: float = 1.0) -> np.ndarray:
+    """Return where a camera shows a particle, shape (particle, camera), bool.
 
     Parameters
     ----------
@@ -162,12 +162,14 @@ def confirmed(normal: Normal, found: Signals, error: float, part: float = 1.0) -
         Light in units of noise.
     error : float
         Error of the model, from `model_error`.
+    least : float
+        Least light [counts].
     part : float
         Part of the limits that applies.
     """
     by_noise = found.light > part * SIGNIFICANCE * found.error
     by_others = found.strength > part * LEFT_RATIO * error * unexplained(normal, found)
-    good: np.ndarray = ((by_noise & by_others) | ~found.seen).all(1)
+    good: np.ndarray = by_noise & by_others & (normal.light > part * least)
     return good
 
 

@@ -1,8 +1,9 @@
 """`link_particles`: the displacement of single particles between two frames, with a correlation field as predictor.
 
 Particles are linked where each is the other's best match in position and light, and no other match is nearly as good.
-The first pass measures how far links lie from the predictor, the second one searches as far as that. A normalised
-median test on the nearest links [1]_ finds outliers.
+The first pass measures how far links lie from the predictor, the second one searches as far as that. Links that do not
+agree with those nearby are outliers: the normalised test of [1]_, with a plane through the neighbours in place of their
+median.
 
 .. [1] J. Duncan et al., "Universal outlier detection for particle image velocimetry (PIV) and particle tracking
    velocimetry (PTV) data", Meas. Sci. Technol. 21 (2010) 057002, doi:10.1088/0957-0233/21/5/057002.
@@ -36,10 +37,17 @@ AMBIGUOUS = 6.0
 """Least difference of cost between a link and the next best one; smaller ones are dropped."""
 NEIGHBOURS = 10
 """Links about a link that judge it."""
-MEDIAN_LIMIT = 4.0
+RESIDUAL_LIMIT = 4.0
 """Largest normalised residual of a valid link."""
-MEDIAN_FLOOR_VOXEL = 0.1
+SCATTER_FLOOR_VOXEL = 0.1
 """Least scatter of neighbours that is assumed [voxel]."""
+GRADIENT = 0.1
+"""Usual gradient of the displacement, which holds the plane through few links [voxel/voxel]. Correlation, the usual
+predictor, bears hardly more."""
+OUTLIER_SIGMA = 2.0
+"""Residual at which a link counts half [standard deviation]."""
+FITS = 5
+"""Fits of the plane, each with weights from the one before."""
 NORMAL_MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -76,20 +84,82 @@ def link_particles(
     ValueError
         If an argument is out of its range, or the voxels differ.
     """
-    for name, value in (("dt_s", dt_s), ("spread_voxel", spread_voxel)):
-        if not (is_finite(value) and value > 0):
-            raise ValueError(f"{name}: expected a number > 0, got {value!r}.")
+    if not (is_finite(dt_s) and dt_s > 0):
+        raise ValueError(f"dt_s: expected a number > 0, got {dt_s!r}.")
+    links = linked(first, second, vectors, spread_voxel=spread_voxel)
+    return link_table(first, second, links.pairs, links.valid, dt_s=dt_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Links:
+    """Links between the particles of two frames, and the flow that they show."""
+
+    pairs: np.ndarray
+    """Numbers of the first and the second particle of each link, shape (link, 2)."""
+    valid: np.ndarray
+    """Links that passed validation, shape (link,), bool."""
+    flow: Flow
+
+    def unlinked(self, frame: int, count: int) -> np.ndarray:
+        """Return the numbers of those of `count` particles of a frame, 0 or 1, that have no valid link."""
+        return np.setdiff1d(np.arange(count), self.pairs[self.valid, frame])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flow:
+    """Displacement of particles: a predictor, corrected by the links nearby."""
+
+    predictor: _Predictor
+    places_voxel: np.ndarray
+    """First particles of valid links [voxel], shape (link, 3)."""
+    off_voxel: np.ndarray
+    """Their displacement beyond the predictor [voxel], shape (link, 3)."""
+
+    @property
+    def known(self) -> bool:
+        """Whether there are links enough about every place."""
+        return len(self.places_voxel) > NEIGHBOURS
+
+    def __call__(self, positions_mm: np.ndarray) -> np.ndarray:
+        """Return the displacement [mm] of particles at places in the first frame, shape (particle, 3)."""
+        voxel_mm, found = self.predictor.voxel_mm, self.predictor(positions_mm)
+        if self.known:
+            found = found + nearby(self.places_voxel, self.off_voxel, positions_mm / voxel_mm)[0]
+        return found * voxel_mm
+
+    def back(self, positions_mm: np.ndarray) -> np.ndarray:
+        """Return the displacement [mm] of particles at places in the second frame to the first one."""
+        moved = np.zeros_like(positions_mm)
+        for _ in range(3):  # the flow is known at the first place
+            moved = -self(positions_mm + moved)
+        return moved
+
+
+def linked(
+    first: FoundParticles,
+    second: FoundParticles,
+    vectors: xr.Dataset | None = None,
+    *,
+    spread_voxel: float = FIRST_SPREAD_VOXEL,
+) -> Links:
+    """Link the particles of two frames; arguments and exceptions as of `link_particles`."""
+    if not (is_finite(spread_voxel) and spread_voxel > 0):
+        raise ValueError(f"spread_voxel: expected a number > 0, got {spread_voxel!r}.")
     if not np.isclose(first.voxel_mm, second.voxel_mm, rtol=1e-6):
         raise ValueError(f"second: expected voxels of {first.voxel_mm:g} mm, got {second.voxel_mm:g} mm.")
-    predicted = _Predictor(vectors, first.voxel_mm)(first.positions_mm)
-    links = np.zeros((0, 2), int)
+    predictor = _Predictor(vectors, first.voxel_mm)
+    predicted = own = predictor(first.positions_mm)
+    pairs = np.zeros((0, 2), int)
     if len(first) and len(second):
-        links = _matched(first, second, predicted, np.full(3, spread_voxel))
-        if len(links) > NEIGHBOURS:
-            predicted, spread = _corrected(first, second, links, predicted)
-            links = _matched(first, second, predicted, spread)
-    valid = _validated(first, second, links, predicted)
-    return link_table(first, second, links, valid, dt_s=dt_s)
+        pairs = _matched(first, second, predicted, np.full(3, spread_voxel))
+        if len(pairs) > NEIGHBOURS:
+            predicted, spread = _corrected(first, second, pairs, predicted)
+            pairs = _matched(first, second, predicted, spread)
+    valid = _validated(first, second, pairs, predicted)
+    a, b = pairs[valid].T
+    places = first.positions_mm[a] / first.voxel_mm
+    off = second.positions_mm[b] / first.voxel_mm - places - own[a]
+    return Links(pairs=pairs, valid=valid, flow=Flow(predictor=predictor, places_voxel=places, off_voxel=off))
 
 
 @dataclass
@@ -166,29 +236,62 @@ def _best(group: np.ndarray, cost: np.ndarray, size: int) -> tuple[np.ndarray, n
 def _corrected(
     first: FoundParticles, second: FoundParticles, links: np.ndarray, predicted: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the predictor corrected by the median of the links nearby, and the spread about it [voxel]."""
+    """Return the predictor corrected by the links nearby, and the spread about it [voxel]."""
     places = first.positions_mm[links[:, 0]] / first.voxel_mm
     off = second.positions_mm[links[:, 1]] / first.voxel_mm - places - predicted[links[:, 0]]
-    tree = cKDTree(places)
-    _, own = tree.query(places, NEIGHBOURS + 1)
-    around = off[own[:, 1:]]
-    median = np.median(around, axis=1)
-    spread = np.percentile(np.abs(off - median), SPREAD_PERCENTILE, axis=0) / 2
-    _, near = tree.query(first.positions_mm / first.voxel_mm, NEIGHBOURS)
-    return predicted + np.median(off[near], axis=1), np.maximum(spread, LEAST_SPREAD_VOXEL)
+    around, _ = nearby(places, off)
+    spread = np.percentile(np.abs(off - around), SPREAD_PERCENTILE, axis=0) / 2
+    correction, _ = nearby(places, off, first.positions_mm / first.voxel_mm)
+    return predicted + correction, np.maximum(spread, LEAST_SPREAD_VOXEL)
 
 
 def _validated(first: FoundParticles, second: FoundParticles, links: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Return which links agree with their neighbours' median, normalised by scatter and standard error."""
+    """Return which links agree with those nearby, normalised by their scatter and the standard error."""
     if len(links) <= NEIGHBOURS:
         return np.ones(len(links), bool)
     places = first.positions_mm[links[:, 0]] / first.voxel_mm
     off = second.positions_mm[links[:, 1]] / first.voxel_mm - places - predicted[links[:, 0]]
     error = np.sqrt(np.square(first.errors_mm[links[:, 0]]) + np.square(second.errors_mm[links[:, 1]])) / first.voxel_mm
-    _, own = cKDTree(places).query(places, NEIGHBOURS + 1)
-    around = off[own[:, 1:]]
-    median = np.median(around, axis=1)
-    scatter = NORMAL_MAD * np.median(np.abs(around - median[:, None]), axis=1)
-    limit = MEDIAN_LIMIT * np.sqrt(np.square(np.maximum(scatter, MEDIAN_FLOOR_VOXEL)) + np.square(error))
-    valid: np.ndarray = (np.abs(off - median) < limit).all(1)
+    around, scatter = nearby(places, off)
+    usual = NORMAL_MAD * np.median(np.abs(off - around), axis=0)  # a plane fits few links closely
+    scatter = np.maximum(scatter, usual)
+    limit = RESIDUAL_LIMIT * np.sqrt(np.square(scatter) + np.square(error))
+    valid: np.ndarray = (np.abs(off - around) < limit).all(1)
     return valid
+
+
+def nearby(places: np.ndarray, off: np.ndarray, at: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the nearest links tell about displacements: a plane through theirs, outliers counting less.
+
+    Few particles are as close as the flow is uniform, so a median of theirs is off by its gradient.
+
+    Parameters
+    ----------
+    places, off : ndarray, shape (link, 3)
+        First particles of links, and their displacement beyond the predictor [voxel].
+    at : ndarray, shape (place, 3), optional
+        Places [voxel]. Default: those of the links, each without the link itself.
+
+    Returns
+    -------
+    value, scatter : ndarray, shape (place, 3)
+        Displacement beyond the predictor at each place, and scatter of the links about it [voxel].
+    """
+    own = int(at is None)
+    at = places if at is None else at
+    _, near = cKDTree(places).query(at, NEIGHBOURS + own)
+    near = near[:, own:]
+    apart = places[near] - at[:, None]
+    terms = np.concatenate([np.ones((*near.shape, 1)), apart], axis=2)
+    value = np.median(off[near], axis=1)
+    slope = np.zeros((len(at), 3, 3))  # of each component along each axis
+    held = np.diag([0.0, 1.0, 1.0, 1.0]) / GRADIENT**2
+    for _ in range(FITS):
+        left = off[near] - value[:, None] - np.einsum("pcj,pnj->pnc", slope, apart)
+        scatter = np.maximum(NORMAL_MAD * np.median(np.abs(left), axis=1), SCATTER_FLOOR_VOXEL)
+        weight = 1 / (np.square(scatter)[:, None] + np.square(left / OUTLIER_SIGMA))
+        matrix = np.einsum("pnc,pni,pnj->pcij", weight, terms, terms) + held
+        right = np.einsum("pnc,pni,pnc->pci", weight, terms, off[near])
+        found = np.linalg.solve(matrix, right[..., None])[..., 0]
+        value, slope = found[..., 0], found[..., 1:]
+    return value, scatter

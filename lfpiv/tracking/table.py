@@ -30,7 +30,8 @@ def link_table(
     Dataset
         Over ``particle``: ``x``, ``y``, ``z`` midway between the frames [mm], ``u``, ``v``, ``w`` [m/s],
         ``displacement_x``, ``_y``, ``_z`` and ``uncertainty_x``, ``_y``, ``_z``, their standard errors [voxel],
-        ``intensity`` [counts], ``residual``, ``signal_to_noise``, ``valid``. Attributes: figures of both frames.
+        ``intensity`` [counts], ``residual``, ``signal_to_noise``, ``valid``, and ``first`` and
+        ``second``, the numbers of the particle among those found in both frames. Attributes: figures of both frames.
     """
     a, b = links.T if len(links) else (np.zeros(0, int), np.zeros(0, int))
     voxel_mm = first.voxel_mm
@@ -49,6 +50,8 @@ def link_table(
     data["residual"] = (residual, "1", "root mean square of the weighted residuals of its pixels; 1 for noise alone")
     ratio = np.minimum(first.signal_to_noise[a], second.signal_to_noise[b])
     data["signal_to_noise"] = (ratio, "1", "light over its standard error, least of the cameras and frames")
+    for name, number in (("first", a), ("second", b)):
+        data[name] = (number, "1", f"number of the particle among those found in the {name} frame")
     data["valid"] = (np.asarray(valid, bool), "1", "true: agrees with its neighbours")
     return xr.Dataset(
         {name: (PARTICLE, values, {"units": unit, "long_name": text}) for name, (values, unit, text) in data.items()},

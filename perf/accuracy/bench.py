@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 from lfpiv import metrics
 from lfpiv.calibration.camera import CalibratedCamera, Calibration, load_calibration
 from lfpiv.calibration.cameras import calibrate
-from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress
 from lfpiv.reproduce import rigs, store
+from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import FULL_SCALE, render_camera
 from lfpiv.velocity.cross_correlation import correlate

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 from lfpiv.calibration.camera import Calibration
 from lfpiv.calibration.cameras import thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
-from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.motion import reconstruct_pair
 from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.settings.processing import Correlation, Smart
 
 TITLE = "What each choice is worth"
 

@@ -27,7 +27,6 @@ from reconstruction_bench import CACHE
 from reconstruction_cases import CONDITIONS, SIZE_MM, Case, Recorded, make_flow, make_rig, record, true_field
 from reconstruction_ways import weights_of
 
-from lfpiv.experiment.settings import Correlation, Smart
 from lfpiv.geometry.grid import Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import lies_in
@@ -39,6 +38,7 @@ from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
 from lfpiv.reproduce.rigs import DT_S, VOXEL_MM
 from lfpiv.runs.bootstrap import IMITATED
+from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.simulation.camera_images import render_camera
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.damping import Damping

@@ -30,7 +30,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.progress import Progress
-from lfpiv.reconstruction import solver
+from lfpiv.reconstruction import instant
 from lfpiv.reconstruction.smart import ImageEquations
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.reproduce import page, plots, store
@@ -153,7 +153,7 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
             (ImageEquations, "back_project", half),
             (ImageEquations, "compare_subset", part),
             (ImageEquations, "back_project_subset", part),
-            (solver, "multiplicative_guess", guess),
+            (instant, "multiplicative_guess", guess),
             (Reconstructor, "instant", timed),
             (Reconstructor, "follow", timed),
             (Reconstructor, "correct", timed),

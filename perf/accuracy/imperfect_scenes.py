@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.experiment.settings import CameraTable, ExperimentTable
+from lfpiv.settings.experiment import ExperimentTable
+from lfpiv.settings.rig import CameraTable
 from lfpiv.simulation.scene import Scene
 
 SIZE_MM = {"small": (4.6, 4.4, 2.4), "paper": (6.0, 5.6, 2.6)}

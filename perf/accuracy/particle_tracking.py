@@ -14,6 +14,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from lfpiv.simulation.camera_images import render_camera
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.found import FoundParticles
 from lfpiv.tracking.linking import link_particles
+from lfpiv.tracking.pairing import exchange
 
 PPM = {"clean": (0.02, 0.05, 0.1, 0.2, 0.3), "real": (0.02, 0.05, 0.1)}
 """Seedings of each condition."""
@@ -46,8 +48,41 @@ WRONG_VOXEL = 1.0
 """Error of a displacement above which a link joins two particles [voxel]."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measured:
+    """What tracking makes of a recording."""
+
+    found: tuple[FoundParticles, ...]
+    """Particles of each frame."""
+    links: xr.Dataset
+    """Links from the first frame to the second."""
+    cpu_s: float
+    """CPU time of a frame."""
+
+
+def search(case: Case, rig: Rig, recorded: Recorded, **settings: float) -> Measured:
+    """Find the particles of both frames with settings of `ParticleSearch`, and link them."""
+    grid = rig.grid.padded(_lit_layers(case, rig))
+    particles = ParticleSearch(weights_of(rig, grid), rig.grid, **settings)
+    start = time.process_time()
+    fits = [
+        particles.fit(_light(case, rig, images), noise={name: rig.noise(name, image) for name, image in images.items()})
+        for images in recorded.images
+    ]
+    found = exchange(particles, fits, spread_voxel=SPREAD_VOXEL)
+    cpu_s = (time.process_time() - start) / len(found)
+    links = link_particles(found[0], found[1], dt_s=1.0, spread_voxel=SPREAD_VOXEL)
+    return Measured(found=found, links=links, cpu_s=cpu_s)
+
+
 def measure(case: Case, folder: Path) -> dict[str, float]:
-    """Find the particles of both frames, link them, and compare them with the truth.
+    """Find the particles of both frames, link them, and compare them with the truth; see `figures_of`."""
+    rig, recorded = make_rig(case.scale, case.angles_deg), record(case, folder / "images")
+    return figures_of(case, rig, recorded, search(case, rig, recorded))
+
+
+def figures_of(case: Case, rig: Rig, recorded: Recorded, measured: Measured) -> dict[str, float]:
+    """Compare particles and links with the truth.
 
     Returns
     -------
@@ -59,19 +94,9 @@ def measure(case: Case, folder: Path) -> dict[str, float]:
         share of their components within two standard errors; `crowding`; `yield`, links per found particle; `cpu_s` of
         a frame.
     """
-    rig, recorded = make_rig(case.scale, case.angles_deg), record(case, folder / "images")
-    grid = rig.grid.padded(_lit_layers(case, rig))
-    search = ParticleSearch(weights_of(rig, grid), rig.grid)
-    start = time.process_time()
-    found = [
-        search.find(_light(case, rig, images), noise={name: rig.noise(name, image) for name, image in images.items()})
-        for images in recorded.images
-    ]
-    figures = {"cpu_s": (time.process_time() - start) / len(found)}
-    rows = [_positions(rig, recorded, frame, one) for frame, one in enumerate(found)]
-    figures |= {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
-    links = link_particles(found[0], found[1], dt_s=1.0, spread_voxel=SPREAD_VOXEL)
-    return figures | _displacements(case, rig, links, figures["particles"])
+    rows = [_positions(rig, recorded, frame, one) for frame, one in enumerate(measured.found)]
+    figures = {"cpu_s": measured.cpu_s} | {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
+    return figures | _displacements(case, rig, measured.links, figures["particles"])
 
 
 def _lit_layers(case: Case, rig: Rig) -> Layers:

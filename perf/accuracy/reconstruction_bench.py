@@ -39,8 +39,8 @@ from reconstruction_ways import WAYS, Way, table_of
 
 import lfpiv
 from lfpiv import metrics
-from lfpiv.experiment.settings import Correlation
 from lfpiv.reproduce import rigs, store
+from lfpiv.settings.processing import Correlation
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.settings import cut_windows
 

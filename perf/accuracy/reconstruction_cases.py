@@ -67,6 +67,7 @@ class Condition:
 
 CONDITIONS = {
     "clean": Condition(counts=400.0, noise=Noise()),
+    "poly": Condition(counts=400.0, noise=Noise(), brightness=Brightness(camera_log_sd=1.0, size_log_sd=0.35)),
     "real": Condition(
         counts=16.0,  # 39 electrons
         noise=Noise(read_noise=0.82),  # 2 electrons
@@ -76,8 +77,9 @@ CONDITIONS = {
         stray=StrayLight(lens_counts=1.6, ambient_counts=0.32, variation=0.3),
     ),
 }
-"""Clean: shot noise of a thousand electrons per pixel and particle, and read-out noise. Real: 39 electrons, particles
-of unlike size that are unlike bright in the cameras, a Gaussian sheet wider than the volume, stray light."""
+"""Clean: shot noise of a thousand electrons per pixel and particle, and read-out noise. Poly: the same, light unlike by
+a factor of e in each camera and of 2 from particle to particle. Real: 39 electrons, particles of unlike size that are
+unlike bright in the cameras, a Gaussian sheet wider than the volume, stray light."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,6 +198,8 @@ class Recorded:
     """Particles of each frame (n, 3) [mm]."""
     light: tuple[np.ndarray, ...]
     """Light of each particle in each frame, mean of the cameras, relative to the mean."""
+    camera_light: tuple[np.ndarray, ...]
+    """The same for each camera, shape (camera, n)."""
 
 
 @lru_cache(maxsize=16)
@@ -223,6 +227,7 @@ def record(case: Case, folder: Path) -> Recorded:
         images=tuple({key: value.astype(np.float32) for key, value in one.items()} for one in images),
         positions_mm=positions,
         light=tuple(one.mean(0) for one in light),
+        camera_light=light,
     )
 
 

@@ -17,7 +17,6 @@ from reconstruction_cases import Recorded, Rig
 from refocused import refocused_volume
 
 from lfpiv import metrics
-from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.grid import AXES, Grid, Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.reconstruction.beyond import light_beyond
@@ -26,6 +25,7 @@ from lfpiv.reconstruction.settings import PLAIN
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import rigs
 from lfpiv.runs.guard import LEAST_LAYERS
+from lfpiv.settings.processing import Smart
 from lfpiv.weights.operator import Weights, build_weights
 
 _KEYS_SINCE = {"subsets": 1, "refinement": 1.0, "predict": False}

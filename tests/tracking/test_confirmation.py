@@ -35,7 +35,7 @@ def test_light_is_told_by_the_images_alone(rig):
     scene = scene_of(images, PLACES, light * [[1, 1], [1, 0], [1, 1]])
     normal = linearise(images, scene, Cloud(positions_mm=PLACES, light=light), 0.05)
     found = confirmation.signals(normal, 0.05)
-    assert confirmation.confirmed(normal, found, 0.02).tolist() == [True, False, True]
+    assert confirmation.shown(normal, found, 0.02, 0.0).tolist() == [[True, True], [True, False], [True, True]]
     assert found.ratio[1] < confirmation.SIGNIFICANCE < found.ratio[0]
     assert found.light[0] == pytest.approx(2e4, rel=0.1)
 
@@ -46,8 +46,8 @@ def test_light_within_the_error_of_a_brighter_particle_is_not_confirmed(rig):
     light = np.array([[1e5, 1e5], [4e3, 4e3]])
     normal = linearise(images, scene_of(images, places, light), Cloud(positions_mm=places, light=light), SCATTER)
     found = confirmation.signals(normal, SCATTER)
-    assert confirmation.confirmed(normal, found, 0.005).tolist() == [True, True]
-    assert confirmation.confirmed(normal, found, 0.2).tolist() == [True, False]
+    assert confirmation.shown(normal, found, 0.005, 0.0).all(1).tolist() == [True, True]
+    assert confirmation.shown(normal, found, 0.2, 0.0).all(1).tolist() == [True, False]
 
 
 def test_error_of_the_model_is_measured(rig):

@@ -6,6 +6,7 @@ import xarray as xr
 
 from lfpiv import link_particles, particle_tracks
 from lfpiv.tracking.found import FoundParticles
+from lfpiv.tracking.linking import NEIGHBOURS, linked, nearby
 
 VOXEL_MM = 0.1
 
@@ -137,3 +138,34 @@ def test_tracks_do_not_depend_on_the_order_of_the_links():
 def test_tracks_need_a_series():
     with pytest.raises(ValueError, match="time series"):
         particle_tracks(link_particles(cloud([[0, 0, 0]]), cloud([[0, 0, 0]]), dt_s=1.0))
+
+
+def test_a_gradient_is_followed_and_an_outlier_is_not():
+    """The plane's slope is held to `GRADIENT`, which costs a tenth of a voxel at most beside exact links."""
+    places = np.random.default_rng(3).uniform(0, 20, (80, 3))
+    off = 0.1 * places[:, [1, 2, 0]] + (1.0, 0.0, -1.0)
+    wrong = off.copy()
+    wrong[7] += 3.0
+    value, _ = nearby(places, wrong)
+    inner = (np.abs(places - 10) < 7).all(1)
+    assert np.abs(value - off)[inner].max() < 0.1
+    median = np.median(off[np.argsort(np.linalg.norm(places[:, None] - places, axis=2), axis=1)[:, 1:11]], axis=1)
+    assert np.abs(median - off)[inner].max() > 0.3, "a median of the neighbours is off by the gradient"
+
+
+def test_flow_leads_back_to_where_it_came_from():
+    at = scattered()
+    shift = np.stack([0.03 * at[:, 1], 0 * at[:, 0], -0.02 * at[:, 0]], axis=1)
+    links = linked(cloud(at), cloud(at + shift))
+    assert links.flow.known and links.valid.sum() > NEIGHBOURS
+    there = at + links.flow(at)
+    assert np.allclose(there + links.flow.back(there), at, atol=0.01 * VOXEL_MM)
+    assert links.unlinked(0, len(at)).tolist() == np.setdiff1d(np.arange(len(at)), links.pairs[links.valid, 0]).tolist()
+
+
+def test_links_name_the_particles_they_join():
+    at = scattered()
+    first, second = cloud(at), cloud(at[::-1] + (0.02, 0.0, 0.0))
+    table = link_particles(first, second, dt_s=1e-3)
+    assert table.sizes["particle"] > 50
+    assert np.array_equal(table["first"].values + table["second"].values, np.full(table.sizes["particle"], len(at) - 1))

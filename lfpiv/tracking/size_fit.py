@@ -1,0 +1,69 @@
+"""Fit the size of the particles to the images of those whose images hardly overlap others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lfpiv.tracking import candidates
+from lfpiv.tracking.fit import Fit
+from lfpiv.tracking.particle_images import ParticleImages
+from lfpiv.tracking.refinement import Normal, overlaps, refine, rendered
+
+OUTLIER_SIGMA = 5.0
+"""Largest residual of a pixel that tells sizes apart [standard deviation]."""
+SIZE_STEP = 1.25
+"""Ratio of the sizes that are compared."""
+CLEAR_OVERLAP = 0.3
+"""Overlap of a particle's image with another one above which it does not tell the size."""
+LEAST_CLEAR, MOST_CLEAR = 8, 100
+"""Least and largest number of particles that tell the size."""
+LARGEST_RATIO = 1.15
+"""Largest size of the particles over that which the autocovariance of the images shows, before particles are found.
+Particles that are not told apart look larger."""
+SIZE_FITS = 4
+"""Largest number of comparisons of sizes in a round."""
+USUAL_SIGMA_VOXEL = 0.7
+"""Size of particles where the images do not show it [voxel]."""
+
+
+def fit_size(fit: Fit) -> None:
+    """Change the size of the particles to the one that explains the images best."""
+    for _ in range(SIZE_FITS):
+        before, fit.model = fit.model, _better_size(fit)
+        fit.refine(1)
+        if abs(np.log(fit.model.sigma_voxel / before.sigma_voxel)) < np.log(SIZE_STEP) / 2:
+            break
+
+
+def _better_size(fit: Fit) -> ParticleImages:
+    """Return the model with the size that explains the images of clear particles best, from three sizes."""
+    assert fit.normal is not None
+    cloud = fit.cloud[_clear(fit.normal, fit.cloud.light)]
+    own = rendered(fit.model, fit.model.lists(cloud.positions_mm), cloud.light)
+    scene = replace(fit.scene, counts=fit.scene.counts - (fit.normal.model - own))
+    variance, lit = fit.scene.variance(fit.normal.model), own > 0
+    chi2 = []
+    for power in (-1, 0, 1):
+        other = fit.model.of_size(fit.model.sigma_voxel * SIZE_STEP**power)
+        moved, _ = refine(other, scene, cloud, iterations=1, scatter=fit.scatter)
+        left = scene.residual(rendered(other, other.lists(moved.positions_mm), moved.light))
+        chi2.append(float(np.minimum(np.square(left) / variance, OUTLIER_SIGMA**2)[lit].sum(dtype=np.float64)))
+    below, here, above = chi2
+    curvature, slope = below - 2 * here + above, (below - above) / 2
+    change = float(np.clip(slope / curvature, -2, 2)) if curvature > 0 else 2 * float(np.sign(slope))
+    return fit.model.of_size(min(fit.model.sigma_voxel * SIZE_STEP**change, fit.largest_voxel))
+
+
+def _clear(normal: Normal, light: np.ndarray) -> np.ndarray:
+    """Return particles of typical light whose images hardly overlap others; of all particles if few do not."""
+    first, second, overlap = overlaps(normal)
+    mixed = np.zeros(len(light), bool)
+    close = (overlap > CLEAR_OVERLAP).any(1)
+    mixed[first[close]], mixed[second[close]] = True, True
+    clear = np.flatnonzero(~mixed) if (~mixed).sum() >= LEAST_CLEAR else np.arange(len(light))
+    mean = np.maximum(light[clear].mean(1), 1e-9)
+    unlike = np.abs(np.log(mean / max(candidates.typical(mean), 1e-9)))
+    usual: np.ndarray = clear[np.argsort(unlike, kind="stable")[:MOST_CLEAR]]
+    return usual
