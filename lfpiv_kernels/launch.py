@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import warp as wp
 
 from lfpiv_kernels import caches, runtime
@@ -80,10 +79,3 @@ def load(kernel: wp.Kernel, device: str) -> None:
         if not (folder / module.get_module_identifier(1 if device == "cpu" else None)).is_dir():
             caches.log_compilation(folder)
     wp.load_module(module, device=device)
-
-
-def to_device(values: np.ndarray, dtype: type | None = None, device: str | None = None) -> wp.array:
-    """Return an array on a device, by default the running one; on the CPU a view of the same memory."""
-    device = device or runtime.device().warp
-    kind = {} if dtype is None else {"dtype": dtype}
-    return wp.array(values, device=device, copy=device != "cpu", **kind)

@@ -138,6 +138,41 @@ def count(rays, shift, window, first_pixel, *, optics, lattice, samples, shape):
     return counts, total
 
 
+def counted(model, first_voxel, points, bits, *, optics, lattice):
+    """Return the share of each voxel's rays that reaches each pixel, shape (voxel, rows * columns).
+
+    `points` are those of ``counted_blocks.sobol_points``, with `bits` bits; `model` and `first_voxel` are as in
+    ``counted_blocks.CountedBlocks.compute``.
+    """
+    rows, columns = optics.sensor_shape
+    images = np.zeros((len(model), rows * columns))
+    for number, own in enumerate(np.asarray(model, float)):
+        shift = np.arange(5, dtype=np.uint64) + np.uint64(5 * (first_voxel + number))
+        for bits_down, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+            shift = ((shift ^ (shift >> np.uint64(bits_down))) * np.uint64(factor)) & np.uint64(0xFFFFFFFF)
+        shift = (shift ^ (shift >> np.uint64(16))) >> np.uint64(32 - bits)
+        at = (points ^ shift.astype(np.int64)[:, None]) / 2.0**bits + 2.0**-25
+        a, b = 2 * at[3] - 1, 2 * at[4] - 1
+        wide = np.abs(a) > np.abs(b)
+        radius = np.where(wide, a, b)
+        angle = np.pi / 4 * np.where(wide, b, a) / radius
+        u, v = radius * np.cos(angle), radius * np.sin(angle)
+        u, v = optics.pupil_radius_mm * np.where(wide, u, v), optics.pupil_radius_mm * np.where(wide, v, u)
+        terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3])
+        st = own[:20].reshape(2, 10) @ terms
+        for axis in range(3):
+            edge = own[20 + 2 * axis : 22 + 2 * axis, None]
+            slope = own[26 + 4 * axis : 30 + 4 * axis].reshape(2, 2)
+            st = st + (at[axis] - 0.5) * (edge + slope @ np.stack([u, v]))
+        st = st.T
+        centre = lattice.centres_mm(lattice.nearest(st))
+        x = (centre + optics.sensor_per_pupil * (st - np.stack([u, v], axis=1))) / optics.pixel_mm
+        column, row = np.floor(x + (columns / 2, rows / 2)).astype(int).T
+        seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        np.add.at(images[number], row[seen] * columns + column[seen], 1 / points.shape[1])
+    return images
+
+
 def gaussian_image(trace, point, sigma_mm, *, optics, lattice, microimages, frame, rectangles):
     """Return the image of a Gaussian particle pixel by pixel, shape (rows * columns,); see ``weights.gaussian``.
 

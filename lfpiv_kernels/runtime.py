@@ -8,17 +8,21 @@ import contextlib
 import io
 import logging
 import os
+import platform
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from lfpiv_kernels import caches
 
 log = logging.getLogger(__name__)
 
 
+TAICHI = os.environ.get("LFPIV_TAICHI", "")
+"""Where Taichi's kernels run if not on the device: "vulkan", by any driver. For tests: Warp has no such device."""
 CHUNKS = 8
 """Parts of work that `run_chunks` cuts on the CPU. Fixed, so that results do not depend on the number of threads."""
 
@@ -36,6 +40,28 @@ class Device:
     tests, see ``native.EMULATED``."""
     reason: str = ""
     """Why this device was picked; empty if it was the one requested."""
+    name: str = ""
+    """Name of the GPU, or of the processor; empty where the system does not say it."""
+    memory_bytes: int | None = None
+    """Memory of the GPU [byte]; None on the CPU."""
+    driver: str = ""
+    """Newest version of CUDA that the driver knows; empty on the CPU."""
+
+    @property
+    def sentence(self) -> str:
+        """Kind, name, memory and driver, threads, and why it was picked, for people."""
+        facts = [self.kind, *([self.name] if self.name else [])]
+        if self.memory_bytes is not None:
+            facts.append(f"{self.memory_bytes / 2**30:.1f} GiB")
+        if self.driver:
+            facts.append(f"driver for CUDA {self.driver}")
+        facts.append(f"{self.threads} {'thread' if self.threads == 1 else 'threads'}")
+        return ", ".join(facts) + (f" ({self.reason})" if self.reason else "")
+
+    def figures(self) -> dict[str, Any]:
+        """Return what a summary says of the device."""
+        names = ("kind", "name", "memory_bytes", "driver", "threads", "reason")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def warp(self) -> str:
@@ -113,7 +139,7 @@ def _start(request: str, threads: int | None) -> Device:
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that log_level does not silence
             ti.init(
-                arch=ti.cuda if kind == "cuda" else ti.cpu,
+                arch=getattr(ti, TAICHI or kind),
                 cpu_max_num_threads=count,
                 log_level=ti.ERROR,
                 offline_cache=True,
@@ -127,14 +153,43 @@ def _start(request: str, threads: int | None) -> Device:
             "device: the kernels need more address space than this process may take: Taichi reserves 1 GiB at its "
             "start. Raise the limit (`ulimit -v`, in KiB; `ulimit -v unlimited`)."
         ) from None
+    if TAICHI and ti.cfg.arch != getattr(ti, TAICHI):  # Taichi takes the CPU without a word
+        raise RuntimeError(f"LFPIV_TAICHI: Taichi finds no driver for {TAICHI!r}.")
     atexit.register(caches.seal_taichi, compiled, ti.reset)
     _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
-    _device = Device(kind, count, form, reason)
+    _device = Device(kind, count, form, reason, **_described(kind))
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_forget_threads)
-    if reason:
-        log.info("kernels run on the CPU (%d %s): %s", count, "thread" if count == 1 else "threads", reason)
+    log.info("kernels run on %s", _device.sentence)
     return _device
+
+
+def _described(kind: str) -> dict[str, Any]:
+    """Return name, memory and driver of the device."""
+    if kind == "cpu":
+        return {"name": _processor()}
+    import warp as wp
+
+    found, version = wp.get_device("cuda:0"), wp.get_cuda_driver_version()
+    return {"name": found.name, "memory_bytes": found.total_memory, "driver": ".".join(map(str, version or ()))}
+
+
+def _processor() -> str:
+    """Return the name of the processor; empty where the system does not say it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+
+
+def free_bytes() -> int | None:
+    """Return the free memory of the running GPU [byte]; None on the CPU."""
+    if device().kind == "cpu":
+        return None
+    import warp as wp
+
+    return int(wp.get_device(device().warp).free_memory)
 
 
 def _forget_threads() -> None:
@@ -176,7 +231,7 @@ def device_of_taichi() -> Device:
     where = device()
     if _taichi_folder is not None:
         caches.log_compilation(_taichi_folder)
-    return where
+    return replace(where, form="gpu") if TAICHI else where
 
 
 def run_chunks(size: int, job: Callable[[int, int, int], None], *, chunks: int = CHUNKS) -> None:

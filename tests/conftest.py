@@ -29,6 +29,11 @@ def pytest_addoption(parser):
         action="store_true",
         help="run the kernels' loops for a GPU on the CPU, one thread after the other",
     )
+    parser.addoption(
+        "--taichi",
+        choices=("vulkan",),
+        help="run Taichi's kernels by a driver of Vulkan, for example the software driver lavapipe of Mesa",
+    )
 
 
 def pytest_configure(config):
@@ -40,6 +45,8 @@ def pytest_configure(config):
         threadpool_limits(len(own))  # of a BLAS that counted the cores before
     if config.getoption("--emulate-gpu"):
         os.environ["LFPIV_EMULATE_GPU"] = "1"
+    if arch := config.getoption("--taichi"):
+        os.environ["LFPIV_TAICHI"] = arch
 
 
 def share_of_cores(worker, workers):

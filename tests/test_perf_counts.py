@@ -33,7 +33,7 @@ EPOCHS = 10
 @pytest.fixture(scope="module")
 def chunks():
     """Launches per operation: the CPU cuts them for its threads, CUDA does not."""
-    return runtime.CHUNKS if runtime.device().kind == "cpu" else 1
+    return runtime.CHUNKS if runtime.device().form == "cpu" else 1
 
 
 @pytest.fixture(scope="module")
@@ -78,18 +78,21 @@ def test_smart_launches_and_allocates_the_same_in_every_iteration(weights, launc
         tracemalloc.stop()
         counts.append(Counter(launches))
         assert volume.attrs["iterations"] == iterations
-    forward, back = ("_project", "_back_project") if chunks > 1 else ("_project_atomic", "_back_project")
+    forward, back = ("_project", "_back_project") if chunks > 1 else ("_scatter", "_gather")
     compare = counts[0]["_compare"] // (3 * CAMERAS)  # small images and volumes are cut into fewer chunks
     assert 0 < compare <= chunks
     # per iteration and camera one projection, comparison and back projection, and one update of the volume, which is
     # small; before the first iteration a misfit
     for count, iterations in zip(counts, (2, 5), strict=True):
+        compared = (iterations + 1) * CAMERAS
+        sums = {"_sum": 4 * compared, "_add_up": 2 * compared}  # a GPU adds the two sums of the misfit itself
         assert count == {
             forward: (iterations + 1) * CAMERAS * chunks,
             "_compare": (iterations + 1) * CAMERAS * compare,
             back: iterations * CAMERAS * chunks,
             "_update": iterations,
-        }
+            "_multiply": 1,  # the caller's first guess, where a camera sees it
+        } | ({} if chunks > 1 else sums)
     pixels = np.prod(next(iter(images.values())).shape)
     budget = 4 * (SMART_IMAGES * pixels + SMART_VOLUMES * GRID.size)
     assert max(peaks) < budget

@@ -1,7 +1,7 @@
 """Direct correlation of blocks with their surroundings: sums of products at every lag, and sums of blocks over windows.
 
 In: both volumes stored by phase (`layout.Phased`). Out: for every layer, lag and lane the sum over the block of
-``a(r) b(r + lag)``. Inner loops are C++: on the CPU a vector holds neighbouring blocks, on CUDA each lane is a thread.
+``a(r) b(r + lag)``. Inner loops are C++: a vector holds neighbouring blocks. A GPU takes the loops of `blocks_gpu`.
 """
 
 import math
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.correlation import split_gpu
+from lfpiv_kernels.correlation import blocks_gpu, split_gpu
 from lfpiv_kernels.correlation.layout import Lattice, Layers, Phased, make_layers
 from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan
@@ -50,14 +50,15 @@ def split_call(volume: wp.array, plan: Plan, lattice: Lattice, split: wp.array) 
     return Call(_split, lattice.planes, inputs, [split])
 
 
-@wp.func_native(
-    "lfpiv::correlate_blocks(first, second, layers, parts, task, scratch_out.data + scratch, sum_out.data);"
-)
+@wp.func_native("""
+#if !LFPIV_GPU
+    lfpiv::correlate_blocks(first, second, layers, task, scratch_out.data + scratch, sum_out.data);
+#endif
+""")
 def _correlate_group(
     first: Phased,
     second: Phased,
     layers: Layers,
-    parts: int,
     task: int,
     scratch: wp.int64,
     scratch_out: wp.array(dtype=float),
@@ -71,16 +72,15 @@ def _correlate_blocks(
     first: Phased,  # blocks of the first volume
     second: Phased,  # their surroundings in the second volume, from the farthest lag on
     layers: Layers,
-    parts: int,  # parts of the lags along z, each of which is a task
     scratch_pitch: int,  # elements of scratch memory per slot
-    slot: int,  # -1 on CUDA, where none is needed
+    slot: int,
     begin: int,
     # out
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
 ):
-    scratch = wp.int64(wp.max(slot, 0)) * wp.int64(scratch_pitch)
-    _correlate_group(first, second, layers, parts, begin + wp.tid(), scratch, scratch_out, sum_out)
+    scratch = wp.int64(slot) * wp.int64(scratch_pitch)
+    _correlate_group(first, second, layers, begin + wp.tid(), scratch, scratch_out, sum_out)
 
 
 @wp.func_native("lfpiv::gather_blocks(layers, blocks_y, blocks_x, pitch, task, sum_out.data);")
@@ -134,8 +134,10 @@ class DirectProducts:
 
     def sum(self, first: Phased, second: Phased, layers: range, sums: wp.array) -> None:
         """Sum the products of some layers of blocks and their surroundings at every lag."""
-        group, parts = (LANES, 1) if runtime.device().form == "cpu" else (1, self.plan.lags[0])
-        tasks = make_layers(self.plan, layers, self.ring, group)
-        inputs = [first, second, tasks, parts, self.scratch_pitch]
-        size = len(layers) * tasks.groups * parts
-        launch(Call(_correlate_blocks, size, inputs, [self.scratch, sums], scratch=True))
+        if runtime.device().form == "gpu":
+            tasks = make_layers(self.plan, layers, self.ring, 1)
+            launch(blocks_gpu.correlation_call(first, second, tasks, len(layers), sums))
+            return
+        tasks = make_layers(self.plan, layers, self.ring, LANES)
+        inputs = [first, second, tasks, self.scratch_pitch]
+        launch(Call(_correlate_blocks, len(layers) * tasks.groups, inputs, [self.scratch, sums], scratch=True))

@@ -14,11 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfpiv_kernels.correlation.blocks import DirectProducts, gather, is_gathered
-from lfpiv_kernels.correlation.memory import free_memory, new_array
+from lfpiv_kernels.correlation.memory import free_memory, new_array, on_device
 from lfpiv_kernels.correlation.peaks import PeakFinder
 from lfpiv_kernels.correlation.plan import LANES, Plan, Triple, make_plan, window_grid
 from lfpiv_kernels.correlation.sides import Side, make_sides
 from lfpiv_kernels.correlation.spectra import SpectralProducts
+from lfpiv_kernels.correlation.sums import means_and_squares
+from lfpiv_kernels.transfer import Values
 
 __all__ = ["WindowPeaks", "correlate_by_plan", "correlate_windows", "window_grid"]
 
@@ -45,8 +47,8 @@ class WindowPeaks:
 
 
 def correlate_windows(
-    first: np.ndarray,
-    second: np.ndarray,
+    first: Values,
+    second: Values,
     *,
     window: Triple,
     step: Triple,
@@ -64,7 +66,7 @@ def correlate_windows(
 
     Parameters
     ----------
-    first, second : ndarray, shape (z, y, x), float32
+    first, second : array, shape (z, y, x), float32
         Finite volumes of equal shape.
     window, step : tuple of int
         Window edges and their distance, order (z, y, x) [voxel].
@@ -96,17 +98,17 @@ def correlate_windows(
 
 
 def correlate_by_plan(
-    plan: Plan, first: np.ndarray, second: np.ndarray, *, symmetric: bool = False, reach: int = PEAK_REACH
+    plan: Plan, first: Values, second: Values, *, symmetric: bool = False, reach: int = PEAK_REACH
 ) -> WindowPeaks:
     """Do what `correlate_windows` does, by a given plan for the volumes' shape."""
-    flat = first.ravel(), second.ravel()
-    squares = [float(np.dot(values, values)) for values in flat]
-    for name, total in zip(("first", "second"), squares, strict=True):
+    volumes = on_device(first), on_device(second)
+    moments = means_and_squares(volumes)
+    for name, (_, total) in zip(("first", "second"), moments, strict=True):
         if not math.isfinite(total):
             raise ValueError(f"{name}: expected finite values whose squares add up to a float32, got others.")
     free_memory()
     searches = (plan.search if symmetric else (0, 0, 0)), plan.search
-    peaks = _find_peaks(plan, make_sides(plan, (first, second), squares, searches), symmetric, reach)
+    peaks = _find_peaks(plan, make_sides(plan, volumes, moments, searches), symmetric, reach)
     return WindowPeaks(
         displacement=np.moveaxis(peaks[:3], 0, -1).copy(),
         second_displacement=np.moveaxis(peaks[3:6], 0, -1).copy(),

@@ -15,7 +15,10 @@ import warp as wp
 from scipy import ndimage
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation import deform_gpu, filters_gpu
+from lfpiv_kernels.correlation.memory import empty_volume, on_device
 from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import Given, Values, as_given, to_device, to_host
 
 wp.set_module_options(native.options("deform.h", contract="fast", unroll=4))
 
@@ -47,13 +50,12 @@ def _deform_pair(
     spacing: wp.vec3,  # distance of control points [voxel], the first one at voxel (0, 0, 0)
     offset: float,  # of the sampled positions from the voxels
     margin: int,
-    batch: int,  # voxels along x per thread
     first_layer: int,
     # out
     first_out: wp.array3d(dtype=float),  # first volume at x - d/2, x = voxel + offset, (z, y, x)
     second_out: wp.array3d(dtype=float),  # second volume at x + d/2, (z, y, x)
 ):
-    layer, y, part = wp.tid()
+    layer, y = wp.tid()
     z = first_layer + layer
     fz = (float(z) + offset) / spacing[0]
     fy = (float(y) + offset) / spacing[1]
@@ -64,7 +66,7 @@ def _deform_pair(
     left = wp.vec3()
     right = wp.vec3()
     cell = wp.int32(-1)
-    for x in range(part * batch, wp.min((part + 1) * batch, first_out.shape[2])):
+    for x in range(first_out.shape[2]):
         fx = (float(x) + offset) / spacing[2]
         ix = wp.min(int(fx), field.shape[2] - 2)
         tx = fx - float(ix)
@@ -80,38 +82,39 @@ def _deform_pair(
         second_out[z, y, x] = _sample(second, shape, pz + half[0], py + half[1], px + half[2])
 
 
-def spline_coefficients(volume: np.ndarray) -> np.ndarray:
+def spline_coefficients(volume: Given) -> Given:
     """Return the cubic B-spline coefficients of a volume that is 0 outside.
 
     Parameters
     ----------
-    volume : ndarray, shape (z, y, x), float32
+    volume : array, shape (z, y, x), float32
 
     Returns
     -------
-    ndarray, shape (z + 2 MARGIN, y + 2 MARGIN, x + 2 MARGIN), float32
+    array, shape (z + 2 MARGIN, y + 2 MARGIN, x + 2 MARGIN), float32
+        On the device if the volume is.
     """
-    return ndimage.spline_filter(np.pad(volume, MARGIN), order=3, output=np.float32)
+    if runtime.device().form == "gpu":
+        return as_given(filters_gpu.spline_coefficients(on_device(volume), MARGIN), volume)
+    return as_given(ndimage.spline_filter(np.pad(to_host(volume), MARGIN), order=3, output=np.float32), volume)
 
 
-def deform_pair(
-    first: np.ndarray, second: np.ndarray, field: np.ndarray, spacing: tuple[float, float, float]
-) -> tuple[np.ndarray, np.ndarray]:
+def deform_pair(first: Given, second: Given, field: Values, spacing: tuple[float, float, float]) -> tuple[Given, Given]:
     """Sample the first volume at ``x - d(x)/2`` and the second at ``x + d(x)/2``.
 
     Parameters
     ----------
-    first, second : ndarray, float32
+    first, second : array, float32
         `spline_coefficients` of both volumes.
-    field : ndarray, shape (n_z, n_y, n_x, 3), float32
+    field : ndarray, shape (n_z, n_y, n_x, 3), float32, or array of vectors on the device
         Displacement d, order (z, y, x) [voxel], at control points, at least 2 per axis; linear between them.
     spacing : tuple of float
         Distance of the control points, order (z, y, x) [voxel]; the first lies on voxel (0, 0, 0).
 
     Returns
     -------
-    first, second : ndarray, shape (z, y, x), float32
-        The deformed volumes; element i along an axis lies at ``i + OFFSET``.
+    first, second : array, shape (z, y, x), float32
+        The deformed volumes; element i along an axis lies at ``i + OFFSET``. On the device if the coefficients are.
 
     Raises
     ------
@@ -120,15 +123,18 @@ def deform_pair(
     """
     if first.shape != second.shape:
         raise ValueError(f"second: expected coefficients of shape {first.shape}, got {second.shape}.")
-    if field.ndim != 4 or field.shape[3] != 3 or min(field.shape[:3]) < 2:
+    if (isinstance(field, np.ndarray) and field.shape[3:] != (3,)) or min(field.shape[:3]) < 2:
         raise ValueError(f"field: expected shape (>= 2, >= 2, >= 2, 3), got {field.shape}.")
-    where = runtime.device()
-    on_cpu = where.kind == "cpu"
-    flat = [wp.array(c.ravel(), dtype=float, device=where.warp, copy=not on_cpu) for c in (first, second)]
+    if isinstance(field, np.ndarray):
+        field = to_device(np.ascontiguousarray(field, np.float32), wp.vec3)
+    flat = [on_device(c).flatten() for c in (first, second)]
     shape = tuple(n - 2 * MARGIN for n in first.shape)
-    nodes = wp.array(np.ascontiguousarray(field, np.float32), dtype=wp.vec3, device=where.warp)
-    outputs = [wp.empty(shape, dtype=float, device=where.warp) for _ in range(2)]
-    batch = shape[2] if where.form == "cpu" else 1
-    inputs = [*flat, wp.vec3i(*first.shape), nodes, wp.vec3(*spacing), OFFSET, MARGIN, batch]
-    launch(Call(_deform_pair, shape[0], inputs, outputs, inner=(shape[1], -(-shape[2] // batch))))
-    return outputs[0].numpy(), outputs[1].numpy()
+    outputs = [empty_volume(shape) for _ in range(2)]
+    size, control = wp.vec3i(*first.shape), (field, wp.vec3(*spacing))
+    if runtime.device().form == "gpu":
+        pairs = zip(flat, (-0.5, 0.5), outputs, strict=True)
+        launch(*(deform_gpu.deform_call(c, size, *control, share, OFFSET, MARGIN, to) for c, share, to in pairs))
+    else:
+        inputs = [*flat, size, *control, OFFSET, MARGIN]
+        launch(Call(_deform_pair, shape[0], inputs, outputs, inner=(shape[1],)))
+    return as_given(outputs[0], first, second), as_given(outputs[1], first, second)

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels.correlation.plan import LANES, Plan, Triple, whole_groups
-from lfpiv_kernels.launch import to_device
+from lfpiv_kernels.transfer import to_device
 
 
 @wp.struct

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.transfer import Values, to_device
 
 _ARENA_BYTES = 1 << 28
 """Largest memory that a thread retains for its next call."""
@@ -49,3 +50,15 @@ def new_array(size: int) -> wp.array:
     if where.kind == "cpu":
         return wp.array(_arena.take(size), dtype=float, device=where.warp, copy=False)
     return wp.empty(size, dtype=float, device=where.warp)
+
+
+def on_device(volume: Values) -> wp.array:
+    """Return a volume as floats on the running device, gap-free; nothing is moved if it is there."""
+    if isinstance(volume, wp.array):
+        return volume
+    return to_device(np.ascontiguousarray(volume, np.float32), float)
+
+
+def empty_volume(shape: tuple[int, ...], dtype: type = float) -> wp.array:
+    """Return an uninitialised volume on the running device, which lives as long as it is used."""
+    return wp.empty(shape, dtype=dtype, device=runtime.device().warp)

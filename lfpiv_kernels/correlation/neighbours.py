@@ -11,7 +11,9 @@ import warp as wp
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation import neighbours_gpu
+from lfpiv_kernels.correlation.memory import on_device
 from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import Values, to_device, to_host
 
 wp.set_module_options(native.options("neighbours.h"))
 
@@ -72,12 +74,12 @@ def _predict(
     _predict_group(field, keep, points, shape, group, first_group + wp.tid(), prediction_out, count_out)
 
 
-def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Prediction:
+def predict(field: Values, keep: np.ndarray, wanted: np.ndarray) -> Prediction:
     """Predict vectors of a field from their neighbours, without the vectors themselves.
 
     Parameters
     ----------
-    field : ndarray, shape (z, y, x, 3)
+    field : array, shape (z, y, x, 3)
         Vectors; any values where `keep` is false.
     keep : ndarray of bool, shape (z, y, x)
         Vectors that count as neighbours.
@@ -101,8 +103,8 @@ def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Predicti
             raise ValueError(f"{name}: expected the shape of the field's grid, {field.shape[:3]}, got {flags.shape}.")
     where = runtime.device()
     points = np.flatnonzero(wanted).astype(np.int32)
-    arrays = ((field, np.float32, float), (keep, np.int32, int), (points, np.int32, int))
-    inputs = [wp.array(np.ascontiguousarray(a, kind).ravel(), dtype=t, device=where.warp) for a, kind, t in arrays]
+    flags = np.ascontiguousarray(keep, np.int32).ravel()
+    inputs = [on_device(field).flatten(), to_device(flags, int), to_device(points, int)]
     prediction = wp.empty((len(points), 3, 6), dtype=float, device=where.warp)
     count = wp.empty(len(points), dtype=int, device=where.warp)
     inputs, outputs = [*inputs, wp.vec3i(*keep.shape)], [prediction.flatten(), count]
@@ -110,4 +112,4 @@ def predict(field: np.ndarray, keep: np.ndarray, wanted: np.ndarray) -> Predicti
         launch(neighbours_gpu.prediction_call(inputs, outputs))
     else:
         launch(Call(_predict, -(-len(points) // VECTORS), [*inputs, VECTORS], outputs))
-    return Prediction(*np.moveaxis(prediction.numpy(), -1, 0), count.numpy())
+    return Prediction(*np.moveaxis(to_host(prediction), -1, 0), to_host(count))

@@ -18,6 +18,7 @@ from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan
 from lfpiv_kernels.correlation.sides import Side
 from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import to_host
 
 wp.set_module_options(native.options("peaks.h", contract="fast"))
 
@@ -142,7 +143,7 @@ class PeakFinder:
     def values(self) -> np.ndarray:
         """Return two displacements (z, y, x), highest coefficient and its rival of all windows, (8, z, y, x)."""
         plan = self.plan
-        lanes = self.peaks.numpy().reshape(8, plan.count[0], -1)[..., : plan.block_grid[1] * plan.pitch]
+        lanes = to_host(self.peaks).reshape(8, plan.count[0], -1)[..., : plan.block_grid[1] * plan.pitch]
         blocks = lanes.reshape(8, plan.count[0], -1, plan.pitch)
         along = (slice(0, (c - 1) * m + 1, m) for c, m in zip(plan.count[1:], plan.block_step[1:], strict=True))
         return blocks[(slice(None), slice(None), *along)]

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from lfpiv_kernels.correlation.blocks import split_call
@@ -14,7 +13,7 @@ from lfpiv_kernels.correlation.layout import Phased, Statistics, Storage
 from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import Plan, Triple
 from lfpiv_kernels.correlation.windows import plane_sums_calls, plane_sums_shape, signal_floor, statistics_call
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,8 @@ class Side:
 class _Volume:
     """One volume, and the memory that its kernels write."""
 
-    values: np.ndarray
     flat: wp.array
+    """Values, flat."""
     search: Triple
     """Largest lags at which its windows are measured; 0 if only at lag 0."""
     voxels: Storage
@@ -47,25 +46,23 @@ class _Volume:
     """Mean and scale of the windows, stored by phase."""
 
     @classmethod
-    def of(cls, plan: Plan, volume: np.ndarray, search: Triple) -> _Volume:
+    def of(cls, plan: Plan, volume: wp.array, search: Triple) -> _Volume:
         """Allocate memory for a volume whose windows are measured at lags up to `search`."""
-        values = np.ascontiguousarray(volume, np.float32)
         lags = tuple(2 * r + 1 for r in search)
         voxels = Storage.of(plan, tuple(b + n - 1 for b, n in zip(plan.block, lags, strict=True)))
         statistics = Storage.of(plan, lags)
         split, sums = new_array(voxels.size), math.prod(plane_sums_shape(plan, search))
         first_sums, second_sums = new_array(sums), new_array(sums)
         mean, scale = new_array(statistics.size), new_array(statistics.size)
-        flat = to_device(values.ravel(), float)
-        return cls(values, flat, search, voxels, statistics, split, (first_sums, second_sums), (mean, scale))
+        return cls(volume.flatten(), search, voxels, statistics, split, (first_sums, second_sums), (mean, scale))
 
-    def calls(self, plan: Plan, square: float) -> list[list[Call]]:
+    def calls(self, plan: Plan, mean: float, square: float) -> list[list[Call]]:
         """Return steps of calls: store voxels by phase and sum over windows, then measure the windows."""
         corner = tuple(o - r for o, r in zip(plan.origin, self.search, strict=True))
         windows = self.statistics.lattice(plan, plan.origin)
         split = split_call(self.flat, plan, self.voxels.lattice(plan, corner), self.split)
         first, *more = plane_sums_calls(self.flat, plan, self.search, windows, self.sums)
-        floor = signal_floor(self.values, square, plan)
+        floor = signal_floor(mean, square, plan)
         last = statistics_call(self.sums, plan, self.search, windows, floor, self.measured)
         return [[split, first], *([call] for call in more), [last]]
 
@@ -84,20 +81,20 @@ class _Volume:
 
 
 def make_sides(
-    plan: Plan, volumes: Sequence[np.ndarray], squares: Sequence[float], searches: Sequence[Triple]
+    plan: Plan, volumes: Sequence[wp.array], moments: Sequence[tuple[float, float]], searches: Sequence[Triple]
 ) -> tuple[Side, Side]:
     """Store both volumes by phase and measure the statistics of their windows.
 
     Parameters
     ----------
     plan : Plan
-    volumes : two ndarray, shape (z, y, x), float32
-    squares : two float
-        Sum of squares of each volume.
+    volumes : two wp.array, shape (z, y, x), float32
+    moments : two tuple of float
+        Mean and sum of squares of each volume.
     searches : two tuple of int
         Largest lags at which windows of each volume are measured, order (z, y, x) [voxel].
     """
     first, second = (_Volume.of(plan, *pair) for pair in zip(volumes, searches, strict=True))
-    for step in zip(first.calls(plan, squares[0]), second.calls(plan, squares[1]), strict=True):
+    for step in zip(first.calls(plan, *moments[0]), second.calls(plan, *moments[1]), strict=True):
         launch(*(call for calls in step for call in calls))
     return first.side(), second.side()

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native
-from lfpiv_kernels.launch import to_device
+from lfpiv_kernels.transfer import to_device
 
 ROWS = native.constant("spectra.h", "ROWS")
 """Frequencies that are computed at once; rows of the matrices along y are padded to a multiple of it."""

@@ -11,12 +11,16 @@ References
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import numpy as np
 
+from lfpiv_kernels import runtime
+from lfpiv_kernels.correlation import uncertainty_gpu
 from lfpiv_kernels.correlation.box_sum import box_sum
+from lfpiv_kernels.correlation.memory import on_device
 from lfpiv_kernels.correlation.plan import Triple
+from lfpiv_kernels.transfer import Values, to_host
 
 REACH = 4
 """Edge of the cubes whose sums of terms are squared [voxel]: nearer terms count as correlated."""
@@ -25,8 +29,8 @@ _FLATTEST = 1.02
 
 
 def displacement_deviation(
-    first: np.ndarray,
-    second: np.ndarray,
+    first: Values,
+    second: Values,
     *,
     window: Triple,
     origin: Triple,
@@ -37,7 +41,7 @@ def displacement_deviation(
 
     Parameters
     ----------
-    first, second : ndarray, shape (z, y, x), float32
+    first, second : array, shape (z, y, x), float32
         Volumes deformed onto each other, so that a fraction of a voxel of displacement remains in each window.
     window, origin, step, count : tuple of int
         Window edges, first voxel of the first window, distance and number of windows, order (z, y, x).
@@ -47,25 +51,21 @@ def displacement_deviation(
     ndarray, shape (*count, 3)
         Standard deviation of the displacement, order (z, y, x) [voxel]; NaN where the correlation has no peak at lag 0.
     """
-    keep = tuple(slice(o, o + (c - 1) * s + 1, s) for o, c, s in zip(origin, count, step, strict=True))
+    layout = window, origin, step, count
+    if runtime.device().form == "gpu":
+        totals, terms = uncertainty_gpu.window_sums(on_device(first), on_device(second), *layout, REACH)
+    else:
+        totals, terms = _window_sums(to_host(first), to_host(second), *layout)
     voxels = math.prod(window)
-
-    def window_sum(volume: np.ndarray) -> np.ndarray:
-        return box_sum(volume, window, keep).astype(float)
-
-    mean_product = window_sum(first) * window_sum(second) / voxels
-    peak = window_sum(first * second) - mean_product
+    mean_product = totals[0] * totals[1] / voxels
+    peak = totals[2] - mean_product
     deviation = np.full((*count, 3), np.nan)
-    for axis in range(3):
-        ahead = [np.zeros_like(volume) for volume in (first, second)]
-        inner = (slice(None),) * axis + (slice(None, -1),)
-        for moved, volume in zip(ahead, (first, second), strict=True):
-            moved[inner] = volume[(slice(None),) * axis + (slice(1, None),)]
-        plus, minus = first * ahead[1], ahead[0] * second
-        side = 0.5 * (window_sum(plus) + window_sum(minus)) - mean_product
-        difference = plus - minus
-        about_zero = _variance_of_sum(difference, window_sum)
-        about_mean = about_zero - window_sum(difference) ** 2 * REACH**3 / voxels
+    for axis, (plus, minus, difference, squares) in enumerate(terms):
+        side = 0.5 * (plus + minus) - mean_product
+        # The sum over pairs of terms of their product times the overlap of two cubes around them, which is 1 for a term
+        # with itself and 0 beyond `REACH`. Unlike a sum of estimated covariances it is never negative.
+        about_zero = squares / REACH**3
+        about_mean = about_zero - difference**2 * REACH**3 / voxels
         variance = np.maximum(about_mean, 0.5 * about_zero)  # a small window's mean holds part of the noise
         with np.errstate(divide="ignore", invalid="ignore"):
             sharpness = np.log(np.maximum(peak / side, _FLATTEST))
@@ -74,14 +74,35 @@ def displacement_deviation(
     return deviation
 
 
-def _variance_of_sum(terms: np.ndarray, window_sum: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Estimate the variance of the sum of correlated terms over windows.
+def _window_sums(
+    first: np.ndarray, second: np.ndarray, window: Triple, origin: Triple, step: Triple, count: Triple
+) -> tuple[list[np.ndarray], Iterator[list[np.ndarray]]]:
+    """Return sums over windows, shape `count`, float64.
 
-    It is the sum over pairs of terms of their product times the overlap of two cubes around them, which is 1 for a term
-    with itself and 0 beyond `REACH`. Unlike a sum of estimated covariances it is never negative.
+    They are those of both volumes and of their product, and for each axis those of the products at a lag of 1 and of
+    -1, of their difference, and of the squares of the difference's sums over cubes.
     """
+    keep = tuple(slice(o, o + (c - 1) * s + 1, s) for o, c, s in zip(origin, count, step, strict=True))
+
+    def window_sum(volume: np.ndarray) -> np.ndarray:
+        return box_sum(volume, window, keep).astype(float)
+
+    def terms(axis: int) -> list[np.ndarray]:
+        ahead = [np.zeros_like(volume) for volume in (first, second)]
+        inner = (slice(None),) * axis + (slice(None, -1),)
+        for moved, volume in zip(ahead, (first, second), strict=True):
+            moved[inner] = volume[(slice(None),) * axis + (slice(1, None),)]
+        plus, minus = first * ahead[1], ahead[0] * second
+        difference = plus - minus
+        return [window_sum(of) for of in (plus, minus, difference, _squared_cubes(difference))]
+
+    return [window_sum(of) for of in (first, second, first * second)], map(terms, range(3))
+
+
+def _squared_cubes(terms: np.ndarray) -> np.ndarray:
+    """Return the squares of the sums of terms over the cube around each voxel, 0 where it leaves the volume."""
     cubes = box_sum(terms, (REACH,) * 3)
     centred = np.zeros_like(cubes)  # box_sum starts at a voxel: move each cube's sum to its middle
     shift = REACH // 2
     centred[shift:, shift:, shift:] = cubes[: -shift or None, : -shift or None, : -shift or None]
-    return window_sum(centred * centred) / REACH**3
+    return centred * centred

@@ -110,12 +110,12 @@ def plane_sums_calls(
     return [Call(_sum_planes, plan.shape[0], inputs, [scratch, *sums], scratch=True)]
 
 
-def signal_floor(volume: np.ndarray, square: float, plan: Plan) -> float:
+def signal_floor(mean: float, square: float, plan: Plan) -> float:
     """Return the sum of squared deviations up to which a window holds no signal.
 
-    `square` is the sum of the volume's squares.
+    `mean` is that of the volume, `square` the sum of its squares.
     """
-    variance = square / volume.size - float(volume.mean()) ** 2
+    variance = square / math.prod(plan.shape) - mean**2
     return SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
 
 

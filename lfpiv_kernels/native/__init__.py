@@ -18,7 +18,7 @@ QUIET = "-w"
 """Option of the CPU's compiler that suppresses warnings, which differ from processor to processor; errors are shown."""
 
 
-def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dict[str, object]:
+def options(header: str, *, contract: str | None = None, unroll: int = 0, gpu: bool = False) -> dict[str, object]:
     """Return the options of a Warp module whose native functions call a header.
 
     Parameters
@@ -29,6 +29,8 @@ def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dic
         Whether the CPU's compiler fuses multiplications and additions wherever it can, or never. Default: Warp decides.
     unroll : int
         Warp's limit for loops that it unrolls.
+    gpu : bool
+        Whether the CPU's compiler, too, takes the loops written for a GPU: for a module that only a GPU runs.
 
     Raises
     ------
@@ -42,7 +44,7 @@ def options(header: str, *, contract: str | None = None, unroll: int = 0) -> dic
         "extra_build_options": wp.ModuleBuildOptions(
             extra_cpu_include_dirs=[FOLDER],
             extra_cuda_include_dirs=[FOLDER],
-            extra_cpu_preamble=emulated if EMULATED else include,
+            extra_cpu_preamble=emulated if EMULATED or gpu else include,
             extra_cuda_preamble=include,
             extra_build_dependencies=_included(header),
         ),

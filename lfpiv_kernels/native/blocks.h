@@ -1,4 +1,4 @@
-// Direct correlation of blocks with their surroundings; see ``correlation/layout.py`` for the structures.
+// Direct correlation of blocks with their surroundings on the CPU; see ``correlation/layout.py`` for the structures.
 #ifndef LFPIV_BLOCKS_H
 #define LFPIV_BLOCKS_H
 
@@ -38,25 +38,7 @@ LFPIV_INLINE void split_plane(const float* volume, const Triple& shape, const La
         }
 }
 
-#if LFPIV_GPU
-
-/// Voxels of one lane's block and its surroundings, read from the volumes.
-template <class Volume>
-struct BlockVoxels {
-    const Volume &first, &second;
-    const float *block, *around;
-
-    LFPIV_INLINE const float* block_row(int z, int y) const {
-        return block + (int64_t)z * first.plane + first.along_y.data[y];
-    }
-    LFPIV_INLINE const float* around_row(int z, int y) const {
-        return around + (int64_t)z * second.plane + second.along_y.data[y];
-    }
-    LFPIV_INLINE V block_at(const float* row, int x) const { return row[first.along_x.data[x]]; }
-    LFPIV_INLINE V around_at(const float* row, int x) const { return row[second.along_x.data[x]]; }
-};
-
-#else
+#if !LFPIV_GPU
 
 /// Voxels of LANES blocks, (z, y, x, lane), and of as many planes of their surroundings, (z % depth, y, x, lane).
 struct BlockVoxels {
@@ -83,8 +65,6 @@ LFPIV_INLINE void copy_plane(const Volume& volume, int plane, int lane, int rows
                 store(to + k, load(from + volume.along_y.data[y] + volume.along_x.data[x] + k));
 }
 
-#endif
-
 /// Sum the products of blocks at all lags along y and x and one lag along z, (lag y, lag x, lane).
 template <class Voxels, class Triple>
 LFPIV_INLINE void sum_lags(const Voxels& voxels, const Triple& block, const Triple& lags, int lag_z, int64_t pitch,
@@ -106,24 +86,17 @@ LFPIV_INLINE void sum_lags(const Voxels& voxels, const Triple& block, const Trip
     }
 }
 
-/// Sum the products of a group of blocks with their surroundings at all lags along y and x and part of those along z.
-/// Tasks are numbered (layer, part of the lags along z, group of lanes).
+/// Sum the products of a group of blocks with their surroundings at all lags. Tasks are numbered (layer, group of
+/// lanes).
 template <class Volume, class Layers>
-LFPIV_INLINE void correlate_blocks(const Volume& first, const Volume& second, const Layers& layers, int parts, int task,
-                                   [[maybe_unused]] float* scratch, float* sums) {
-    const int lane = task % layers.groups * layers.group, part = task / layers.groups % parts;
-    const int layer = layers.begin + task / layers.groups / parts, plane = layer * layers.stride[0];
+LFPIV_INLINE void correlate_blocks(const Volume& first, const Volume& second, const Layers& layers, int task,
+                                   float* scratch, float* sums) {
+    const int lane = task % layers.groups * layers.group;
+    const int layer = layers.begin + task / layers.groups, plane = layer * layers.stride[0];
     const int nz = layers.lags[0], ny = layers.lags[1], nx = layers.lags[2];
     const int depth = layers.block[0], rows = layers.block[1], columns = layers.block[2];
-    const int begin = part * nz / parts, end = (part + 1) * nz / parts;
     float* to = sums + (int64_t)(layer % layers.ring) * nz * ny * nx * layers.lanes + lane;
     const int64_t plane_pitch = (int64_t)ny * nx * layers.lanes;
-#if LFPIV_GPU
-    const BlockVoxels<Volume> voxels{first, second, first.values.data + (int64_t)plane * first.plane + lane,
-                                     second.values.data + (int64_t)plane * second.plane + lane};
-    for (int lag = begin; lag < end; ++lag)
-        sum_lags(voxels, layers.block, layers.lags, lag, layers.lanes, to + lag * plane_pitch);
-#else
     const int rows_around = rows + ny - 1, columns_around = columns + nx - 1, block_size = rows * columns * LANES;
     float* around = scratch + (int64_t)depth * block_size;
     BlockVoxels voxels{scratch, around, depth, rows, columns, rows_around, columns_around};
@@ -132,14 +105,15 @@ LFPIV_INLINE void correlate_blocks(const Volume& first, const Volume& second, co
         copy_plane(second, plane + z, lane, rows_around, columns_around, to);
     };
     for (int z = 0; z < depth; ++z) copy_plane(first, plane + z, lane, rows, columns, scratch + z * block_size);
-    for (int z = begin; z < begin + depth - 1; ++z) copy_around(z);
-    for (int lag = begin; lag < end; ++lag) {
+    for (int z = 0; z < depth - 1; ++z) copy_around(z);
+    for (int lag = 0; lag < nz; ++lag) {
         copy_around(lag + depth - 1);
         for (voxels.half = 0; voxels.half < LANES; voxels.half += WIDTH)
             sum_lags(voxels, layers.block, layers.lags, lag, layers.lanes, to + lag * plane_pitch + voxels.half);
     }
-#endif
 }
+
+#endif
 
 /// Add to each lane the `count - 1` that follow at a distance. In place: lanes that are read have not been written yet.
 LFPIV_INLINE void add_following(float* sums, int lanes, int count, int distance) {

@@ -10,13 +10,32 @@ namespace lfpiv {
 /// Rows of a block at most.
 constexpr int TALLEST = 64;
 static_assert(TALLEST % ROW_GROUP == 0, "the tallest block needs no filling");
+/// Heights of blocks of profiles, in groups of rows, none included.
+constexpr int HEIGHTS = 17;
+static_assert(HEIGHTS == TALLEST / ROW_GROUP + 1, "one for each height");
 /// Parts of a voxel at most.
 constexpr int MOST_PARTS = 64;
 /// Steps of a cell's outline at most.
 constexpr int MOST_STEPS = 8;
 
-/// Count the blocks and the bytes of values that a voxel needs at most.
-LFPIV_INLINE void measure(const WeightInputs& in, int index, int* blocks_out, int* bytes_out) {
+/// Blocks and bytes of values that some lenses need at most for the pixels in their boxes.
+struct Room {
+    V blocks, bytes, tiles;
+
+    LFPIV_INLINE Room(const WeightInputs& in, const PixelBox& box, M lit) {
+        tiles = floor((box.last_column - box.first_column + (float)BLOCK_WIDTH) / (float)BLOCK_WIDTH);
+        const V rows = box.last_row - box.first_row + 1.0f, none = V{};
+        const V parts = floor((rows + (float)(TALLEST - 1)) / (float)TALLEST);
+        const V filled = rows + parts * (float)(BLOCK_WIDTH + ROW_GROUP - 1);
+        const V values = in.profiles ? tiles * filled : tiles * rows * (float)BLOCK_WIDTH;
+        blocks = lit ? tiles * parts : none, bytes = lit ? values : none;
+    }
+};
+/// Bytes behind the last value that a vector may be stored to.
+constexpr int PAST_VALUES = 2 * BLOCK_WIDTH;
+
+/// Count the lenses that a voxel reaches, and the blocks and the bytes of values that it needs at most.
+LFPIV_INLINE void measure(const WeightInputs& in, int index, int* lenses_out, int* blocks_out, int* bytes_out) {
     const Voxel voxel(in, index);
     ReachedLenses reached(voxel);
     int blocks = 0, bytes = 0;
@@ -26,19 +45,16 @@ LFPIV_INLINE void measure(const WeightInputs& in, int index, int* blocks_out, in
         reached.take(lenses);
         const M lit = reached.pixel_box(reached.count - n, lenses, box);
         if (!any(lit)) continue;
-        const V tiles = floor((box.last_column - box.first_column + (float)BLOCK_WIDTH) / (float)BLOCK_WIDTH);
-        const V rows = box.last_row - box.first_row + 1.0f, none = V{};
-        const V parts = floor((rows + (float)(TALLEST - 1)) / (float)TALLEST);
-        const V filled = rows + parts * (float)(BLOCK_WIDTH + ROW_GROUP - 1);
-        const V values = in.profiles ? tiles * filled : tiles * rows * (float)BLOCK_WIDTH;
-        const V lit_blocks = lit ? tiles * parts : none, lit_values = lit ? values : none;
+        const Room room(in, box, lit);
         for (int k = 0; k < WIDTH; ++k) {
-            blocks += (int)lane(lit_blocks, k);
-            bytes += (int)lane(lit_values, k);
+            blocks += (int)lane(room.blocks, k);
+            bytes += (int)lane(room.bytes, k);
+            if (LFPIV_GPU) bytes += PAST_VALUES * (int)lane(room.tiles, k);  // each tile has room of its own there
         }
     }
+    lenses_out[index] = reached.count;
     blocks_out[index] = blocks;
-    bytes_out[index] = bytes + 2 * BLOCK_WIDTH;  // a vector may be stored past the last value
+    bytes_out[index] = bytes + PAST_VALUES;
 }
 
 #if defined(__CUDA_ARCH__)
@@ -110,28 +126,66 @@ struct Outline {
     bool square;
 };
 
-/// Steps of the cell's outline, and offsets of the voxel's parts, under one lens.
-struct CellParts {
-    Smear<float> step_a[MOST_STEPS], step_b[MOST_STEPS];
-    float part_a[MOST_PARTS], part_b[MOST_PARTS];
+#if LFPIV_GPU
 
+/// Steps of the cell's outline, and offsets of the voxel's parts, under one lens: computed wherever they are used, for
+/// a thread has no memory for tables.
+struct CellParts {
+    const LensValues& values;
+    const Voxel& voxel;
+    const Outline& outline;
+
+    LFPIV_INLINE CellParts(const LensValues& values, const Voxel& voxel, const Outline& outline, int)
+        : values(values), voxel(voxel), outline(outline) {}
+
+    LFPIV_INLINE Smear<float> step_a(int q) const {
+        return smear_of(2.0f * outline.extent[2 * q], values.wide_a, values.smear_a.narrow, values.smear_a.bend);
+    }
+    LFPIV_INLINE Smear<float> step_b(int q) const {
+        return smear_of(2.0f * outline.extent[2 * q + 1], values.wide_b, values.smear_b.narrow, values.smear_b.bend);
+    }
+    LFPIV_INLINE float part_a(int part) const {
+        const V* e = values.edge;
+        return voxel.parts == 1 ? 0.0f : middle_of_part_rounded(voxel.in.cuts, part, e[0], e[1], e[2]);
+    }
+    LFPIV_INLINE float part_b(int part) const {
+        const V* e = values.edge + 3;
+        return voxel.parts == 1 ? 0.0f : middle_of_part(voxel.in.cuts, part, e[0], e[1], e[2]);
+    }
+};
+
+#else
+
+/// Steps of the cell's outline, and offsets of the voxel's parts, under one lens.
+class CellParts {
+    Smear<float> steps_a[MOST_STEPS], steps_b[MOST_STEPS];
+    float parts_a[MOST_PARTS], parts_b[MOST_PARTS];
+
+public:
     LFPIV_INLINE CellParts(const LensValues& values, const Voxel& voxel, const Outline& outline, int lens) {
         for (int q = 0; !outline.square && q < outline.steps; ++q) {
             const float width = 2.0f * outline.extent[2 * q], height = 2.0f * outline.extent[2 * q + 1];
             const Smear<float> a = values.one(values.smear_a, lens), b = values.one(values.smear_b, lens);
-            step_a[q] = smear_of(width, in_memory(values.wide_a, lens), a.narrow, a.bend);
-            step_b[q] = smear_of(height, in_memory(values.wide_b, lens), b.narrow, b.bend);
+            steps_a[q] = smear_of(width, in_memory(values.wide_a, lens), a.narrow, a.bend);
+            steps_b[q] = smear_of(height, in_memory(values.wide_b, lens), b.narrow, b.bend);
         }
-        part_a[0] = part_b[0] = 0.0f;
+        parts_a[0] = parts_b[0] = 0.0f;
         if (voxel.parts == 1) return;
         float e[6];
         for (int n = 0; n < 6; ++n) e[n] = in_memory(values.edge[n], lens);
         for (int part = 0; part < voxel.parts; ++part) {
-            part_a[part] = middle_of_part_rounded(voxel.in.cuts, part, e[0], e[1], e[2]);
-            part_b[part] = middle_of_part(voxel.in.cuts, part, e[3], e[4], e[5]);
+            parts_a[part] = middle_of_part_rounded(voxel.in.cuts, part, e[0], e[1], e[2]);
+            parts_b[part] = middle_of_part(voxel.in.cuts, part, e[3], e[4], e[5]);
         }
     }
+
+    LFPIV_INLINE const Smear<float>& step_a(int q) const { return steps_a[q]; }
+    LFPIV_INLINE const Smear<float>& step_b(int q) const { return steps_b[q]; }
+    LFPIV_INLINE float part_a(int part) const { return parts_a[part]; }
+    LFPIV_INLINE float part_b(int part) const { return parts_b[part]; }
 };
+
+#endif
 
 /// The pixels under one lens of a group in one tile.
 struct LensTile {
@@ -165,27 +219,61 @@ struct LensTile {
     /// Return the lens's part of a value.
     LFPIV_INLINE float of(const V& x) const { return in_memory(x, lens); }
 
+    /// Return the profile along the columns in levels, from column x of the tile on.
+    LFPIV_INLINE V level_across(int x) const {
+        const V from = lane_numbers(1, 8) + (column0 + (float)x - of(values.column));
+        const V level = smeared(of(values.a) - from * of(values.step_a), smear_a) * to_a + 0.5f;
+        return min(level, splat(LEVELS));
+    }
+    /// Return the profile along the rows in levels, from a row of the box on.
+    LFPIV_INLINE V level_down(int row) const {
+        const V from = lane_numbers(1, WIDTH) + ((float)row - of(values.row));
+        const V level = smeared(of(values.b) - from * of(values.step_b), smear_b) * of(values.to_b) + 0.5f;
+        return min(level, splat(LEVELS));
+    }
+
+#if LFPIV_GPU
+
+    /// Return the profile along the columns, a byte each.
+    LFPIV_INLINE uint64_t profile_across() const {
+        uint64_t word = 0;
+        for (int x = 0; x < 8; ++x) word |= (uint64_t)(unsigned char)level_across(x) << (8 * x);
+        return word & columns;
+    }
+
+    /// Write the block of rows from `first` on as two profiles. Nothing is written where all weights round to zero. The
+    /// levels along the rows are computed twice: to find the lit ones, and to write them.
+    LFPIV_INLINE void write_profiles(uint64_t across, int first, int height, BlockWriter& out) const {
+        int top = -1, bottom = -1;
+        for (int y = 0; y < height; ++y) {
+            if (level_down(first + y) < 1.0f) continue;
+            bottom = y;
+            if (top < 0) top = y;
+        }
+        if (top < 0) return;
+        const int left = lowest_bit(across) / 8, lit = bottom - top + 1;
+        const int rows = (lit + ROW_GROUP - 1) / ROW_GROUP * ROW_GROUP;
+        store_word(out.value, across >> (8 * left));
+        out.value += BLOCK_WIDTH;
+        for (int y = 0; y < rows; ++y) out.value[y] = y < lit ? (unsigned char)level_down(first + top + y) : 0;
+        out.value += rows;
+        out.finish(ray, first + top, left, rows, BLOCK_WIDTH);
+    }
+
+#else
+
     /// Return the profile along the columns, a byte each.
     LFPIV_INLINE uint64_t profile_across() const {
         unsigned char level[WIDTH < 8 ? 8 : WIDTH];
-        for (int x = 0; x < 8; x += ACROSS) {
-            const V from = lane_numbers(1, 8) + (column0 + (float)x - of(values.column));
-            const V y = smeared(of(values.a) - from * of(values.step_a), smear_a) * to_a + 0.5f;
-            store_bytes(level + x, min(y, splat(LEVELS)));
-        }
+        for (int x = 0; x < 8; x += ACROSS) store_bytes(level + x, level_across(x));
         return load_word(level) & columns;
     }
 
     /// Write the block of rows from `first` on as two profiles. Nothing is written where all weights round to zero.
     LFPIV_INLINE void write_profiles(uint64_t across, int first, int height, BlockWriter& out) const {
         unsigned char level[TALLEST + 24] = {};
-        const float to_b = of(values.to_b);
         int top = -1, bottom = -1;
-        for (int y = 0; y < height; y += WIDTH) {
-            const V from = lane_numbers(1, WIDTH) + ((float)(first + y) - of(values.row));
-            const V z = smeared(of(values.b) - from * of(values.step_b), smear_b) * to_b + 0.5f;
-            store_bytes(level + y, min(z, splat(LEVELS)));
-        }
+        for (int y = 0; y < height; y += WIDTH) store_bytes(level + y, level_down(first + y));
         for (int y = 0; y < height; y += 8) {
             const uint64_t word = load_word(level + y) & bytes_below(height - y);
             if (!word) continue;
@@ -203,23 +291,40 @@ struct LensTile {
         out.finish(ray, first + top, left, rows, BLOCK_WIDTH);
     }
 
+#endif
+
     /// Return the probability, times the widest smears, that rays at (a, b) lie in the lens's cell.
+#if LFPIV_GPU
     LFPIV_INLINE V inside_cell(V a, V b) const {
-        const int parts = voxel.parts;
-        if (outline.square && parts == 1) return smeared(a, smear_a) * smeared(b, smear_b);
-        V inside = {};
-        for (int part = 0; outline.square && part < parts; ++part)
-            inside += smeared(a - cell.part_a[part], smear_a) * smeared(b - cell.part_b[part], smear_b);
-        for (int part = 0; !outline.square && part < parts; ++part) {
-            V lower = {};
-            for (int q = 0; q < outline.steps; ++q) {
-                const V higher = smeared(b - cell.part_b[part], cell.step_b[q]);
-                inside += smeared(a - cell.part_a[part], cell.step_a[q]) * (higher - lower);
+        V inside = 0.0f;
+        for (int part = 0; part < voxel.parts; ++part) {
+            V lower = 0.0f;
+            for (int q = 0; q < outline.steps; ++q) {  // a square has one, from the middle on
+                const V higher = smeared(b - cell.part_b(part), cell.step_b(q));
+                inside += smeared(a - cell.part_a(part), cell.step_a(q)) * (higher - lower);
                 lower = higher;
             }
         }
         return inside;
     }
+#else
+    LFPIV_INLINE V inside_cell(V a, V b) const {
+        const int parts = voxel.parts;
+        if (outline.square && parts == 1) return smeared(a, smear_a) * smeared(b, smear_b);
+        V inside = {};
+        for (int part = 0; outline.square && part < parts; ++part)
+            inside += smeared(a - cell.part_a(part), smear_a) * smeared(b - cell.part_b(part), smear_b);
+        for (int part = 0; !outline.square && part < parts; ++part) {
+            V lower = {};
+            for (int q = 0; q < outline.steps; ++q) {
+                const V higher = smeared(b - cell.part_b(part), cell.step_b(q));
+                inside += smeared(a - cell.part_a(part), cell.step_a(q)) * (higher - lower);
+                lower = higher;
+            }
+        }
+        return inside;
+    }
+#endif
 
     /// Write the levels of all pixels of `height` rows, 8 to a row.
     LFPIV_INLINE void write_levels(int first, int height, unsigned char* out) const {
@@ -292,23 +397,28 @@ LFPIV_INLINE int first_ray(const WeightInputs& in, const Lenses& lenses, const L
     return block * edge * edge + row * edge + column;
 }
 
+/// Write the blocks of one tile of the pixels under a group of lenses.
+LFPIV_INLINE void fill_tile(const LensGroup& group, const LensValues& values, const Bend& bend, const Outline& outline,
+                            int tile, M here, BlockWriter& out) {
+    const Voxel& voxel = group.voxel;
+    const Tile rows(group, here, (float)(tile * BLOCK_WIDTH));
+    for (unsigned live = rows.lit(); live; live &= live - 1) {
+        const int lens = lowest_bit(live), layer = (int)in_memory(rows.layer, lens);
+        const int ray = first_ray(voxel.in, group.lenses, values, lens, layer) + tile * BLOCK_WIDTH;
+        const CellParts cell(values, voxel, outline, lens);
+        const LensTile pixels(values, voxel, bend, outline, cell, lens, tile, ray);
+        pixels.write((int)in_memory(rows.low, lens), (int)in_memory(rows.high, lens), out);
+    }
+}
+
 /// Write the blocks of the pixels under one group of lenses.
 LFPIV_INLINE void fill_group(const LensGroup& group, const Top& top, const Bend& bend, const Outline& outline, M lit,
                              BlockWriter& out) {
-    const Voxel& voxel = group.voxel;
     const LensValues values(group, top, bend, lit);
     for (int tile = 0;; ++tile) {
-        const float column0 = (float)(tile * BLOCK_WIDTH);
-        const M here = values.columns > column0;
+        const M here = values.columns > (float)(tile * BLOCK_WIDTH);
         if (!any(here)) break;
-        const Tile rows(group, here, column0);
-        for (unsigned live = rows.lit(); live; live &= live - 1) {
-            const int lens = lowest_bit(live), layer = (int)in_memory(rows.layer, lens);
-            const int ray = first_ray(voxel.in, group.lenses, values, lens, layer) + tile * BLOCK_WIDTH;
-            const CellParts cell(values, voxel, outline, lens);
-            const LensTile pixels(values, voxel, bend, outline, cell, lens, tile, ray);
-            pixels.write((int)in_memory(rows.low, lens), (int)in_memory(rows.high, lens), out);
-        }
+        fill_tile(group, values, bend, outline, tile, here, out);
     }
 }
 
@@ -355,9 +465,6 @@ LFPIV_INLINE void fill(const WeightInputs& in, const Outline& outline, int index
 
 /// Where the blocks of a voxel go: those of even lenses before those of odd ones; of these, profiles by their height.
 struct BlockOrder {
-    static constexpr int HEIGHTS = TALLEST / ROW_GROUP + 1;
-    int block[2 * HEIGHTS + 1] = {};
-    int value[2 * HEIGHTS + 1] = {};
     const bool profiles;
     const int lens_rays, lenses_i;
 
@@ -378,30 +485,31 @@ struct BlockOrder {
 /// Copy the blocks of a voxel in their order to where they lie without gaps.
 LFPIV_INLINE void pack(const BlockArrays& from, const BlockArrays& to, int voxel, bool profiles, int edge, int lenses_i,
                        int* even_blocks_out, int* even_values_out) {
-    BlockOrder order(profiles, edge, lenses_i);
+    const BlockOrder order(profiles, edge, lenses_i);
+    int block_of[2 * HEIGHTS + 1] = {}, value_of[2 * HEIGHTS + 1] = {};
     const int from_block = from.first_block[voxel], to_block = to.first_block[voxel];
     const int blocks = to.first_block[voxel + 1] - to_block;
     for (int k = from_block; k < from_block + blocks; ++k) {
         const int place = order.place(from.ray[k], from.height[k]);
-        order.block[place + 1] += 1;
-        order.value[place + 1] += order.bytes(from.height[k], from.width[k]);
+        block_of[place + 1] += 1;
+        value_of[place + 1] += order.bytes(from.height[k], from.width[k]);
     }
-    for (int place = 0; place < 2 * BlockOrder::HEIGHTS; ++place) {
-        order.block[place + 1] += order.block[place];
-        order.value[place + 1] += order.value[place];
+    for (int place = 0; place < 2 * HEIGHTS; ++place) {
+        block_of[place + 1] += block_of[place];
+        value_of[place + 1] += value_of[place];
     }
-    even_blocks_out[voxel] = order.block[BlockOrder::HEIGHTS];
-    even_values_out[voxel] = order.value[BlockOrder::HEIGHTS];
+    even_blocks_out[voxel] = block_of[HEIGHTS];
+    even_values_out[voxel] = value_of[HEIGHTS];
     const unsigned char* value = from.value + from.first_value[voxel];
     for (int k = from_block; k < from_block + blocks; ++k) {
         const int height = from.height[k], width = from.width[k], bytes = order.bytes(height, width);
-        const int place = order.place(from.ray[k], height), block = to_block + order.block[place]++;
+        const int place = order.place(from.ray[k], height), block = to_block + block_of[place]++;
         to.ray[block] = from.ray[k];
         to.height[block] = (unsigned char)height;
         to.width[block] = (unsigned char)width;
-        unsigned char* out = to.value + to.first_value[voxel] + order.value[place];
+        unsigned char* out = to.value + to.first_value[voxel] + value_of[place];
         for (int n = 0; n < bytes; ++n) out[n] = value[n];
-        order.value[place] += bytes;
+        value_of[place] += bytes;
         value += bytes;
     }
 }

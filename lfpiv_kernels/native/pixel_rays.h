@@ -1,4 +1,5 @@
-// The linear map between the rays of a camera and its pixels, for those rays that voxels light.
+// The linear map between the rays of a camera and its pixels, for those rays that voxels light. For the CPU; a GPU has
+// ``pixel_rays_gpu.h``.
 #ifndef LFPIV_PIXEL_RAYS_H
 #define LFPIV_PIXEL_RAYS_H
 
@@ -42,23 +43,14 @@ struct PixelRun {
         for (int n = (int)((int64_t)darks * run / runs); n < last; ++n) rays_out[dark[n]] = 0.0f;
     }
 
-#if LFPIV_GPU
-    /// Pixels that `for_pixels` gives at once. Neighbouring threads have neighbouring pixels.
-    static constexpr int GROUP = 1;
-    LFPIV_INLINE int begin() const { return start + run; }
-    LFPIV_INLINE int step() const { return runs; }
-#else
     /// Pixels that `for_pixels` gives at once: all of the run, so that the compiler's vectors are full.
     static constexpr int GROUP = RUN;
-    LFPIV_INLINE int begin() const { return start + run * RUN; }
-    LFPIV_INLINE int step() const { return RUN; }
-#endif
 
-    /// Call work(first pixel, number of pixels) for the run's pixels, `GROUP` at a time.
+    /// Call work(first pixel, number of pixels) for the run's pixels.
     template <class Work>
     LFPIV_INLINE void for_pixels(Work work) const {
-        for (int done = 0, next = begin(); done < RUN && next < pixels; done += GROUP, next += step())
-            work(next, pixels - next < GROUP ? pixels - next : GROUP);
+        const int next = start + run * RUN;
+        if (next < pixels) work(next, pixels - next < GROUP ? pixels - next : GROUP);
     }
 };
 

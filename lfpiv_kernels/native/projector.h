@@ -1,5 +1,5 @@
 // A voxel's blocks of weights against the rays of a camera: gathering and scattering light, one row of a block at a
-// time.
+// time. For the CPU; a GPU has ``projector_gpu.h``.
 #ifndef LFPIV_PROJECTOR_H
 #define LFPIV_PROJECTOR_H
 
@@ -13,6 +13,8 @@ constexpr int BLOCK_WIDTH = 8;
 constexpr int ROW_GROUP = 4;
 /// Groups of rows up to which loops over a block's rows are unrolled: a microimage of 24 pixels.
 constexpr int UNROLLED = 6;
+
+#if !LFPIV_GPU  // see ``projector_gpu.h``
 
 /// One row of a block. Lanes beyond the block's width belong to another block.
 using Row = Floats<BLOCK_WIDTH>;
@@ -81,18 +83,6 @@ LFPIV_INLINE Row gather_pixels(const float* ray, int rows, int columns, int stri
     return first_lanes(even + odd, columns);
 }
 
-#if LFPIV_GPU
-
-/// Return the sums along the columns of `groups` groups of rows, each row times its level.
-LFPIV_INLINE Row sum_rows(const float* ray, int groups, int stride, const unsigned char* down) {
-    Row total = splat<BLOCK_WIDTH>(0.0f);
-    for (int k = 0; k < groups * ROW_GROUP; ++k, ray += stride)
-        total = total + load<BLOCK_WIDTH>(ray) * splat<BLOCK_WIDTH>((float)down[k]);
-    return total;
-}
-
-#else
-
 /// Two rows of a block side by side.
 using RowPair = Floats<2 * BLOCK_WIDTH>;
 static_assert(BLOCK_WIDTH == 8 && ROW_GROUP == 4, "lanes below");
@@ -136,8 +126,6 @@ LFPIV_INLINE Row sum_rows(const float* ray, int groups, int stride, const unsign
     return first_row(both) + second_row(both);
 }
 
-#endif
-
 /// Walk over blocks of profiles. Those of one height follow each other, so that each height has a loop of its own,
 /// whose rows the compiler unrolls.
 template <int GROUPS, class Work>
@@ -179,8 +167,6 @@ LFPIV_INLINE float gather(const VoxelBlocks& blocks, const float* rays) {
                                       blocks.stride, level);
     return sum(total);
 }
-
-#if !LFPIV_GPU  // without atomics: each thread needs rays of its own
 
 /// Add light to two rows.
 LFPIV_INLINE void add_to_rows(float* ray, int stride, RowPair light) {
@@ -234,10 +220,6 @@ LFPIV_INLINE void scatter(const VoxelBlocks& blocks, float intensity, float* ray
         }
     }
 }
-
-#else
-
-LFPIV_INLINE void scatter(const VoxelBlocks&, float, float*) {}  // a GPU scatters atomically, in another kernel
 
 #endif
 

@@ -15,6 +15,38 @@ POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2)
 """Exponents of u and v in the polynomial's terms."""
 
 
+@ti.func
+def _count_ray(
+    rays: ti.template(),
+    point,
+    u,
+    v,
+    w,
+    first_pixel: ti.template(),
+    camera,
+    lattice,
+    hexagonal: ti.template(),
+    count_out: ti.template(),
+):
+    """Trace the ray of a point through the pupil point (u, v) [mm], and count it in its pixel of window w."""
+    st = ti.Vector([0.0, 0.0])
+    for k in ti.static(range(2)):
+        st[k] = (
+            rays[point, k, 0]
+            + u * (rays[point, k, 1] + u * (rays[point, k, 3] + u * rays[point, k, 6]))
+            + v * (rays[point, k, 2] + v * (rays[point, k, 5] + v * rays[point, k, 9]))
+            + u * v * (rays[point, k, 4] + u * rays[point, k, 7] + v * rays[point, k, 8])
+        )
+    lens = nearest_lens(lattice, st[0], st[1], hexagonal)
+    centre = lens_centre(lattice, lens[0], lens[1])
+    x = (centre[0] + camera[0] * (st[0] - u)) / camera[1] + camera[2]
+    y = (centre[1] + camera[0] * (st[1] - v)) / camera[1] + camera[3]
+    column = ti.cast(ti.floor(x), ti.i32) - first_pixel[w, 0]
+    row = ti.cast(ti.floor(y), ti.i32) - first_pixel[w, 1]
+    if 0 <= column < count_out.shape[2] and 0 <= row < count_out.shape[1]:
+        count_out[w, row, column] += 1
+
+
 @ti.kernel
 def _count_rays(
     # in
@@ -26,38 +58,31 @@ def _count_rays(
     lattice: Lattice,
     hexagonal: ti.template(),
     samples: ti.i32,
+    per_ray: ti.template(),  # whether each ray is a task of its own, as a GPU wants it, or each point
     # out
     count_out: ti.types.ndarray(dtype=ti.i32, ndim=3),
     total_out: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
     """Count rays; see `count_rays`. Taichi takes arrays only as arguments of their own, hence their number."""
     step = 2.0 * camera[4] / samples
-    for point in range(rays.shape[0]):
-        w = window[point]
-        traced = 0
-        for a in range(samples):
-            for b in range(samples):
-                u = (a + shift[point, 0]) * step - camera[4]
-                v = (b + shift[point, 1]) * step - camera[4]
-                if u * u + v * v <= camera[4] * camera[4]:
-                    traced += 1
-                    st = ti.Vector([0.0, 0.0])
-                    for k in ti.static(range(2)):
-                        st[k] = (
-                            rays[point, k, 0]
-                            + u * (rays[point, k, 1] + u * (rays[point, k, 3] + u * rays[point, k, 6]))
-                            + v * (rays[point, k, 2] + v * (rays[point, k, 5] + v * rays[point, k, 9]))
-                            + u * v * (rays[point, k, 4] + u * rays[point, k, 7] + v * rays[point, k, 8])
-                        )
-                    lens = nearest_lens(lattice, st[0], st[1], hexagonal)
-                    centre = lens_centre(lattice, lens[0], lens[1])
-                    x = (centre[0] + camera[0] * (st[0] - u)) / camera[1] + camera[2]
-                    y = (centre[1] + camera[0] * (st[1] - v)) / camera[1] + camera[3]
-                    column = ti.cast(ti.floor(x), ti.i32) - first_pixel[w, 0]
-                    row = ti.cast(ti.floor(y), ti.i32) - first_pixel[w, 1]
-                    if 0 <= column < count_out.shape[2] and 0 <= row < count_out.shape[1]:
-                        count_out[w, row, column] += 1
-        ti.atomic_add(total_out[w], traced)
+    if ti.static(per_ray):
+        for point, a, b in ti.ndrange(rays.shape[0], samples, samples):
+            u = (a + shift[point, 0]) * step - camera[4]
+            v = (b + shift[point, 1]) * step - camera[4]
+            if u * u + v * v <= camera[4] * camera[4]:
+                _count_ray(rays, point, u, v, window[point], first_pixel, camera, lattice, hexagonal, count_out)
+                ti.atomic_add(total_out[window[point]], 1)
+    else:
+        for point in range(rays.shape[0]):
+            traced = 0
+            for a in range(samples):
+                for b in range(samples):
+                    u = (a + shift[point, 0]) * step - camera[4]
+                    v = (b + shift[point, 1]) * step - camera[4]
+                    if u * u + v * v <= camera[4] * camera[4]:
+                        traced += 1
+                        _count_ray(rays, point, u, v, window[point], first_pixel, camera, lattice, hexagonal, count_out)
+            ti.atomic_add(total_out[window[point]], traced)
 
 
 def count_rays(rays, shift, window, first_pixel, camera, lattice, *, hexagonal, samples, shape):
@@ -91,9 +116,10 @@ def count_rays(rays, shift, window, first_pixel, camera, lattice, *, hexagonal, 
     total : ndarray, shape (window,), int32
         Rays traced.
     """
-    runtime.device_of_taichi()
+    per_ray = runtime.device_of_taichi().form == "gpu"
     count = np.zeros((len(first_pixel), *shape), np.int32)
     total = np.zeros(len(first_pixel), np.int32)
-    _count_rays(rays, shift, window, first_pixel, camera, lattice, bool(hexagonal), int(samples), count, total)
+    arguments = (rays, shift, window, first_pixel, camera, lattice, bool(hexagonal), int(samples), per_ray)
+    _count_rays(*arguments, count, total)
     ti.sync()
     return count, total

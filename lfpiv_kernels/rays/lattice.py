@@ -26,18 +26,19 @@ def lens_centre(lattice, i, j):
 def nearest_lens(lattice, s, t, hexagonal: ti.template()):
     """Return the index (i, j) of the lens whose centre is nearest to (s, t). Twin: ``LensLattice.nearest``."""
     ds, dt = s - lattice[0], t - lattice[1]
-    i = ti.round(lattice[6] * ds + lattice[7] * dt)
-    j = ti.round(lattice[8] * ds + lattice[9] * dt)
-    if ti.static(hexagonal):
-        best_i, best_j = i, j
+    along_i = lattice[6] * ds + lattice[7] * dt
+    along_j = lattice[8] * ds + lattice[9] * dt
+    nearest = ti.Vector([ti.round(along_i), ti.round(along_j)])
+    if ti.static(hexagonal):  # one of the four lenses around: no branches, so that rays can be traced side by side
+        i, j = ti.floor(along_i), ti.floor(along_j)
         best = ti.f32(1e30)
-        for a, b in ti.static(ti.ndrange((-1, 2), (-1, 2))):
+        for a, b in ti.static(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0))):
             centre = lens_centre(lattice, i + a, j + b)
             distance = (s - centre[0]) ** 2 + (t - centre[1]) ** 2
-            if distance < best:
-                best, best_i, best_j = distance, i + a, j + b
-        i, j = best_i, best_j
-    return ti.Vector([i, j])
+            nearest[0] = ti.select(distance < best, i + a, nearest[0])
+            nearest[1] = ti.select(distance < best, j + b, nearest[1])
+            best = ti.min(distance, best)
+    return nearest
 
 
 def cell_steps(layout: str) -> np.ndarray:

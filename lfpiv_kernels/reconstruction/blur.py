@@ -1,30 +1,25 @@
 """Warp: Gaussian blur of a volume along its three axes. Twin: ``scipy.ndimage.gaussian_filter``.
 
 Each thread blurs planes of the outermost axis, so its intermediate results stay in the caches. The loops are C++, see
-``blur.h``.
+``blur.h``. A GPU has ``blur_gpu``.
 """
 
 import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.reconstruction import blur_gpu
+from lfpiv_kernels.reconstruction.blur_layout import Axis
+from lfpiv_kernels.reconstruction.voxels import parts_of
+from lfpiv_kernels.transfer import Array, empty, like, to_device
 
 wp.set_module_options(native.options("blur.h", contract="fast"))
 
 BORDERS = ("constant", "nearest")
 """Beyond the volume: zero, or its outermost voxels continued."""
-
-
-@wp.struct
-class Axis:
-    """The weights along one axis, see ``AxisBlur`` in ``blur.h``."""
-
-    first: wp.array(dtype=int)
-    weight: wp.array(dtype=float)
-    taps: int
-    begin: int
-    end: int
+FEWEST_VOXELS = 8192
+"""Smallest part of a launch: a smaller one takes less time than the launch itself."""
 
 
 @wp.func_native("""
@@ -87,15 +82,15 @@ class GaussianBlur:
         self.shape = shape
         self._axes = [_axis(profile / profile.sum(), size, border) for size in shape]
 
-    def __call__(self, volume: np.ndarray) -> np.ndarray:
-        """Return the blurred volume; both float32, C-contiguous, shape (voxel,)."""
-        blurred, work = np.empty_like(volume), np.empty_like(volume)
-        device = runtime.device()
-        outputs = [to_device(array, float) for array in (work, blurred)]
-        launch(Call(_blur, self.shape[0], [*self._axes, to_device(volume, float)], outputs))
-        if device.kind != "cpu":
-            blurred[:] = outputs[1].numpy()
-        return blurred
+    def __call__(self, volume: Array) -> Array:
+        """Return the blurred volume, on the device if `volume` is; both float32, C-contiguous, shape (voxel,)."""
+        source, work, blurred = to_device(volume, float), empty(volume.size), empty(volume.size)
+        if runtime.device().form == "gpu":
+            blur_gpu.blur(self._axes, source, work, blurred)
+        else:
+            call = Call(_blur, self.shape[0], [*self._axes, source], [work, blurred])
+            launch(call, parts=parts_of(volume.size, FEWEST_VOXELS))
+        return like(volume, blurred)
 
 
 def _axis(profile: np.ndarray, size: int, border: str) -> Axis:

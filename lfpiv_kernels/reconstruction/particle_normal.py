@@ -13,7 +13,8 @@ import warp as wp
 from scipy import sparse
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import to_device, to_host
 from lfpiv_kernels.weights.gaussian import ImageLists
 
 wp.set_module_options(native.options("particle_pairs.h", contract="fast"))
@@ -158,14 +159,14 @@ def pair_blocks(lists: ImageLists, weight: np.ndarray, residual: np.ndarray) -> 
     right = to_device(np.zeros((count, 4), np.float32), wp.vec4f)
     call = _by_particle if runtime.device().form == "cpu" else _by_pixel
     launch(call(lists, weight, residual, [neighbour, block, right]), parts=PARTS)
-    near = neighbour.numpy()
+    near = to_host(neighbour)
     row, slot = np.nonzero(near >= 0)
-    column, upper = near[row, slot], block.numpy()[row, slot]
+    column, upper = near[row, slot], to_host(block)[row, slot]
     off = row != column
     rows, columns = np.concatenate([row, column[off]]), np.concatenate([column, row[off]])
     blocks = np.concatenate([upper, upper[off].transpose(0, 2, 1)])
     order = np.lexsort((columns, rows))
-    return PairBlocks(row=rows[order], column=columns[order], block=blocks[order], right=right.numpy())
+    return PairBlocks(row=rows[order], column=columns[order], block=blocks[order], right=to_host(right))
 
 
 def _by_particle(lists: ImageLists, weight: np.ndarray, residual: np.ndarray, outputs: list[wp.array]) -> Call:

@@ -2,52 +2,26 @@
 
 A pixel at the edge of two microimages sees two parts of the pupil through two lenses. It has a ray for each, with the
 share of the pixel's cell that lies inside the pupil: image[p] = sum of share[r] * light[r] over the rays r of pixel p.
-The rays of a microimage are neighbours in memory. The loops are C++, see ``pixel_rays.h``. Twin: ``reference.dense``.
+The rays of a microimage are neighbours in memory. The loops are C++, see ``pixel_rays.h``; a GPU has those of
+``pixel_rays_gpu``. Twin: ``reference.dense``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.reconstruction import pixel_rays_gpu
+from lfpiv_kernels.reconstruction.pixel_layout import PixelRays
+from lfpiv_kernels.transfer import to_device
 from lfpiv_kernels.weights.microimages import Microimages
 
 wp.set_module_options(native.options("pixel_rays.h"))
 
 RUN: int = native.constant("pixel_rays.h", "RUN")
 """Pixels that a thread goes through."""
-
-
-@wp.struct
-class PixelRays:
-    """The rays of every pixel.
-
-    Pixels under even lenses come first, then those under odd lenses, then those that see an even and an odd one. Within
-    each they are in the order in which their first rays lie in memory.
-    """
-
-    pixel: wp.array(dtype=int)
-    """Sensor pixel."""
-    first: wp.array(dtype=int)
-    """Index of its first ray; one element more than there are pixels."""
-    place: wp.array(dtype=int)
-    """Where each ray lies in memory."""
-    share: wp.array(dtype=float)
-    """Fraction of the pixel's cell that the ray stands for."""
-    dark: wp.array(dtype=int)
-    """Where rays lie that voxels light but no pixel sees: corners of blocks."""
-    start: int
-    """The first pixel that takes part."""
-    end: int
-    """The end of the pixels that take part."""
-    aside: int
-    """The first pixel whose rays stay dark."""
-    asides: int
-    """The end of the pixels whose rays stay dark."""
-    runs: int
-    """Threads that go through the pixels."""
 
 
 @wp.struct
@@ -173,6 +147,8 @@ class RayMap:
         The first ray of each part. A ray may lie in several parts; their light adds up.
     two_sets : bool
         Whether rays belong to even or odd lenses. Otherwise all count as those of even lenses.
+    places : callable, optional
+        Where rays lie in the device's memory by their place in `light`. Default: at the same place.
     """
 
     def __init__(
@@ -183,6 +159,7 @@ class RayMap:
         starts: Sequence[int],
         *,
         two_sets: bool,
+        places: Callable[[np.ndarray], np.ndarray] | None = None,
     ):
         size = int(np.prod(microimages.sensor_shape))
         placed = PlacedRays()
@@ -195,6 +172,8 @@ class RayMap:
         even, odd, pixels, lit, darks = (int(n) for n in count)
         place, share, dark = np.empty(lit, np.int32), np.empty(lit, np.float32), np.empty(darks, np.int32)
         _run_once(_sort_rays, [placed, _on_cpu(number)], [first, place, share, dark])
+        if places is not None:
+            place, dark = places(place), places(dark)
         self.pixel: np.ndarray = seen[:pixels].copy()
         """Sensor pixels that voxels light, in the order of `PixelRays`, shape (pixel,), int32."""
         arrays = {
@@ -212,10 +191,16 @@ class RayMap:
 
     def spread(self, image: wp.array, rays_out: wp.array) -> None:
         """Write each pixel's light, times their shares, on its rays: the adjoint of `collect`."""
+        if runtime.device().form == "gpu":
+            pixel_rays_gpu.spread(self.rays, image, rays_out)
+            return
         launch(Call(_spread, self.rays.runs, [self.rays, image], [rays_out]), parts=runtime.CHUNKS)
 
     def collect(self, rays: wp.array, image_out: wp.array) -> None:
         """Sum the rays of every pixel, each times its share. Pixels without rays do not change."""
+        if runtime.device().form == "gpu":
+            pixel_rays_gpu.collect(self.rays, rays, image_out)
+            return
         launch(Call(_collect, self.rays.runs, [self.rays, rays], [image_out]), parts=runtime.CHUNKS)
 
 

@@ -3,23 +3,26 @@
 A block is at most `BLOCK_WIDTH` rays wide, so that its row is one vector. It holds one value per ray, or a profile
 along the columns and one along the rows, whose products are the values. Blocks under even lenses come before those
 under odd ones, so that either half of them can be taken alone. The adjoint gathers per voxel. The projection
-scatters: on the CPU every part of the voxels adds to rays of its own, which each pixel sums in a fixed order; on CUDA
-it adds atomically. The innermost loops are C++, see ``projector.h``. Twin: ``reference.dense``.
+scatters: every part of the voxels adds to rays of its own, which each pixel sums in a fixed order. The innermost loops
+are C++, see ``projector.h``. A GPU has ``projector_gpu`` instead. Twin: ``reference.dense``.
 """
 
 import contextlib
 import itertools
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch, load, to_device
+from lfpiv_kernels.launch import Call, launch, load
+from lfpiv_kernels.reconstruction import voxels
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes, PlaneShares
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
+from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
+from lfpiv_kernels.reconstruction.weight_blocks import Blocks
+from lfpiv_kernels.transfer import Array, empty, overwrite, to_device, to_host, zeros
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
@@ -28,62 +31,6 @@ wp.set_module_options(native.options("projector.h"))
 
 EVEN, ODD, ALL = 0, 1, 2
 """Lenses whose rays take part: i + j is even, odd, or either. Neighbours in a row or column of lenses differ."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Blocks:
-    """Weights of all voxels for one camera: a sparse matrix with 8-bit values and a scale per column.
-
-    A block is `width` rays wide and `height` rows high. In the form "pixels" it has one value per ray, row by row. In
-    the form "profiles" it has `width` values A, then `height` values B; the value of column c and row k is A[c] B[k].
-    There `width` is `BLOCK_WIDTH` and `height` a multiple of `ROW_GROUP`, and blocks are sorted by it.
-    """
-
-    form: str
-    """"profiles" or "pixels"."""
-    first_block: np.ndarray
-    """Index of each voxel's first block, shape (voxel + 1,), int32."""
-    first_value: np.ndarray
-    """Index of each voxel's first value, shape (voxel + 1,), int64."""
-    ray: np.ndarray
-    """Index of each block's first ray, shape (block,), int32."""
-    height: np.ndarray
-    """Rows of rays of each block, shape (block,), uint8."""
-    width: np.ndarray
-    """Rays in a row of each block, at most `BLOCK_WIDTH`, shape (block,), uint8."""
-    value: np.ndarray
-    """Weights in levels, shape (value + BLOCK_WIDTH,), uint8. A vector may be read past the last one."""
-    scale: np.ndarray
-    """Weight of one level, shape (voxel,), float32."""
-    microimages: Microimages
-    """Where the rays lie in memory."""
-    even_blocks: np.ndarray | None = None
-    """Number of each voxel's blocks under even lenses, which come first, shape (voxel,), int32; None for all."""
-    even_values: np.ndarray | None = None
-    """Number of their values, shape (voxel,), int32."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of all arrays [byte]."""
-        names = ("first_block", "first_value", "ray", "height", "width", "value", "scale", "even_blocks", "even_values")
-        return sum(array.nbytes for array in (getattr(self, name) for name in names) if array is not None)
-
-    def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur twice."""
-        value, rays, weights = int(self.first_value[voxel]), [], []
-        for block in range(self.first_block[voxel], self.first_block[voxel + 1]):
-            width, height = int(self.width[block]), int(self.height[block])
-            rays.append(self.ray[block] + np.arange(height)[:, None] * self.microimages.edge + np.arange(width))
-            if self.form == "profiles":
-                across, down = np.split(self.value[value : value + width + height].astype(np.float64), [width])
-                weights.append(down[:, None] * across)
-                value += width + height
-            else:
-                weights.append(self.value[value : value + width * height].astype(np.float64))
-                value += width * height
-        if not rays:
-            return np.zeros(0, np.int64), np.zeros(0)
-        return np.concatenate(rays, axis=None), np.concatenate(weights, axis=None) * float(self.scale[voxel])
 
 
 @wp.struct
@@ -167,37 +114,6 @@ def _values(matrix: Matrix, width: int, height: int):
 
 
 @wp.kernel
-def _project_atomic(
-    # in
-    matrix: Matrix,
-    volume: wp.array(dtype=float),
-    lenses: int,
-    first_voxel: int,
-    # out
-    rays_out: wp.array(dtype=float),
-):
-    voxel = first_voxel + wp.tid()
-    intensity = volume[voxel] * matrix.scale[voxel]
-    if intensity == 0.0:
-        return
-    value = wp.int64(matrix.first_value[voxel])
-    first, last = int(matrix.first_block[voxel]), int(matrix.first_block[voxel + 1])
-    if lenses == wp.static(EVEN):
-        last = first + matrix.even_blocks[voxel]
-    if lenses == wp.static(ODD):
-        first += matrix.even_blocks[voxel]
-        value += wp.int64(matrix.even_values[voxel])
-    for block in range(first, last):
-        width, height = int(matrix.width[block]), int(matrix.height[block])
-        for row in range(height):
-            for column in range(width):
-                level = _level(matrix, value, width, row, column)
-                if level > 0.0:
-                    wp.atomic_add(rays_out, matrix.ray[block] + row * matrix.stride + column, intensity * level)
-        value += _values(matrix, width, height)
-
-
-@wp.kernel
 def _count_lit(
     # in
     matrix: Matrix,
@@ -231,7 +147,7 @@ class Projector:
     `project` and `back_project` may be called from several threads, which take turns. A caller of `scatter` and
     `gather` that needs the light on the rays in between calls them inside `reserved`.
 
-    Arrays in and out are float32, C-contiguous and flat. On the CPU they are used in place.
+    Arrays in and out are float32, C-contiguous and flat. Those of the device, and all on the CPU, are used in place.
     """
 
     def __init__(self, blocks: Blocks, planes: PlaneShares | None = None):
@@ -241,12 +157,17 @@ class Projector:
         """How voxels are shared among the nodes whose weights `blocks` are; None if these are the voxels."""
         self._planes = None if planes is None else DepthPlanes(planes)
         self._on_cpu = runtime.device().form == "cpu"
+        self.lens_sets = 1 if blocks.even_blocks is None else 2
+        """Sets of lenses that can be taken alone."""
+        self._tiled = None if self._on_cpu else TiledProjector(blocks)
+        if self._tiled is not None:
+            self.rays = self._tiled.rays
+            self.map = self._map_rays()
+            return
         self._matrix = Matrix()
         for name in ("first_block", "first_value", "ray", "height", "width", "scale"):
             setattr(self._matrix, name, to_device(getattr(blocks, name)))
         self._matrix.level = to_device(blocks.value)
-        self.lens_sets = 1 if blocks.even_blocks is None else 2
-        """Sets of lenses that can be taken alone."""
         for name, ends in (("even_blocks", blocks.first_block), ("even_values", blocks.first_value)):
             array = getattr(blocks, name)
             setattr(self._matrix, name, to_device(np.diff(ends).astype(np.int32) if array is None else array))
@@ -270,10 +191,8 @@ class Projector:
 
     def _find_spans(self) -> list[tuple[int, int]]:
         """Return the first ray that each part of the voxels can touch, and the end of its rays."""
-        voxels, rays = len(self.blocks.scale), self.blocks.microimages
-        if not self._on_cpu:
-            return [(0, rays.size)]
-        edges = [self.blocks.first_block[voxels * part // runtime.CHUNKS] for part in range(runtime.CHUNKS + 1)]
+        size, rays = len(self.blocks.scale), self.blocks.microimages
+        edges = [self.blocks.first_block[size * part // runtime.CHUNKS] for part in range(runtime.CHUNKS + 1)]
         spans = []
         for a, b in itertools.pairwise(edges):
             if a == b:
@@ -285,9 +204,13 @@ class Projector:
 
     def _map_rays(self) -> RayMap:
         """Return the map between pixels and the rays that voxels light."""
-        self._scatter(np.ones(len(self.blocks.scale), np.float32), ALL)
-        starts, two = [start for start, _ in self._spans], self.lens_sets == 2
-        return RayMap(self.blocks.microimages, self.rays.numpy(), self._places, starts, two_sets=two)
+        self._scatter(voxels.ones(len(self.blocks.scale)), ALL)
+        rays, two = self.blocks.microimages, self.lens_sets == 2
+        if self._tiled is not None:
+            light = self._tiled.in_order(to_host(self.rays))
+            return RayMap(rays, light, [0, rays.size], [0], two_sets=two, places=self._tiled.places)
+        starts = [start for start, _ in self._spans]
+        return RayMap(rays, to_host(self.rays), self._places, starts, two_sets=two)
 
     @contextlib.contextmanager
     def reserved(self) -> Iterator[None]:
@@ -310,64 +233,67 @@ class Projector:
             finally:
                 self._reserved = False
 
-    def scatter(self, volume: np.ndarray, lenses: int = ALL) -> None:
+    def scatter(self, volume: np.ndarray | wp.array, lenses: int = ALL) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
-        self._scatter(volume if self._planes is None else self._planes.spread(volume), lenses)
+        light = to_device(volume, float)
+        self._scatter(light if self._planes is None else self._planes.spread(light), lenses)
 
-    def _scatter(self, volume: np.ndarray, lenses: int) -> None:
+    def _scatter(self, light: wp.array, lenses: int) -> None:
         """Do as `scatter` with the light of what `blocks` are of."""
-        voxels = to_device(volume, float)
-        if not self._on_cpu:
-            self.rays.zero_()
-            launch(Call(_project_atomic, len(volume), [self._matrix, voxels, lenses], [self.rays]))
+        if self._tiled is not None:
+            self._tiled.scatter(light, lenses)
             return
-        rays = self.rays.numpy()
+        rays = to_host(self.rays)
 
         def scatter_part(part, first, last):
             rays[self._places[part] : self._places[part + 1]] = 0.0
-            inputs, outputs = [self._matrix, voxels, lenses, first], [self._parts[part]]
+            inputs, outputs = [self._matrix, light, lenses, first], [self._parts[part]]
             wp.launch(_project, dim=last - first, inputs=inputs, outputs=outputs, device="cpu")
 
-        runtime.run_chunks(len(volume), scatter_part)
+        runtime.run_chunks(light.size, scatter_part)
 
-    def gather(self, out: np.ndarray, active: np.ndarray | None = None, lenses: int = ALL) -> np.ndarray:
+    def gather(self, out: Array, active: np.ndarray | wp.array | None = None, lenses: int = ALL) -> Array:
         """Add the weighted sum of the light on each voxel's rays of some lenses to `out`, shape (voxel,). Return `out`.
 
         Voxels whose `active`, shape (voxel,), float32, is zero do not change.
         """
+        volume, mask = to_device(out, float), None if active is None else to_device(active, float)
         if self._planes is None:
-            return self._gather(out, active, lenses)
-        every = active is None or bool(active.all())
-        lit = None if every else self._planes.spread((active != 0).astype(np.float32), absolute=True)
-        found = self._planes.collect(self._gather(np.zeros(self._planes.shares.size, np.float32), lit, lenses))
-        return np.add(out, found, out=out, where=True if every else active != 0)
+            self._gather(volume, mask, lenses)
+        else:
+            if mask is not None and self._on_cpu and to_host(mask).all():
+                mask = None
+            lit = None if mask is None else self._planes.spread(voxels.indicator(mask), absolute=True)
+            found = self._planes.collect(self._gather(zeros(self._planes.shares.size), lit, lenses))
+            voxels.add(found, volume, mask)
+        overwrite(out, volume)
+        return out
 
-    def _gather(self, out: np.ndarray, active: np.ndarray | None, lenses: int) -> np.ndarray:
+    def _gather(self, volume: wp.array, active: wp.array | None, lenses: int) -> wp.array:
         """Do as `gather` for what `blocks` are of."""
-        volume, device = to_device(out, float), runtime.device().warp
-        mask = to_device(np.ones_like(out) if active is None else active, float)
+        mask, device = voxels.ones(volume.size) if active is None else active, runtime.device().warp
+        if self._tiled is not None:
+            self._tiled.gather(volume, mask, lenses)
+            return volume
 
         def gather_part(part, first, last):
             inputs = [self._matrix, self._parts[part], mask, lenses, first]
             wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume], device=device)
 
-        runtime.run_chunks(len(out), gather_part)
-        if not self._on_cpu:
-            out[:] = volume.numpy()
-        return out
+        runtime.run_chunks(volume.size, gather_part)
+        return volume
 
-    def project(self, volume: np.ndarray, out: np.ndarray, lenses: int = ALL) -> np.ndarray:
+    def project(self, volume: np.ndarray | wp.array, out: Array, lenses: int = ALL) -> Array:
         """Write the image of `volume`, shape (voxel,), through some lenses into `out`, shape (pixel,). Return `out`."""
         with self.reserved():
             self.scatter(volume, lenses)
-            out.fill(0.0)  # pixels that no voxel lights
-            image = to_device(out, float)
+            image = out if isinstance(out, wp.array) else empty(out.size) if not self._on_cpu else to_device(out, float)
+            image.zero_()  # pixels that no voxel lights
             self.map.collect(self.rays, image)
-        if not self._on_cpu:
-            out[:] = image.numpy()
+        overwrite(out, image)
         return out
 
-    def back_project(self, image: np.ndarray, out: np.ndarray, lenses: int = ALL) -> np.ndarray:
+    def back_project(self, image: np.ndarray | wp.array, out: Array, lenses: int = ALL) -> Array:
         """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
 
         Rays of other lenses than `lenses` do not count. Return `out`.
@@ -391,9 +317,12 @@ class Projector:
 
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32. With planes: a weighted mean of its nodes'."""
-        count = wp.zeros(len(self.blocks.scale), dtype=int, device=runtime.device().warp)
-        share = to_device(self.blocks.microimages.share, float)
-        launch(Call(_count_lit, len(count), [self._matrix, share], [count]))
+        share = self.blocks.microimages.share
+        if self._tiled is not None:
+            count = self._tiled.count_lit(share)
+        else:
+            count = wp.zeros(len(self.blocks.scale), dtype=int, device="cpu")
+            launch(Call(_count_lit, len(count), [self._matrix, to_device(share, float)], [count]))
         if self._planes is None:
-            return count.numpy()
-        return np.rint(np.maximum(self._planes.collect(count.numpy().astype(np.float32)), 0)).astype(np.int32)
+            return to_host(count)
+        return np.rint(np.maximum(self._planes.collect(to_host(count).astype(np.float32)), 0)).astype(np.int32)

@@ -1,16 +1,22 @@
 """Warp: the steps of SMART (Eq. 5) on pixels and voxels, each in one sweep over arrays. Twin: ``reference.smart``."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.reconstruction import pixel_rays_gpu
 from lfpiv_kernels.reconstruction.pixel_rays import PixelRays
 from lfpiv_kernels.reconstruction.projector import ALL, Projector
+from lfpiv_kernels.reconstruction.sums import Totals
+from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of, sweep
+from lfpiv_kernels.transfer import empty, to_device, zeros
 
 wp.set_module_options(native.options("update.h"))
 
-FEWEST_RUNS, FEWEST_VOXELS = 256, 16384
+FEWEST_RUNS = 256
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
 LARGEST_LEAP = 50.0
 """Largest ratio of two iterates that momentum repeats, and the inverse of the smallest one."""
@@ -54,51 +60,120 @@ def _compare(
     _compare_run(first_run + wp.tid(), map, image, gain, held, floor, rays_out, squares_out, divergence_out)
 
 
+@wp.func
+def _extrapolated(light: float, last: float, exponent: float):
+    """Return light * (light / last)^exponent; zeros of `last` stay zero."""
+    if last > 0.0:
+        ratio = wp.clamp(light / last, 1.0 / LARGEST_LEAP, LARGEST_LEAP)
+        return wp.max(light * wp.pow(ratio, exponent), SMALLEST)
+    return last
+
+
+@wp.func
+def _store(
+    voxel: int,
+    light: float,
+    last: wp.array(dtype=float),
+    momentum: float,
+    stepped_out: wp.array(dtype=float),
+    ahead_out: wp.array(dtype=float),
+):
+    """Store a voxel's light after a step and, if there was a last one, that to which momentum carries it."""
+    if last.shape[0] > 0:
+        before = last[voxel]
+        lifted = wp.where(before > 0.0, wp.max(light, SMALLEST), light)
+        stepped_out[voxel] = lifted
+        ahead_out[voxel] = _extrapolated(lifted, before, momentum)
+    else:
+        stepped_out[voxel] = light
+
+
 @wp.kernel
 def _update(
     # in
+    volume: wp.array(dtype=float),
     exponent: wp.array(dtype=float),
     step: wp.array(dtype=float),
+    length: float,
+    over: wp.array(dtype=float),  # times which the exponent counts, if there is any
+    last: wp.array(dtype=float),
+    momentum: float,
     first_voxel: int,
     # out
-    volume_out: wp.array(dtype=float),
+    stepped_out: wp.array(dtype=float),
+    ahead_out: wp.array(dtype=float),
 ):
     voxel = first_voxel + wp.tid()
-    volume_out[voxel] = volume_out[voxel] * wp.exp(step[voxel] * exponent[voxel])
+    change = exponent[voxel] * length
+    if over.shape[0] > 0:
+        change = change * over[voxel]
+    _store(voxel, volume[voxel] * wp.exp(step[voxel] * change), last, momentum, stepped_out, ahead_out)
 
 
 @wp.kernel
 def _sharpen(
     # in
+    volume: wp.array(dtype=float),
     logarithm: wp.array(dtype=float),
     blurred: wp.array(dtype=float),
     share: float,
     largest: float,
+    over: wp.array(dtype=float),  # times which the blurred logarithm counts, if there is any
+    last: wp.array(dtype=float),
+    momentum: float,
     first_voxel: int,
     # out
-    volume_out: wp.array(dtype=float),
+    stepped_out: wp.array(dtype=float),
+    ahead_out: wp.array(dtype=float),
 ):
     voxel = first_voxel + wp.tid()
-    step = logarithm[voxel] + share * (logarithm[voxel] - blurred[voxel])
-    volume_out[voxel] = volume_out[voxel] * wp.exp(wp.clamp(step, -largest, largest))
+    smooth = blurred[voxel]
+    if over.shape[0] > 0:
+        smooth = smooth * over[voxel]
+    step = logarithm[voxel] + share * (logarithm[voxel] - smooth)
+    light = volume[voxel] * wp.exp(wp.clamp(step, -largest, largest))
+    _store(voxel, light, last, momentum, stepped_out, ahead_out)
 
 
 @wp.kernel
 def _extrapolate(
     # in
+    last: wp.array(dtype=float),
     exponent: float,
     first_voxel: int,
     # out
     volume_out: wp.array(dtype=float),
-    last_out: wp.array(dtype=float),
+    ahead_out: wp.array(dtype=float),
 ):
     voxel = first_voxel + wp.tid()
-    last = last_out[voxel]
-    if last > 0.0:
-        light = wp.max(volume_out[voxel], SMALLEST)
-        volume_out[voxel] = light
-        ratio = wp.clamp(light / last, 1.0 / LARGEST_LEAP, LARGEST_LEAP)
-        last_out[voxel] = wp.max(light * wp.pow(ratio, exponent), SMALLEST)
+    _store(voxel, volume_out[voxel], last, exponent, volume_out, ahead_out)
+
+
+@wp.kernel
+def _hold(
+    # in
+    pixel: wp.array(dtype=int),
+    image: wp.array(dtype=float),
+    first_pixel: int,
+    # out
+    held_out: wp.array(dtype=float),
+):
+    k = first_pixel + wp.tid()
+    held_out[k] = held_out[k] + image[pixel[k]]
+
+
+@dataclass(frozen=True)
+class Leap:
+    """Momentum after a step: `ahead` becomes volume * (volume / last)^exponent.
+
+    Zeros of `last` stay zero in `ahead`. Elsewhere `volume` and `ahead` become at least `SMALLEST`.
+    """
+
+    last: wp.array
+    """Volume after the step before, shape (voxel,), float32."""
+    exponent: float
+    ahead: wp.array
+    """Where to write; it may be the memory of `last` or of what the step starts from."""
 
 
 class Comparison:
@@ -114,87 +189,108 @@ class Comparison:
     image : ndarray, shape (pixel,), float32
         Counts >= 0, zero where the gain is zero.
     gain : ndarray, shape (pixel,), float32
-        What a pixel records per unit of light.
+        What a pixel records per unit of light; or on the device, shape (lit pixel,), as of `lit_pixels`.
     floor : float
         Noise floor [counts].
     """
 
-    def __init__(self, projector: Projector, image: np.ndarray, gain: np.ndarray, floor: float):
+    def __init__(self, projector: Projector, image: np.ndarray, gain: np.ndarray | wp.array, floor: float):
         self.projector = projector
-        self._floor = float(floor)
-        self._image, self._gain = (to_device(array[projector.map.pixel], float) for array in (image, gain))
-        device = runtime.device().warp
-        self._size = len(image)
-        self._held = wp.zeros(len(projector.map.pixel), dtype=float, device=device)
-        self._sums = [wp.zeros(projector.map.rays.runs, dtype=wp.float64, device=device) for _ in range(2)]
+        self.floor = float(floor)
+        pixel = projector.map.pixel
+        self.image = to_device(image[pixel], float)
+        """Counts of the pixels that voxels light, on the device."""
+        self.gain = gain if isinstance(gain, wp.array) else to_device(gain[pixel], float)
+        """Their gains."""
+        self.size = len(image)
+        """Pixels of the sensor."""
+        self._held = zeros(len(pixel))
+        parts = pixel_rays_gpu.WARPS if runtime.device().form == "gpu" else projector.map.rays.runs
+        self._sums = [empty(parts, wp.float64) for _ in range(2)]
 
-    def hold(self, volume: np.ndarray) -> None:
+    def hold(self, volume: wp.array) -> None:
         """Add the projection of `volume` to that of each volume that is compared from now on. Overwrites the rays."""
         self.projector.scatter(volume)
-        image = wp.zeros(self._size, dtype=float, device=self._held.device)
+        image = empty(self.size)
         self.projector.map.collect(self.projector.rays, image)
-        self._held = to_device(self._held.numpy() + image.numpy()[self.projector.map.pixel], float)
+        call = Call(_hold, self._held.size, [self.projector.map.rays.pixel, image], [self._held])
+        launch(call, parts=parts_of(self._held.size, FEWEST_VOXELS))
 
     def release(self) -> None:
         """Forget the volumes that are held."""
         self._held.zero_()
 
-    def compare(self, volume: np.ndarray, lenses: int = ALL) -> tuple[float, float]:
+    def compare(self, volume: np.ndarray | wp.array, totals: Totals, lenses: int = ALL) -> None:
         """Project `volume`, shape (voxel,), and write gain * log((image + floor) / (projection + floor)) on the rays.
 
-        With `lenses` only the pixels that see no other lenses count. The other rays become dark.
+        With `lenses` only the pixels that see no other lenses count. The other rays become dark. Add to the first two
+        totals:
 
-        Returns
-        -------
-        float
-            Sum of (image - projection)^2, the projection with gain [counts^2].
-        float
-            Sum of P log(P / I) - P + I with P the projection and I the image, both plus floor [counts].
+        - the sum of (image - projection)^2, the projection with gain [counts^2];
+        - the sum of P log(P / I) - P + I with P the projection and I the image, both plus floor [counts].
         """
         self.projector.scatter(volume, lenses)
         rays = self.projector.map.rays if lenses == ALL else self.projector.map.of_lenses[lenses]
-        inputs = [rays, self._image, self._gain, self._held, self._floor]
+        inputs = [rays, self.image, self.gain, self._held, self.floor]
         outputs = [self.projector.rays, *self._sums]
-        launch(Call(_compare, rays.runs, inputs, outputs), parts=_parts(rays.runs, FEWEST_RUNS))
-        squares, divergence = (float(sums.numpy()[: rays.runs].sum()) for sums in self._sums)
-        return squares, divergence
+        if runtime.device().form == "gpu":
+            size = pixel_rays_gpu.compare(inputs, outputs)
+        else:
+            size = rays.runs
+            launch(Call(_compare, size, inputs, outputs), parts=parts_of(size, FEWEST_RUNS))
+        for place, sums in enumerate(self._sums):
+            totals.add(place, sums, size)
 
 
-def update(volume: np.ndarray, exponent: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Multiply `volume` by exp(step * exponent) in place; float32, shape (voxel,). Return `volume`."""
-    _sweep(_update, [to_device(exponent, float), to_device(step, float)], [volume])
-    return volume
+def update(
+    volume: wp.array,
+    exponent: wp.array,
+    step: wp.array,
+    *,
+    length: float = 1.0,
+    over: wp.array | None = None,
+    leap: Leap | None = None,
+    stepped: wp.array,
+) -> None:
+    """Write volume * exp(step * exponent * length) to `stepped`; float32, shape (voxel,).
 
-
-def sharpened(
-    volume: np.ndarray, logarithm: np.ndarray, blurred: np.ndarray, share: float, largest: float
-) -> np.ndarray:
-    """Multiply `volume` by exp(logarithm + share * (logarithm - blurred)) in place; float32, shape (voxel,).
-
-    The absolute exponent is at most `largest`. Return `volume`.
+    Parameters
+    ----------
+    volume, exponent, step : array
+        On the device.
+    length : float
+        Factor of all exponents.
+    over : array, optional
+        Factor of each exponent.
+    leap : Leap, optional
+        Momentum that goes on from the step.
+    stepped : array
+        Where to write. It may be any of the other arrays.
     """
-    inputs = [to_device(logarithm, float), to_device(blurred, float), float(share), float(largest)]
-    _sweep(_sharpen, inputs, [volume])
-    return volume
+    last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
+    sweep(_update, volume.size, [volume, exponent, step, float(length), over, last, float(momentum)], [stepped, ahead])
 
 
-def extrapolate(volume: np.ndarray, last: np.ndarray, exponent: float) -> np.ndarray:
-    """Overwrite `last` by volume * (volume / last)^exponent; both float32, shape (voxel,). Return `last`.
+def sharpen(
+    volume: wp.array,
+    logarithm: wp.array,
+    blurred: wp.array,
+    share: float,
+    largest: float,
+    *,
+    over: wp.array | None = None,
+    leap: Leap | None = None,
+    stepped: wp.array,
+) -> None:
+    """Write volume * exp(logarithm + share * (logarithm - over * blurred)) to `stepped`; float32, shape (voxel,).
 
-    Zeros of `last` stay zero. Elsewhere `last` and `volume` become at least `SMALLEST`.
+    The absolute exponent is at most `largest`. The other arguments are as of `update`.
     """
-    _sweep(_extrapolate, [float(exponent)], [volume, last])
-    return last
+    last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
+    inputs = [volume, logarithm, blurred, float(share), float(largest), over, last, float(momentum)]
+    sweep(_sharpen, volume.size, inputs, [stepped, ahead])
 
 
-def _sweep(kernel: wp.Kernel, inputs: list[object], arrays: list[np.ndarray]) -> None:
-    """Launch a kernel on all voxels; it changes `arrays`."""
-    outputs = [to_device(array, float) for array in arrays]
-    launch(Call(kernel, len(arrays[0]), inputs, outputs), parts=_parts(len(arrays[0]), FEWEST_VOXELS))
-    if runtime.device().kind != "cpu":
-        for array, output in zip(arrays, outputs, strict=True):
-            array[:] = output.numpy()
-
-
-def _parts(size: int, fewest: int) -> int:
-    return min(runtime.CHUNKS, 1 + size // fewest)
+def extrapolate(volume: wp.array, leap: Leap) -> None:
+    """Let momentum go on from `volume` as it is after a step. Lifts its numbers as `Leap` says."""
+    sweep(_extrapolate, volume.size, [leap.last, float(leap.exponent)], [volume, leap.ahead])

@@ -22,7 +22,9 @@ FIXED = 1 << 20
 """Integer units per count: 20 bits below one count, 43 bits above."""
 
 RAYS_PER_TASK = 2048
-"""Rays of a parallel task, so few that a few sources with many rays make enough tasks for all threads."""
+"""Rays of a parallel task on the CPU, so few that a few sources with many rays make enough tasks for all threads."""
+MOST_TASKS = 1 << 30
+"""Parallel tasks of a launch on a GPU, where each ray is a task if there are no more. Taichi's indices have 31 bits."""
 
 SOURCES = ("ball", "gaussian", "disc")
 """Shapes of a source: a ball or a disc of given radius, or a Gaussian of given standard deviation."""
@@ -250,7 +252,7 @@ def render_sources(
     ndarray, shape (rows, columns), float64
         Counts per pixel, without noise.
     """
-    runtime.device_of_taichi()
+    form = runtime.device_of_taichi().form
     points_mm = np.asarray(points_mm, float).reshape(-1, 3)
     count = len(points_mm)
     if not np.isfinite(points_mm).all():
@@ -272,7 +274,7 @@ def render_sources(
             np.ascontiguousarray(np.broadcast_to(counts, count) / len(rays), np.float32),
             np.ascontiguousarray(rays, np.float32),
             *camera.arguments(),
-            RAYS_PER_TASK,
+            RAYS_PER_TASK if form == "cpu" else -(-count * len(rays) // MOST_TASKS),
             len(camera.plates) > 0,
             bool(np.any(camera.aberrations[4:])),
             bool(camera.hexagonal),

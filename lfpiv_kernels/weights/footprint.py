@@ -20,7 +20,7 @@ take time and no memory.
 The integral has two forms. "pixels" follows the slopes and the offset pixel by pixel. "profiles" takes them as linear
 and without cross terms under a lens. Then the weights of a square cell are the product of a profile along the columns
 and one along the rows (rank 1), which takes a third of the memory. The loops are C++, see ``footprint.h``: they work on
-vectors of lenses and of pixels. Twin: ``reference.footprint``.
+vectors of lenses and of pixels; on a GPU see ``footprint_gpu``. Twin: ``reference.footprint``.
 """
 
 import math
@@ -29,8 +29,11 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch, to_device
-from lfpiv_kernels.weights.ray_model import GEOMETRY_SIZE
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import to_device, to_host
+from lfpiv_kernels.weights import footprint_gpu
+from lfpiv_kernels.weights.footprint_arrays import BlockArrays, Inputs, Outline
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, GEOMETRY_SIZE
 
 wp.set_module_options(native.options("footprint.h", contract="fast"))
 
@@ -46,47 +49,16 @@ SCRATCH_BYTES = 1 << 26
 """Values that are computed before they are packed [byte]."""
 
 
-@wp.struct
-class Inputs:
-    """What the kernels read, the same for all voxels."""
-
-    model: wp.array(dtype=float)
-    """Ray models, (voxel, MODEL_SIZE), flat."""
-    geometry: wp.array(dtype=float)
-    """The camera's, (GEOMETRY_SIZE,)."""
-    lenses: wp.vec4i
-    """First i and j, lenses along i and j."""
-    corners: wp.array(dtype=int)
-    """First pixel (column, row) of each lens's block, (lens along j, lens along i, 2), flat."""
-    cuts: wp.vec3i
-    """Parts of a voxel along x, y, z."""
-    profiles: bool
-
-
-@wp.struct
-class Outline:
-    """Outline of a lens's cell, from ``lattice.cell_steps``."""
-
-    extent: wp.array(dtype=float)
-    """Half extents along a and b, (step, 2), flat."""
-    steps: int
-    square: bool
-
-
-@wp.struct
-class BlockArrays:
-    """Blocks of voxels on the device, and where each voxel's begin."""
-
-    first_block: wp.array(dtype=int)
-    first_value: wp.array(dtype=int)
-    ray: wp.array(dtype=int)
-    height: wp.array(dtype=wp.uint8)
-    width: wp.array(dtype=wp.uint8)
-    value: wp.array(dtype=wp.uint8)
-
-
-@wp.func_native("lfpiv::measure(lfpiv::weight_inputs(inputs), voxel, blocks_out.data, bytes_out.data);")
-def _measure(inputs: Inputs, voxel: int, blocks_out: wp.array(dtype=int), bytes_out: wp.array(dtype=int)): ...
+@wp.func_native(
+    "lfpiv::measure(lfpiv::weight_inputs(inputs), voxel, lenses_out.data, blocks_out.data, bytes_out.data);"
+)
+def _measure(
+    inputs: Inputs,
+    voxel: int,
+    lenses_out: wp.array(dtype=int),
+    blocks_out: wp.array(dtype=int),
+    bytes_out: wp.array(dtype=int),
+): ...
 
 
 @wp.func_native("""
@@ -130,10 +102,11 @@ def _measure_blocks(
     inputs: Inputs,
     first_voxel: int,
     # out
-    blocks_out: wp.array(dtype=int),  # blocks and values that each voxel needs at most
+    lenses_out: wp.array(dtype=int),  # lenses that each voxel reaches
+    blocks_out: wp.array(dtype=int),  # blocks and values that it needs at most
     bytes_out: wp.array(dtype=int),
 ):
-    _measure(inputs, first_voxel + wp.tid(), blocks_out, bytes_out)
+    _measure(inputs, first_voxel + wp.tid(), lenses_out, blocks_out, bytes_out)
 
 
 @wp.kernel
@@ -209,6 +182,7 @@ class Footprints:
         self._inputs.corners = to_device(microimages.corner.ravel())
         self._inputs.cuts = wp.vec3i(*cuts)
         self._inputs.profiles = form == "profiles"
+        self._tiles = -(-microimages.edge // BLOCK_WIDTH)  # blocks side by side under a lens
         self._order = [self._inputs.profiles, microimages.edge, columns]
         self._outline = Outline()
         self._outline.extent, self._outline.steps = to_device(np.ravel(outline)), len(outline)
@@ -230,14 +204,18 @@ class Footprints:
         """
         model = np.ascontiguousarray(model, np.float32)
         self._inputs.model = to_device(model.ravel())
-        most = self._counts_of(len(model))
+        most = [wp.empty(len(model), dtype=int, device=self._device.warp) for _ in range(3)]
         self._launch(_measure_blocks, len(model), [self._inputs], most)
-        blocks, values = (count.numpy() for count in most)
-        edges = np.flatnonzero(np.diff(np.cumsum(values, dtype=np.int64) // SCRATCH_BYTES)) + 1
+        lenses, blocks, values = (to_host(count) for count in most)
+        scratch = values.astype(np.int64)
+        if self._device.form == "gpu":
+            scratch += footprint_gpu.TILE_BYTES * int(lenses.max(initial=1)) * self._tiles
+        edges = np.flatnonzero(np.diff(np.cumsum(scratch) // SCRATCH_BYTES)) + 1
         for first, last in zip([0, *edges], [*edges, len(model)], strict=True):
-            yield self._fill(model[first:last], blocks[first:last], values[first:last])
+            part = slice(first, last)
+            yield self._fill(model[part], int(lenses[part].max(initial=1)), blocks[part], values[part])
 
-    def _fill(self, model, most_blocks, most_values):
+    def _fill(self, model, lenses, most_blocks, most_values):
         """Compute blocks of some voxels where there is room for as many as they can have."""
         first_block, first_value = _starts(most_blocks), _starts(most_values)
         self._blocks = _block_arrays(
@@ -249,9 +227,13 @@ class Footprints:
         )
         self._scale = self._memory("scale", len(model), float)
         self._inputs.model = to_device(model.ravel())
-        counts = self._counts_of(len(model))
-        self._launch(_fill_blocks, len(model), [self._inputs, self._outline], [self._blocks, self._scale, *counts])
-        self._counts = [count.numpy() for count in counts]
+        counts = [wp.empty(len(model), dtype=int, device=self._device.warp) for _ in range(2)]
+        inputs, outputs = [self._inputs, self._outline], [self._blocks, self._scale, *counts]
+        if self._device.form == "gpu":
+            self._filled = footprint_gpu.fill(inputs, len(model), lenses, self._tiles, outputs)
+        else:
+            self._launch(_fill_blocks, len(model), inputs, outputs)
+        self._counts = [to_host(count) for count in counts]
         return self._counts
 
     def write(self, ray, height, width, value, per_voxel):
@@ -268,15 +250,14 @@ class Footprints:
         filled = (ray, height, width, value, *even)
         arrays = [to_device(array) for array in filled]
         packed = _block_arrays(*(_starts(count) for count in self._counts), *arrays[:4])
-        self._launch(_pack_blocks, len(scale), [self._blocks, *self._order], [packed, *arrays[4:]])
-        scale[:] = self._scale.numpy()[: len(scale)]
-        if self._device.kind == "cuda":
+        outputs = [packed, *arrays[4:]]
+        scale[:] = to_host(self._scale)[: len(scale)]
+        if self._device.form == "cpu":
+            self._launch(_pack_blocks, len(scale), [self._blocks, *self._order], outputs)
+        else:
+            footprint_gpu.pack(self._blocks, self._filled, len(scale), self._order, outputs)
             for array, on_device in zip(filled, arrays, strict=True):
-                array[:] = on_device.numpy()
-
-    def _counts_of(self, voxels):
-        """Return room for each voxel's number of blocks and of values."""
-        return [wp.empty(voxels, dtype=int, device=self._device.warp) for _ in range(2)]
+                array[:] = to_host(on_device)
 
     def _memory(self, name, size, dtype):
         """Return scratch memory of at least `size`, which is used again for the next voxels."""

@@ -16,7 +16,8 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import to_device, to_host
 from lfpiv_kernels.weights.microimages import LAYERS, Microimages
 
 wp.set_module_options(native.options("gaussian.h", contract="fast"))
@@ -329,13 +330,13 @@ class GaussianImages:
         most = to_device(np.zeros(count, np.int32))
         box = to_device(np.zeros((count, 4), np.int32), wp.vec4i)
         launch(Call(_bound_pixels, count, [inputs], [most, box]), parts=PARTS)
-        room = np.concatenate([[0], np.cumsum(most.numpy(), dtype=np.int64)])
+        room = np.concatenate([[0], np.cumsum(to_host(most), dtype=np.int64)])
         used = to_device(np.zeros(count, np.int32))
         pixel = to_device(np.empty(room[-1], np.int32))
         values = to_device(np.empty((room[-1], VALUES), np.float32), wp.vec4f)
         launch(Call(_write_pixels, count, [inputs, to_device(room)], [used, pixel, values]), parts=PARTS)
-        first = np.concatenate([[0], np.cumsum(used.numpy(), dtype=np.int64)])
+        first = np.concatenate([[0], np.cumsum(to_host(used), dtype=np.int64)])
         closed = np.empty(first[-1], np.int32), np.empty((first[-1], VALUES), np.float32)
         outputs = [to_device(closed[0]), to_device(closed[1], wp.vec4f)]
         launch(Call(_close_gaps, count, [to_device(room), to_device(first), pixel, values], outputs), parts=PARTS)
-        return ImageLists(first=first, pixel=outputs[0].numpy(), values=outputs[1].numpy(), box=box.numpy())
+        return ImageLists(first=first, pixel=to_host(outputs[0]), values=to_host(outputs[1]), box=to_host(box))

@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import to_device
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, ROW_GROUP
 
 wp.set_module_options(native.options("microimages.h", contract="off"))  # rounds as NumPy does

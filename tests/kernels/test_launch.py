@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from lfpiv_kernels.launch import Call, launch, to_device
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import to_device
 
 
 @wp.kernel

@@ -8,12 +8,12 @@ import h5py
 from distributed import KilledWorker
 
 from lfpiv.experiment.opening import read_experiment
-from lfpiv.experiment.settings import Series
 from lfpiv.results.folder import Folder
 from lfpiv.runs import dispatch, guard, refinement
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.stretches import cut
 from lfpiv.runs.worker import Result
+from lfpiv.settings.particles import Series
 from lfpiv.weights.operator import build_weights
 
 FIRST = 3

@@ -1,0 +1,102 @@
+"""Volumes in which some voxels hold no fluid: what both hold in common, and their intensities less the local mean."""
+
+import numpy as np
+import warp as wp
+from scipy import ndimage
+
+from lfpiv_kernels import runtime
+from lfpiv_kernels.correlation import filters_gpu, voxelwise_gpu
+from lfpiv_kernels.correlation.memory import empty_volume, on_device
+from lfpiv_kernels.correlation.plan import Triple
+from lfpiv_kernels.transfer import Given, Values, as_given, to_device, to_host
+
+TINY = float(np.finfo(np.float32).tiny)
+"""Least share of fluid that a mean is divided by."""
+
+
+def flags_on_device(flags: Values) -> wp.array:
+    """Return flags of voxels on the running device; nothing is moved if they are there."""
+    return flags if isinstance(flags, wp.array) else to_device(np.ascontiguousarray(flags, bool), wp.bool)
+
+
+def inverted(flags: Given) -> Given:
+    """Return true where flags are false."""
+    if runtime.device().form == "gpu":
+        given = flags_on_device(flags)
+        others = empty_volume(given.shape, wp.bool)
+        voxelwise_gpu.run(voxelwise_gpu._invert, [given], others)
+        return as_given(others, flags)
+    return as_given(~to_host(flags), flags)
+
+
+def as_numbers(flags: Given) -> Given:
+    """Return 1 where voxels are flagged, else 0, float32."""
+    if runtime.device().form == "gpu":
+        flagged = flags_on_device(flags)
+        numbers = empty_volume(flagged.shape)
+        voxelwise_gpu.run(voxelwise_gpu._as_numbers, [flagged], numbers)
+        return as_given(numbers, flags)
+    return as_given(to_host(flags).astype(np.float32), flags)
+
+
+def common_fluid(first: Given, second: Given) -> Given:
+    """Return the voxels that hold fluid in both volumes, flags of shape (z, y, x).
+
+    Where the two solids differ, the flow carries particles across the wall. One volume then shows particles cut by the
+    edge of the other. So voxels beside the difference are left out too.
+
+    Parameters
+    ----------
+    first, second : array, shape (z, y, x), float32
+        Part of each voxel that is solid; above 1/2 it holds no fluid.
+    """
+    if runtime.device().form == "gpu":
+        solids = on_device(first), on_device(second)
+        fluid = empty_volume(first.shape, wp.bool)
+        voxelwise_gpu.run(voxelwise_gpu._find_fluid, [*solids], fluid)
+        return as_given(fluid, first)
+    one, other = to_host(first) > 0.5, to_host(second) > 0.5
+    differ = one ^ other
+    if differ.any():
+        differ = ndimage.binary_dilation(differ)
+    return as_given(~(one | other | differ), first)
+
+
+def levelled(first: Given, second: Given, fluid: Values, window: Triple) -> tuple[Given, Given]:
+    """Return both volumes less the local mean of their fluid, 0 where either of them holds none.
+
+    The coefficient of volumes whose local mean is 0 needs no mean over the fluid of each window at each lag. Their
+    edges do not correlate with each other. The mean is that over a window around each voxel.
+
+    Parameters
+    ----------
+    first, second : array, shape (z, y, x), float32
+    fluid : array of bool, shape (z, y, x)
+        From `common_fluid`.
+    window : tuple of int
+        Edges, order (z, y, x) [voxel].
+    """
+    if runtime.device().form == "gpu":
+        flags = flags_on_device(fluid)
+        share = filters_gpu.local_mean(as_numbers(flags), window, filters_gpu.ZEROS)
+        levels = [_levelled(on_device(volume), flags, share, window) for volume in (first, second)]
+    else:
+        inside = to_host(fluid)
+        share = np.maximum(_local_mean(inside.astype(np.float32), window), np.finfo(np.float32).tiny)
+        levels = [
+            np.where(inside, volume - _local_mean(np.where(inside, volume, 0), window) / share, 0).astype(np.float32)
+            for volume in map(to_host, (first, second))
+        ]
+    return as_given(levels[0], first), as_given(levels[1], second)
+
+
+def _levelled(volume: wp.array, fluid: wp.array, share: wp.array, window: Triple) -> wp.array:
+    inside, level = empty_volume(volume.shape), empty_volume(volume.shape)
+    voxelwise_gpu.run(voxelwise_gpu._in_fluid, [volume, fluid], inside)
+    mean = filters_gpu.local_mean(inside, window, filters_gpu.ZEROS)
+    voxelwise_gpu.run(voxelwise_gpu._level, [volume, mean, share, fluid, TINY], level)
+    return level
+
+
+def _local_mean(values: np.ndarray, window: Triple) -> np.ndarray:
+    return ndimage.uniform_filter(values, window, mode="constant")

@@ -1,0 +1,127 @@
+"""Sums over windows for the uncertainty on a GPU; host functions and CPU form: ``uncertainty``.
+
+Products of voxels are not stored: the first sum along x forms them.
+"""
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import native
+from lfpiv_kernels.correlation import filters_gpu
+from lfpiv_kernels.correlation.memory import empty_volume
+from lfpiv_kernels.correlation.plan import Triple
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import to_host
+
+wp.set_module_options(native.quiet_options() | {"max_unroll": 0})
+
+
+@wp.func
+def _value(volume: wp.array3d(dtype=float), z: int, y: int, x: int):
+    """Return a voxel's value, 0 behind the volume."""
+    if z >= volume.shape[0] or y >= volume.shape[1] or x >= volume.shape[2]:
+        return float(0.0)
+    return volume[z, y, x]
+
+
+@wp.kernel
+def _sum_products(
+    # in
+    one: wp.array3d(dtype=float),
+    other: wp.array3d(dtype=float),
+    lag: wp.vec3i,  # of the other volume, >= 0
+    window: int,  # voxels along x per sum
+    origin: int,  # first voxel of sum 0
+    step: int,  # distance of the sums [voxel]
+    begin: int,
+    # out
+    sum_out: wp.array3d(dtype=float),  # a thread per sum
+):
+    layer, y, k = wp.tid()
+    z = begin + layer
+    first = origin + k * step
+    total = float(0.0)
+    for x in range(first, first + window):
+        total += one[z, y, x] * _value(other, z + lag[0], y + lag[1], x + lag[2])
+    sum_out[z, y, k] = total
+
+
+@wp.kernel
+def _sum_differences(
+    # in
+    one: wp.array3d(dtype=float),
+    other: wp.array3d(dtype=float),
+    lag: wp.vec3i,
+    window: int,
+    before: int,  # voxels of a sum before the one that it belongs to
+    begin: int,
+    # out
+    sum_out: wp.array3d(dtype=float),  # of products at a lag of the other volume less those at a lag of the first
+):
+    layer, y, k = wp.tid()
+    z = begin + layer
+    first = k - before
+    total = float(0.0)
+    if first >= 0 and first + window <= one.shape[2]:
+        for x in range(first, first + window):
+            ahead = one[z, y, x] * _value(other, z + lag[0], y + lag[1], x + lag[2])
+            total += ahead - _value(one, z + lag[0], y + lag[1], x + lag[2]) * other[z, y, x]
+    sum_out[z, y, k] = total
+
+
+@wp.kernel
+def _square(
+    # in
+    values: wp.array3d(dtype=float),
+    begin: int,
+    # out
+    square_out: wp.array3d(dtype=float),
+):
+    layer, y, x = wp.tid()
+    z = begin + layer
+    square_out[z, y, x] = values[z, y, x] * values[z, y, x]
+
+
+def window_sums(
+    first: wp.array, second: wp.array, window: Triple, origin: Triple, step: Triple, count: Triple, reach: int
+) -> tuple[list[np.ndarray], list[list[np.ndarray]]]:
+    """Return the sums of both volumes and of their product, and of the terms of each axis; see ``uncertainty``."""
+    taps = tuple(np.ones(edge) for edge in window)
+    sums = empty_volume((12, *count))
+
+    def along_y_and_x(volume: wp.array, out: wp.array) -> None:
+        for axis in (1, 0):
+            layout = {"step": step[axis], "count": count[axis], "border": filters_gpu.WHOLE}
+            to = out if axis == 0 else None
+            volume = filters_gpu.filter_along(volume, axis, taps[axis], origin[axis], **layout, out=to)
+
+    def product_sums(one: wp.array, other: wp.array, lag: wp.vec3i, out: wp.array) -> None:
+        rows = empty_volume((*one.shape[:2], count[2]))
+        inputs = [one, other, lag, window[2], origin[2], step[2]]
+        launch(Call(_sum_products, one.shape[0], inputs, [rows], inner=rows.shape[1:]))
+        along_y_and_x(rows, out)
+
+    for k, volume in enumerate((first, second)):
+        filters_gpu.window_sums(volume, origin, step, count, taps, sums[k])
+    product_sums(first, second, wp.vec3i(0, 0, 0), sums[2])
+    for axis in range(3):
+        lag = wp.vec3i(*(int(k == axis) for k in range(3)))
+        to = 3 + 3 * axis
+        product_sums(first, second, lag, sums[to])
+        product_sums(second, first, lag, sums[to + 1])
+        squares = _squared_cubes(first, second, lag, reach)
+        filters_gpu.window_sums(squares, origin, step, count, taps, sums[to + 2])
+    found = to_host(sums).astype(float)
+    terms = [[plus, minus, plus - minus, squares] for plus, minus, squares in found[3:].reshape(3, 3, *count)]
+    return list(found[:3]), terms
+
+
+def _squared_cubes(first: wp.array, second: wp.array, lag: wp.vec3i, reach: int) -> wp.array:
+    """Return the squares of the sums of differences over the cube around each voxel, 0 where it leaves the volume."""
+    cubes = empty_volume(first.shape)
+    inputs = [first, second, lag, reach, reach // 2]
+    launch(Call(_sum_differences, first.shape[0], inputs, [cubes], inner=tuple(first.shape[1:])))
+    for axis in (1, 0):
+        cubes = filters_gpu.filter_along(cubes, axis, np.ones(reach), -(reach // 2), border=filters_gpu.WHOLE)
+    launch(Call(_square, first.shape[0], [cubes], [cubes], inner=tuple(first.shape[1:])))
+    return cubes

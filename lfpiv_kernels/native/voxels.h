@@ -1,0 +1,88 @@
+// Sweeps over the voxels of volumes: on the CPU a thread goes through a run of neighbours, on a GPU it has one voxel.
+#ifndef LFPIV_VOXELS_H
+#define LFPIV_VOXELS_H
+
+#include "simd.h"
+
+namespace lfpiv {
+
+/// Voxels that a thread of the CPU goes through.
+constexpr int RUN = 1024;
+/// Sums of a thread of the CPU that are independent of each other.
+constexpr int LANES = 8;
+
+/// Call body(voxel) for the voxels of a run. An output may be an input, voxel for voxel.
+template <class Body>
+LFPIV_INLINE void for_voxels(int run, int size, Body body) {
+#if LFPIV_GPU
+    if (run < size) body(run);
+#else
+    const int begin = run * RUN, end = size - begin < RUN ? size : begin + RUN;
+#pragma clang loop vectorize(assume_safety)
+    for (int voxel = begin; voxel < end; ++voxel) body(voxel);
+#endif
+}
+
+/// Write one * factor * other.
+LFPIV_INLINE void multiply(int run, int size, const float* one, float factor, const float* other, float* out) {
+    for_voxels(run, size, [=](int k) { out[k] = one[k] * factor * other[k]; });
+}
+
+/// Write numerator / max(denominator, least).
+LFPIV_INLINE void divide(int run, int size, const float* numerator, const float* denominator, float least, float* out) {
+    for_voxels(run, size, [=](int k) {
+        const float below = denominator[k];
+        out[k] = numerator[k] / (below > least ? below : least);
+    });
+}
+
+/// Write 1 where the volume is not 0, else 0.
+LFPIV_INLINE void indicate(int run, int size, const float* volume, float* out) {
+    for_voxels(run, size, [=](int k) { out[k] = volume[k] != 0.0f ? 1.0f : 0.0f; });
+}
+
+/// Add a volume to another, where `mask` is not 0 if it is not null.
+LFPIV_INLINE void add_masked(int run, int size, const float* added, const float* mask, float* out) {
+    if (mask)
+        for_voxels(run, size, [=](int k) { out[k] = mask[k] != 0.0f ? out[k] + added[k] : out[k]; });
+    else
+        for_voxels(run, size, [=](int k) { out[k] = out[k] + added[k]; });
+}
+
+/// Overwrite a volume by `values` where `active` is 0.
+LFPIV_INLINE void replace(int run, int size, const float* active, const float* values, float* out) {
+    for_voxels(run, size, [=](int k) { out[k] = active[k] == 0.0f ? values[k] : out[k]; });
+}
+
+/// Write 1 for voxels with light of at least `least`, else 0; leave the others' light in `light`.
+LFPIV_INLINE void part(int run, int size, float least, float* light, float* active) {
+    for_voxels(run, size, [=](int k) {
+        const float own = light[k];
+        const bool bright = own >= least && own > 0.0f;
+        active[k] = bright ? 1.0f : 0.0f;
+        light[k] = bright ? 0.0f : own;
+    });
+}
+
+/// Return the sum of weight * value^2, float32, from `begin` to `end`, `step` apart, in float64. Add the values to
+/// `added` if it is not null.
+LFPIV_INLINE double sum_squares(const float* weight, const float* values, int begin, int end, int step, float* added) {
+    double sum[LANES] = {};
+    int first = begin;
+#if !LFPIV_GPU
+    for (; step == 1 && first + LANES <= end; first += LANES)
+        for (int lane = 0; lane < LANES; ++lane) {
+            const float value = values[first + lane];
+            sum[lane] += (double)(weight[first + lane] * value * value);
+        }
+#endif
+    for (int k = first; k < end; k += step) sum[0] += (double)(weight[k] * values[k] * values[k]);
+    if (added)
+        for (int k = begin; k < end; k += step) added[k] += values[k];
+    for (int lane = 1; lane < LANES; ++lane) sum[0] += sum[lane];
+    return sum[0];
+}
+
+}  // namespace lfpiv
+
+#endif

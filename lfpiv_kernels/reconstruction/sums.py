@@ -1,0 +1,270 @@
+"""Warp: sums, largest values and quantiles of arrays on the device, whose results stay there until they are read.
+
+Orders are fixed, so that no result depends on the number of threads. On the CPU a thread sums neighbours, and NumPy
+sums what the threads found. On a GPU each of `LANES` threads sums every `LANES`-th element, so that neighbouring
+threads read neighbours; `GROUPS` threads sum what these found, and one thread the rest. Twins: NumPy's sums, and the
+sorted light in `brightest_share`.
+"""
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.reconstruction.voxels import parts_of
+from lfpiv_kernels.transfer import empty, to_device, to_host, zeros
+
+wp.set_module_options(native.options("voxels.h"))
+
+LANES = 16384
+"""Threads of a sum on a GPU."""
+GROUPS = 128
+"""Threads that sum what these found."""
+PIECE = 4096
+"""Elements that a thread of the CPU sums."""
+DIGIT = 8
+"""Thresholds that one sweep of `brightest_share` tries on a GPU: a digit of the result's 32 bits, to the base 8."""
+LAST = 10
+"""The last sweep, after which all bits are known."""
+
+Sums = wp.types.vector(length=DIGIT, dtype=wp.float64)
+
+
+@wp.struct
+class Piece:
+    """Which elements a thread takes: `count` of them from `stride` * thread on, `step` apart."""
+
+    stride: int
+    step: int
+    size: int
+    count: int
+
+
+@wp.func
+def _end(piece: Piece, begin: int):
+    """Return the end of a thread's elements."""
+    if piece.step > 1:
+        return piece.size
+    return wp.min(begin + piece.count, piece.size)
+
+
+@wp.kernel
+def _sum(
+    # in
+    values: wp.array(dtype=wp.float64),
+    piece: Piece,
+    first: int,
+    # out
+    sums_out: wp.array(dtype=wp.float64),
+):
+    thread = first + wp.tid()
+    total, begin = wp.float64(0.0), thread * piece.stride
+    for k in range(begin, _end(piece, begin), piece.step):
+        total += values[k]
+    sums_out[thread] = total
+
+
+@wp.func_native("return lfpiv::sum_squares(weight.data, values.data, begin, end, step, added_out.data);")
+def _squares(
+    weight: wp.array(dtype=float),
+    values: wp.array(dtype=float),
+    begin: int,
+    end: int,
+    step: int,
+    added_out: wp.array(dtype=float),
+) -> wp.float64: ...
+
+
+@wp.kernel
+def _sum_squares(
+    # in
+    weight: wp.array(dtype=float),
+    values: wp.array(dtype=float),
+    piece: Piece,
+    first: int,
+    # out
+    added_out: wp.array(dtype=float),  # to which `values` are added, if there is any
+    sums_out: wp.array(dtype=wp.float64),
+):
+    thread = first + wp.tid()
+    begin = thread * piece.stride
+    sums_out[thread] = _squares(weight, values, begin, _end(piece, begin), piece.step, added_out)
+
+
+@wp.kernel
+def _find_largest(
+    # in
+    values: wp.array(dtype=float),
+    piece: Piece,
+    first: int,
+    # out
+    largest_out: wp.array(dtype=float),
+):
+    thread = first + wp.tid()
+    begin = thread * piece.stride
+    largest = float(-wp.inf)
+    for k in range(begin, _end(piece, begin), piece.step):
+        largest = wp.max(largest, values[k])
+    largest_out[thread] = largest
+
+
+@wp.kernel
+def _add_up(
+    # in
+    sums: wp.array(dtype=wp.float64),
+    place: int,
+    first: int,
+    # out
+    totals_out: wp.array(dtype=wp.float64),
+):
+    total = wp.float64(0.0)
+    for k in range(sums.shape[0]):
+        total += sums[k]
+    totals_out[place + first + wp.tid()] += total
+
+
+@wp.func
+def _limit(known: wp.array(dtype=wp.uint64), digit: int, place: int):
+    """Return the bits that begin with the known digits and have `place` as the next one. They rise with the light."""
+    return known[0] + (wp.uint64(place) << wp.uint64(3 * (LAST - digit)))
+
+
+@wp.kernel
+def _sum_below(
+    # in
+    light: wp.array(dtype=float),
+    known: wp.array(dtype=wp.uint64),
+    digit: int,
+    piece: Piece,
+    first: int,
+    # out
+    sums_out: wp.array(dtype=Sums),
+):
+    thread = first + wp.tid()
+    total, begin = Sums(), thread * piece.stride
+    for k in range(begin, _end(piece, begin), piece.step):
+        value = light[k]
+        bits = wp.uint64(wp.cast(value, wp.uint32))
+        for place in range(DIGIT):
+            if bits < _limit(known, digit, place + 1):
+                total[place] += wp.float64(value)
+    sums_out[thread] = total
+
+
+@wp.kernel
+def _sum_vectors(
+    # in
+    values: wp.array(dtype=Sums),
+    piece: Piece,
+    first: int,
+    # out
+    sums_out: wp.array(dtype=Sums),
+):
+    thread = first + wp.tid()
+    total, begin = Sums(), thread * piece.stride
+    for k in range(begin, _end(piece, begin), piece.step):
+        total += values[k]
+    sums_out[thread] = total
+
+
+@wp.kernel
+def _next_digit(
+    # in
+    sums: wp.array(dtype=Sums),
+    share: wp.float64,
+    digit: int,
+    first: int,
+    # out
+    known_out: wp.array(dtype=wp.uint64),
+    all_out: wp.array(dtype=wp.float64),
+    least_out: wp.array(dtype=float),
+):
+    total = Sums()
+    for k in range(sums.shape[0]):
+        total += sums[k]
+    if digit == 0:
+        all_out[0] = total[DIGIT - 1]
+    place = int(0)  # noqa: RUF046 - a variable for Warp
+    while place < DIGIT - 1 and total[place] < share * all_out[0]:
+        place += 1
+    known_out[0] = _limit(known_out, digit, place)
+    least_out[0] = wp.cast(wp.uint32(known_out[0]), float)
+
+
+class Totals:
+    """Sums of float64 numbers that stay on the device until they are read together."""
+
+    def __init__(self, count: int):
+        self.values = zeros(count, wp.float64)
+
+    def clear(self) -> None:
+        """Set all totals to zero."""
+        self.values.zero_()
+
+    def add(self, place: int, numbers: wp.array, size: int | None = None) -> None:
+        """Add the sum of the first `size` numbers, float64, to the total at `place`; default: of all."""
+        size = numbers.size if size is None else size
+        if runtime.device().form == "cpu":
+            to_host(self.values)[place] += to_host(numbers)[:size].sum()
+            return
+        lanes, groups = empty(LANES, wp.float64), empty(GROUPS, wp.float64)
+        launch(Call(_sum, LANES, [numbers, _piece(size, LANES)], [lanes]))
+        launch(Call(_sum, GROUPS, [lanes, _piece(LANES, GROUPS)], [groups]))
+        launch(Call(_add_up, 1, [groups, place], [self.values]))
+
+    def add_squares(self, place: int, weight: wp.array, values: wp.array, added: wp.array | None = None) -> None:
+        """Add sum_j weight_j values_j^2, float32, to the total at `place`; add `values` to `added` if given."""
+        threads = LANES if runtime.device().form == "gpu" else -(-values.size // PIECE)
+        sums = empty(threads, wp.float64)
+        call = Call(_sum_squares, threads, [weight, values, _piece(values.size, threads)], [added, sums])
+        launch(call, parts=parts_of(threads, 2))
+        self.add(place, sums)
+
+    def read(self) -> list[float]:
+        """Return the totals."""
+        return [float(value) for value in to_host(self.values)]
+
+
+def largest(values: wp.array) -> wp.array:
+    """Return the largest number, shape (1,), float32, which stays on the device."""
+    if runtime.device().form == "cpu":
+        return to_device(np.array([to_host(values).max()]), float)
+    size = values.size
+    for threads in (LANES, GROUPS, 1):
+        found = empty(threads)
+        launch(Call(_find_largest, threads, [values, _piece(size, threads)], [found]))
+        values, size = found, threads
+    return values
+
+
+def brightest_share(light: wp.array, share: float) -> wp.array:
+    """Return the light of the faintest voxel that is kept where the faintest, with a share of all light, are left out.
+
+    It stays on the device, shape (1,), float32. Equal voxels are kept or left out together. `light` is >= 0.
+
+    On the CPU the light is sorted. On a GPU the threshold is the smallest float32 number up to which voxels hold the
+    share, found digit by digit of its bits.
+    """
+    if runtime.device().form == "cpu":
+        ordered = np.sort(to_host(light))
+        below = np.cumsum(ordered, dtype=np.float64)
+        place = min(int(np.searchsorted(below, share * below[-1])), len(ordered) - 1)
+        return to_device(ordered[place : place + 1].copy(), float)
+    known, whole, least = zeros(1, wp.uint64), zeros(1, wp.float64), empty(1)
+    lanes, groups = empty(LANES, Sums), empty(GROUPS, Sums)
+    for digit in range(LAST + 1):
+        launch(Call(_sum_below, LANES, [light, known, digit, _piece(light.size, LANES)], [lanes]))
+        launch(Call(_sum_vectors, GROUPS, [lanes, _piece(LANES, GROUPS)], [groups]))
+        launch(Call(_next_digit, 1, [groups, wp.float64(share), digit], [known, whole, least]))
+    return least
+
+
+def _piece(size: int, threads: int) -> Piece:
+    """Return which of `size` elements each thread takes."""
+    piece = Piece()
+    piece.size = piece.count = size
+    if runtime.device().form == "gpu":
+        piece.stride, piece.step = 1, threads
+    else:
+        piece.stride, piece.step, piece.count = PIECE, 1, PIECE
+    return piece

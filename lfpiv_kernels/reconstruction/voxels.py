@@ -1,0 +1,222 @@
+"""Warp: sweeps over the voxels of flat volumes on the device: products, quotients, masks. Twins: NumPy's operators.
+
+Volumes have shape (voxel,), float32. A sweep may overwrite one of its arguments.
+"""
+
+import warp as wp
+
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.transfer import empty
+
+wp.set_module_options(native.options("voxels.h"))
+
+RUN: int = native.constant("voxels.h", "RUN")
+"""Voxels that a thread of the CPU goes through."""
+FEWEST_VOXELS = 16384
+"""Smallest part of a launch: a smaller one takes less time than the launch itself."""
+
+
+@wp.func_native("lfpiv::multiply(run, size, one.data, factor, other.data, product_out.data);")
+def _multiply_run(
+    run: int,
+    size: int,
+    one: wp.array(dtype=float),
+    factor: float,
+    other: wp.array(dtype=float),
+    product_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _multiply(
+    # in
+    one: wp.array(dtype=float),
+    factor: float,
+    other: wp.array(dtype=float),
+    size: int,
+    first_run: int,
+    # out
+    product_out: wp.array(dtype=float),
+):
+    _multiply_run(first_run + wp.tid(), size, one, factor, other, product_out)
+
+
+@wp.func_native("lfpiv::divide(run, size, numerator.data, denominator.data, least, quotient_out.data);")
+def _divide_run(
+    run: int,
+    size: int,
+    numerator: wp.array(dtype=float),
+    denominator: wp.array(dtype=float),
+    least: float,
+    quotient_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _divide(
+    # in
+    numerator: wp.array(dtype=float),
+    denominator: wp.array(dtype=float),
+    least: float,
+    size: int,
+    first_run: int,
+    # out
+    quotient_out: wp.array(dtype=float),
+):
+    _divide_run(first_run + wp.tid(), size, numerator, denominator, least, quotient_out)
+
+
+@wp.func_native("lfpiv::indicate(run, size, volume.data, lit_out.data);")
+def _indicate_run(
+    run: int,
+    size: int,
+    volume: wp.array(dtype=float),
+    lit_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _indicate(
+    # in
+    volume: wp.array(dtype=float),
+    size: int,
+    first_run: int,
+    # out
+    lit_out: wp.array(dtype=float),
+):
+    _indicate_run(first_run + wp.tid(), size, volume, lit_out)
+
+
+@wp.func_native("lfpiv::add_masked(run, size, added.data, mask.data, volume_out.data);")
+def _add_run(
+    run: int,
+    size: int,
+    added: wp.array(dtype=float),
+    mask: wp.array(dtype=float),
+    volume_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _add(
+    # in
+    added: wp.array(dtype=float),
+    mask: wp.array(dtype=float),
+    size: int,
+    first_run: int,
+    # out
+    volume_out: wp.array(dtype=float),
+):
+    _add_run(first_run + wp.tid(), size, added, mask, volume_out)
+
+
+@wp.func_native("lfpiv::replace(run, size, active.data, values.data, volume_out.data);")
+def _replace_run(
+    run: int,
+    size: int,
+    active: wp.array(dtype=float),
+    values: wp.array(dtype=float),
+    volume_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _replace(
+    # in
+    active: wp.array(dtype=float),
+    values: wp.array(dtype=float),
+    size: int,
+    first_run: int,
+    # out
+    volume_out: wp.array(dtype=float),
+):
+    _replace_run(first_run + wp.tid(), size, active, values, volume_out)
+
+
+@wp.func_native("lfpiv::part(run, size, share * least.data[0], light_out.data, active_out.data);")
+def _part_run(
+    run: int,
+    size: int,
+    least: wp.array(dtype=float),
+    share: float,
+    light_out: wp.array(dtype=float),
+    active_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _part(
+    # in
+    least: wp.array(dtype=float),
+    share: float,
+    size: int,
+    first_run: int,
+    # out
+    light_out: wp.array(dtype=float),
+    active_out: wp.array(dtype=float),
+):
+    _part_run(first_run + wp.tid(), size, least, share, light_out, active_out)
+
+
+def multiply(one: wp.array, other: wp.array, out: wp.array | None = None, *, factor: float = 1.0) -> wp.array:
+    """Return one * factor * other; write it to `out` if given."""
+    found = empty(one.size) if out is None else out
+    _run(_multiply, [one, float(factor), other], [found])
+    return found
+
+
+def divide(numerator: wp.array, denominator: wp.array, least: float, out: wp.array | None = None) -> wp.array:
+    """Return numerator / max(denominator, least); write it to `out` if given."""
+    found = empty(numerator.size) if out is None else out
+    _run(_divide, [numerator, denominator, float(least)], [found])
+    return found
+
+
+def indicator(volume: wp.array) -> wp.array:
+    """Return 1 where the volume is not 0, else 0."""
+    lit = empty(volume.size)
+    _run(_indicate, [volume], [lit])
+    return lit
+
+
+def add(added: wp.array, out: wp.array, mask: wp.array | None = None) -> None:
+    """Add a volume to `out`, where `mask` is not 0 if one is given."""
+    _run(_add, [added, mask], [out])
+
+
+def replace_resting(out: wp.array, values: wp.array, active: wp.array) -> None:
+    """Overwrite `out` by `values` where `active` is 0."""
+    _run(_replace, [active, values], [out])
+
+
+def part_bright(light: wp.array, least: wp.array, share: float = 1.0) -> wp.array:
+    """Return 1 for voxels with light of at least share * `least`, shape (1,), else 0. Leave the others' in `light`."""
+    active = empty(light.size)
+    _run(_part, [least, float(share)], [light, active])
+    return active
+
+
+def ones(size: int) -> wp.array:
+    """Return a volume of ones."""
+    found = empty(size)
+    found.fill_(1.0)
+    return found
+
+
+def _run(kernel: wp.Kernel, inputs: list[object], outputs: list[wp.array]) -> None:
+    """Launch a kernel on all runs of voxels."""
+    size = outputs[0].size
+    runs = size if runtime.device().form == "gpu" else -(-size // RUN)
+    launch(Call(kernel, runs, [*inputs, size], outputs), parts=parts_of(size, FEWEST_VOXELS))
+
+
+def sweep(kernel: wp.Kernel, size: int, inputs: list[object], outputs: list[wp.array | None]) -> None:
+    """Launch a kernel on all voxels. An array that is None has no elements there."""
+    launch(Call(kernel, size, inputs, outputs), parts=parts_of(size, FEWEST_VOXELS))
+
+
+def parts_of(size: int, fewest: int) -> int:
+    """Return the parts of a launch on the CPU, each with at least `fewest` threads; one if it runs on one core."""
+    cores = runtime.device().threads
+    return 1 if cores == 1 else min(runtime.CHUNKS, 2 * cores, 1 + size // fewest)

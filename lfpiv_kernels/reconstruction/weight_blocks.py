@@ -1,0 +1,63 @@
+"""Weights of one camera as 8-bit blocks of rays, on the host."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfpiv_kernels.weights.microimages import Microimages
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blocks:
+    """Weights of all voxels for one camera: a sparse matrix with 8-bit values and a scale per column.
+
+    A block is `width` rays wide and `height` rows high. In the form "pixels" it has one value per ray, row by row. In
+    the form "profiles" it has `width` values A, then `height` values B; the value of column c and row k is A[c] B[k].
+    There `width` is `BLOCK_WIDTH` and `height` a multiple of `ROW_GROUP`, and blocks are sorted by it.
+    """
+
+    form: str
+    """"profiles" or "pixels"."""
+    first_block: np.ndarray
+    """Index of each voxel's first block, shape (voxel + 1,), int32."""
+    first_value: np.ndarray
+    """Index of each voxel's first value, shape (voxel + 1,), int64."""
+    ray: np.ndarray
+    """Index of each block's first ray, shape (block,), int32."""
+    height: np.ndarray
+    """Rows of rays of each block, shape (block,), uint8."""
+    width: np.ndarray
+    """Rays in a row of each block, at most `BLOCK_WIDTH`, shape (block,), uint8."""
+    value: np.ndarray
+    """Weights in levels, shape (value + BLOCK_WIDTH,), uint8. A vector may be read past the last one."""
+    scale: np.ndarray
+    """Weight of one level, shape (voxel,), float32."""
+    microimages: Microimages
+    """Where the rays lie in memory."""
+    even_blocks: np.ndarray | None = None
+    """Number of each voxel's blocks under even lenses, which come first, shape (voxel,), int32; None for all."""
+    even_values: np.ndarray | None = None
+    """Number of their values, shape (voxel,), int32."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays [byte]."""
+        names = ("first_block", "first_value", "ray", "height", "width", "value", "scale", "even_blocks", "even_values")
+        return sum(array.nbytes for array in (getattr(self, name) for name in names) if array is not None)
+
+    def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur twice."""
+        value, rays, weights = int(self.first_value[voxel]), [], []
+        for block in range(self.first_block[voxel], self.first_block[voxel + 1]):
+            width, height = int(self.width[block]), int(self.height[block])
+            rays.append(self.ray[block] + np.arange(height)[:, None] * self.microimages.edge + np.arange(width))
+            if self.form == "profiles":
+                across, down = np.split(self.value[value : value + width + height].astype(np.float64), [width])
+                weights.append(down[:, None] * across)
+                value += width + height
+            else:
+                weights.append(self.value[value : value + width * height].astype(np.float64))
+                value += width * height
+        if not rays:
+            return np.zeros(0, np.int64), np.zeros(0)
+        return np.concatenate(rays, axis=None), np.concatenate(weights, axis=None) * float(self.scale[voxel])

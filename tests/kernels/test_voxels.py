@@ -1,0 +1,146 @@
+"""Sweeps over voxels, sums, quantiles and the first guess against NumPy, and their independence of the threads."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from lfpiv_kernels import runtime
+from lfpiv_kernels.reconstruction import first_guess, sums, update, voxels
+from lfpiv_kernels.transfer import duplicate, empty, to_device, to_host, zeros
+
+TOLERANCE_SUM = 1e-12  # float64 sums of the same terms in another order, relative
+TOLERANCE_F32 = 1e-6  # a few roundings of float32, relative
+TOLERANCE_GUESS = 2e-4  # exp(x) - 1 from x = 1e-3 on, where the difference loses three of seven digits, relative
+SIZES = [1, 7, 1025, 20_011]
+
+
+@pytest.fixture(params=SIZES)
+def volumes(request):
+    """Four volumes: positive, with zeros, of 0 and 1, and of any sign."""
+    rng = np.random.default_rng(request.param)
+    lit = (rng.random(request.param) > 0.3).astype(np.float32)
+    positive, signed = rng.lognormal(0, 2, request.param).astype(np.float32), rng.normal(size=request.param)
+    return positive, positive[::-1] * lit, lit, signed.astype(np.float32)
+
+
+def test_sweeps_are_the_operators_of_numpy(volumes):
+    positive, dark, lit, signed = volumes
+    on = [to_device(one.copy()) for one in volumes]
+    np.testing.assert_array_equal(
+        to_host(voxels.multiply(on[0], on[3], factor=0.7)), positive * np.float32(0.7) * signed
+    )
+    np.testing.assert_array_equal(to_host(voxels.divide(on[3], on[1], 0.5)), signed / np.maximum(dark, np.float32(0.5)))
+    np.testing.assert_array_equal(to_host(voxels.indicator(on[1])), dark != 0)
+    np.testing.assert_array_equal(to_host(voxels.ones(len(lit))), np.ones_like(lit))
+    for mask, expected in ((None, positive + signed), (on[2], np.where(lit > 0, positive + signed, positive))):
+        total = duplicate(on[0])
+        voxels.add(on[3], total, mask)
+        np.testing.assert_array_equal(to_host(total), expected)
+    replaced = duplicate(on[0])
+    voxels.replace_resting(replaced, on[3], on[2])
+    np.testing.assert_array_equal(to_host(replaced), np.where(lit > 0, positive, signed))
+
+
+def test_a_sweep_may_overwrite_what_it_reads(volumes):
+    positive, dark, _, signed = volumes
+    one, other = (to_device(array.copy()) for array in (positive, dark))
+    np.testing.assert_array_equal(to_host(voxels.multiply(one, to_device(signed), one)), positive * signed)
+    np.testing.assert_array_equal(to_host(voxels.divide(to_device(signed), other, 0.1, other)), signed / dark.clip(0.1))
+
+
+def test_voxels_are_parted_at_a_threshold_that_stays_on_the_device(volumes):
+    positive, dark, _, _ = volumes
+    light, largest = to_device(dark.copy()), sums.largest(to_device(positive))
+    assert to_host(largest)[0] == positive.max()
+    active = to_host(voxels.part_bright(light, largest, 0.01))
+    bright = (dark >= np.float32(0.01) * positive.max()) & (dark > 0)
+    np.testing.assert_array_equal(active, bright)
+    np.testing.assert_array_equal(to_host(light), np.where(bright, 0, dark))
+
+
+def test_totals_are_sums_in_float64(volumes):
+    positive, _, lit, signed = volumes
+    totals, added = sums.Totals(3), to_device(lit.copy())
+    numbers = signed.astype(np.float64)
+    for _ in range(2):
+        totals.add(0, to_device(numbers))
+    totals.add(1, to_device(numbers), len(numbers) // 2)
+    totals.add_squares(2, to_device(positive), to_device(signed), added)
+    squares = (positive * signed * signed).sum(dtype=np.float64)
+    expected = [2 * numbers.sum(), numbers[: len(numbers) // 2].sum(), squares]
+    np.testing.assert_allclose(totals.read(), expected, atol=TOLERANCE_SUM * np.abs(numbers).sum(), rtol=TOLERANCE_SUM)
+    np.testing.assert_array_equal(to_host(added), lit + signed)
+    totals.clear()
+    assert totals.read() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-6, 0.01, 0.3, 0.9])
+def test_the_faintest_kept_voxel_is_that_of_the_sorted_light(volumes, share):
+    dark = volumes[1] if volumes[1].any() else volumes[0]
+    ordered = np.sort(dark)
+    below = np.cumsum(ordered, dtype=np.float64)
+    kept = to_host(sums.brightest_share(to_device(dark), share))[0]
+    assert kept in dark or (share == 0 and kept == 0)
+    least = np.searchsorted(below, share * below[-1] * (1 - TOLERANCE_SUM))
+    most = min(np.searchsorted(below, share * below[-1] * (1 + TOLERANCE_SUM)), len(ordered) - 1)
+    assert ordered[least] <= kept <= ordered[most] or kept == 0
+
+
+def test_sums_do_not_depend_on_the_threads(monkeypatch):
+    rng = np.random.default_rng(1)
+    weight, values = (to_device(rng.normal(size=100_003).astype(np.float32)) for _ in range(2))
+    device, found = runtime.device(), []
+    for threads in (1, 2, 5):
+        used = min(threads, device.threads)
+        monkeypatch.setattr(runtime, "device", lambda used=used: dataclasses.replace(device, threads=used))
+        totals = sums.Totals(1)
+        totals.add_squares(0, weight, values)
+        found.append(totals.read())
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize("over", [False, True])
+@pytest.mark.parametrize("momentum", [False, True])
+@pytest.mark.parametrize("in_place", [False, True])
+def test_steps_with_momentum_equal_their_twin(volumes, over, momentum, in_place):
+    positive, dark, lit, signed = volumes
+    last = np.where(dark > 0, positive * 1.1, 0).astype(np.float32)
+    share, largest, beta, length = 0.5, 3.0, 0.8, 0.9
+    factor = lit.astype(float) if over else 1.0
+    smart = dark * np.exp(0.3 * signed.astype(float) * length * factor)
+    logarithm = signed.astype(float)
+    sharp = dark * np.exp(np.clip(logarithm + share * (logarithm - 0.5 * logarithm * factor), -largest, largest))
+    for expected, is_sharp in ((smart, False), (sharp, True)):
+        volume, memory = to_device(dark.copy()), to_device(last.copy())
+        stepped = memory if in_place and momentum else volume if in_place else empty(dark.size)
+        leap = update.Leap(memory, beta, volume if in_place else empty(dark.size)) if momentum else None
+        keywords = {"over": to_device(lit) if over else None, "leap": leap, "stepped": stepped}
+        if is_sharp:
+            update.sharpen(volume, to_device(signed), to_device(0.5 * signed), share, largest, **keywords)
+        else:
+            step = to_device(np.full_like(dark, 0.3))
+            update.update(volume, to_device(signed), step, length=length, **keywords)
+        np.testing.assert_allclose(to_host(stepped), expected, rtol=10 * TOLERANCE_F32)
+        if leap is not None:
+            ratio = np.divide(expected, last, out=np.ones_like(expected), where=last > 0)
+            ahead = expected * np.clip(ratio, 1 / update.LARGEST_LEAP, update.LARGEST_LEAP) ** beta
+            np.testing.assert_allclose(to_host(leap.ahead), np.where(last > 0, ahead, 0), rtol=20 * TOLERANCE_F32)
+
+
+def test_the_first_guess_equals_its_twin(volumes):
+    positive, _, lit, _ = volumes
+    total = np.linspace(0.5, 2, lit.size).astype(np.float32)
+    logarithm = np.log1p(positive.astype(float) * 1e-2)
+    guess = np.expm1(logarithm / total) * lit
+    expected = np.where(lit > 0, np.maximum(guess, 1e-3 * guess.max()), 0)
+    arrays = (to_device(one.astype(np.float32)) for one in (logarithm, total, lit))
+    found = to_host(first_guess.exponentiate(*arrays, 1e-3))
+    np.testing.assert_allclose(found, expected, rtol=TOLERANCE_GUESS)
+
+
+def test_arrays_made_on_the_device_are_of_its_memory(device):
+    for made in (empty(3), zeros(3), duplicate(zeros(3))):
+        assert made.shape == (3,) and made.dtype == wp.float32 and str(made.device) == runtime.device().warp
+    assert not to_host(zeros(3)).any()
