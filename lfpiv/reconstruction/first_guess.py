@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from lfpiv.geometry.volume import in_order
-from lfpiv.reconstruction.smart import CameraEquation
 from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels.reconstruction.first_guess import add_logarithms, exponentiate, give_light
+from lfpiv_kernels.reconstruction.update import Comparison
+from lfpiv_kernels.transfer import DeviceArray, zeros
 
 LEAST_FLOOR_SHARE = 1e-3
 """Least floor in the first guess, as a share of the brightest counts."""
@@ -17,37 +19,32 @@ FAINTEST = 1e-6
 
 
 def multiplicative_guess(
-    cameras: Sequence[CameraEquation], peaks: Sequence[float], column_sum: np.ndarray, lit: np.ndarray
-) -> np.ndarray:
+    comparisons: Sequence[Comparison], peaks: Sequence[float], column_sum: DeviceArray, lit: DeviceArray
+) -> DeviceArray:
     """Return exp(sum_i w log(1 + I / b) / sum_i w) - 1, scaled so that its projections have the images' light.
 
     Parameters
     ----------
-    cameras : sequence of CameraEquation
+    comparisons : sequence of Comparison
         Images I, floors b and weights w.
     peaks : sequence of float
         Brightest counts of each image.
-    column_sum : ndarray, shape (voxel,), float32
-        sum_i w.
-    lit : ndarray, shape (voxel,), bool
-        Voxels that some camera sees. The others are zero.
+    column_sum : array, shape (voxel,), float32
+        sum_i w, on the device.
+    lit : array, shape (voxel,), float32
+        1 for voxels that some camera sees, on the device. The others are zero.
 
     Returns
     -------
-    ndarray, shape (voxel,), float32
+    array, shape (voxel,), float32
+        On the device.
     """
-    logarithm = np.zeros_like(column_sum)
-    for camera, peak in zip(cameras, peaks, strict=True):
-        floor = max(camera.floor, LEAST_FLOOR_SHARE * peak)
-        camera.projector.back_project(camera.gain * np.log1p(camera.image / floor), logarithm)
-    guess = np.expm1(np.divide(logarithm, column_sum, out=np.zeros_like(column_sum), where=lit))
-    guess = np.where(lit, np.maximum(guess, FAINTEST * guess.max()), 0.0).astype(np.float32)
-    seen = light = 0.0
-    for camera in cameras:
-        modelled = camera.gain * camera.projector.project(guess, np.empty_like(camera.image))
-        seen += float(camera.image[modelled > 0].sum(dtype=np.float64))
-        light += float(modelled.sum(dtype=np.float64))
-    return (guess * (seen / light)).astype(np.float32)
+    logarithm = zeros(column_sum.size)
+    for comparison, peak in zip(comparisons, peaks, strict=True):
+        add_logarithms(comparison, max(comparison.floor, LEAST_FLOOR_SHARE * peak), logarithm)
+    guess = exponentiate(logarithm, column_sum, lit, FAINTEST)
+    give_light(guess, comparisons)
+    return guess
 
 
 def checked_guess(first: np.ndarray, stored: StoredGrid) -> np.ndarray:

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv_kernels.reconstruction.update import extrapolate
+from lfpiv_kernels.reconstruction.update import Leap, extrapolate
+from lfpiv_kernels.reconstruction.voxels import replace_resting
+from lfpiv_kernels.transfer import DeviceArray, empty
 
 MOMENTUM = 0.9
 """Largest exponent beta: a memory of ten iterations."""
@@ -21,8 +23,8 @@ MOMENTUM = 0.9
 class Momentum:
     """Memory of the last step."""
 
-    previous: np.ndarray
-    """Coefficients after the last step, before they were extrapolated, shape (voxel,), float32."""
+    previous: DeviceArray
+    """Coefficients after the last step, before they were extrapolated, shape (voxel,), float32, on the device."""
     time: float = 1.0
     """Nesterov's t_k; 1 when the momentum starts."""
     largest: float = MOMENTUM
@@ -38,18 +40,23 @@ class Momentum:
         """Exponent beta of the next extrapolation; 0 when the momentum starts."""
         return min((self.time - 1) / self.following_time, self.largest)
 
-    def stopped(self, coefficients: np.ndarray, where: np.ndarray) -> Momentum:
-        """Return the momentum without memory of some voxels, whose coefficients do not change by it.
+    def forget(self, coefficients: DeviceArray, active: DeviceArray) -> None:
+        """Forget the voxels where `active` is 0: their `coefficients` will not change by the momentum."""
+        replace_resting(self.previous, coefficients, active)
 
-        `where` is true there, shape (voxel,).
-        """
-        return Momentum(np.where(where, coefficients, self.previous), self.time, self.largest)
+    def leap(self, ahead: DeviceArray) -> Leap:
+        """Return what a step needs to extrapolate its coefficients into `ahead`."""
+        return Leap(self.previous, self.exponent, ahead)
 
-    def extrapolate(self, coefficients: np.ndarray) -> tuple[np.ndarray, Momentum]:
+    def after(self, coefficients: DeviceArray) -> Momentum:
+        """Return the momentum after a step to `coefficients`."""
+        return Momentum(coefficients, self.following_time, self.largest)
+
+    def extrapolate(self, coefficients: DeviceArray) -> tuple[DeviceArray, Momentum]:
         """Return extrapolated coefficients after a step, and the momentum after it.
 
         `coefficients` are lifted in place to the smallest normal float32 where they were not zero before the step.
         """
-        ahead = self.previous.copy()
-        extrapolate(coefficients, ahead, self.exponent)
-        return ahead, Momentum(coefficients, self.following_time, self.largest)
+        ahead = empty(coefficients.size)
+        extrapolate(coefficients, self.leap(ahead))
+        return ahead, self.after(coefficients)

@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfpiv.experiment.settings import Correlation
 from lfpiv.geometry.volume import MASKED
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import DEFAULTS, SmartSettings, require_whole
 from lfpiv.reconstruction.shared_light import MotionField, shared_guesses
 from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.settings.processing import Correlation
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
 from lfpiv.velocity.peak_width import peak_reach, refine_search

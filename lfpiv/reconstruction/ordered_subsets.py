@@ -37,6 +37,9 @@ from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State
 from lfpiv.reconstruction.steps import Step
 from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
+from lfpiv_kernels.reconstruction.sums import Totals
+from lfpiv_kernels.reconstruction.voxels import multiply
+from lfpiv_kernels.transfer import DeviceArray, duplicate, zeros
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +70,7 @@ class Partition:
     subsets: tuple[Subset, ...]
     """The subsets in their order."""
     steps: tuple[Step, ...]
-    """Step of each subset."""
+    """Step of each subset; all are of one kind."""
 
 
 @dataclass(frozen=True)
@@ -86,27 +89,27 @@ class Agreement:
 
     Parameters
     ----------
-    coefficients : ndarray, shape (voxel,), float32
-        Coefficients c before the epoch, the weights of <a, b> = sum_j c_j a_j b_j.
+    coefficients : array, shape (voxel,), float32
+        Coefficients c before the epoch, on the device: the weights of <a, b> = sum_j c_j a_j b_j.
     """
 
-    def __init__(self, coefficients: np.ndarray):
+    def __init__(self, coefficients: DeviceArray):
         self._weight = coefficients
-        self._sum = np.zeros_like(coefficients)
-        self._squares = 0.0
+        self._sum = zeros(coefficients.size)
+        self._totals = Totals(2)
 
-    def add(self, exponent: np.ndarray) -> None:
+    def add(self, exponent: DeviceArray) -> None:
         """Add the exponent of a subset, shape (voxel,), float32."""
-        self._sum += exponent
-        self._squares += self._square(exponent)
+        self._totals.add_squares(0, self._weight, exponent, self._sum)
 
-    @property
-    def value(self) -> float:
-        """|sum_n g_n|^2 / sum_n |g_n|^2, from 0 to the number of subsets; 1 where all exponents are 0."""
-        return self._square(self._sum) / self._squares if self._squares > 0 else 1.0
+    def measured(self) -> float:
+        """Return |sum_n g_n|^2 / sum_n |g_n|^2, from 0 to the number of subsets; 1 where all exponents are 0.
 
-    def _square(self, exponent: np.ndarray) -> float:
-        return float((self._weight * exponent * exponent).sum(dtype=np.float64))
+        Called once.
+        """
+        self._totals.add_squares(1, self._weight, self._sum)
+        squares, square = self._totals.read()
+        return square / squares if squares > 0 else 1.0
 
 
 def subsets_of(cameras: int, halves: bool) -> tuple[Subset, ...]:
@@ -136,6 +139,8 @@ def iterate_epochs(
 ) -> Iterator[Epoch]:
     """Iterate over the subsets; yield what each epoch leaves. End early where one subset is left.
 
+    The next epoch overwrites the state that one leaves.
+
     Parameters
     ----------
     equations : ImageEquations
@@ -151,25 +156,32 @@ def iterate_epochs(
     resting : RestingVoxels, optional
         Lets dark voxels rest. Default: all voxels take part in all epochs.
     """
-    coefficients, momentum = state.coefficients, Momentum(state.coefficients, largest=SUBSET_MOMENTUM)
+    coefficients = duplicate(state.coefficients)
+    momentum = Momentum(duplicate(coefficients), largest=SUBSET_MOMENTUM)
     partition, following = partitions[0], list(partitions[1:])
     for epoch in range(epochs):
-        misfit, length = Misfit(0.0, 0.0), np.float32(1 / (1 + SHORTENING * epoch))
         active = None if resting is None else resting.active_in(epoch, sieve(coefficients))
+        over = None
         if active is not None:
-            momentum = momentum.stopped(coefficients, active == 0)
-        agreement = Agreement(coefficients) if following else None
+            momentum.forget(coefficients, active)
+            over = partition.steps[0].over(active)
+        length = float(np.float32(1 / (1 + SHORTENING * epoch)))
+        agreement = Agreement(duplicate(coefficients)) if following else None
+        equations.begin()
         for subset, step in zip(partition.subsets, partition.steps, strict=True):
-            volume = sieve(coefficients) if active is None else sieve(coefficients) * active
-            misfit += equations.compare_subset(subset.camera, subset.lenses, volume)
+            volume = sieve(coefficients)
+            if active is not None:
+                volume = multiply(volume, active)
+            equations.compare_subset(subset.camera, subset.lenses, volume)
             exponent = equations.back_project_subset(subset.camera, subset.lenses, volume)
             if agreement is not None:
                 agreement.add(exponent)
-            exponent *= length
-            coefficients, momentum = momentum.extrapolate(step(coefficients, exponent, active))
-        yield Epoch(State(coefficients, momentum, state.steps), misfit, len(partition.subsets))
-        if agreement is not None and agreement.value < CONFLICT:
-            log.debug("epoch %d: agreement of the subsets %.2f, larger subsets follow", epoch + 1, agreement.value)
+            coefficients, after = step(coefficients, exponent, momentum, length=length, over=over, in_place=True)
+            assert after is not None  # with a momentum there is one after it
+            momentum = after
+        yield Epoch(State(coefficients, momentum, state.steps), equations.measured(), len(partition.subsets))
+        if agreement is not None and (value := agreement.measured()) < CONFLICT:
+            log.debug("epoch %d: agreement of the subsets %.2f, larger subsets follow", epoch + 1, value)
             partition = following.pop(0)
             if len(partition.subsets) == 1:
                 return

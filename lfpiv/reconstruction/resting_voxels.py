@@ -17,9 +17,10 @@ in which none rests. The light that the sieve spreads from active voxels into re
 
 from __future__ import annotations
 
-import numpy as np
-
 from lfpiv.reconstruction.smart import ImageEquations
+from lfpiv_kernels.reconstruction.sums import brightest_share
+from lfpiv_kernels.reconstruction.voxels import multiply, part_bright
+from lfpiv_kernels.transfer import DeviceArray, duplicate
 
 ALL = 2
 """Epochs at the start in which no voxel rests."""
@@ -42,32 +43,31 @@ class RestingVoxels:
 
     def __init__(self, equations: ImageEquations):
         self._equations = equations
-        self._active: np.ndarray | None = None
+        self._active: DeviceArray | None = None
         self._possible = all(camera.projector.planes is None for camera in equations.cameras)
 
-    def active_in(self, epoch: int, volume: np.ndarray) -> np.ndarray | None:
+    def active_in(self, epoch: int, volume: DeviceArray) -> DeviceArray | None:
         """Choose the voxels that take part in the next epoch.
 
         Parameters
         ----------
         epoch : int
             Number of the epoch, from 0 on.
-        volume : ndarray, shape (voxel,), float32
-            The volume before it.
+        volume : array, shape (voxel,), float32
+            The volume before it, on the device.
 
         Returns
         -------
-        ndarray or None
+        array or None
             1 for voxels that take part, 0 for those that rest, shape (voxel,), float32. None for all.
         """
         few = volume.size < FEWEST_VOXELS
         if few or not self._possible or epoch < ALL or (epoch - ALL) % (CYCLE + 1) == CYCLE:
             self.wake()
             return None
-        light = volume if self._active is None else volume * self._active
-        active = (light >= faintest_kept(light, LIGHT)) & (light > 0)
-        self._equations.hold(np.where(active, np.float32(0), light))
-        self._active = active.astype(np.float32)
+        light = duplicate(volume) if self._active is None else multiply(volume, self._active)
+        self._active = part_bright(light, brightest_share(light, LIGHT))
+        self._equations.hold(light)
         return self._active
 
     def wake(self) -> None:
@@ -75,13 +75,3 @@ class RestingVoxels:
         if self._active is not None:
             self._equations.release()
         self._active = None
-
-
-def faintest_kept(light: np.ndarray, share: float) -> float:
-    """Return the light of the faintest value that is kept when the faintest, with a share of all light, are left out.
-
-    Equal values are kept or left out together.
-    """
-    ordered = np.sort(light)
-    below = np.cumsum(ordered, dtype=np.float64)
-    return float(ordered[min(np.searchsorted(below, share * below[-1]), len(ordered) - 1)])

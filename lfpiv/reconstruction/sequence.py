@@ -29,14 +29,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfpiv.experiment.settings import DEFAULT_WINDOWS, Correlation
 from lfpiv.reconstruction.fixed_lag import ITERATIONS as CORRECTIONS
 from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
+from lfpiv.reconstruction.instant import PreparedInstant
 from lfpiv.reconstruction.motion import LEAST_VALID
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import MotionField
 from lfpiv.reconstruction.sieve import coefficients
-from lfpiv.reconstruction.solver import PreparedInstant, SmartSolver
+from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.settings import cut_windows
 from lfpiv_kernels.correlation import deform

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.experiment.settings import Smart
 from lfpiv.geometry.volume import is_finite
+from lfpiv.settings.processing import Smart
 
 NORMALISATIONS = ("column", "paper")
 AUTO = "auto"

@@ -15,6 +15,8 @@ from functools import cached_property
 import numpy as np
 
 from lfpiv_kernels.reconstruction.blur import GaussianBlur
+from lfpiv_kernels.reconstruction.voxels import divide, multiply
+from lfpiv_kernels.transfer import Array, DeviceArray, duplicate, to_device, to_host
 
 TRUNCATE = 3.5
 """Reach of the sieve's Gaussian [standard deviation]."""
@@ -35,8 +37,8 @@ class Sieve:
     shape: tuple[int, int, int]
     """Voxel counts in stored order."""
 
-    def __call__(self, volume: np.ndarray) -> np.ndarray:
-        """Blur a volume."""
+    def __call__(self, volume: Array) -> Array:
+        """Return the blurred volume, on the device if `volume` is. The identity returns `volume` itself."""
         if self.sigma_voxel == 0:
             return volume
         return self._blur(volume)
@@ -51,18 +53,16 @@ class Smoothing:
     """Gaussian blur of volumes, shape (voxel,), continued constantly outside the volume."""
 
     sigma_voxel: float
-    """Standard deviation [voxel]; 0 for the identity."""
+    """Standard deviation, above 0 [voxel]."""
     shape: tuple[int, int, int]
     """Voxel counts in stored order."""
-    lit: np.ndarray
-    """Voxels that some camera sees, shape (voxel,), bool. The others stay dark."""
+    lit: DeviceArray
+    """1 for voxels that some camera sees, shape (voxel,), float32. The others stay dark."""
 
-    def __call__(self, volume: np.ndarray) -> np.ndarray:
-        """Blur a volume."""
-        if self.sigma_voxel == 0:
-            return volume
-        smoothed: np.ndarray = self._blur(volume) * self.lit
-        return smoothed
+    def __call__(self, volume: DeviceArray) -> DeviceArray:
+        """Return the blurred volume; all on the device."""
+        smoothed = self._blur(volume)
+        return multiply(smoothed, self.lit, smoothed)
 
     @cached_property
     def _blur(self) -> GaussianBlur:
@@ -77,8 +77,9 @@ def coefficients(volume: np.ndarray, sieve_voxel: float) -> np.ndarray:
     if sieve_voxel == 0:
         return volume
     nz, ny, nx = volume.shape
-    sieve, flat = Sieve(sieve_voxel, (nz, ny, nx)), volume.ravel()
-    found, least = flat, np.float32(FAINTEST * volume.max())
+    sieve, flat = Sieve(sieve_voxel, (nz, ny, nx)), to_device(np.ascontiguousarray(volume, np.float32).ravel(), float)
+    found, least = duplicate(flat), float(np.float32(FAINTEST * volume.max()))
     for _ in range(UNBLURRED):
-        found = found * sieve(flat / np.maximum(sieve(found), least))
-    return found.reshape(volume.shape)
+        ratio = divide(flat, sieve(found), least)
+        multiply(found, sieve(ratio), found)
+    return to_host(found).reshape(volume.shape)

@@ -17,7 +17,9 @@ from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.steps import Step
 from lfpiv_kernels.reconstruction.projector import Projector
+from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
+from lfpiv_kernels.transfer import DeviceArray, zeros
 
 
 @dataclass(frozen=True)
@@ -29,18 +31,15 @@ class Misfit:
     divergence: float
     """f [counts]."""
 
-    def __add__(self, other: Misfit) -> Misfit:
-        return Misfit(self.squares + other.squares, self.divergence + other.divergence)
-
 
 @dataclass(frozen=True, kw_only=True)
 class CameraEquation:
-    """One camera's equation I = gain * W E; arrays are float32, shape (pixel,)."""
+    """One camera's equation I = gain * W E."""
 
     image: np.ndarray
-    """Counts >= 0, zero where `gain` is zero and where no voxel lights a pixel."""
-    gain: np.ndarray
-    """Counts that a pixel records per unit of light."""
+    """Counts >= 0, shape (pixel,), float32; zero where `gain` is zero and where no voxel lights a pixel."""
+    gain: np.ndarray | DeviceArray
+    """Counts that a pixel records per unit of light, shape (pixel,), float32; or on the device, of lit pixels only."""
     floor: float
     """Noise floor b [counts]."""
     projector: Projector
@@ -48,14 +47,17 @@ class CameraEquation:
 
 
 class ImageEquations:
-    """The equations of all cameras. Volumes are flat, in stored order, float32.
+    """The equations of all cameras, on the device. Volumes are flat, in stored order, float32.
 
-    Each projector holds the light of one volume at a time. So `compare` and `back_project` are called inside `locked`.
+    Each projector holds the light of one volume at a time. So comparisons and `back_project` are called inside
+    `locked`. The sums of a misfit stay on the device until `measured` reads them.
     """
 
     def __init__(self, cameras: Sequence[CameraEquation]):
         self.cameras = tuple(cameras)
-        self._comparisons = [Comparison(one.projector, one.image, one.gain, one.floor) for one in self.cameras]
+        self.comparisons = [Comparison(one.projector, one.image, one.gain, one.floor) for one in self.cameras]
+        """The images beside the projections, on the device."""
+        self._totals = Totals(2)
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -65,37 +67,48 @@ class ImageEquations:
                 locks.enter_context(camera.projector.reserved())
             yield
 
-    def compare(self, volume: np.ndarray) -> Misfit:
+    def compare(self, volume: DeviceArray) -> Misfit:
         """Project a volume and compare it with the images. The projectors then hold gain * log((I + b) / (P + b))."""
-        misfit = Misfit(0.0, 0.0)
-        for comparison in self._comparisons:
-            misfit += Misfit(*comparison.compare(volume))
-        return misfit
+        self.begin()
+        for comparison in self.comparisons:
+            comparison.compare(volume, self._totals)
+        return self.measured()
 
-    def back_project(self, volume: np.ndarray) -> np.ndarray:
+    def back_project(self, volume: DeviceArray) -> DeviceArray:
         """Back-project the logarithms that `compare` left: sum_i w log((I + b) / (P + b)); 0 where `volume` is 0."""
-        exponent = np.zeros_like(volume)
+        exponent = zeros(volume.size)
         for camera in self.cameras:
             camera.projector.gather(exponent, active=volume)
         return exponent
 
-    def hold(self, volume: np.ndarray) -> None:
+    def hold(self, volume: DeviceArray) -> None:
         """Add the projections of a volume to those of each volume that is compared from now on, until `release`."""
-        for comparison in self._comparisons:
+        for comparison in self.comparisons:
             comparison.hold(volume)
 
     def release(self) -> None:
         """Forget the volumes that are held."""
-        for comparison in self._comparisons:
+        for comparison in self.comparisons:
             comparison.release()
 
-    def compare_subset(self, camera: int, lenses: int, volume: np.ndarray) -> Misfit:
-        """Do as `compare` for the rays of one camera through some lenses only, see ``projector.ALL``."""
-        return Misfit(*self._comparisons[camera].compare(volume, lenses))
+    def begin(self) -> None:
+        """Begin to sum the misfits of `compare_subset` anew."""
+        self._totals.clear()
 
-    def back_project_subset(self, camera: int, lenses: int, volume: np.ndarray) -> np.ndarray:
+    def compare_subset(self, camera: int, lenses: int, volume: DeviceArray) -> None:
+        """Do as `compare` for the rays of one camera through some lenses only, see ``projector.ALL``.
+
+        The misfit is added to that of the subsets before, since `begin`.
+        """
+        self.comparisons[camera].compare(volume, self._totals, lenses)
+
+    def measured(self) -> Misfit:
+        """Return the misfit that was summed since `begin`."""
+        return Misfit(*self._totals.read())
+
+    def back_project_subset(self, camera: int, lenses: int, volume: DeviceArray) -> DeviceArray:
         """Do as `back_project` for the rays of one camera through some lenses only."""
-        exponent = np.zeros_like(volume)
+        exponent = zeros(volume.size)
         self.cameras[camera].projector.gather(exponent, active=volume, lenses=lenses)
         return exponent
 
@@ -104,27 +117,33 @@ class ImageEquations:
 class State:
     """State of the iteration."""
 
-    coefficients: np.ndarray
-    """Coefficients c of the sieve, E = G c, shape (voxel,), float32. Zeros stay zero."""
+    coefficients: DeviceArray
+    """Coefficients c of the sieve, E = G c, shape (voxel,), float32, on the device. Zeros stay zero."""
     momentum: Momentum | None
     """None iterates without momentum."""
     steps: tuple[Step, ...]
     """Steps, the fastest first. The last one is SMART's own."""
 
-    def proposals(self, exponent: np.ndarray, smooth: Callable[[np.ndarray], np.ndarray]) -> Iterator[State]:
+    def proposals(self, exponent: DeviceArray, smooth: Callable[[DeviceArray], DeviceArray] | None) -> Iterator[State]:
         """Propose the next states, the fastest first: with momentum, without it, and by the steps that remain.
 
         A state without momentum's extrapolation starts the momentum anew. Steps that were passed over are given up.
         """
         for number, step in enumerate(self.steps):
-            stepped = smooth(step(self.coefficients, exponent))
+            momentum = self.momentum if number == 0 else None
+            stepped, after = step(self.coefficients, exponent, momentum if smooth is None else None)
+            if smooth is not None:
+                stepped = smooth(stepped)
+                if momentum is not None:
+                    stepped, after = momentum.extrapolate(stepped)
             if self.momentum is None:
                 yield State(stepped, None, self.steps[number:])
                 continue
-            if number == 0:
-                yield State(*self.momentum.extrapolate(stepped), self.steps)
-                if self.momentum.exponent == 0:  # nothing was extrapolated
+            if momentum is not None and after is not None:
+                yield State(stepped, after, self.steps)
+                if momentum.exponent == 0:  # nothing was extrapolated
                     continue
+                stepped = after.previous
             yield State(stepped, Momentum(stepped), self.steps[number:])
 
 
@@ -134,8 +153,8 @@ def iterate(
     sieve: Sieve,
     *,
     iterations: int,
-    smooth: Callable[[np.ndarray], np.ndarray] = lambda volume: volume,
-) -> Iterator[tuple[np.ndarray, Misfit]]:
+    smooth: Callable[[DeviceArray], DeviceArray] | None = None,
+) -> Iterator[tuple[DeviceArray, Misfit]]:
     """Iterate SMART; yield the first volume and the one after each iteration, with their misfits.
 
     An iteration takes the first of its proposals by which the misfit does not rise, or else the last one. `smooth` is
@@ -146,14 +165,10 @@ def iterate(
     for left in reversed(range(iterations)):
         yield volume, misfit
         exponent = equations.back_project(volume)
-        for proposal in state.proposals(exponent, smooth if left else _unchanged):
+        for proposal in state.proposals(exponent, smooth if left else None):
             volume = sieve(proposal.coefficients)
             proposed = equations.compare(volume)
             if not proposed.divergence > misfit.divergence:
                 break
         state, misfit = proposal, proposed
     yield volume, misfit
-
-
-def _unchanged(volume: np.ndarray) -> np.ndarray:
-    return volume

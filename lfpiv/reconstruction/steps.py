@@ -16,11 +16,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-import numpy as np
-
+from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
 from lfpiv_kernels.reconstruction.blur import GaussianBlur
-from lfpiv_kernels.reconstruction.update import sharpened, update
+from lfpiv_kernels.reconstruction.update import Leap, sharpen, update
+from lfpiv_kernels.reconstruction.voxels import divide, multiply
+from lfpiv_kernels.transfer import DeviceArray, empty
 
 SHARPENING = 0.5
 """Share of a correction's fine part that a sharpened step adds to it."""
@@ -34,13 +35,37 @@ LEAST_ACTIVE = 0.05
 
 
 class Step(Protocol):
-    """Step of the iteration; arrays have shape (voxel,), float32."""
+    """Step of the iteration; arrays have shape (voxel,), float32, on the device."""
 
-    def __call__(self, coefficients: np.ndarray, exponent: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-        """Return the next coefficients. Zeros stay zero.
+    def __call__(
+        self,
+        coefficients: DeviceArray,
+        exponent: DeviceArray,
+        momentum: Momentum | None = None,
+        *,
+        length: float = 1.0,
+        over: DeviceArray | None = None,
+        in_place: bool = False,
+    ) -> tuple[DeviceArray, Momentum | None]:
+        """Return the next coefficients and the momentum after them. Zeros stay zero.
 
-        `active` is 1 for voxels that take part and 0 for those that do not change; `exponent` is 0 there.
+        Parameters
+        ----------
+        coefficients, exponent : array
+            Coefficients and the back-projected exponent. With `over` the exponent is 0 for voxels that do not change.
+        momentum : Momentum, optional
+            Momentum that extrapolates the step.
+        length : float
+            Factor of the exponent.
+        over : array, optional
+            What `over` made of the voxels that take part.
+        in_place : bool
+            Overwrite the coefficients, the exponent and the momentum's memory.
         """
+        ...
+
+    def over(self, active: DeviceArray) -> DeviceArray:
+        """Return the factor of a blurred exponent where only voxels whose `active` is 1, and not 0, take part."""
         ...
 
 
@@ -48,37 +73,79 @@ class Step(Protocol):
 class SmartStep:
     """SMART's own step. For mu <= 1 and without smoothing the misfit cannot rise."""
 
-    size: np.ndarray
-    """mu / G s, shape (voxel,), float32."""
+    size: DeviceArray
+    """mu / G s, shape (voxel,), float32, on the device."""
     sieve: Sieve
 
-    def __call__(self, coefficients: np.ndarray, exponent: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-        """Return the next coefficients."""
-        blurred = self.sieve(exponent)
-        if active is not None:
-            blurred = blurred * active
-        following: np.ndarray = update(coefficients.copy(), blurred, self.size)
-        return following
+    def __call__(
+        self,
+        coefficients: DeviceArray,
+        exponent: DeviceArray,
+        momentum: Momentum | None = None,
+        *,
+        length: float = 1.0,
+        over: DeviceArray | None = None,
+        in_place: bool = False,
+    ) -> tuple[DeviceArray, Momentum | None]:
+        """Return the next coefficients and the momentum after them."""
+        stepped, leap = _targets(coefficients, momentum, in_place)
+        update(coefficients, self.sieve(exponent), self.size, length=length, over=over, leap=leap, stepped=stepped)
+        return _followed(stepped, leap, momentum)
+
+    def over(self, active: DeviceArray) -> DeviceArray:
+        """Return `active`: light that is blurred into resting voxels does not count."""
+        return active
 
 
 @dataclass(frozen=True)
 class SharpenedStep:
     """Step without the sieve's second blur, sharpened. The misfit may rise."""
 
-    size: np.ndarray
-    """mu / s, shape (voxel,), float32."""
+    size: DeviceArray
+    """mu / s, shape (voxel,), float32, on the device."""
     shape: tuple[int, int, int]
     """Voxel counts in stored order."""
 
-    def __call__(self, coefficients: np.ndarray, exponent: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
-        """Return the next coefficients. The blur is the mean over active voxels."""
-        logarithm = exponent * self.size
+    def __call__(
+        self,
+        coefficients: DeviceArray,
+        exponent: DeviceArray,
+        momentum: Momentum | None = None,
+        *,
+        length: float = 1.0,
+        over: DeviceArray | None = None,
+        in_place: bool = False,
+    ) -> tuple[DeviceArray, Momentum | None]:
+        """Return the next coefficients and the momentum after them."""
+        logarithm = multiply(exponent, self.size, exponent if in_place else None, factor=length)
         blurred = self._blur(logarithm)
-        if active is not None:
-            blurred *= active / np.maximum(self._blur(active), np.float32(LEAST_ACTIVE))
-        following: np.ndarray = sharpened(coefficients.copy(), logarithm, blurred, SHARPENING, LARGEST_STEP)
-        return following
+        stepped, leap = _targets(coefficients, momentum, in_place)
+        sharpen(coefficients, logarithm, blurred, SHARPENING, LARGEST_STEP, over=over, leap=leap, stepped=stepped)
+        return _followed(stepped, leap, momentum)
+
+    def over(self, active: DeviceArray) -> DeviceArray:
+        """Return the factor that makes a blur of active voxels the mean over them, and 0 elsewhere."""
+        blurred = self._blur(active)
+        return divide(active, blurred, LEAST_ACTIVE, blurred)
 
     @cached_property
     def _blur(self) -> GaussianBlur:
         return GaussianBlur(SHARPENED_VOXEL, self.shape, truncate=TRUNCATE, border="nearest")
+
+
+def _targets(coefficients: DeviceArray, momentum: Momentum | None, in_place: bool) -> tuple[DeviceArray, Leap | None]:
+    """Return where the coefficients after a step go, and those that momentum extrapolates from them."""
+    if momentum is None:
+        return coefficients if in_place else empty(coefficients.size), None
+    if in_place:
+        return momentum.previous, momentum.leap(coefficients)
+    return empty(coefficients.size), momentum.leap(empty(coefficients.size))
+
+
+def _followed(
+    stepped: DeviceArray, leap: Leap | None, momentum: Momentum | None
+) -> tuple[DeviceArray, Momentum | None]:
+    """Return the next coefficients and the momentum after a step."""
+    if momentum is None or leap is None:
+        return stepped, None
+    return leap.ahead, momentum.after(stepped)

@@ -44,7 +44,7 @@ def reconstruct(
     first guess is ``exp(sum_i w log(I + b) / sum_i w)``, less the floor's own share, scaled to the images' light.
 
     The keywords are those of the table ``[smart]`` of an experiment file, one by one: hence more than eight. Their
-    defaults are the table's (`lfpiv.experiment.settings.Smart`). For many instants make one
+    defaults are the table's (`lfpiv.settings.processing.Smart`). For many instants make one
     `lfpiv.reconstruction.solver.SmartSolver`. `lfpiv.measure_pair` adds what a run does besides: guard layers, finer
     voxels, light that stands still.
 

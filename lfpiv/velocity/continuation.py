@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from lfpiv.velocity import validation
 from lfpiv.velocity.windows import Windows
+from lfpiv_kernels.transfer import Values
 
 REACH = 2
 """Neighbours on either side of a window that enter a fit."""
@@ -41,20 +42,14 @@ class Fit:
         return values
 
 
-def fluid_centroids(fluid: np.ndarray, windows: Windows) -> np.ndarray:
+def fluid_centroids(fluid: Values, windows: Windows) -> np.ndarray:
     """Return the middle of each window's fluid relative to the window's centre, shape (z, y, x, 3) [voxel].
 
     `fluid` is true for voxels with fluid, shape (z, y, x). The result is 0 for windows without fluid.
     """
-    share = windows.means(fluid)
-    offsets = np.zeros((*windows.count, 3))
-    for axis, centres in enumerate(windows.centres):
-        along = [1, 1, 1]
-        along[axis] = -1
-        moment = windows.means(fluid * np.arange(fluid.shape[axis]).reshape(along))
-        middle = np.divide(moment, share, out=np.zeros_like(share), where=share > 0)
-        offsets[..., axis] = np.where(share > 0, middle - centres.reshape(along), 0)
-    return offsets
+    offsets = windows.middles(fluid) - np.stack(np.meshgrid(*windows.centres, indexing="ij"), -1)
+    centred: np.ndarray = np.nan_to_num(offsets, nan=0.0)
+    return centred
 
 
 def fit_neighbours(
@@ -101,7 +96,7 @@ def fit_neighbours(
 
 
 def continued(
-    field: np.ndarray, predicted: np.ndarray | float, valid: np.ndarray, fluid: np.ndarray, windows: Windows
+    field: np.ndarray, predicted: np.ndarray | float, valid: np.ndarray, fluid: Values, windows: Windows
 ) -> np.ndarray:
     """Return a field whose vectors belong to the windows' centres, continued where nothing was measured.
 
@@ -113,7 +108,7 @@ def continued(
         The prediction.
     valid : ndarray of bool, shape (z, y, x)
         Windows that were measured.
-    fluid : ndarray of bool
+    fluid : array of bool
         Voxels with fluid, of the volume's shape.
     windows : Windows
         The grid.

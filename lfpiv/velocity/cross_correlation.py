@@ -35,6 +35,8 @@ from lfpiv.velocity.volume_pair import (
     voxel_axes,
     without,
 )
+from lfpiv_kernels.correlation.light import powered
+from lfpiv_kernels.correlation.memory import on_device
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +93,7 @@ def correlate(
     negates the result. A single pass takes windows of the first volume only: it is twice as fast and less accurate.
 
     It has more than 8 parameters because each setting of the table ``[correlation]`` is one keyword. Their defaults are
-    the table's (`lfpiv.experiment.settings.Correlation`).
+    the table's (`lfpiv.settings.processing.Correlation`).
 
     Parameters
     ----------
@@ -103,7 +105,7 @@ def correlate(
     windows : int or sequence, optional
         Window of each pass [voxel]: (z, y, x) or one edge, within the volume; a number is the window of a single pass.
         The last window sets the vector grid. All others overlap by at least `multi_pass.COARSE_OVERLAP`. Repeat a
-        window to iterate. Default: `lfpiv.experiment.settings.DEFAULT_WINDOWS`, cut to the volume.
+        window to iterate. Default: `lfpiv.settings.processing.DEFAULT_WINDOWS`, cut to the volume.
     overlap : float
         Part of a window that its neighbour shares, 0 <= overlap < 1.
     voxel_mm : float, optional
@@ -190,10 +192,10 @@ def correlate(
     seen = seen_by_two(volume_a, volume_b)
     voxels = Voxels(seen=seen, solid=solid, unseeded=unseeded_voxels((first, second), without(solid, seen)))
     missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
-    first, second = (preprocess(volume, missing, intensity_power) for volume in (first, second))
-    last, figures = correlate_passes(first, second, settings, voxels)
-    one, other = (np.maximum(volume, 0) ** (1 / intensity_power) for volume in (first, second))
-    standing = on_standing_light(one, other, last.given.windows, last.field, last.valid)
+    one, other = (preprocess(on_device(volume), missing, intensity_power) for volume in (first, second))
+    last, figures = correlate_passes(one, other, settings, voxels)
+    lights = powered(one, 1 / intensity_power), powered(other, 1 / intensity_power)
+    standing = on_standing_light(*lights, last.given.windows, last.field, last.valid)
     if standing.any():
         log.warning(
             "correlation: light brighter than particles stays in place in %d windows: their vectors are not valid",
@@ -204,7 +206,7 @@ def correlate(
     share = float(last.valid[measurable].mean()) if measurable.any() else 0.0
     verdict = Verdict.GOOD if share >= GOOD_SHARE else Verdict.POOR if share >= POOR_SHARE else Verdict.FAILED
     if verdict is not Verdict.GOOD:
-        if moves_beyond(first, second, first_search):
+        if moves_beyond(one, other, first_search):
             verdict = Verdict.TOO_FAR
         log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
     if voxels.unseeded is not None:

@@ -14,14 +14,17 @@ import numpy as np
 
 from lfpiv.velocity import validation
 from lfpiv.velocity.continuation import continued
-from lfpiv.velocity.coverage import Coverage, MaskedPair, Voxels
+from lfpiv.velocity.coverage import Coverage, Voxels
 from lfpiv.velocity.peak_width import peak_reach, refine_search
 from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.settings import CorrelationSettings, Triple, triple
 from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation import deform
 from lfpiv_kernels.correlation.correlate import PEAK_REACH, WindowPeaks, correlate_windows
+from lfpiv_kernels.correlation.fluid import as_numbers, common_fluid, inverted, levelled
+from lfpiv_kernels.correlation.memory import on_device
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
+from lfpiv_kernels.transfer import Values
 
 log = logging.getLogger(__name__)
 
@@ -42,9 +45,9 @@ class PassInput:
     """Positions of the vectors along each axis of the given volumes [voxel]."""
     search: Triple
     """Largest lag (z, y, x) [voxel]."""
-    volumes: tuple[np.ndarray, np.ndarray]
+    volumes: tuple[Values, Values]
     """The two volumes, deformed onto each other in all passes but the first, with a mask less their local mean."""
-    fluid: np.ndarray | None = None
+    fluid: Values | None = None
     """True for voxels that hold fluid in both volumes, shape (z, y, x); None without a mask."""
     reach: int = PEAK_REACH
     """Lags around the highest coefficient that belong to its peak."""
@@ -141,14 +144,15 @@ class Pass:
 
 
 def correlate_passes(
-    first: np.ndarray, second: np.ndarray, settings: CorrelationSettings, voxels: Voxels
+    first: Values, second: Values, settings: CorrelationSettings, voxels: Voxels
 ) -> tuple[Pass, tuple[PassFigures, ...]]:
     """Correlate two volumes in one pass per window of the settings.
 
     Parameters
     ----------
-    first, second : ndarray, shape (z, y, x), float32
-        Volumes without background, 0 where there is no fluid.
+    first, second : array, shape (z, y, x), float32
+        Volumes without background, 0 where there is no fluid. They are brought to the device once, unless they are
+        there, and what is made of them stays there.
     settings : CorrelationSettings
         Windows, overlap and largest displacement.
     voxels : Voxels
@@ -163,8 +167,8 @@ def correlate_passes(
         Figures of every pass.
     """
     shape, last = triple(first.shape), len(settings.windows) - 1
-    pair = UndeformedPair((first, second), voxels.solid)
-    reach = peak_reach(first, second, settings.windows[-1])
+    pair = UndeformedPair((on_device(first), on_device(second)), voxels.solid_on_device)
+    reach = peak_reach(*pair.volumes, settings.windows[-1])
     coarse = max(settings.overlap, COARSE_OVERLAP)
     overlaps = [coarse] * last + [settings.overlap]
     windows = Windows.overlapping(shape, settings.windows[0], overlaps[0])
@@ -178,13 +182,12 @@ def correlate_passes(
         fluid=fluid,
         reach=reach,
     )
-    flags = [voxels.coarse] * last + [voxels]
-    coverage = flags[0].coverage(windows, settings.windows[-1])
+    coverage = voxels.coverage(windows, settings.windows[-1], predicts=last > 0)
     result = _correlate_pass(given, coverage, symmetric=last > 0)
     figures = [result.figures]
     for number in range(1, last + 1):
         given = _deform(pair, result, settings.windows[number], overlaps[number])
-        coverage = flags[number].coverage(given.windows, settings.windows[-1])
+        coverage = voxels.coverage(given.windows, settings.windows[-1], predicts=number < last)
         result = _correlate_pass(given, coverage, symmetric=True)
         figures.append(result.figures)
     log.debug("correlation passes: %s", figures)
@@ -195,36 +198,36 @@ def correlate_passes(
 class UndeformedPair:
     """The two volumes before any deformation, and the voxels that hold no fluid."""
 
-    volumes: tuple[np.ndarray, np.ndarray]
+    volumes: tuple[Values, Values]
     """Volumes without background, shape (z, y, x), float32."""
-    solid: np.ndarray | None
+    solid: Values | None
     """True for voxels without fluid, shape (z, y, x); None without a mask."""
 
-    def given(self, window: Triple) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray | None]:
+    def given(self, window: Triple) -> tuple[tuple[Values, Values], Values | None]:
         """Return the volumes of the first pass and their fluid."""
         if self.solid is None:
             return self.volumes, None
-        masked = MaskedPair(volumes=self.volumes, solids=(self.solid, self.solid))
-        return masked.levelled(window), masked.fluid
+        fluid = inverted(self.solid)
+        return levelled(*self.volumes, fluid, window), fluid
 
-    def deformed(self, predictor: Predictor, window: Triple) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray | None]:
+    def deformed(self, predictor: Predictor, window: Triple) -> tuple[tuple[Values, Values], Values | None]:
         """Return the volumes of a later pass, deformed onto each other by the predicted field, and their fluid."""
         first, second = self._splines
-        volumes = deform.deform_pair(first, second, predictor.field, predictor.spacing)
+        volumes = deform.deform_pair(first, second, predictor.control, predictor.spacing)
         if self._solid_spline is None:
             return volumes, None
-        solids = deform.deform_pair(self._solid_spline, self._solid_spline, predictor.field, predictor.spacing)
-        masked = MaskedPair(volumes=volumes, solids=(solids[0] > 0.5, solids[1] > 0.5))
-        return masked.levelled(window), masked.fluid
+        solids = deform.deform_pair(self._solid_spline, self._solid_spline, predictor.control, predictor.spacing)
+        fluid = common_fluid(*solids)
+        return levelled(*volumes, fluid, window), fluid
 
     @cached_property
-    def _splines(self) -> tuple[np.ndarray, np.ndarray]:
+    def _splines(self) -> tuple[Values, Values]:
         first, second = self.volumes
-        return deform.spline_coefficients(first), deform.spline_coefficients(second)
+        return deform.spline_coefficients(on_device(first)), deform.spline_coefficients(on_device(second))
 
     @cached_property
-    def _solid_spline(self) -> np.ndarray | None:
-        return None if self.solid is None else deform.spline_coefficients(self.solid.astype(np.float32))
+    def _solid_spline(self) -> Values | None:
+        return None if self.solid is None else deform.spline_coefficients(on_device(as_numbers(self.solid)))
 
 
 def _deform(pair: UndeformedPair, before: Pass, window: Triple, overlap: float) -> PassInput:

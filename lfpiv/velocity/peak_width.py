@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from scipy import ndimage
-
 from lfpiv.velocity.settings import REFINE_SEARCH, Triple
+from lfpiv_kernels.correlation import sums
 from lfpiv_kernels.correlation.correlate import PEAK_REACH
+from lfpiv_kernels.correlation.light import fluctuation
+from lfpiv_kernels.transfer import Values
 
 OWN = 0.2
 """Autocorrelation of the volumes below which a lag no longer belongs to a peak."""
@@ -21,7 +21,7 @@ LARGEST_REACH = 8
 """Largest reach [voxel]. Particles as large as that take more than a window."""
 
 
-def peak_reach(first: np.ndarray, second: np.ndarray, window: Triple) -> int:
+def peak_reach(first: Values, second: Values, window: Triple) -> int:
     """Return the number of lags around a correlation peak that belong to it.
 
     It is the smallest one, from `PEAK_REACH` on, beyond which the autocorrelation of the volumes is below `OWN` along
@@ -29,18 +29,18 @@ def peak_reach(first: np.ndarray, second: np.ndarray, window: Triple) -> int:
 
     Parameters
     ----------
-    first, second : ndarray, shape (z, y, x), float32
+    first, second : array, shape (z, y, x), float32
         Volumes as they are correlated.
     window : (int, int, int)
         Last window (z, y, x) [voxel]. The mean over it is subtracted: light that varies slowly is no particle.
     """
-    fluctuations = [volume - ndimage.uniform_filter(volume, window) for volume in (first, second)]
-    power = sum(float(np.square(one, dtype=np.float64).sum()) for one in fluctuations)
+    fluctuations = [fluctuation(volume, window) for volume in (first, second)]
+    power = sums.power(fluctuations)
     if not power > 0:
         return PEAK_REACH
     for reach in range(PEAK_REACH, LARGEST_REACH):
-        lags = [(axis, reach + 1) for axis in range(3) if first.shape[axis] > 2 * (reach + 1)]
-        if not lags or min(sum(_product(one, *lag) for one in fluctuations) for lag in lags) < OWN * power:
+        axes = [axis for axis in range(3) if first.shape[axis] > 2 * (reach + 1)]
+        if not axes or min(sums.lag_products(fluctuations, reach + 1, axes)) < OWN * power:
             return reach
     return LARGEST_REACH
 
@@ -49,9 +49,3 @@ def refine_search(reach: int) -> Triple:
     """Return the largest lag of a pass after the first [voxel]: as far beyond the peak as for the least reach."""
     lag = math.ceil(REFINE_SEARCH * reach / PEAK_REACH)
     return lag, lag, lag
-
-
-def _product(values: np.ndarray, axis: int, lag: int) -> float:
-    """Return the sum of products of voxels that lie `lag` apart along an axis."""
-    moved = np.moveaxis(values, axis, 0)
-    return float((moved[lag:] * moved[:-lag]).sum(dtype=np.float64))

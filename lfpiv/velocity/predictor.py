@@ -15,6 +15,8 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 
 from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation import deform
+from lfpiv_kernels.correlation.interpolation import from_control_points, to_control_points
+from lfpiv_kernels.transfer import Values, to_host
 
 CONTROL_SPACING = 4
 """Largest distance of control points [voxel]."""
@@ -26,8 +28,8 @@ class Predictor:
 
     points: tuple[np.ndarray, ...]
     """Control points along each axis (z, y, x) [voxel]."""
-    field: np.ndarray
-    """Displacement (z, y, x) at the control points, shape (z, y, x, 3), float32 [voxel]."""
+    control: Values
+    """Displacement (z, y, x) at the control points, shape (z, y, x), vectors of float32 on the device [voxel]."""
     shape: tuple[int, int, int]
     """Shape of the volume [voxel]."""
 
@@ -36,9 +38,13 @@ class Predictor:
         """Interpolate a field of shape (z, y, x, 3) [voxel], known at `nodes` along each axis of a volume."""
         counts = [max(2, math.ceil((n - 1) / CONTROL_SPACING) + 1) for n in shape]
         points = tuple(np.linspace(0, max(n - 1, 1), count) for n, count in zip(shape, counts, strict=True))
-        for axis in range(3):
-            field = _apply(spline_matrix(nodes[axis], points[axis]), field, axis)
-        return cls(points=points, field=field.astype(np.float32), shape=shape)
+        matrices = [spline_matrix(*axis) for axis in zip(nodes, points, strict=True)]
+        return cls(points=points, control=to_control_points(matrices, field), shape=shape)
+
+    @property
+    def field(self) -> np.ndarray:
+        """Displacement (z, y, x) at the control points, shape (z, y, x, 3), float32, on the host [voxel]."""
+        return to_host(self.control)
 
     @property
     def spacing(self) -> tuple[float, float, float]:
@@ -48,17 +54,13 @@ class Predictor:
 
     def window_means(self, windows: Windows) -> np.ndarray:
         """Return the displacement averaged over windows, shape (z, y, x, 3) [voxel]."""
-        means = self.field.astype(float)
+        matrices = []
         for axis in range(3):
             points, positions = self.points[axis], deform.OFFSET + np.arange(self.shape[axis])
             linear = make_interp_spline(points, np.eye(len(points)), k=1)(positions)  # extends beyond the last point
             edge, first = windows.window[axis], windows.first_voxels[axis]
-            means = _apply(np.stack([linear[start : start + edge].mean(0) for start in first]), means, axis)
-        return means
-
-
-def _apply(matrix: np.ndarray, field: np.ndarray, axis: int) -> np.ndarray:
-    return np.moveaxis(np.tensordot(matrix, field, (1, axis)), 0, axis)
+            matrices.append(np.stack([linear[start : start + edge].mean(0) for start in first]))
+        return from_control_points(matrices, self.control)
 
 
 def spline_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:

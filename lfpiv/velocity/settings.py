@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from lfpiv.experiment.settings import DEFAULT_WINDOWS, Correlation
 from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import is_finite
+from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation
 
 Triple = tuple[int, int, int]
 """Whole numbers along (z, y, x)."""

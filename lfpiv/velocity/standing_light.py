@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from lfpiv.velocity.windows import Windows
+from lfpiv_kernels.correlation.light import shared_light
+from lfpiv_kernels.transfer import Values
 
 MOVING_VOXEL = 1.0
 """Least displacement of vectors that moving particles made [voxel]."""
@@ -17,17 +19,15 @@ BRIGHTER = 1.5
 LEAST_MOVING = 0.25
 """Least share of vectors that must move for their light to be a measure."""
 
-_TINY = float(np.finfo(np.float32).tiny)
-
 
 def on_standing_light(
-    first: np.ndarray, second: np.ndarray, windows: Windows, field: np.ndarray, valid: np.ndarray
+    first: Values, second: Values, windows: Windows, field: np.ndarray, valid: np.ndarray
 ) -> np.ndarray:
     """Return the vectors whose windows hold more standing light than particles.
 
     Parameters
     ----------
-    first, second : ndarray, shape (z, y, x), float32
+    first, second : array, shape (z, y, x), float32
         Intensities of both volumes, without background, not deformed. Each is taken relative to its mean.
     windows : Windows
         Windows of the vectors.
@@ -47,8 +47,8 @@ def on_standing_light(
     none = np.zeros(valid.shape, bool)
     if not valid.any() or moving.sum() < LEAST_MOVING * valid.sum():
         return none
-    one, other = (np.maximum(volume, 0) / max(float(np.maximum(volume, 0).mean()), _TINY) for volume in (first, second))
-    staying = windows.means(np.minimum(one, other))
-    typical = float(np.median(windows.means((one + other) / 2)[moving]))
+    least, mean = shared_light(first, second)
+    staying = windows.means(least)
+    typical = float(np.median(windows.means(mean)[moving]))
     bright: np.ndarray = staying >= BRIGHTER * typical
     return valid & bright if typical > 0 else none

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from lfpiv.experiment.settings import DEFAULT_WINDOWS, SMALLEST_WINDOW, Correlation
 from lfpiv.geometry.grid import AXES
 from lfpiv.prompt import times
+from lfpiv.settings.processing import DEFAULT_WINDOWS, SMALLEST_WINDOW, Correlation
 from lfpiv.velocity.derived import LEAST_VECTORS
 from lfpiv.velocity.settings import Triple, cut_windows
 from lfpiv.velocity.windows import Windows

@@ -6,12 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.ndimage
 import xarray as xr
 from scipy import fft
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import MASKED, SPACING_TOLERANCE, VIEWS, checked_mask, is_finite
+from lfpiv_kernels.correlation import light
+from lfpiv_kernels.transfer import Given, Values, to_host
 
 LARGEST_BLOCK = 128
 """Largest edge of the central block that is correlated as a whole [voxel]."""
@@ -90,14 +91,15 @@ def missing_smoothing(smoothing_voxel: float, *volumes: xr.DataArray | np.ndarra
     return math.sqrt(max(smoothing_voxel**2 - sieve**2, 0.0)) if sieve > 0 else smoothing_voxel
 
 
-def preprocess(volume: np.ndarray, smoothing_voxel: float, intensity_power: float) -> np.ndarray:
+def preprocess(volume: Given, smoothing_voxel: float, intensity_power: float) -> Given:
     """Smooth a volume without background by a Gaussian and raise its intensities to a power, negative ones as 0.
 
-    The result is float32 like the volume, shape (z, y, x). A power of 1 leaves negative intensities.
+    The result is float32 like the volume, shape (z, y, x), and on the device if the volume is. A power of 1 leaves
+    negative intensities.
     """
     if smoothing_voxel > 0:
-        volume = scipy.ndimage.gaussian_filter(volume, smoothing_voxel, mode="constant")
-    return volume if intensity_power == 1 else np.maximum(volume, 0) ** np.float32(intensity_power)
+        volume = light.smoothed(volume, smoothing_voxel)
+    return volume if intensity_power == 1 else light.powered(volume, np.float32(intensity_power))
 
 
 def voxel_axes(
@@ -184,14 +186,15 @@ def without(solid: np.ndarray | None, seen: np.ndarray | None) -> np.ndarray | N
     return ~seen if solid is None else solid | ~seen
 
 
-def moves_beyond(first: np.ndarray, second: np.ndarray, search: tuple[int, int, int]) -> bool:
+def moves_beyond(first: Values, second: Values, search: tuple[int, int, int]) -> bool:
     """Return whether two volumes (z, y, x) as a whole clearly correlate at larger lags than `search` reaches.
 
-    The central blocks of both volumes are correlated with wrap-around.
+    The central blocks of both volumes are correlated with wrap-around, on the host.
     """
     middle = tuple(slice(max(n - LARGEST_BLOCK, 0) // 2, (n + min(n, LARGEST_BLOCK)) // 2) for n in first.shape)
-    spectrum, other = (fft.rfftn(volume[middle] - volume[middle].mean()) for volume in (first, second))
-    shape = first[middle].shape
+    one, other = (to_host(volume[middle]) for volume in (first, second))
+    spectrum, other = (fft.rfftn(block - block.mean()) for block in (one, other))
+    shape = one.shape
     correlation = fft.irfftn(spectrum.conj() * other, shape)
     lags = np.meshgrid(*(np.abs(n * fft.fftfreq(n)) for n in shape), indexing="ij", sparse=True)
     near = np.logical_and.reduce(np.broadcast_arrays(*(lag <= reach for lag, reach in zip(lags, search, strict=True))))

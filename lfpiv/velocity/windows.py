@@ -8,6 +8,8 @@ import numpy as np
 
 from lfpiv.velocity.settings import Triple, triple
 from lfpiv_kernels.correlation.plan import window_grid
+from lfpiv_kernels.correlation.window_means import window_means, window_middles
+from lfpiv_kernels.transfer import Values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +36,13 @@ class Windows:
         """Return the windows that cover a volume, each of which shares a part with its neighbours."""
         return cls.covering(shape, window, triple(max(1, round(edge * (1 - overlap))) for edge in window))
 
-    def means(self, values: np.ndarray) -> np.ndarray:
+    def means(self, values: Values) -> np.ndarray:
         """Return the mean over each window, shape (z, y, x); of flags the share. `values` has the volume's shape."""
-        mean = values.astype(float)
-        for axis, (edge, start) in enumerate(zip(self.window, self.first_voxels, strict=True)):
-            below = np.insert(mean.cumsum(axis), 0, 0, axis)
-            mean = (below.take(start + edge, axis) - below.take(start, axis)) / edge
-        return mean
+        return window_means(values, self.window, self.origin, self.step, self.count)
+
+    def middles(self, flags: Values) -> np.ndarray:
+        """Return the mean place of each window's flagged voxels, shape (z, y, x, 3) [voxel]; NaN without any."""
+        return window_middles(flags, self.window, self.origin, self.step, self.count)
 
     @property
     def centres(self) -> list[np.ndarray]:

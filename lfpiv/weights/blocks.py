@@ -92,7 +92,7 @@ class PackedCamera:
         )
 
 
-class _Growing:
+class Growing:
     """Array of unknown length that is filled piece by piece. Memory that is reserved but not written costs nothing."""
 
     def __init__(self, dtype: type, expected: int):
@@ -217,8 +217,8 @@ def blocks_of(
     """
     footprints = packed.footprints(form, cuts)
     blocks, values = (int(1.02 * count) + BLOCK_WIDTH for count in expected)
-    ray, height, width = (_Growing(dtype, blocks) for dtype in (np.int32, np.uint8, np.uint8))
-    value = _Growing(np.uint8, values)
+    ray, height, width = (Growing(dtype, blocks) for dtype in (np.int32, np.uint8, np.uint8))
+    value = Growing(np.uint8, values)
     counts, per_voxel = [], []
     for model in models:
         for count in footprints.compute(model):

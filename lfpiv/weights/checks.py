@@ -14,7 +14,7 @@ from lfpiv_kernels import runtime
 from lfpiv_kernels.weights.ray_model import MODEL_SIZE
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.camera import Calibration
+    from lfpiv.calibration.camera import CalibratedCamera, Calibration
 
 
 def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") -> int:
@@ -29,9 +29,14 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
         chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
         places = choose_planes(stored, camera, chosen) or stored
         blocks, values = sample_blocks(PackedCamera.of(camera), places, chosen)
-        rays = 4 * (5 + 2) * camera.microimages.size + 24 * runtime.CHUNKS
+        rays = rays_bytes(camera)
         total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * places.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
     return int(total)
+
+
+def rays_bytes(camera: CalibratedCamera) -> int:
+    """Return the memory of a camera's rays and of the map between them and the pixels [byte]."""
+    return 4 * (5 + 2) * camera.microimages.size + 24 * runtime.CHUNKS
 
 
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:

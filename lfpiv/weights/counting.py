@@ -1,41 +1,31 @@
 """Weights by counting rays (Eq. 10): weight = rays that reach a pixel / rays traced from the voxel.
 
-Object points in a voxel and points in the pupil are stratified samples. `count_voxels` traces and counts them. A whole
-grid of counts becomes the operator's `Blocks` (`count_blocks`). A few counted voxels, `CountedVoxels`, measure the
-error of integrated weights.
+Object points in a voxel and points in the pupil are stratified samples. `count_voxels` traces and counts them. A few
+counted voxels, `CountedVoxels`, measure the error of integrated weights. For whole grids see
+`lfpiv.weights.counted_grid`.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lfpiv.lightfield.microimage_layout import plain
-from lfpiv.warn import Code, Warning, warn
-from lfpiv.weights.blocks import PackedCamera, require_numbers
+from lfpiv.weights.blocks import PackedCamera
 from lfpiv.weights.ray_fit import fit_rays
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.count import count_rays
 from lfpiv_kernels.reconstruction.projector import Blocks, Projector
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
-log = logging.getLogger(__name__)
-
 COUNT_POINTS = 8
 """Object points along each edge of a voxel: 512 per voxel. The paper has 500."""
-COUNT_SAMPLES = 36
-"""Pupil points along each axis when every voxel of a grid is counted: about 1,000 rays per object point."""
-COUNT_CHUNK = 64
-"""Number of voxels counted at once. Each needs a window of the sensor in memory."""
-COUNT_TALLEST = 128
-"""Largest height of a block of counts [row]."""
+PAPER_SAMPLES = 144
+"""Pupil points along each axis: the paper's step of 0.05 degrees."""
 VOXELS = 6
 """Number of voxels per camera that are compared with integrated weights."""
 POOLS = 1 << 12, 1 << 18
@@ -216,69 +206,3 @@ def _window(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np
     on_sensor, in_window = _overlap(image.shape, shape, corner)
     out[in_window] = image[on_sensor]
     return out
-
-
-def count_blocks(stored: StoredGrid, camera: CalibratedCamera) -> Blocks:
-    """Count the rays of every voxel of a grid and pack the counts into blocks. Warn that this takes long."""
-    rays, size = plain(camera.optics.sensor_shape), stored.grid.size
-    warn(log, Warning(code=Code.COUNT_SLOW, subject=camera.name, figures={"voxels": size}))
-    parts = []
-    for first in range(0, size, COUNT_CHUNK):
-        last = min(first + COUNT_CHUNK, size)
-        counts, total, corner = count_voxels(
-            camera, stored.centres_mm(np.arange(first, last)), stored.grid.voxel_mm, samples=COUNT_SAMPLES, seed=first
-        )
-        parts.append(_pack_windows(counts / total[:, None, None], corner, camera.optics.sensor_shape, rays.edge))
-    blocks, rows, ray, height, value, scale = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    require_numbers(blocks.sum(dtype=np.int64), stored.grid.shape)
-    return Blocks(
-        form="pixels",
-        first_block=np.concatenate([[0], np.cumsum(blocks)]).astype(np.int32),
-        first_value=np.concatenate([[0], BLOCK_WIDTH * np.cumsum(rows)]).astype(np.int64),
-        ray=ray,
-        height=height,
-        width=np.full(len(ray), BLOCK_WIDTH, np.uint8),
-        value=np.append(value, np.zeros(BLOCK_WIDTH, np.uint8)),
-        scale=scale,
-        microimages=rays,
-    )
-
-
-def _pack_windows(
-    windows: np.ndarray, corner: np.ndarray, sensor_shape: tuple[int, int], stride: int
-) -> tuple[np.ndarray, ...]:
-    """Pack windows of weights, shape (voxel, rows, columns), into blocks of one column of tiles each.
-
-    Return the number of blocks and of rows per voxel, and the arrays ray, height, value, scale of `Blocks`.
-    """
-    row = corner[:, 1, None] + np.arange(windows.shape[1])
-    column = corner[:, 0, None] + np.arange(windows.shape[2])
-    seen = ((row >= 0) & (row < sensor_shape[0]))[:, :, None] & ((column >= 0) & (column < sensor_shape[1]))[:, None]
-    windows = np.where(seen, windows, 0.0)
-    windows = np.pad(windows, ((0, 0), (0, 0), (0, -windows.shape[2] % BLOCK_WIDTH)))
-    tiles = windows.reshape(*windows.shape[:2], -1, BLOCK_WIDTH).transpose(0, 2, 1, 3)  # voxel, tile column, row, lane
-    scale = tiles.max((1, 2, 3)) / LEVELS
-    lit = tiles.any(-1)
-    place = np.arange(lit.shape[2]) % COUNT_TALLEST
-    starts = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (1, 0)))[:, :, :-1] & (place > 0)))
-    ends = np.argwhere(lit & ~(np.pad(lit, ((0, 0), (0, 0), (0, 1)))[:, :, 1:] & (place < COUNT_TALLEST - 1)))
-    voxel, tile, first = starts.T
-    # a tile that begins left of the sensor starts at the end of the row above, with weights of 0 there
-    pixel = (corner[voxel, 1] + first) * stride + corner[voxel, 0] + tile * BLOCK_WIDTH
-    unit = np.where(scale > 0, scale, 1.0)
-    value = np.rint(tiles[lit] / unit[np.nonzero(lit)[0], None]).astype(np.uint8)
-    shift = np.maximum(-pixel, 0)  # before the sensor's first pixel: move the block's lanes instead
-    if shift.any():
-        rows_of = np.repeat(shift, ends[:, 2] - first + 1)
-        for amount in np.unique(rows_of[rows_of > 0]):
-            some = rows_of == amount
-            value[some] = np.roll(value[some], -amount, axis=1)
-        pixel = pixel + shift
-    return (
-        np.bincount(voxel, minlength=len(windows)),
-        np.bincount(voxel, weights=ends[:, 2] - first + 1, minlength=len(windows)).astype(np.int64),
-        pixel.astype(np.int32),
-        (ends[:, 2] - first + 1).astype(np.uint8),
-        value,
-        scale.astype(np.float32),
-    )

@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import logging
 import math
+import shutil
 from collections.abc import Hashable, Mapping
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lfpiv.calibration.coverage import SEEN_SHARE, warn_seen_by_one
-from lfpiv.experiment.settings import Compute
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.prompt import Card, Shown
+from lfpiv.settings.processing import Compute
 from lfpiv.weights.adjoint import Adjoint, checked_out
 from lfpiv.weights.blocks import (
     Cuts,
@@ -29,7 +31,8 @@ from lfpiv.weights.blocks import (
 )
 from lfpiv.weights.card import card_of
 from lfpiv.weights.choice import Choice, choose_form, choose_uncounted, memory_check
-from lfpiv.weights.counting import CountedVoxels, add_entries, add_window, count_blocks, count_voxels
+from lfpiv.weights.counted_grid import count_blocks
+from lfpiv.weights.counting import CountedVoxels, add_entries
 from lfpiv.weights.depth_planes import choose_planes
 from lfpiv.weights.even_light import EvenLight, project_even_light
 from lfpiv.weights.stored_grid import StoredGrid
@@ -46,8 +49,6 @@ DEFAULTS = Compute()
 """Computation and form of the weights where none are stated."""
 METHODS = ("footprint", "count")
 FORMS = ("auto", *footprint.FORMS)
-COUNT_SAMPLES_ONE = 144
-"""Pupil points along each axis for one voxel's image: the paper's step of 0.05 degrees."""
 
 Images = dict[str, np.ndarray]
 
@@ -65,7 +66,7 @@ class Weights(Shown):
     cameras : mapping of str to CalibratedCamera
         The cameras.
     projectors : mapping of str to Projector
-        Weights of each camera. The weights of other cameras are counted when first needed.
+        Weights of each camera.
     method : {"footprint", "count"}
         How the weights were made.
     choices : mapping of str to Choice, optional
@@ -168,20 +169,12 @@ class Weights(Shown):
         if len(voxel) != 3 or any(not 0 <= i < n for i, n in zip(voxel, self.grid.shape, strict=True)):
             raise ValueError(f"voxel: expected (iz, iy, ix) inside the grid {self.grid.shape}, got {tuple(voxel)}.")
         image = np.zeros(setup.optics.sensor_shape, np.float32)
-        index = self.stored.index(voxel)
-        if camera in self._projectors:
-            add_entries(image, self._projectors[camera], index)
-        else:  # not counted yet: trace this voxel only
-            centre = self.stored.centres_mm(np.array([index]))
-            counts, total, corner = count_voxels(setup, centre, self.grid.voxel_mm, samples=COUNT_SAMPLES_ONE)
-            add_window(image, counts[0] / max(int(total[0]), 1), corner[0])
+        add_entries(image, self._projectors[camera], self.stored.index(voxel))
         weights: np.ndarray = image * setup.gain
         return weights
 
     def projector(self, name: str) -> Projector:
-        """Return one camera's stored weights, without white-image gain. Count them if they are not stored yet."""
-        if name not in self._projectors:
-            self._projectors[name] = Projector(count_blocks(self.stored, self.cameras[name]))
+        """Return one camera's stored weights, without white-image gain."""
         return self._projectors[name]
 
     @property
@@ -242,7 +235,8 @@ class Weights(Shown):
             pixels = projector.see_only(lenses)
             image, sums = np.zeros_like(gain), np.zeros(self.grid.size, np.float32)
             image[pixels] = gain[pixels]
-            self._lens_sums[name, lenses] = projector.back_project(image, sums, lenses)
+            projector.back_project(image, sums, lenses)
+            self._lens_sums[name, lenses] = sums
         return self._lens_sums[name, lenses]
 
     @property
@@ -319,6 +313,8 @@ def build_weights(
     *,
     form: str = DEFAULTS.weights_form,
     planes: bool = True,
+    rays: int = DEFAULTS.count_rays,
+    finished: Path | None = None,
     limit_bytes: float = math.inf,
     progress: StepProgress | None = None,
 ) -> Weights:
@@ -331,8 +327,7 @@ def build_weights(
     grid : Grid
         Voxels.
     method : {"footprint", "count"}
-        Area-integrated weights, or counted rays. Counting a whole grid is slow, so it starts only when the operator is
-        first applied; `Weights.image` traces one voxel without it.
+        Area-integrated weights, or counted rays.
     form : {"auto", "profiles", "pixels"}
         How footprints are stored. "profiles": products of a profile along the sensor's columns and one along its rows
         for every voxel and lens (rank 1), small and fast, for straight rays and square microlenses. "pixels": one value
@@ -340,6 +335,11 @@ def build_weights(
     planes : bool
         Store the weights of nodes on planes across each camera's line of sight where that is accurate, see
         `lfpiv.weights.depth_planes`. False: the weights of every voxel.
+    rays : int
+        Rays that are counted per voxel and camera, one of ``compute.count_rays``.
+    finished : Path, optional
+        Folder in which parts of a count are kept until all voxels are counted, so that a count that was killed goes on
+        where it was. It is removed at the end.
     limit_bytes : float
         Memory that the weights may take [byte]; default: no limit.
     progress : callable, optional
@@ -352,9 +352,11 @@ def build_weights(
     Raises
     ------
     ValueError
-        If `method` or `form` is unknown, or profiles are requested for a hexagonal microlens layout.
+        If `method`, `form` or `rays` is unknown, or profiles are requested for a hexagonal microlens layout.
     InputError
         If the weights would not fit into `limit_bytes`. Raised before they are computed.
+    StorageError
+        If parts of a count cannot be written to `finished`.
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}.")
@@ -365,23 +367,28 @@ def build_weights(
     if form == "profiles" and hexagonal:
         raise ValueError(f"form: 'profiles' need square microlenses, those of camera {hexagonal[0]!r} are hexagonal.")
     stored = StoredGrid.for_cameras(grid, cameras.values())
-    if method == "count":
-        return Weights(stored, cameras, {}, method)
     runtime.device()
     projectors, choices, counted = dict[str, Projector](), dict[str, Choice](), dict[str, CountedVoxels]()
     whole = progress or (lambda fraction: None)
     for number, (name, camera) in enumerate(cameras.items()):
+        used = sum(projector.blocks.nbytes for projector in projectors.values())
+        step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
+        if method == "count":
+            allow = memory_check(name, grid, Choice(form="pixels"), limit_bytes - used)
+            projectors[name] = Projector(count_blocks(stored, camera, rays, step, allow, finished))
+            continue
         if form == "auto" and camera.lattice.layout == "square":
             counted[name] = CountedVoxels(stored, camera)
             choices[name] = choose_form(counted[name])
         else:
             choices[name] = choose_uncounted(stored, camera, form)
-        chosen, used = choices[name], sum(projector.blocks.nbytes for projector in projectors.values())
+        chosen = choices[name]
         allow = memory_check(name, grid, chosen, limit_bytes - used)
-        step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
         nodes = choose_planes(stored, camera, chosen.form, chosen.cuts) if planes else None
         blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
         projectors[name] = Projector(blocks, nodes.shares if nodes else None)
+    if finished is not None:
+        shutil.rmtree(finished, ignore_errors=True)
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)
     text = "weights of %d voxels on %d cameras: %.0f MiB"
     log.info(text, grid.size, len(cameras), weights.memory_bytes / 2**20)

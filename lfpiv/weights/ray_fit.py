@@ -68,23 +68,26 @@ def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) ->
     return out
 
 
-def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float) -> np.ndarray:
-    """Return ray models of single voxels, see ``lfpiv_kernels.weights.ray_model.MODEL_SIZE``.
+def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float, degree: int = 2) -> np.ndarray:
+    """Return ray models of single voxels, see `grid_models`.
 
     The projected edges are differences of the mapping between opposite faces of the voxel.
 
     Returns
     -------
-    ndarray, shape (voxel, 30), float32
+    ndarray, shape (voxel, 30 or 38), float32
     """
-    model = np.empty((len(centres_mm), 30), np.float32)
-    model[:, :12] = fit_rays(camera, centres_mm, degree=2).reshape(-1, 12)
+    fits = fit_rays(camera, centres_mm, degree=degree).reshape(len(centres_mm), -1)
+    terms = fits.shape[1]
+    model = np.empty((len(centres_mm), terms + 18), np.float32)
+    model[:, :terms] = fits
     for axis in range(3):
         face = np.zeros(3)
         face[axis] = voxel_mm / 2
-        edge = fit_rays(camera, centres_mm + face, degree=2) - fit_rays(camera, centres_mm - face, degree=2)
-        model[:, 12 + 2 * axis : 14 + 2 * axis] = edge[:, :, 0]
-        model[:, 18 + 4 * axis : 22 + 4 * axis] = edge[:, :, 1:3].reshape(-1, 4)
+        before, behind = (fit_rays(camera, centres_mm + sign * face, degree=degree) for sign in (-1, 1))
+        edge = behind - before
+        model[:, terms + 2 * axis : terms + 2 + 2 * axis] = edge[:, :, 0]
+        model[:, terms + 6 + 4 * axis : terms + 10 + 4 * axis] = edge[:, :, 1:3].reshape(-1, 4)
     return _finite(model)
 
 
@@ -93,6 +96,7 @@ def grid_models(
     shape: tuple[int, int, int],
     centres_mm: Callable[[np.ndarray], np.ndarray],
     axes: tuple[int, int, int],
+    degree: int = 2,
 ) -> Iterator[np.ndarray]:
     """Yield ray models of a grid's voxels, plane by plane of its outermost axis.
 
@@ -111,60 +115,65 @@ def grid_models(
         Returns (x, y, z) [mm].
     axes : tuple of int
         World axis (x, y, z: 0, 1, 2) of each axis of the grid.
+    degree : {2, 3}
+        Degree of the polynomials in the pupil point.
 
     Yields
     ------
-    ndarray, shape (voxels of a plane, 30), float32
-        See ``lfpiv_kernels.weights.ray_model.MODEL_SIZE``.
+    ndarray, shape (voxels of a plane, 30 or 38), float32
+        See ``lfpiv_kernels.weights.ray_model.MODEL_SIZE`` and, for degree 3,
+        ``lfpiv_kernels.rays.counted_blocks.MODEL_SIZE``.
     """
     outer, rows, columns = shape
-    fits, along = _interpolated(camera, shape, centres_mm)
+    fits, along = _interpolated(camera, shape, centres_mm, degree)
+    terms = fits.shape[-1]
 
     def plane_fits(plane: int) -> np.ndarray:
         plane_nodes = along[0][plane + 1] @ fits.reshape(len(fits), -1)
         row_fits = along[1] @ plane_nodes.reshape(fits.shape[1], -1)
         every: np.ndarray = along[2] @ row_fits.reshape(rows + 2, fits.shape[2], -1)
-        return every.reshape(rows + 2, columns + 2, 2, 6)
+        return every.reshape(rows + 2, columns + 2, 2, terms // 2)
 
     before, here = plane_fits(-1), plane_fits(0)
     for plane in range(outer):
         after = plane_fits(plane + 1)
-        model = np.empty((rows, columns, 30), np.float32)
-        model[..., :12] = here[1:-1, 1:-1].reshape(rows, columns, 12)
+        model = np.empty((rows, columns, terms + 18), np.float32)
+        model[..., :terms] = here[1:-1, 1:-1].reshape(rows, columns, terms)
         differences = (
             after[1:-1, 1:-1] - before[1:-1, 1:-1],
             here[2:, 1:-1] - here[:-2, 1:-1],
             here[1:-1, 2:] - here[1:-1, :-2],
         )
         for axis, difference in zip(axes, differences, strict=True):
-            model[..., 12 + 2 * axis : 14 + 2 * axis] = 0.5 * difference[..., 0]
-            model[..., 18 + 4 * axis : 22 + 4 * axis] = 0.5 * difference[..., 1:3].reshape(rows, columns, 4)
-        yield model.reshape(-1, 30)
+            edge, slope = terms + 2 * axis, terms + 6 + 4 * axis
+            model[..., edge : edge + 2] = 0.5 * difference[..., 0]
+            model[..., slope : slope + 4] = 0.5 * difference[..., 1:3].reshape(rows, columns, 4)
+        yield model.reshape(rows * columns, -1)
         before, here = here, after
 
 
 def _interpolated(
-    camera: CalibratedCamera, shape: tuple[int, int, int], centres_mm: Callable[[np.ndarray], np.ndarray]
+    camera: CalibratedCamera, shape: tuple[int, int, int], centres_mm: Callable[[np.ndarray], np.ndarray], degree: int
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Fit at the nodes of a coarser grid, shape (nodes, nodes, nodes, 12), and return the interpolation matrices.
+    """Fit at the nodes of a coarser grid, shape (nodes, nodes, nodes, 12 or 20), and return the interpolation matrices.
 
     There is one matrix per axis, shape (voxels + 2, nodes), float32. Its rows are one voxel before the grid, those of
     the grid, and one voxel behind it.
     """
     rng = np.random.default_rng(0)
     probes = np.column_stack([rng.integers(0, n, PROBES) for n in shape])
-    scale = camera.optics.pupil_radius_mm ** np.array([sum(power) for power in POWERS if sum(power) <= 2])
-    expected = _finite(fit_rays(camera, centres_mm(probes), degree=2)) * scale
+    scale = camera.optics.pupil_radius_mm ** np.array([sum(power) for power in POWERS if sum(power) <= degree])
+    expected = _finite(fit_rays(camera, centres_mm(probes), degree=degree)) * scale
     for step in STEPS:
         counts = [math.ceil((n + 1) / step) + 1 for n in shape]
         nodes = [np.linspace(-1, n, count) for n, count in zip(shape, counts, strict=True)]
         points = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
-        fits = _finite(fit_rays(camera, centres_mm(points), degree=2)).reshape(*counts, 12)
+        fits = _finite(fit_rays(camera, centres_mm(points), degree=degree)).reshape(*counts, 2 * len(scale))
         along = [_spline_matrix(at, n) for at, n in zip(nodes, shape, strict=True)]
         if step == 1:
             break
         weights = [matrix[probe + 1] for matrix, probe in zip(along, probes.T, strict=True)]
-        found = np.einsum("pa,pb,pc,abcf->pf", *weights, fits, optimize=True).reshape(PROBES, 2, 6) * scale
+        found = np.einsum("pa,pb,pc,abcf->pf", *weights, fits, optimize=True).reshape(PROBES, 2, -1) * scale
         error = np.abs(found - expected).sum(-1).max() / camera.lattice.pitch_mm
         if error < NEAR_PITCH:
             break

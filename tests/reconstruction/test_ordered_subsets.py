@@ -19,6 +19,7 @@ from lfpiv.weights.operator import Weights
 from lfpiv_kernels import reference, runtime
 from lfpiv_kernels.reconstruction import update as kernels
 from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
+from lfpiv_kernels.transfer import to_device, to_host
 
 TOLERANCE_SUM = 1e-6  # float32 sums of the same terms in another order, of the brightest pixel
 TOLERANCE_ADJOINT = 1e-6  # float32 sums of terms with random signs, of the norms' product
@@ -117,11 +118,11 @@ def test_epochs_equal_their_dense_twin(weights):
     sieve, column_sum = Sieve(0.0, weights.stored.shape), sum(matrix.sum(0) for matrix in dense).astype(np.float32)
     sums = [dense[one.camera][seen].sum(0).astype(np.float32) for one, seen in zip(subsets, pixels, strict=True)]
     sizes = ordered_subsets.step_sizes(column_sum, sums, np.ones(len(first), bool))
-    state = State(first.copy(), momentum.Momentum(first.copy()), ())
-    partition = ordered_subsets.Partition(subsets, tuple(SmartStep(size, sieve) for size in sizes))
+    state = State(to_device(first), momentum.Momentum(to_device(first)), ())
+    partition = ordered_subsets.Partition(subsets, tuple(SmartStep(to_device(size), sieve) for size in sizes))
     with equations.locked():
         epochs = ordered_subsets.iterate_epochs(equations, state, sieve, partitions=[partition], epochs=3)
-        found = [epoch.state.coefficients for epoch in epochs][-1]
+        found = to_host([epoch.state.coefficients for epoch in epochs][-1])
     np.testing.assert_allclose(found, twin, atol=TOLERANCE_TWIN * twin.max())
 
 
@@ -131,10 +132,10 @@ def test_agreement_is_the_number_of_subsets_for_one_will_and_nothing_for_opposit
     exponents = rng.normal(size=(4, weight.size)).astype(np.float32)
 
     def agreement(*each):
-        found = ordered_subsets.Agreement(weight)
+        found = ordered_subsets.Agreement(to_device(weight))
         for exponent in each:
-            found.add(exponent)
-        return found.value
+            found.add(to_device(exponent))
+        return found.measured()
 
     assert agreement(*[exponents[0]] * 4) == pytest.approx(4, rel=1e-6)
     assert agreement(exponents[0], -exponents[0]) == 0
@@ -159,8 +160,8 @@ def epochs_of(weights, images, partitions, epochs):
     for subsets in partitions:
         sums = [weights.sums_of_lenses(names[one.camera], one.lenses) for one in subsets]
         sizes = ordered_subsets.step_sizes(weights.camera_sums.sum(0), sums, lit)
-        made.append(ordered_subsets.Partition(subsets, tuple(SmartStep(size, sieve) for size in sizes)))
-    first = np.full(weights.grid.size, 1e3, np.float32)
+        made.append(ordered_subsets.Partition(subsets, tuple(SmartStep(to_device(size), sieve) for size in sizes)))
+    first = to_device(np.full(weights.grid.size, 1e3, np.float32))
     state = State(first, momentum.Momentum(first), ())
     with equations.locked():
         found = list(ordered_subsets.iterate_epochs(equations, state, sieve, partitions=made, epochs=epochs))

@@ -11,10 +11,12 @@ import lfpiv
 from lfpiv.reconstruction import resting_voxels, solver, steps
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.particle_size import ParticleSizer
-from lfpiv.reconstruction.resting_voxels import RestingVoxels, faintest_kept
+from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
 from lfpiv_kernels.reconstruction.projector import EVEN, ODD
+from lfpiv_kernels.reconstruction.sums import brightest_share
+from lfpiv_kernels.transfer import to_device, to_host
 
 TOLERANCE_MISFIT = 1e-5  # float32 sums of the same terms in another order, relative
 TOLERANCE_STEP = 1e-5  # float32 against float64, relative
@@ -50,7 +52,7 @@ def equations(recorded):
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
 def test_the_faintest_that_rest_hold_at_most_their_share_of_the_light(share):
     light = np.random.default_rng(1).lognormal(0, 3, 1000).astype(np.float32)
-    least = faintest_kept(light, share)
+    least = to_host(brightest_share(to_device(light), share))[0]
     resting = light[light < least].sum(dtype=np.float64) / light.sum(dtype=np.float64)
     with_next = light[light <= least].sum(dtype=np.float64) / light.sum(dtype=np.float64)
     assert resting <= share <= with_next
@@ -62,7 +64,8 @@ def test_voxels_rest_in_cycles_and_more_of_them_in_each_epoch(equations):
     epochs = range(resting_voxels.ALL + 2 * (resting_voxels.CYCLE + 1))
     with equations.locked():
         resting = RestingVoxels(equations)
-        active = [resting.active_in(epoch, volume) for epoch in epochs]
+        active = [resting.active_in(epoch, to_device(volume)) for epoch in epochs]
+        active = [None if one is None else to_host(one) for one in active]
         resting.wake()
     every = [number for number, one in enumerate(active) if one is None]
     assert every == [0, 1, resting_voxels.ALL + resting_voxels.CYCLE, len(epochs) - 1]
@@ -76,26 +79,33 @@ def test_no_voxel_of_a_small_volume_rests(equations, monkeypatch):
     volume = np.random.default_rng(2).lognormal(0, 3, 1000).astype(np.float32)
     monkeypatch.setattr(resting_voxels, "FEWEST_VOXELS", volume.size + 1)
     resting = RestingVoxels(equations)
-    assert [resting.active_in(epoch, volume) for epoch in range(12)] == [None] * 12
+    assert [resting.active_in(epoch, to_device(volume)) for epoch in range(12)] == [None] * 12
 
 
 def test_light_at_rest_counts_until_it_is_released(equations):
     volume = np.random.default_rng(3).uniform(0, 2e4, equations.cameras[0].projector.blocks.scale.size)
     bright = np.where(volume > 1e4, volume, 0).astype(np.float32)
-    dark = (volume - bright).astype(np.float32)
+    parts = volume.astype(np.float32), bright, (volume - bright).astype(np.float32)
+    every, bright, dark = (to_device(part) for part in parts)
     with equations.locked():
-        whole, back = equations.compare(volume.astype(np.float32)), equations.back_project(bright)
+        whole, back = equations.compare(every), to_host(equations.back_project(bright)).copy()
         equations.hold(dark)
-        held, from_held = equations.compare(bright), equations.back_project(bright)
-        halves = [equations.compare_subset(0, lenses, bright).divergence for lenses in (EVEN, ODD)]
+        held, from_held = equations.compare(bright), to_host(equations.back_project(bright))
+        halves = [_of_half(equations, lenses, bright) for lenses in (EVEN, ODD)]
         equations.release()
         released = equations.compare(bright)
-        whole_volume = volume.astype(np.float32)
-        expected = [equations.compare_subset(0, lenses, whole_volume).divergence for lenses in (EVEN, ODD)]
+        expected = [_of_half(equations, lenses, every) for lenses in (EVEN, ODD)]
     assert held.divergence == pytest.approx(whole.divergence, rel=TOLERANCE_MISFIT)
     assert halves == pytest.approx(expected, rel=TOLERANCE_MISFIT)
     np.testing.assert_allclose(from_held, back, atol=1e-4 * np.abs(back).max())
     assert abs(released.divergence - whole.divergence) > 0.01 * whole.divergence
+
+
+def _of_half(equations, lenses, volume):
+    """The misfit of one camera's half."""
+    equations.begin()
+    equations.compare_subset(0, lenses, volume)
+    return equations.measured().divergence
 
 
 @pytest.mark.parametrize("sharpened", [True, False])
@@ -105,8 +115,10 @@ def test_steps_leave_resting_voxels_and_blur_over_the_others(sharpened):
     active = (rng.random(336) > 0.4).astype(np.float32)
     size, exponent = rng.uniform(0.2, 0.4, 336).astype(np.float32), active * rng.normal(size=336).astype(np.float32)
     sieve = Sieve(0.6, shape)
-    step = steps.SharpenedStep(size, shape) if sharpened else steps.SmartStep(size, sieve)
-    following = step(coefficients, exponent, active)
+    on_device = to_device(size)
+    step = steps.SharpenedStep(on_device, shape) if sharpened else steps.SmartStep(on_device, sieve)
+    following, _ = step(to_device(coefficients), to_device(exponent), over=step.over(to_device(active)))
+    following = to_host(following)
     np.testing.assert_array_equal(following[active == 0], coefficients[active == 0])
     logarithm = (size * exponent).astype(float)
     if sharpened:
@@ -122,19 +134,20 @@ def test_steps_leave_resting_voxels_and_blur_over_the_others(sharpened):
 
 def test_momentum_forgets_voxels_that_stop():
     before, after = np.array([1.0, 1.0, 2.0], np.float32), np.array([2.0, 2.0, 2.0], np.float32)
-    moving = Momentum(before, time=5.0).stopped(after, np.array([False, True, False]))
-    ahead, _ = moving.extrapolate(after.copy())
+    moving = Momentum(to_device(before), time=5.0)
+    moving.forget(to_device(after), to_device(np.array([1.0, 0.0, 1.0], np.float32)))
+    ahead = to_host(moving.extrapolate(to_device(after.copy()))[0])
     assert ahead[0] > 2 and ahead[1:].tolist() == [2, 2]
 
 
 def test_volumes_are_as_good_with_fewer_voxels_visited(recorded, monkeypatch):
     weights, images = recorded
     settings = {"iterations": 14, "subsets": "auto", "sieve_voxel": 0.6}
-    visited = []
+    visited = []  # voxels
     gather = type(weights.projector("cam1")).gather
 
     def counted(self, out, active=None, lenses=2):
-        visited.append(out.size if active is None else np.count_nonzero(active))
+        visited.append(out.size if active is None else np.count_nonzero(active.numpy()))
         return gather(self, out, active, lenses)
 
     monkeypatch.setattr(type(weights.projector("cam1")), "gather", counted)

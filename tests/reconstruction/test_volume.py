@@ -13,17 +13,20 @@ from scipy import ndimage
 from scipy.optimize import minimize
 from support import plain_steps
 from support.ideal_rig import IdealCamera, IdealRig, optics, two_cameras
+from support.plain_rays import plain
 
 import lfpiv
 from lfpiv.calibration import coverage
-from lfpiv.lightfield.microimage_layout import plain
 from lfpiv.reconstruction import momentum, particle_size, sieve, smart, steps
 from lfpiv.results import netcdf
 from lfpiv.weights.operator import Weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import reference, runtime
 from lfpiv_kernels.reconstruction import update as kernels
+from lfpiv_kernels.reconstruction import voxels
 from lfpiv_kernels.reconstruction.projector import Blocks, Projector
+from lfpiv_kernels.reconstruction.sums import Totals
+from lfpiv_kernels.transfer import to_device, to_host
 from lfpiv_kernels.weights import ray_model
 
 TOLERANCE_F32 = 2e-4  # 50 iterations of float32 steps whose sums have <= 60 terms: 50 * 60 * 6e-8
@@ -182,11 +185,13 @@ def test_momentum_that_only_harms_leaves_plain_smart(monkeypatch):
     weights = random_system(6)
     images, _ = noisy_images(weights, 6)
 
-    def spoil(volume, last, exponent):
-        last[:] = volume * (1.0 if exponent == 0 else 1e3)
+    def spoil(*arguments, leap, stepped, **keywords):
+        kernels.update(*arguments, leap=leap, stepped=stepped, **keywords)
+        if leap is not None and leap.exponent > 0:
+            voxels.multiply(stepped, voxels.ones(stepped.size), leap.ahead, factor=1e3)
 
     plain = plain_steps.reconstruct(weights, images, iterations=12, accelerate=False)
-    monkeypatch.setattr(momentum, "extrapolate", spoil)
+    monkeypatch.setattr(steps, "update", spoil)
     spoilt = plain_steps.reconstruct(weights, images, iterations=12)
     assert spoilt.values.tobytes() == plain.values.tobytes()
     assert spoilt.misfit == plain.misfit
@@ -218,7 +223,9 @@ def test_comparison_equals_its_twin_far_from_the_minimum_and_at_it(distance):
     image = image.astype(float)
     ratio = np.log((image + floor) / (projected + floor))
     terms = image - projected - (projected + floor) * ratio
-    squares, misfit = comparison.compare(volume)
+    totals = Totals(2)
+    comparison.compare(volume, totals)
+    squares, misfit = totals.read()
     lit = matrix.sum(1) > 0  # what the others recorded is none of the voxels' business
     assert squares == pytest.approx(np.square(image - projected)[lit].sum(), rel=TOLERANCE_NEAR)
     assert misfit == pytest.approx(terms[lit].sum(), rel=TOLERANCE_NEAR)
@@ -388,9 +395,10 @@ def test_sharp_steps_reach_the_images_in_half_the_iterations(seed):
 def _misfits(weights, images, first, sharp):
     """Misfits of 60 iterations with a sieve and momentum, with sharp steps or without."""
     blur, total = sieve.Sieve(0.6, weights.stored.shape), weights.stored.store(weights.column_sum)
-    sharpened = (steps.SharpenedStep(1 / total, blur.shape),) if sharp else ()
-    guess = weights.stored.store(first.astype(np.float32))
-    state = smart.State(guess, momentum.Momentum(guess), (*sharpened, steps.SmartStep(1 / blur(total), blur)))
+    sharpened = (steps.SharpenedStep(to_device(1 / total), blur.shape),) if sharp else ()
+    guess = to_device(weights.stored.store(first.astype(np.float32)))
+    plain = steps.SmartStep(to_device(1 / blur(total)), blur)
+    state = smart.State(guess, momentum.Momentum(guess), (*sharpened, plain))
     states = smart.iterate(equations_of(weights, images, 1e-3), state, blur, iterations=60)
     return [misfit.divergence for _, misfit in states]
 
@@ -415,11 +423,14 @@ def test_a_sharp_step_that_raises_the_misfit_is_taken_back(gain):
     images, image = noisy_images(weights, 12)
     blur, total = sieve.Sieve(0.6, weights.stored.shape), weights.stored.store(weights.column_sum)
 
-    def sharp(coefficients, exponent):
-        return coefficients * np.exp(np.clip(gain * exponent / total, -3, 3))
+    def sharp(coefficients, exponent, memory):
+        change = np.clip(gain * to_host(exponent) / total, -3, 3)
+        stepped = to_device((to_host(coefficients) * np.exp(change)).astype(np.float32))
+        return (stepped, None) if memory is None else memory.extrapolate(stepped)
 
-    first = np.ones_like(total)
-    state = smart.State(first, momentum.Momentum(first), (sharp, steps.SmartStep(1 / blur(total), blur)))
+    first = to_device(np.ones_like(total))
+    plain = steps.SmartStep(to_device(1 / blur(total)), blur)
+    state = smart.State(first, momentum.Momentum(first), (sharp, plain))
     states = smart.iterate(equations_of(weights, images, 0.2), state, blur, iterations=40)
     misfits = [misfit.divergence for _, misfit in states]
     assert (np.diff(misfits) <= TOLERANCE_MISFIT * image.sum()).all()

@@ -10,7 +10,7 @@ from support import plain_steps
 from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, shear, uniform
 
 import lfpiv
-from lfpiv.experiment.settings import DEFAULT_WINDOWS
+from lfpiv.settings.processing import DEFAULT_WINDOWS
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.velocity.settings import CorrelationSettings, cut_windows
 from lfpiv.velocity.validation import LEAST_SEEN

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lfpiv
-from lfpiv.experiment.settings import Correlation
+from lfpiv.settings.processing import Correlation
 from lfpiv.velocity import vector_grid
 from lfpiv.warn import Code
 

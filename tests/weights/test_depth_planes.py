@@ -17,6 +17,7 @@ from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
 from lfpiv_kernels.reconstruction.projector import EVEN, ODD
+from lfpiv_kernels.transfer import to_device
 
 TOLERANCE_TWIN = 2e-6  # float32 sums of up to 64 shares
 TOLERANCE_ADJOINT = 1e-5  # as of the operator
@@ -167,7 +168,7 @@ def test_no_voxel_rests_where_nodes_share_the_weights(both, monkeypatch):
         )
         with equations.locked():
             resting = RestingVoxels(equations)
-            rested.append(any(resting.active_in(epoch, volume) is not None for epoch in range(6)))
+            rested.append(any(resting.active_in(epoch, to_device(volume)) is not None for epoch in range(6)))
     assert rested == [False, True]
 
 

@@ -371,15 +371,12 @@ def test_out_is_reused_and_results_do_not_depend_on_threads(small, monkeypatch):
 def test_counted_operator_agrees_with_the_footprint(small):
     grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.3, 0.2, 0.2), voxel_mm=VOXEL_MM)
     rig = IdealRig(small.cameras)
-    by_count, by_footprint = (lfpiv.build_weights(rig, grid, method=method) for method in ("count", "footprint"))
-    single = by_count.image("cam1", (0, 1, 2))  # traced alone, with more rays
+    by_count, by_footprint = lfpiv.build_weights(rig, grid, "count", rays=131072), lfpiv.build_weights(rig, grid)
     volume = np.random.default_rng(6).random(grid.shape).astype(np.float32)
     counted_images, images = by_count(volume), by_footprint(volume)
     for name, image in images.items():
         # twelve voxels' footprint errors and counting noise partly average out
         assert np.linalg.norm(image - counted_images[name]) <= FOOTPRINT_MEAN * np.linalg.norm(image)
-    stored = by_count.image("cam1", (0, 1, 2))
-    assert np.linalg.norm(stored - single) <= 0.06 * np.linalg.norm(single)  # the smaller count's noise of about 4 %
     unit = {name: np.ones(c.optics.sensor_shape, np.float32) for name, c in rig.cameras.items()}
     ones = by_count.T(unit)
     assert np.allclose(ones, by_footprint.T(unit), rtol=0.02)

@@ -1,0 +1,163 @@
+"""`PreparedInstant`: the images of one instant and all that SMART needs to reconstruct it, perhaps several times."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
+from lfpiv.reconstruction.history import History
+from lfpiv.reconstruction.momentum import Momentum
+from lfpiv.reconstruction.normalisation import Normalisation
+from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Partition, iterate_epochs
+from lfpiv.reconstruction.recording import Recording
+from lfpiv.reconstruction.resting_voxels import RestingVoxels
+from lfpiv.reconstruction.result import Reconstruction, SmartStop
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.smart import ImageEquations, State, iterate
+from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels.reconstruction.sums import largest
+from lfpiv_kernels.reconstruction.voxels import multiply, part_bright
+from lfpiv_kernels.transfer import DeviceArray, duplicate, to_device, to_host
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedInstant:
+    """Images of one instant with all that SMART needs to know of them. Made by `SmartSolver.prepare`."""
+
+    stored: StoredGrid
+    settings: SmartSettings
+    recordings: Mapping[str, Recording]
+    normalisation: Normalisation
+    intensity_cap: float
+    solid: np.ndarray | None
+    """True for voxels without fluid, shape (z, y, x); None without a mask."""
+    views: np.ndarray | None
+    """Number of cameras that see each voxel, for the result; None if two see every voxel."""
+    equations: ImageEquations
+
+    def solve(
+        self,
+        *,
+        iterations: int | None = None,
+        whole_passes: int = WHOLE_PASSES,
+        first: np.ndarray | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> Reconstruction:
+        """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
+
+        `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes.
+        """
+        settings, normalisation = self.settings, self.normalisation
+        guess = duplicate(self._from_images) if first is None else self._given(first)
+        if settings.active_share > 0:
+            active = part_bright(duplicate(guess), largest(guess), settings.active_share)
+            multiply(guess, active, guess)
+        momentum = Momentum(guess) if settings.accelerate else None
+        state = State(guess, momentum, normalisation.steps)
+        count = settings.iterations if iterations is None else iterations
+        history = History(settings, count)
+        epochs = count - min(whole_passes, -(-count // 2)) if normalisation.has_subsets else 0
+        partitions = normalisation.partitions if epochs else ()
+        with self.equations.locked():
+            if partitions:
+                state = self._solve_subsets(state, partitions, history, epochs, progress)
+            volume, stop = self._solve_whole(state, history, progress)
+        if stop is SmartStop.DIVERGED:
+            log.warning("SMART: %s", stop.value)
+        last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
+        return Reconstruction(
+            grid=self.stored.grid,
+            volume=self._restored(volume),
+            solid=self.solid,
+            views=self.views,
+            residual=tuple(float(np.sqrt(squares)) / self._norm for squares in history.squares),
+            misfit=tuple(history.divergence),
+            stop=stop or last,
+            floor={name: one.floor for name, one in self.recordings.items()},
+            camera_gain={name: one.camera_gain for name, one in self.recordings.items()},
+            light_outside={name: one.light_outside for name, one in self.recordings.items()},
+            sieve_voxel=normalisation.sieve.sigma_voxel,
+            intensity_cap=self.intensity_cap,
+            settings=settings,
+        )
+
+    def misfit(self, first: np.ndarray) -> float:
+        """Return the misfit of a first guess, shape (z, y, x) [counts]; raise ValueError as `solve`."""
+        guess = self._given(first)
+        with self.equations.locked():
+            return self.equations.compare(self.normalisation.sieve(guess)).divergence
+
+    def _given(self, first: np.ndarray) -> DeviceArray:
+        """Return the caller's first guess, shape (z, y, x), on the device, without light that no camera sees."""
+        return multiply(to_device(checked_guess(first, self.stored), float), self.normalisation.lit)
+
+    def _restored(self, volume: DeviceArray) -> np.ndarray:
+        """Return a volume (z, y, x) of the host without the light that the sieve spreads into the solid."""
+        restored = self.stored.restore(to_host(volume))
+        return restored if self.solid is None else np.where(self.solid, np.float32(0), restored)
+
+    @cached_property
+    def _from_images(self) -> DeviceArray:
+        """First guess from the images alone, in stored order, on the device."""
+        peaks = [one.peak for one in self.recordings.values()]
+        normalisation = self.normalisation
+        return multiplicative_guess(self.equations.comparisons, peaks, normalisation.column_sum, normalisation.lit)
+
+    @cached_property
+    def _norm(self) -> float:
+        """Euclidean norm of all images [counts]."""
+        images = (one.image for one in self.recordings.values())
+        return float(np.sqrt(sum(np.einsum("i,i", image, image, dtype=np.float64) for image in images)))
+
+    def _solve_subsets(
+        self,
+        state: State,
+        partitions: Sequence[Partition],
+        history: History,
+        epochs: int,
+        progress: Callable[[float], None] | None,
+    ) -> State:
+        """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
+        history.append(
+            self.equations.compare(self.normalisation.sieve(state.coefficients))
+        )  # exact, as all steps begin here
+        resting = RestingVoxels(self.equations)
+        for epoch in iterate_epochs(
+            self.equations, state, self.normalisation.sieve, partitions=partitions, epochs=epochs, resting=resting
+        ):
+            state = epoch.state
+            if history.epochs:
+                history.append(epoch.misfit)
+            history.subsets.append(epoch.subsets)
+            if progress is not None:
+                progress(history.epochs / (history.iterations + 1))
+            if history.settled:
+                break
+        resting.wake()
+        return state
+
+    def _solve_whole(
+        self,
+        state: State,
+        history: History,
+        progress: Callable[[float], None] | None,
+    ) -> tuple[DeviceArray, SmartStop | None]:
+        """Iterate over all rays in the iterations that are left. Return the last volume, and why it stopped early."""
+        sieve, smooth = self.normalisation.sieve, self.normalisation.smoothing
+        left, done = history.iterations - history.epochs, history.epochs
+        states = iterate(self.equations, state, sieve, iterations=left, smooth=smooth)
+        for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
+            history.append(misfit)
+            if progress is not None:
+                progress((done + number + 1) / (history.iterations + 1))
+            stop = history.early_stop
+            if stop is not None:
+                break
+        return volume, stop

@@ -1,0 +1,127 @@
+"""What SMART needs to know of a rig besides the images: sums of the weights, which voxels are seen, and step sizes.
+
+All of it is the same for every instant whose cameras are found equally bright, so it is computed once, and stays on the
+device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import numpy as np
+
+from lfpiv.reconstruction.ordered_subsets import Partition, Subset, step_sizes, subsets_of
+from lfpiv.reconstruction.settings import AUTO, SmartSettings
+from lfpiv.reconstruction.sieve import Sieve, Smoothing
+from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
+from lfpiv.weights.operator import Weights
+from lfpiv_kernels.reconstruction.projector import ALL
+from lfpiv_kernels.transfer import DeviceArray, to_device
+
+LEAST_COLUMN_SUM = 1e-6
+"""Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
+
+
+class Normalisation:
+    """Sums, masks, gains and steps of a rig.
+
+    Parameters
+    ----------
+    weights : Weights
+        The operator.
+    settings : SmartSettings
+        Settings of the reconstruction.
+    subsets : tuple of Subset
+        The subsets to begin with.
+    solid : ndarray, shape (z, y, x), or None
+        True for voxels without fluid.
+    camera_gains : mapping of str to float
+        Brightness of each camera relative to the brightest.
+    sieve : Sieve
+        The sieve.
+    """
+
+    def __init__(
+        self,
+        weights: Weights,
+        settings: SmartSettings,
+        subsets: tuple[Subset, ...],
+        solid: np.ndarray | None,
+        camera_gains: Mapping[str, float],
+        sieve: Sieve,
+    ):
+        self.sieve = sieve
+        self._weights, self._settings, self._subsets = weights, settings, subsets
+        self._camera_gains = [np.float32(camera_gains[name]) for name in weights.cameras]
+        sums = zip(self._camera_gains, weights.camera_sums, strict=True)
+        self._column_sum: np.ndarray = sum(gain * own for gain, own in sums)
+        self._seen = self._column_sum > LEAST_COLUMN_SUM * self._column_sum.max()
+        self._lit = self._seen if solid is None else self._seen & (weights.stored.store(~solid) > 0)
+        self.column_sum: DeviceArray = to_device(self._column_sum, float)
+        """Sum of the weights of each voxel, shape (voxel,), float32."""
+        self.lit: DeviceArray = to_device(self._lit.astype(np.float32), float)
+        """1 for voxels that some camera sees and that hold fluid, else 0, shape (voxel,), float32."""
+
+    @property
+    def has_subsets(self) -> bool:
+        """Whether the rays are divided into subsets."""
+        return len(self._subsets) > 1
+
+    @cached_property
+    def gains(self) -> dict[str, DeviceArray]:
+        """Camera name -> counts that a pixel records per unit of light, of the pixels that voxels light, float32."""
+        gains = {}
+        for name, relative in zip(self._weights.cameras, self._camera_gains, strict=True):
+            gain = self._weights.gain(name)[self._weights.projector(name).map.pixel]
+            gains[name] = to_device(gain if relative == 1 else gain * relative, float)
+        return gains
+
+    @cached_property
+    def steps(self) -> tuple[Step, ...]:
+        """Steps of an iteration, the fastest first. Sharpened steps come with a sieve and momentum."""
+        relaxation = self._settings.relaxation
+        if self._settings.normalisation == "column":
+            size = self._quotient(relaxation, self.sieve(self._column_sum), self._lit)
+            unblurred = self._quotient(relaxation, self._column_sum, self._lit)
+        else:
+            pixels = self._weights.stored.store(self._weights.affected_pixels)
+            size = unblurred = self._quotient(relaxation / self._weights.largest, pixels, self._lit & (pixels > 0))
+        plain = SmartStep(size, self.sieve)
+        sharpened = self._settings.accelerate and self.sieve.sigma_voxel > 0
+        return (SharpenedStep(unblurred, self.sieve.shape), plain) if sharpened else (plain,)
+
+    @cached_property
+    def smoothing(self) -> Smoothing | None:
+        """Blur of the coefficients between iterations; None without any."""
+        width = self._settings.smoothing_voxel
+        return Smoothing(width, self.sieve.shape, self.lit) if width > 0 else None
+
+    @cached_property
+    def partitions(self) -> tuple[Partition, ...]:
+        """The subsets to begin with, and the whole cameras that may follow if "auto" began with halves."""
+        cameras = len(self._weights.cameras)
+        may_grow = self._settings.subsets == AUTO and len(self._subsets) > cameras
+        in_turn = (self._subsets, subsets_of(cameras, False)) if may_grow else (self._subsets,)
+        return tuple(self._partition(subsets) for subsets in in_turn)
+
+    def _partition(self, subsets: tuple[Subset, ...]) -> Partition:
+        """Return the subsets with the step of each."""
+        sizes = step_sizes(self._column_sum, [self._subset_sum(one) for one in subsets], self._seen)
+        mu = np.float32(self._settings.relaxation)
+        on_device = [to_device(mu * size, float) for size in sizes]
+        if self.sieve.sigma_voxel > 0:
+            return Partition(subsets, tuple(SharpenedStep(size, self.sieve.shape) for size in on_device))
+        return Partition(subsets, tuple(SmartStep(size, self.sieve) for size in on_device))
+
+    def _subset_sum(self, subset: Subset) -> np.ndarray:
+        """Return the sum of each voxel's weights over the pixels of a subset."""
+        if subset.lenses == ALL:
+            own = self._weights.camera_sums[subset.camera]
+        else:
+            own = self._weights.sums_of_lenses(list(self._weights.cameras)[subset.camera], subset.lenses)
+        total: np.ndarray = self._camera_gains[subset.camera] * own
+        return total
+
+    def _quotient(self, numerator: float, denominator: np.ndarray, where: np.ndarray) -> DeviceArray:
+        return to_device(np.divide(numerator, denominator, out=np.zeros_like(self._column_sum), where=where), float)
