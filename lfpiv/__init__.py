@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.geometry.resampling import volume_on as volume_on
     from lfpiv.lightfield.lens_array import LensArray as LensArray
     from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
+    from lfpiv.planning.campaign import plan as plan
     from lfpiv.reconstruction.bootstrap import measure_damping as measure_damping
     from lfpiv.reconstruction.motion import reconstruct_pair as reconstruct_pair
     from lfpiv.reconstruction.volume import reconstruct as reconstruct
@@ -68,6 +69,7 @@ _MODULES = {
     "open_results": "lfpiv.results.reader",
     "open_particles": "lfpiv.results.particles",
     "particle_tracks": "lfpiv.tracking.tracks",
+    "plan": "lfpiv.planning.campaign",
     "prepare": "lfpiv.runs.measurement",
     "reconstruct": "lfpiv.reconstruction.volume",
     "reconstruct_pair": "lfpiv.reconstruction.motion",

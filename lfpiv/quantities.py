@@ -74,3 +74,19 @@ def significant(value: float | None, digits: int = _DIGITS) -> str:
     mantissa, _, power = f"{rounded:.{digits - 1}e}".partition("e")
     mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
     return f"{mantissa}e{int(power)}".replace("-", MINUS)
+
+
+def duration(seconds: float) -> str:
+    """Write a time for people, as the times of runs.
+
+    Examples
+    --------
+    >>> duration(0.234), duration(40), duration(299), duration(7800), duration(400_000)
+    ('0.23 s', '40 s', '5 min', '2 h 10 min', '4 d 15 h')
+    """
+    minutes, hours = round(seconds / 60), round(seconds / 3600)
+    if seconds < 90:
+        return f"{seconds:.0f} s" if seconds >= 10 or seconds == 0 else f"{seconds:.2g} s"
+    if minutes < 90:
+        return f"{minutes} min"
+    return f"{minutes // 60} h {minutes % 60} min" if hours < 48 else f"{hours // 24} d {hours % 24} h"

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from lfpiv.calibration import checks
 from lfpiv.calibration.board.board import agreeing_dots
@@ -74,20 +75,21 @@ def calibrate_or_continue(
     experiment: Experiment, kept: KeptCameras | None, progress: StepProgress | None = None
 ) -> Calibration:
     """Calibrate every camera as `calibrate` does, without measuring again the dots of cameras in `kept`."""
-    whole, count = progress or (lambda fraction: None), len(experiment.cameras)
-    measured = {}
-    for number, setup in enumerate(experiment.cameras):
-        step = part_of(whole, 0.75 * number / count, 0.75 * (number + 1) / count)
-        measured[setup.name] = measure_or_load(experiment, setup, kept, step)
-    errors = _fit_board(experiment, measured)
-    cameras = {}
-    for number, setup in enumerate(experiment.cameras):
-        step = part_of(whole, 0.75 + 0.25 * number / count, 0.75 + 0.25 * (number + 1) / count)
-        with collected() as warnings:
-            camera = _calibrate_camera(experiment, setup, measured[setup.name], errors, step)
-        found = (replace(warning, subject=setup.name) for warning in (*measured[setup.name].warnings, *warnings))
-        cameras[setup.name] = replace(camera, warnings=tuple(found))
-    return Calibration(cameras, board=errors)
+    with threadpool_limits(1, "blas"):  # its sums depend on its number of threads
+        whole, count = progress or (lambda fraction: None), len(experiment.cameras)
+        measured = {}
+        for number, setup in enumerate(experiment.cameras):
+            step = part_of(whole, 0.75 * number / count, 0.75 * (number + 1) / count)
+            measured[setup.name] = measure_or_load(experiment, setup, kept, step)
+        errors = _fit_board(experiment, measured)
+        cameras = {}
+        for number, setup in enumerate(experiment.cameras):
+            step = part_of(whole, 0.75 + 0.25 * number / count, 0.75 + 0.25 * (number + 1) / count)
+            with collected() as warnings:
+                camera = _calibrate_camera(experiment, setup, measured[setup.name], errors, step)
+            found = (replace(warning, subject=setup.name) for warning in (*measured[setup.name].warnings, *warnings))
+            cameras[setup.name] = replace(camera, warnings=tuple(found))
+        return Calibration(cameras, board=errors)
 
 
 def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibration:
@@ -113,20 +115,21 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
     """
     if not math.isfinite(angle_error_deg):
         raise ValueError(f"angle_error_deg: expected a finite angle [degree], got {angle_error_deg}.")
-    cameras = {}
-    for setup in experiment.cameras:
-        with collected() as warnings:
-            sensor = decode(experiment, setup)
-        cameras[setup.name] = CalibratedCamera(
-            name=setup.name,
-            optics=setup.optics,
-            lattice=sensor.lattice,
-            decoder=sensor.decoder,
-            baseline=thin_lens_model(setup.optics, _stated(experiment, setup).away_from_z(angle_error_deg)),
-            report=sensor.quality,
-            warnings=tuple(replace(warning, subject=setup.name) for warning in warnings),
-        )
-    return Calibration(cameras)
+    with threadpool_limits(1, "blas"):
+        cameras = {}
+        for setup in experiment.cameras:
+            with collected() as warnings:
+                sensor = decode(experiment, setup)
+            cameras[setup.name] = CalibratedCamera(
+                name=setup.name,
+                optics=setup.optics,
+                lattice=sensor.lattice,
+                decoder=sensor.decoder,
+                baseline=thin_lens_model(setup.optics, _stated(experiment, setup).away_from_z(angle_error_deg)),
+                report=sensor.quality,
+                warnings=tuple(replace(warning, subject=setup.name) for warning in warnings),
+            )
+        return Calibration(cameras)
 
 
 def _stated(experiment: Experiment, setup: CameraSetup) -> Orientation:

@@ -6,13 +6,13 @@ The microimage of the lens at s_l is centred at X_c = s_l (1 + f_m/s_i) on the s
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv_kernels.weights import microimages
 from lfpiv_kernels.weights.microimages import Microimages
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 
 def microimage_edge(optics: Optics) -> int:
@@ -67,16 +67,14 @@ def microimages_of(optics: Optics, lattice: LensLattice) -> Microimages:
     return rays
 
 
-def plain(sensor_shape: tuple[int, int]) -> Microimages:
-    """Return every pixel as one ray, in rows padded by BLOCK_WIDTH, for weights that were counted per pixel."""
-    rows, columns = sensor_shape
-    pixel = np.full((rows, columns + BLOCK_WIDTH), -1, np.int32)
-    pixel[:, :columns] = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
-    return Microimages(
-        first_lens=(0, 0),
-        corner=np.zeros((1, 1, 2), np.int32),
-        edge=columns + BLOCK_WIDTH,
-        pixel=pixel.ravel(),
-        share=(pixel.ravel() >= 0).astype(np.float32),
-        sensor_shape=(rows, columns),
-    )
+def whole_microimages(optics: Optics, lattice: LensLattice) -> Microimages:
+    """Return the blocks of pixels behind the lenses, each pixel as a whole ray, for counted weights.
+
+    A block holds every pixel that light through the pupil and the lens's cell can reach.
+    """
+    to_pixels = optics.sensor_per_pupil / optics.pixel_mm
+    radius = (optics.pupil_radius_mm + lattice.pitch_mm / math.sqrt(2)) * to_pixels  # a cell reaches that far at most
+    first, centre = microimage_centres(optics, lattice, radius + 1)
+    edge = math.floor(2 * radius) + 2
+    rays: Microimages = microimages.lens_rays((int(first[0]), int(first[1])), centre, radius, edge, optics.sensor_shape)
+    return replace(rays, share=(rays.pixel >= 0).astype(np.float32))

@@ -104,7 +104,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         ("Weights", _weights(summary.weights)),
         ("Cameras against each other", _agreement(summary.weights, experiment.noun)),
         ("Damping by ghosts", _damping(summary.damping)),
-        ("Computed on", f"{summary.device.kind}, {markup.count(summary.device.threads, 'thread')}"),
+        ("Computed on", summary.device.sentence),
     ]
     return '<h2 id="run">What was run</h2>' + markup.facts([row for row in rows if row[1]])
 

@@ -9,6 +9,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from lfpiv_kernels.runtime import Device
+
 
 class _Figures(BaseModel):
     model_config = ConfigDict(frozen=True)
@@ -148,6 +150,19 @@ class DeviceFigures(_Figures):
 
     kind: str
     threads: int
+    name: str = ""
+    """Empty in older summaries, and where the system does not say it."""
+    memory_bytes: int | None = None
+    """Memory of the GPU [byte]; None on the CPU, and in older summaries."""
+    driver: str = ""
+    """Version of CUDA that the GPU's driver knows; empty on the CPU."""
+    reason: str = ""
+    """Why it was picked; empty if it was the one requested."""
+
+    @property
+    def sentence(self) -> str:
+        """The same for people."""
+        return Device(**{name: getattr(self, name) for name in type(self).model_fields}).sentence
 
 
 class Summary(_Figures):

@@ -17,7 +17,6 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.settings import Series
 from lfpiv.files import writing
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.records import read_object
@@ -27,6 +26,7 @@ from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.left_out import LeftOut
 from lfpiv.results.reader import open_results
 from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
+from lfpiv.settings.particles import Series
 from lfpiv.velocity import derived
 from lfpiv.version import versions
 

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.settings import Series
 from lfpiv.records import RecordError, read_object, validate
+from lfpiv.settings.particles import Series
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
@@ -69,6 +69,11 @@ class Folder:
     def guard(self) -> Path:
         """Guard layers that the particle images demand."""
         return self.path / "guard.json"
+
+    @property
+    def counts(self) -> Path:
+        """Parts of counted weights, until all voxels are counted."""
+        return self.path / ".counts"
 
     @property
     def bootstrap(self) -> Path:

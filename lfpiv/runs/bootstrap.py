@@ -12,8 +12,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
-from threadpoolctl import threadpool_limits
-
 from lfpiv.errors import InputError
 from lfpiv.files import writing
 from lfpiv.geometry.grid import AXES
@@ -82,8 +80,7 @@ def decide(
         return None
     start, damping, reason = time.perf_counter(), None, ""
     try:
-        with threadpool_limits(1):  # sums of BLAS depend on its number of threads
-            damping = _measure(make_work(), pairs, progress)
+        damping = _measure(make_work(), pairs, progress)
     except InputError as error:
         log.warning("damping by ghosts: not measured: %s", error)
         return None

@@ -42,7 +42,7 @@ class WeightsFigures:
     profile_errors: Mapping[str, Sequence[float]]
     """Camera -> relative errors of profiles against counted rays; empty for counted weights."""
     count_errors: Mapping[str, Sequence[float]]
-    """Camera -> relative errors of the weights against counted rays; empty for counted weights."""
+    """Camera -> relative errors of the weights against a converged count of rays."""
     self_calibration: SelfCalibrationFigures | None
 
     def to_json(self) -> dict[str, Any]:
@@ -57,10 +57,10 @@ class WeightsFigures:
         if self.disparity is not None:
             stored |= {"disparity_voxel": self.disparity.voxel, "disparity_pair": self.disparity.pair}
             stored["disparity_std_voxel"] = self.disparity.std_voxel
+        stored["count_check_l2"] = [error for errors in self.count_errors.values() for error in _rounded(errors)]
         if self.method == "footprint":
             stored |= {"form": dict(self.forms), "cuts": dict(self.cuts)}
             stored["profiles_check_l2"] = {name: _rounded(errors) for name, errors in self.profile_errors.items()}
-            stored["count_check_l2"] = [error for errors in self.count_errors.values() for error in _rounded(errors)]
         return stored
 
 

@@ -59,7 +59,8 @@ def weights_bytes(experiment: Experiment) -> int:
     """
     from lfpiv.weights.checks import estimate_memory
 
-    cameras, grid, form = _nominal_cameras(experiment), experiment.grid, experiment.compute.weights_form
+    cameras, grid, compute = _nominal_cameras(experiment), experiment.grid, experiment.compute
+    form = compute.weights_form if compute.weights == "footprint" else "pixels"  # counts: as pixels, without planes
     weights = estimate_memory(cameras, grid, form)
     if form == "auto" and (most := estimate_memory(cameras, grid, "pixels")) > weights:
         log.info("memory: %s for weights, up to %s where rays bend", size_text(weights), size_text(most))

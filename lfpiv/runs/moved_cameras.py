@@ -162,7 +162,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
     Uses one pair after another, `pairs` first, until the answer is clear. Return None if there is one camera only, if
     no pair shows particles, or if the cameras show none in common. Warn in the last case if several pairs agree on it.
     """
-    if len(weights.cameras) < 2 or weights.method != "footprint":
+    if len(weights.cameras) < 2:
         return None
     darks, volumes, used = read_darks(experiment), CameraVolumes(weights), list[int]()
     fit, lost, losses, clear = None, list[str](), 0, True

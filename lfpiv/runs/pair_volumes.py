@@ -18,7 +18,6 @@ import xarray as xr
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.experiment.settings import DEFAULT_WINDOWS, Correlation
 from lfpiv.geometry.grid import Grid, Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS
@@ -31,6 +30,7 @@ from lfpiv.runs.frame_light import FrameLight
 from lfpiv.runs.guard import with_guard
 from lfpiv.runs.pair_vectors import LastVectors
 from lfpiv.runs.refinement import refined
+from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation
 from lfpiv.velocity.settings import FIRST_SEARCH
 from lfpiv.warn import Code, Warning
 

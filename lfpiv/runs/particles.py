@@ -11,6 +11,7 @@ from lfpiv.results.pair_files import PairVolumes
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.linking import link_particles
+from lfpiv.tracking.pairing import exchange
 from lfpiv.warn import Code, Warning
 
 HIDDEN, HIDDEN_ONE = 0.5, 0.14
@@ -45,10 +46,11 @@ def track(
     warnings : list of Warning
         Doubts whether particles can be told apart.
     """
-    first, second = (
-        search.find(frame.images, volume, noise=frame.noise, clipped=frame.clipped or None)
+    fits = [
+        search.fit(frame.images, volume, noise=frame.noise, clipped=frame.clipped or None)
         for frame, volume in zip(light, volumes.volumes, strict=True)
-    )
+    ]
+    first, second = exchange(search, fits, vectors)
     table = link_particles(first, second, vectors, dt_s=float(vectors.attrs["dt_s"]))
     return table, [*crowded_warnings(table, len(search.weights.cameras)), *unlinked_warnings(table)]
 

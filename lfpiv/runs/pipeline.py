@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import bootstrap, dispatch, local_workers, memory, rig, task, unchanged, worker_plan
+from lfpiv.runs import bootstrap, device_memory, dispatch, local_workers, memory, rig, task, unchanged, worker_plan
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
@@ -220,6 +220,9 @@ def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None)
             planned = worker_plan.fit_installation(planned, current.device)
             planned = worker_plan.fit_memory(planned, finest, needed, current.device)
         worker_plan.require_memory(finest, needed, 1 if scheduler else planned.workers)
+        if not scheduler:
+            sharing = -(-planned.workers // max(len(gpus), 1))
+            device_memory.require(finest, needed, current.device, sharing=sharing)
         if planned.workers > 1 and not scheduler:
             local_workers.start_preloading(planned.kind)
     return _Checked(todo=todo, failed=failed, workers=scheduler or planned)

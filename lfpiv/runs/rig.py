@@ -228,18 +228,20 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
             finest.grid,
             compute.weights,
             form=compute.weights_form,
+            rays=compute.count_rays,
+            finished=run.folder.counts if compute.weights == "count" else None,
             limit_bytes=memory.left_for_weights(finest),
             progress=run.step("weights"),
         )
         weights.volume = experiment.grid
         _ = weights.camera_sums  # computed here, once for all pairs and workers
         seconds = time.perf_counter() - start
-        counted = compare_with_count(weights) if compute.weights == "footprint" else {}
+        counted = compare_with_count(weights)
         disparity = moved_cameras.check(experiment, weights, todo)
     errors = [error for camera in counted.values() for error in camera]
     if errors:  # a camera may see none of the voxels that were drawn
         share = 100 * np.mean(errors)
-        log.info("weights differ from counted rays by %.1f %% (mean of %d voxels)", share, len(errors))
+        log.info("weights differ from a converged count of rays by %.1f %% (mean of %d voxels)", share, len(errors))
     return weights, WeightsFigures(
         method=compute.weights,
         memory_mib=weights.memory_bytes / MIB,

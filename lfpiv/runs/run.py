@@ -75,7 +75,8 @@ def open_run(
                 running = runtime.start(request, threads=experiment.compute.threads)
             except (RuntimeError, ValueError) as error:
                 raise InputError(str(error)) from None
-            stack.enter_context(threadpool_limits(running.threads))
+            # sums of BLAS depend on its number of threads; operations on small matrices are slower with several
+            stack.enter_context(threadpool_limits(1))
             yield Run(
                 experiment=experiment,
                 folder=folder,

@@ -169,7 +169,7 @@ def build(
     return {
         "schema_version": SCHEMA_VERSION,
         **_settings(experiment),
-        "device": {"kind": device.kind, "threads": device.threads, "reason": device.reason},
+        "device": device.figures(),
         "workers": asdict(done.workers) if done.workers else {},
         "versions": version.versions(),
         "timings_s": {

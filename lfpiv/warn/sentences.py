@@ -50,7 +50,6 @@ class Code(enum.Enum):
     # weights
     WEIGHTS_UNCHECKED = "weights_unchecked"
     WEIGHTS_DIFFER = "weights_differ"
-    COUNT_SLOW = "count_slow"
     # volumes and vectors
     DIVERGED = "diverged"
     UNEXPLAINED = "unexplained"
@@ -200,7 +199,6 @@ SENTENCES: Mapping[Code, str] = {
         "is {aim_mean:percent} % ({aim_worst:percent1} %). Cause: {cause} (rays depart from second order by "
         "{bent_pitch:.2f}, a voxel's edge is {wide_pitch:.1f} microlens pitch)"
     ),
-    Code.COUNT_SLOW: "counting rays for {voxels} voxels; 'footprint' is about a thousand times faster",
     Code.DIVERGED: "SMART: {verdict}",
     Code.UNEXPLAINED: (
         "the volumes explain little of the images' light (residual {residual:.2f}; 0.3 to 0.6 is usual): do not rely "

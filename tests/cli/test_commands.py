@@ -14,6 +14,7 @@ import typer
 import lfpiv
 from lfpiv.cli import commands, terminal
 from lfpiv.errors import InputError
+from lfpiv.quantities import duration
 from lfpiv.runs import memory, pipeline
 
 
@@ -274,7 +275,7 @@ def test_log_lines_state_the_remaining_time(caplog, monkeypatch):
         for fraction in (0.0, 0.05, 0.25, 1.0):
             progress("step", fraction)
     assert [record.getMessage() for record in caplog.records] == ["step: 0 %", "step: 25 %, about 3 min left"]
-    assert [terminal.duration(s) for s in (40, 299, 7800)] == ["40 s", "5 min", "2 h 10 min"]
+    assert [duration(s) for s in (40, 299, 7800)] == ["40 s", "5 min", "2 h 10 min"]
 
 
 def test_memory_is_counted_before_the_work(tiny_experiment):

@@ -9,8 +9,8 @@ import pytest
 
 import lfpiv
 from lfpiv.cli import commands, init
-from lfpiv.experiment.settings import ExperimentTable
 from lfpiv.experiment.toml import read_toml, tomllib
+from lfpiv.settings.experiment import ExperimentTable
 
 EXAMPLE = shlex.split(init.EXAMPLE)
 

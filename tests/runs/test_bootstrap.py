@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import lfpiv
-from lfpiv.experiment.settings import Bootstrap, Smart
 from lfpiv.results import datasets, netcdf, stored_damping
 from lfpiv.results.folder import Folder
 from lfpiv.runs import bootstrap, pipeline
+from lfpiv.settings.processing import Bootstrap, Smart
 from lfpiv.velocity.damping import AxisDamping, Damping
 
 AXIS = AxisDamping(slope=0.8, slope_error=0.02, offset=0.1, offset_error=0.01, fluctuation=0.5, uncertainty_factor=1.2)

@@ -6,9 +6,9 @@ import math
 import pytest
 
 from lfpiv.experiment.opening import read_experiment
-from lfpiv.experiment.settings import Series
 from lfpiv.runs import memory
 from lfpiv.runs.memory import GIB
+from lfpiv.settings.particles import Series
 
 PROGRAMS, CACHE, SHARED = 1, 12, 2
 """What a group holds [GiB]: programs, files that the kernel may drop, and shared memory, which counts as a file, too,

@@ -15,7 +15,7 @@ from lfpiv.calibration.board.pose import CameraPose
 from lfpiv.geometry.optics import NEIGHBOURS, Optics
 
 if TYPE_CHECKING:
-    from lfpiv.experiment.settings import Board
+    from lfpiv.settings.rig import Board
 
 FEWEST_DOTS = 4
 """Least number of dots that make a board."""

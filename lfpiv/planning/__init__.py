@@ -1,0 +1,1 @@
+"""What a campaign will take, from a short calibration of this machine: time, memory and disk."""

@@ -1,0 +1,167 @@
+"""`Plan`: what a campaign takes, as figures and for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lfpiv.files import size_text
+from lfpiv.planning.cost import Cost
+from lfpiv.prompt import Card, Shown, count, times
+from lfpiv.quantities import duration
+from lfpiv_kernels.runtime import Device
+
+
+@dataclass(frozen=True, kw_only=True)
+class Time:
+    """Time of the parts of a campaign."""
+
+    preparation: Mapping[str, Cost]
+    """Done once: "calibration", "images", "weights", "cameras". A step whose cost is not known is missing."""
+    first: Cost
+    """What only the first pair of each worker needs."""
+    pair: Cost
+    """One pair in one worker."""
+    steps: Mapping[str, Cost]
+    """Of a pair: "images", "reconstruction", "correlation", "writing"."""
+    simulated: Cost
+    """Pairs that are simulated at the end to measure the damping by ghosts."""
+    total_s: float
+    """The campaign with all workers, without its report [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Memory:
+    """Memory of a campaign [byte]."""
+
+    needed: int
+    """Of all workers of this machine."""
+    weights: int
+    """Of the weights, which the workers share."""
+    worker: int
+    """Of each worker beside them."""
+    allowed: int
+    """What a run may take here now."""
+    device_needed: int | None
+    """On each GPU; None on the CPU."""
+    device_free: int | None
+    """Free memory of the GPU; None on the CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disk:
+    """Files of a campaign [byte]."""
+
+    pair: int
+    """Vectors of a pair."""
+    results: int
+    """Vectors of all pairs."""
+    volumes: int
+    """Both volumes of a pair, if they are kept, before compression."""
+    weights: int
+    """Weights that several workers share while they work; 0 for one."""
+    free: int
+    """Free space where the results go."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Plan(Shown):
+    """What a campaign takes. Made by `plan`."""
+
+    name: str
+    file: Path
+    noun: str
+    """What results are numbered by: "pair" or "instant"."""
+    pairs: int
+    workers: int
+    device: Device
+    """Where the calibration ran; `threads` are those of each worker."""
+    shape: tuple[int, int, int]
+    """Voxels of the volume (z, y, x)."""
+    voxel_mm: float
+    reconstructed: tuple[int, int, int]
+    """Voxels that are reconstructed, with guard layers and refined (z, y, x)."""
+    reconstructed_mm: float
+    """Their edge [mm]."""
+    vectors: tuple[int, int, int]
+    """Vectors of a pair (z, y, x)."""
+    time: Time
+    memory: Memory
+    disk: Disk
+    limits: tuple[str, ...]
+    """What limits the campaign."""
+    assumptions: tuple[str, ...]
+    """What the plan takes for granted."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether memory and disk suffice."""
+        return self.memory.needed <= self.memory.allowed and self.disk.results + self.disk.weights <= self.disk.free
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the form of ``lfpiv plan --json``."""
+
+        def cost(one: Cost) -> dict[str, float]:
+            return {"wall_s": one.wall_s, "cpu_s": one.cpu_s}
+
+        when = self.time
+        return {
+            "experiment": {"name": self.name, "file": str(self.file)},
+            f"{self.noun}s": self.pairs,
+            "workers": self.workers,
+            "threads": self.device.threads,
+            "device": self.device.figures(),
+            "volume": {"shape": list(self.shape), "voxels": math.prod(self.shape), "voxel_mm": self.voxel_mm},
+            "reconstructed": {
+                "shape": list(self.reconstructed),
+                "voxels": math.prod(self.reconstructed),
+                "voxel_mm": self.reconstructed_mm,
+            },
+            "vectors": {"shape": list(self.vectors), "count": math.prod(self.vectors)},
+            "time": {
+                "preparation": {name: cost(one) for name, one in when.preparation.items()},
+                "first": cost(when.first),
+                "pair": cost(when.pair),
+                "steps": {name: cost(one) for name, one in when.steps.items()},
+                "simulated": cost(when.simulated),
+                "total_s": when.total_s,
+            },
+            "memory_bytes": vars(self.memory),
+            "disk_bytes": vars(self.disk),
+            "fits": self.fits,
+            "limits": list(self.limits),
+            "assumptions": list(self.assumptions),
+        }
+
+    def card(self) -> Card:
+        """Return the plan for people."""
+        when, need, disk = self.time, self.memory, self.disk
+        z, y, x = self.vectors
+        prepared = ", ".join(f"{name} {duration(one.wall_s)}" for name, one in when.preparation.items())
+        steps = ", ".join(f"{name} {duration(one.wall_s)}" for name, one in when.steps.items())
+        all_of = f"{count(self.pairs, self.noun)} with {count(self.workers, 'worker')}"
+        several = f", {size_text(need.worker)} for each worker" if self.workers > 1 else ""
+        facts = [
+            ("device", self.device.sentence),
+            ("volume", f"{times(self.shape)} voxels (z, y, x) of {self.voxel_mm:.4g} mm"),
+            (
+                "reconstructed",
+                f"{times(self.reconstructed)} of {self.reconstructed_mm:.4g} mm: {math.prod(self.reconstructed):,}",
+            ),
+            ("vectors", f"{times((x, y, z))} (x, y, z), {math.prod(self.vectors):,} per {self.noun}"),
+            ("preparation", f"{duration(sum(one.wall_s for one in when.preparation.values()))}: {prepared}"),
+            (f"a {self.noun}", f"{duration(when.pair.wall_s)}: {steps}"),
+            ("in all", f"{duration(when.total_s)} for {all_of}, without the report"),
+            ("memory", f"{size_text(need.needed)}, {size_text(need.weights)} of it for weights{several}"),
+            ("disk", f"{size_text(disk.results)}, {size_text(disk.pair)} per {self.noun}"),
+        ]
+        if need.device_needed is not None and need.device_free is not None:
+            text = f"{size_text(need.device_needed)} needed, {size_text(need.device_free)} free"
+            facts.insert(-1, ("memory of the GPU", text))
+        if disk.weights:
+            facts.append(("while it runs", f"{size_text(disk.weights)} of disk for the weights that workers share"))
+        facts += [("limit", text) for text in self.limits] + [("taken for granted", text) for text in self.assumptions]
+        return Card(f"Plan of {self.name!r}: {all_of}", tuple(facts))
