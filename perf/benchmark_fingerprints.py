@@ -14,7 +14,8 @@ from pathlib import Path
 
 from lfpiv.benchmark import fingerprint
 from lfpiv.benchmark.cases import case_list, names
-from lfpiv.benchmark.make import TRUTH, make
+from lfpiv.benchmark.make import make
+from lfpiv.benchmark.truth import TRUTH
 from lfpiv.files import MIB, write_text
 from lfpiv.version import versions
 

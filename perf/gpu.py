@@ -3,20 +3,26 @@
     python perf/gpu.py [--out FOLDER] [--paper]
 
 Writes FOLDER/tests.txt, FOLDER/perf.jsonl and FOLDER/limits.json (the bandwidth of the GPU's memory), and prints a
-table that compares the cases with this limit. The exit status is 1 if a test fails or a result is wrong, 2 without a
-GPU.
+table that compares the cases with this limit and with the times that ``gpu_model`` predicts. The
+exit status is 1 if a test fails or a result is wrong, 2 without a GPU.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+Predict = Callable[[str], float | None]
+"""From the name of a case to its predicted time [s], None where there is no model of it."""
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = 1 << 28
@@ -38,6 +44,34 @@ def limits() -> dict[str, float | str]:
         seconds.append(time.perf_counter() - start)
     device = wp.get_device("cuda:0")
     return {"gpu": device.name, "architecture": device.arch, "bytes_per_second": 8 * COPIED / float(np.min(seconds))}
+
+
+def predictor() -> Predict:
+    """Return `predicted` of ``gpu_model``; without that module, a function that knows no case."""
+    try:
+        predicted: Predict = importlib.import_module("gpu_model").predicted
+    except (ModuleNotFoundError, AttributeError):
+        return lambda case: None
+    return predicted
+
+
+def table(lines: list[dict[str, Any]], bytes_per_second: float, predicted: Predict) -> list[str]:
+    """Return a row per case of the lines of ``perf/run.py``.
+
+    A row has the measured time and the predicted one [s], and the least time in which the stored weights can be read
+    once as a share of the measured one.
+    """
+    rows = [f"{'case':32s} {'measured':>12s} {'predicted':>12s} {'of bandwidth':>13s}"]
+    for name in dict.fromkeys(line["case"] for line in lines):
+        found = {line["metric"]: line["value"] for line in lines if line["case"] == name and "metric" in line}
+        if "wall" in found:
+            seconds, stored = predicted(name), found.get("stored_bytes")
+            model = "" if seconds is None else f"{seconds:10.4f} s"
+            share = "" if stored is None else f"{stored / found['wall'] / bytes_per_second:.2f}"
+            rows.append(f"{name:32s} {found['wall']:10.4f} s {model:>12s} {share:>13s}".rstrip())
+        elif "wrong" in found:
+            rows.append(f"{name:32s} wrong: {found['wrong']}")
+    return rows
 
 
 def main() -> int:
@@ -64,14 +98,7 @@ def main() -> int:
         command = [sys.executable, str(ROOT / "perf/run.py"), "--device", "cuda", "--all", *["--paper"] * given.paper]
         wrong = subprocess.run(command, stdout=file).returncode
     lines = [json.loads(line) for line in (given.out / "perf.jsonl").read_text().splitlines()]
-    for name in dict.fromkeys(line["case"] for line in lines):
-        found = {line["metric"]: line["value"] for line in lines if line["case"] == name and "metric" in line}
-        if "wall" in found:
-            stored = found.get("stored_bytes")
-            share = f"{stored / found['wall'] / machine['bytes_per_second']:.2f} of the bandwidth" if stored else ""
-            print(f"{name:32s} {found['wall']:10.4f} s  {share}")
-        elif "wrong" in found:
-            print(f"{name:32s} wrong: {found['wrong']}")
+    print("\n".join(table(lines, float(machine["bytes_per_second"]), predictor())))
     return int(bool(tests or wrong))
 
 

@@ -2,6 +2,7 @@
 
     pip install '.[gpu-check]'
     python perf/gpu_static.py [--arch 75 80 90 100] [--json FILE]
+    python perf/gpu_static.py --arch 75 80 90 100 --json docs/figures/gpu_static.json  # the table of the pages
 
 Warp compiles each module to PTX, and ptxas assembles it: registers, stack and spilled bytes of each kernel, and the
 share of a multiprocessor's threads for which the registers suffice (occupancy). Kernels that only the CPU runs are
@@ -22,8 +23,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-REGISTERS, THREADS = 65536, 2048
-"""Of a multiprocessor, compute capabilities 8.0 to 10.0; 7.5 has half as many threads."""
+REGISTERS = 65536
+"""Of a multiprocessor."""
+THREADS = {75: 1024, 80: 2048, 90: 2048, 100: 2048}
+"""Of a multiprocessor, by compute capability."""
 BLOCK = 256
 """Threads of a block: Warp's default."""
 REGISTER_UNIT = 256
@@ -31,16 +34,27 @@ REGISTER_UNIT = 256
 ARCHITECTURES = (75, 80, 90, 100)
 """Compute capabilities. The compiler in Warp no longer knows 7.0."""
 CPU_ONLY = {
-    "blocks": ("_split", "_gather_blocks"),
+    "blocks": ("_split", "_correlate_blocks", "_gather_blocks"),
+    "blur": ("_blur",),
+    "box_sum": ("_box_sum",),
+    "deform": ("_deform_pair",),
+    "depth_planes": ("_spread", "_collect"),
+    "footprint": ("_fill_blocks", "_pack_blocks"),
     "neighbours": ("_predict",),
     "particle_normal": ("_multiply_images",),
+    "pixel_rays": ("_collect", "_spread", "_number_pixels", "_sort_rays"),
     "planes": ("_transform_planes",),
-    "projector": ("_project",),
+    "projector": ("_project", "_back_project", "_count_lit"),
+    "projector_gpu": ("_count_entries", "_write_entries"),
     "spectra": ("_correlate_spectra",),
+    "update": ("_compare",),
     "windows": ("_sum_planes", "_window_statistics"),
 }
 """Kernels by module that a GPU never runs: it has other kernels in their place."""
-CPU_MODULES = ("neighbours", "planes", "spectra", "windows")
+CPU_MODULES = (
+    "blocks", "blur", "box_sum", "deform", "depth_planes", "neighbours", "pixel_rays", "planes", "projector", "spectra",
+    "windows",
+)  # fmt: skip
 """Modules without a kernel for a GPU; their headers need not compile for one."""
 
 
@@ -64,7 +78,7 @@ class Kernel:
         """Share of a multiprocessor's threads for which the registers suffice."""
         per_warp = -(-self.registers * 32 // REGISTER_UNIT) * REGISTER_UNIT
         blocks = REGISTERS // max(per_warp * BLOCK // 32, 1)
-        return min(1.0, blocks * BLOCK / THREADS)
+        return min(1.0, blocks * BLOCK / THREADS[self.architecture])
 
 
 def assembler() -> str | None:
@@ -121,7 +135,14 @@ def _assemble(module: object, short: str, architecture: int) -> Iterator[Kernel]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arch", type=int, nargs="+", default=[90], help="compute capabilities, without the point")
+    parser.add_argument(
+        "--arch",
+        type=int,
+        nargs="+",
+        default=[90],
+        choices=ARCHITECTURES,
+        help="compute capabilities, without the point",
+    )
     parser.add_argument("--json", type=Path, help="file for the table")
     given = parser.parse_args()
     rows = [kernel for architecture in given.arch for kernel in measure(architecture)]

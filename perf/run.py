@@ -14,6 +14,7 @@ import contextlib
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -190,6 +191,12 @@ def compare(name: str, base: Path, device: str) -> None:
     print(json.dumps(line), flush=True)
 
 
+def stop(*_: object) -> None:
+    """End the process so that the other checkout is removed, which a second signal must not interrupt."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit(143)
+
+
 def machine() -> dict:
     """Return the facts about the machine and the checkout that the figures depend on."""
     model = platform.processor()
@@ -237,6 +244,7 @@ def main() -> int:
         parser.error(f"--case: unknown {', '.join(unknown)}; there are {', '.join(CASES)}")
     print(json.dumps(machine()), flush=True)
     if given.against:
+        signal.signal(signal.SIGTERM, stop)
         names = given.case or [f"{op}_small" for op in COMPARED]
         with tempfile.TemporaryDirectory() as folder:
             tree = Path(folder) / "base"

@@ -48,8 +48,8 @@ def _pair(edge: int, cameras: int) -> dict[str, Any]:
     import inputs
 
     import lfpiv
-    from lfpiv.experiment.settings import Correlation, Smart
     from lfpiv.reconstruction.refinement import needed_refinement
+    from lfpiv.settings.processing import Correlation, Smart
 
     rows, columns = (int(edge * 0.1 * stretch / 0.0055) + 200 for stretch in (1, 2**0.5))
     calibration, user = inputs.rig((rows, columns), cameras=cameras), inputs.grid({"voxels": edge})

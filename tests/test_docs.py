@@ -23,9 +23,9 @@ from support.public_names import public_modules
 
 import lfpiv
 from lfpiv.cli import commands
-from lfpiv.experiment.settings import ExperimentTable
 from lfpiv.experiment.toml import tomllib
 from lfpiv.runs import pipeline
+from lfpiv.settings.experiment import ExperimentTable
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.warn import Code
 

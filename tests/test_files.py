@@ -7,7 +7,7 @@ import pytest
 
 import lfpiv
 from lfpiv import files
-from lfpiv.experiment.settings import Smart
+from lfpiv.settings.processing import Smart
 
 
 def test_a_failed_write_leaves_the_old_file_alone(tmp_path):

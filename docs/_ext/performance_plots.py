@@ -1,7 +1,7 @@
 """Plots and a table of the page on performance, drawn from stored figures in the colours of the page, light or dark.
 
-`draw` and `table` need no Sphinx; `setup` registers the directives ``{performance-plot} NAME ...`` and
-``{performance-table}``. `perf/scaling.py` and `perf/run.py` write the figures.
+`draw`, `table` and `gpu_table` need no Sphinx; `setup` registers the directives ``{performance-plot} NAME ...`` and
+``{performance-table}``, ``{gpu-table}``. `perf/scaling.py`, `perf/run.py` and `perf/gpu_static.py` write the figures.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from lfpiv.report import svg
 
 FOLDER = Path(__file__).resolve().parents[1] / "figures"
 SCALING, PEERS = FOLDER / "scaling.json", FOLDER / "peers.jsonl"
+GPU_STATIC = FOLDER / "gpu_static.json"
 PARTS = {"weights_s": "weights, once", "volumes_s": "both volumes", "vectors_s": "vectors"}
 PEER_NAMES = {
     "project_small": "projection, SciPy CSR",
@@ -100,6 +101,28 @@ def table() -> str:
     return "\n".join(lines)
 
 
+def gpu_table() -> str:
+    """Return registers, stack, spills and occupancy of the kernels on GPUs as Markdown, the fullest kernels first."""
+    rows: Rows = json.loads(GPU_STATIC.read_text("utf-8"))
+    kernels: dict[tuple[str, str], dict[int, Mapping[str, Any]]] = {}
+    for row in rows:
+        kernels.setdefault((row["module"], row["name"]), {})[row["architecture"]] = row
+    capabilities = sorted({row["architecture"] for row in rows})
+    named = ", ".join(f"{one / 10:.1f}" for one in capabilities)
+    lines = [
+        f"| kernel | registers at {named} | stack [byte] | spilled [byte] | occupancy at {named} |",
+        "|---|---|---|---|---|",
+    ]
+    for (module, name), found in sorted(
+        kernels.items(), key=lambda item: (min(row["occupancy"] for row in item[1].values()), item[0])
+    ):
+        by = [found[one] for one in capabilities]
+        registers, occupancy = (", ".join(format(row[key]) for row in by) for key in ("registers", "occupancy"))
+        stack, spilled = (max(row[key] for row in by) for key in ("stack", "spilled"))
+        lines.append(f"| `{module}.{name}` | {registers} | {stack} | {spilled} | {occupancy} |")
+    return "\n".join(lines)
+
+
 def setup(app):
     """Register the directives."""
     from sphinx.util.docutils import SphinxDirective
@@ -111,5 +134,13 @@ def setup(app):
             self.env.note_dependency(str(SCALING))
             return self.parse_text_to_nodes(table())
 
+    class GpuTable(SphinxDirective):
+        """What the CUDA compiler makes of the kernels."""
+
+        def run(self):
+            self.env.note_dependency(str(GPU_STATIC))
+            return self.parse_text_to_nodes(gpu_table())
+
     app.add_directive("performance-table", PerformanceTable)
+    app.add_directive("gpu-table", GpuTable)
     return add_directive(app, "performance-plot", draw, PLOTS, (SCALING, PEERS))

@@ -23,7 +23,7 @@ if not (folder / "report.html").exists():
 calibration = lfpiv.load_calibration(folder / "calibration.h5")
 grid = lfpiv.Grid.from_extent(centre_mm=(0.0, 0.0, 1.0), size_mm=(0.5, 0.5, 0.5), voxel_mm=0.1)
 weights = lfpiv.build_weights(calibration, grid)
-counted = lfpiv.build_weights(calibration, grid, "count")
+counted = lfpiv.build_weights(calibration, grid, "count", rays=131072)
 
 voxel = (2, 2, 2)  # the middle one, at (0, 0, 1) mm
 footprint, rays = weights.image("left", voxel), counted.image("left", voxel)

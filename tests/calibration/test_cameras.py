@@ -14,6 +14,7 @@ from scipy import ndimage
 from support.calibration_scene import CALIBRATION_SCENE as SCENE
 from support.calibration_scene import MAPPING_PITCH
 from support.ideal_rig import rotation
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import lfpiv
 from lfpiv import warn
@@ -21,6 +22,7 @@ from lfpiv.calibration import checks, coverage
 from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.coverage import warn_outside
 from lfpiv.calibration.thin_lens_model import thin_lens_model
+from lfpiv.experiment.experiment import Experiment
 from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
@@ -392,3 +394,19 @@ def test_the_sample_experiment_reaches_the_projects_figures(sample_data, tmp_pat
         metres = vectors[f"displacement_{axis}"].values * 0.1e-3 / spec["dt_s"]
         assert np.allclose(vectors[name].values, metres, rtol=1e-5)
         assert vectors[name].attrs["units"] == "m/s"
+
+
+@pytest.mark.parametrize("calibrate", [lfpiv.calibrate, lfpiv.thin_lens])
+def test_blas_takes_one_thread_whatever_it_may_take_outside(tiny_experiment, monkeypatch, calibrate):
+    """Sums of BLAS depend on its number of threads: a script and a run on another machine must agree."""
+    seen = []
+
+    def read_image(*_):
+        seen.extend(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+        raise KeyboardInterrupt
+
+    experiment = lfpiv.open_experiment(tiny_experiment)
+    monkeypatch.setattr(Experiment, "white", read_image)
+    with threadpool_limits(2, "blas"), pytest.raises(KeyboardInterrupt):
+        calibrate(experiment)
+    assert seen and set(seen) == {1}

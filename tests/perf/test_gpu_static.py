@@ -1,52 +1,78 @@
 """What the CUDA compiler makes of the kernels; needs ptxas, from the extra `gpu-check`."""
 
+import json
+from pathlib import Path
+
 import pytest
-from gpu_static import Kernel, assembler, measure
+from gpu_static import ARCHITECTURES, Kernel, assembler, measure
 
 LEAST_OCCUPANCY = 0.25
 """With fewer threads a multiprocessor waits for memory: a quarter of them hides some 400 clocks of it."""
 LEAST_OCCUPANCY_OF_A_PASS = 0.5
 """Of kernels that run in every pass of a reconstruction or a correlation."""
 EVERY_PASS = {
-    ("blur", "_blur"),
+    ("blocks_gpu", "_correlate_lanes"),
+    ("blur_gpu", "_blur_axis"),
+    ("deform_gpu", "_deform"),
+    ("depth_planes_gpu", "_collect"),
+    ("depth_planes_gpu", "_spread"),
+    ("filters_gpu", "_filter"),
     ("peaks", "_find_peaks"),
-    ("pixel_rays", "_collect"),
-    ("pixel_rays", "_spread"),
-    ("projector", "_back_project"),
-    ("projector", "_project_atomic"),
-    ("update", "_compare"),
+    ("pixel_rays_gpu", "_collect"),
+    ("pixel_rays_gpu", "_compare"),
+    ("pixel_rays_gpu", "_spread"),
+    ("projector_gpu", "_gather"),
+    ("projector_gpu", "_scatter"),
+    ("split_gpu", "_split_voxels"),
+    ("sums_gpu", "_sum_products"),
+    ("sums_gpu", "_sum_values"),
+    ("uncertainty_gpu", "_sum_differences"),
+    ("uncertainty_gpu", "_sum_products"),
     ("update", "_extrapolate"),
     ("update", "_sharpen"),
     ("update", "_update"),
+    ("windows_gpu", "_sum_columns"),
+    ("windows_gpu", "_sum_rows"),
+    ("windows_gpu", "_window_statistics"),
 }
-TOO_LARGE = {("footprint", "_fill_blocks")}
-"""Known to miss the least occupancy: one thread holds all that a voxel's lenses need."""
-STACKS = {("footprint", "_fill_blocks"), ("footprint", "_pack_blocks"), ("projector", "_back_project")}
-"""Known to keep arrays in memory."""
+BELOW_LIMIT = {("footprint_gpu", "_fill_pixels", 100)}
+"""Known to miss the least occupancy: for 10.0 the compiler takes 133 registers, and spills 96 bytes if held to 128."""
+STORED = Path(__file__).resolve().parents[2] / "docs" / "figures" / "gpu_static.json"
+"""The table of the pages; not installed."""
 
 
-@pytest.fixture(scope="module")
-def kernels():
+@pytest.fixture(scope="module", params=ARCHITECTURES)
+def kernels(request):
     if assembler() is None:
         pytest.skip("ptxas is not installed; pip install 'lfpiv[gpu-check]'")
-    return {(kernel.module, kernel.name): kernel for kernel in measure(90)}
+    return {(kernel.module, kernel.name): kernel for kernel in measure(request.param)}
 
 
 @pytest.mark.slow
 def test_enough_threads_fit_on_a_multiprocessor(kernels):
     assert set(kernels) >= EVERY_PASS
-    assert {key for key, one in kernels.items() if one.occupancy < LEAST_OCCUPANCY} == TOO_LARGE
+    few = {(*key, one.architecture) for key, one in kernels.items() if one.occupancy < LEAST_OCCUPANCY}
+    assert few <= BELOW_LIMIT
     assert not {key for key in EVERY_PASS if kernels[key].occupancy < LEAST_OCCUPANCY_OF_A_PASS}
 
 
 @pytest.mark.slow
 def test_registers_are_not_spilled_and_arrays_stay_in_registers(kernels):
     assert {key for key, one in kernels.items() if one.spilled} == set()
-    assert {key for key, one in kernels.items() if one.stack} == STACKS
+    assert {key for key, one in kernels.items() if one.stack} == set()
+
+
+@pytest.mark.slow
+def test_the_table_of_the_pages_has_these_kernels(kernels):
+    """Make it again: python perf/gpu_static.py --arch 75 80 90 100 --json docs/figures/gpu_static.json."""
+    rows = json.loads(STORED.read_text("utf-8"))
+    assert {row["architecture"] for row in rows} == set(ARCHITECTURES)
+    assert {(row["module"], row["name"]) for row in rows} == set(kernels)
 
 
 def test_occupancy_follows_from_the_registers():
-    def occupancy(registers):
-        return Kernel("module", "kernel", 90, registers, stack=0, spilled=0, shared=0).occupancy
+    def occupancy(registers, architecture=90):
+        return Kernel("module", "kernel", architecture, registers, stack=0, spilled=0, shared=0).occupancy
 
     assert [occupancy(n) for n in (16, 32, 64, 65, 128, 255)] == [1.0, 1.0, 0.5, 0.375, 0.25, 0.125]
+    assert [occupancy(n, 75) for n in (64, 128)] == [1.0, 0.5]  # half as many threads

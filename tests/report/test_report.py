@@ -17,7 +17,6 @@ from support import report_run
 
 import lfpiv
 from lfpiv import quantities
-from lfpiv.experiment.settings import Series
 from lfpiv.geometry.names import COMPONENTS
 from lfpiv.report import calibration, flow, markup, overview, slice_panels, vectors, verdicts, volumes
 from lfpiv.report import pairs as pairs_section
@@ -41,6 +40,7 @@ from lfpiv.report.summary import CameraFigures, Summary
 from lfpiv.report.svg import cell_edges
 from lfpiv.report.verdicts import Level
 from lfpiv.results import netcdf
+from lfpiv.settings.particles import Series
 
 PLOTLY_BYTES, PAGE_BYTES, CAMERA_BYTES, VECTOR_BYTES = 2.4e6, 1.5e6, 0.7e6, 32
 """Largest size of a report: plotly.js packed (1.9 MB in version 7), pictures and tables, pictures of each camera, and
