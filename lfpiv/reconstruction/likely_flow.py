@@ -24,8 +24,11 @@ from lfpiv.velocity.modes import field_of, modes_of, shells_of
 
 SLOPES = (0.5, 1.2)
 """Limits of the slope of all modes."""
+LEAST_SLOPE = 0.1
+"""Least slope of a shell. Vectors show too little of what lies below for it to be made from them."""
 SHELL_SPREAD = 0.2
-"""Standard deviation of the slopes of shells around that of all modes. A shell without flow gets the slope of all."""
+"""Standard deviation of the slopes of shells around that of all modes. A shell without flow, such as that of
+the mean, gets the slope of all."""
 
 
 class LikelyFlow:
@@ -98,7 +101,9 @@ class LikelyFlow:
         found = np.mean([self._sums(found * found) for _, found in pairs], axis=0)
         overall = np.clip(products.sum(0) / np.maximum(imposed.sum(0), _TINY), *SLOPES)
         known = _errors(overall, imposed, products, found) / (len(simulated) * SHELL_SPREAD**2 * self._counts)
-        slope = (products + known * overall) / np.maximum(imposed + known, _TINY)
+        whole = imposed + known
+        slope = np.divide(products + known * overall, whole, out=np.tile(overall, (len(whole), 1)), where=whole > 0)
+        slope = np.maximum(slope, LEAST_SLOPE)
         return slope, _errors(slope, imposed, products, found) / self._counts
 
     def _sums(self, powers: np.ndarray) -> np.ndarray:

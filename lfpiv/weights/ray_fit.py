@@ -77,10 +77,10 @@ def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float
     -------
     ndarray, shape (voxel, 30 or 38), float32
     """
-    fits = fit_rays(camera, centres_mm, degree=degree).reshape(len(centres_mm), -1)
-    terms = fits.shape[1]
+    fits = fit_rays(camera, centres_mm, degree=degree)
+    terms = fits.shape[1] * fits.shape[2]
     model = np.empty((len(centres_mm), terms + 18), np.float32)
-    model[:, :terms] = fits
+    model[:, :terms] = fits.reshape(-1, terms)
     for axis in range(3):
         face = np.zeros(3)
         face[axis] = voxel_mm / 2

@@ -188,7 +188,7 @@ def unbounded(entry, name, definitions, above=frozenset()):
     needed = {
         "array": [{"maxItems"}] if "items" in entry else [],
         "string": [{"maxLength", "enum", "const"}],
-        "number": [{"minimum", "exclusiveMinimum"}, {"maximum", "exclusiveMaximum"}],
+        "number": [{"minimum", "exclusiveMinimum", "enum"}, {"maximum", "exclusiveMaximum", "enum"}],
     }
     needed["integer"] = needed["number"]
     if not all(one & set(entry) for one in needed.get(entry.get("type"), [])):

@@ -81,3 +81,13 @@ def test_errors_alone_make_hardly_any_flow():
     still = np.zeros((6, 7, 8, 3))
     found = likely([measured(still, rng) for _ in range(12)], rng)
     assert found.std() < 0.5 * NOISE
+
+
+def test_a_shell_without_any_power_leaves_the_flow_finite():
+    """The shell of the mean holds nothing else in few windows, and the mean of fluctuations may be exactly zero."""
+    rng = np.random.default_rng(7)
+    flow = waves(shape=(1, 3, 4))
+    flow[..., 0] = np.tile([1.0, -1.0], (1, 3, 2))  # sums to zero to the bit
+    pairs = [Simulated(vectors=simulated(flow, rng).vectors, imposed=flow)]
+    pairs[0].vectors["displacement_z"].values[:] = flow[..., 0]
+    assert np.isfinite(LikelyFlow([flow])(0, pairs)).all()

@@ -227,7 +227,7 @@ def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
     written, said = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 3, said
     assert "pair 3:" in written and "damaged" in written
-    assert "pair 0: " in said and "CPU (1 thread" in said, "what workers log is lost"
+    assert "pair 0: " in said and "kernels run on cpu" in said and "1 thread" in said, "what workers log is lost"
     assert len(list(tmp_path.glob("*.job"))) > 1 and (tmp_path / "slurm-logs").is_dir()
     for folder in (reference := small_run.results(tmp_path / "reference"), out):
         (folder / "vectors" / "pair_0003.nc").unlink(missing_ok=True)
