@@ -151,8 +151,6 @@ class _Mapping:
     """The network and its errors."""
     agreeing: np.ndarray
     """Labels used, shape (n,), bool."""
-    nominal: NominalDifference
-    """Difference from the stated pose and magnification."""
     sigma_nor_stated: float
     """Mean error on the held-out dots at their stated places [microlens pitch]."""
 
@@ -197,12 +195,15 @@ def _calibrate_camera(
         corrected = errors.points_mm(DotBoard.from_settings(experiment.board), dots.dot)
         dots = replace(dots, points_mm=corrected)
         lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
-    checks.check_pupil(experiment, setup, dots, lens)
-    mapping = _fit_mapping(experiment, setup, dots, stated_mm, lens, sensor.lattice.pitch_mm)
+    residual = dots.array_mm - lens(dots.points_mm, dots.pupil_mm)
+    typical_pitch = float(np.median(np.linalg.norm(residual, axis=1))) / sensor.lattice.pitch_mm
+    checks.check_pupil(experiment, setup, dots, lens, typical_pitch)
+    nominal = checks.compare_with_nominal(setup, lens, typical_pitch)
+    mapping = _fit_mapping(experiment, setup, dots, stated_mm, lens, residual, sensor.lattice.pitch_mm)
     step(0.9)
     rejected = dots.rejected + _disagreeing_per_plane(dots, mapping.agreeing, math.prod(experiment.board.dots))
     checks.check_rejected(experiment, setup, dots, rejected)
-    quality = _quality(sensor, dots, mapping, int(rejected.sum()))
+    quality = _quality(sensor, dots, mapping, nominal, int(rejected.sum()))
     training_dots = len(np.unique(dots.dot[mapping.agreeing][mapping.training.split.training]))
     checks.check_mapping(setup, quality, mapping.training.network, experiment.network.estimator, training_dots)
     log.info(
@@ -231,14 +232,12 @@ def _fit_mapping(
     dots: BoardDots,
     stated_mm: np.ndarray,
     lens: ThinLensModel,
+    residual: np.ndarray,
     pitch_mm: float,
 ) -> _Mapping:
     """Leave out dots that disagree with their neighbours, and train the network."""
     settings, place = experiment.network, f"{experiment.path}: labels of camera {setup.name!r}"
     std = label_std(dots, pitch_mm)
-    residual = dots.array_mm - lens(dots.points_mm, dots.pupil_mm)
-    typical_residual = float(np.median(np.linalg.norm(residual, axis=1))) / pitch_mm
-    nominal = checks.compare_with_nominal(setup, lens, typical_residual)
     agreeing = agreeing_dots(dots, residual, pitch_mm)
     baseline = lens if settings.baseline == "thin_lens" else None
     points, pupil, std = dots.points_mm[agreeing], dots.pupil_mm[agreeing], std[agreeing]
@@ -266,7 +265,6 @@ def _fit_mapping(
         baseline=baseline,
         training=training,
         agreeing=agreeing,
-        nominal=nominal,
         sigma_nor_stated=float(stated.mean()),
     )
 
@@ -275,12 +273,14 @@ def _disagreeing_per_plane(dots: BoardDots, agreeing: np.ndarray, dots_per_plane
     return np.bincount(np.unique(dots.dot[~agreeing]) // dots_per_plane, minlength=len(dots.found))
 
 
-def _quality(sensor: Sensor, dots: BoardDots, mapping: _Mapping, rejected: int) -> CalibrationQuality:
+def _quality(
+    sensor: Sensor, dots: BoardDots, mapping: _Mapping, nominal: NominalDifference, rejected: int
+) -> CalibrationQuality:
     training = mapping.training
     return CalibrationQuality(
         **vars(sensor.quality),
-        turn_from_nominal_deg=mapping.nominal.turn_deg,
-        magnification=mapping.nominal.magnification,
+        turn_from_nominal_deg=nominal.turn_deg,
+        magnification=nominal.magnification,
         sigma_nor_test=training.sigma_nor,
         sigma_nor_stated=mapping.sigma_nor_stated,
         dots_found=int(dots.found.sum()),

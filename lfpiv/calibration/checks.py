@@ -45,7 +45,12 @@ MAGNIFICATION = 0.04
 EXPLAINED_PITCH = 0.2
 """Median residual of the thin lens below which its magnification is compared [microlens pitch]."""
 PUPIL_SCALE, PUPIL_SCALE_INCOMPLETE = 0.3, 0.1
-"""Largest difference of the fitted pupil scale from 1, and the same where over a tenth of the dots are missing."""
+"""Largest difference of the fitted pupil scale from 1 where no thin lens fits the labels, and the same where over a
+tenth of the dots are missing."""
+FITTED_PITCH = 0.1
+"""Median residual of the thin lens up to which labels are right whatever its pupil [microlens pitch]."""
+MEDIUM = 0.1
+"""Difference of the refractive index of what the board stands in from 1 above which a warning is due."""
 COMPLETE = 0.9
 """Part of the expected dots that a complete board shows."""
 SIGMA_NOR_PITCH = {"lens_integral": 0.03, "gaussian": 0.1}
@@ -102,8 +107,16 @@ class NominalDifference:
     """Magnification at the middle of the board."""
 
 
-def check_pupil(experiment: Experiment, setup: CameraSetup, dots: BoardDots, fitted: ThinLensModel) -> None:
-    """Refuse labels that fit only a camera with another pupil: depth and defocus of the dots contradict each other."""
+def check_pupil(
+    experiment: Experiment, setup: CameraSetup, dots: BoardDots, fitted: ThinLensModel, residual_pitch: float
+) -> None:
+    """Refuse labels that fit only a camera with another pupil: depth and defocus of the dots contradict each other.
+
+    Labels that a thin lens fits are right, whatever its pupil: behind a plane surface of a liquid it is another one.
+    `residual_pitch` is the labels' median distance from the fitted thin lens [microlens pitch].
+    """
+    if residual_pitch <= FITTED_PITCH:
+        return
     found, expected = dots.found.sum(), dots.expected.sum()
     limit = PUPIL_SCALE if found >= COMPLETE * expected else PUPIL_SCALE_INCOMPLETE
     if not abs(fitted.pupil_scale - 1) <= limit:
@@ -134,6 +147,12 @@ def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, residual_pit
     if residual_pitch < EXPLAINED_PITCH and not 1 / (1 + MAGNIFICATION) < ratio < 1 + MAGNIFICATION:
         figures = {"magnification": float(magnification), "stated": abs(setup.optics.magnification)}
         warn(log, Warning(code=Code.MAGNIFIED, subject=setup.name, figures=figures))
+    elif residual_pitch < FITTED_PITCH:
+        # Behind a plane surface a point at the depth z appears at z / n. A lens without the surface, n times as far
+        # away and with n times the focal length, takes the same images through the same pupil.
+        index = fitted.image_distance_mm / setup.optics.image_distance_mm / fitted.pupil_scale
+        if abs(index - 1) > MEDIUM:
+            warn(log, Warning(code=Code.MEDIUM, subject=setup.name, figures={"index": index, "depth": 1 / index}))
     return NominalDifference(turn_deg=float(turn), magnification=float(magnification))
 
 

@@ -34,6 +34,7 @@ class Code(enum.Enum):
     PLANE_OFF = "plane_off"
     TURNED = "turned"
     MAGNIFIED = "magnified"
+    MEDIUM = "medium"
     FEW_LABELS = "few_labels"
     MAPPING_ERROR = "mapping_error"
     # cameras and volume
@@ -144,6 +145,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.MAGNIFIED: (
         "the board's dots are magnified {magnification:.3f} times, not {stated:g} times as stated. Check "
         "magnification, and board.spacing_mm and board.planes_mm: all lengths and velocities depend on those two."
+    ),
+    Code.MEDIUM: (
+        "the board looks {depth:.2f} times as deep as stated. That is right in a medium of the refractive index "
+        "{index:.2f}, such as water (1.33), and the calibration holds. Otherwise check board.planes_mm, "
+        "focal_length_mm and f_number: depth and w depend on the planes."
     ),
     Code.FEW_LABELS: (
         "{dots} dots give the network {values} values for its {parameters} parameters, so it can be wrong between "

@@ -1,0 +1,95 @@
+"""Boards in a liquid: calibrated as any other, and told; labels that contradict each other are still refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.calibration_scene import CALIBRATION_SCENE, MAPPING_PITCH
+
+import lfpiv
+from lfpiv.calibration import checks
+from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
+from lfpiv.geometry.optics import Optics
+from lfpiv.simulation.scene import true_mapping
+from lfpiv.simulation.simulator import simulate
+from lfpiv.warn import Code, collected
+
+OPTICS = Optics(
+    focal_length_mm=100.0,
+    magnification=-1.0,
+    f_number=4.0,
+    microlens_pitch_mm=0.1,
+    microlens_focal_length_mm=0.8,
+    pixel_mm=0.0055,
+    sensor_shape=(1000, 1200),
+)
+LABEL_MM = 0.0005
+INDEX = 0.03  # the liquid's index, from depth and defocus with prior knowledge of the optics
+
+
+def fitted_through(index):
+    """Fit a thin lens to labels of a board behind a plane surface that faces the camera: its depth is z / index."""
+    rng, camera = np.random.default_rng(0), thin_lens_model(OPTICS, 45.0)
+    points = np.stack(np.meshgrid(*[np.linspace(-2, 2, 7)] * 2, np.linspace(-2, 2, 5)), -1).reshape(-1, 3).repeat(20, 0)
+    pupil = rng.uniform(-8, 8, (len(points), 2))
+    seen = points @ camera.rotation.T / (1, 1, index) @ camera.rotation
+    array = camera(seen, pupil) + LABEL_MM * rng.standard_normal((len(points), 2))
+    fitted = fit_thin_lens(points, pupil, array, OPTICS)
+    return fitted, float(np.median(np.linalg.norm(array - fitted(points, pupil), axis=1))) / OPTICS.microlens_pitch_mm
+
+
+class Setup:
+    name, optics, orientation = "left", OPTICS, None
+
+
+class HalfFound:
+    found = np.array([60])
+    expected = np.array([100])
+
+
+class Of:
+    path = "experiment.toml"
+
+
+@pytest.mark.parametrize("index", [1.0, 1.333, 1.5])
+def test_the_medium_is_told_and_is_no_reason_to_refuse(index):
+    fitted, residual_pitch = fitted_through(index)
+    checks.check_pupil(Of, Setup, HalfFound, fitted, residual_pitch)
+    with collected() as warnings:
+        checks.compare_with_nominal(Setup, fitted, residual_pitch)
+    if index == 1:
+        assert not warnings
+        return
+    (warning,) = warnings
+    assert warning.code == Code.MEDIUM and warning.figures["index"] == pytest.approx(index, abs=INDEX)
+    assert "refractive index 1." in warning.sentence
+
+
+def test_labels_that_no_thin_lens_fits_are_refused():
+    fitted, residual_pitch = fitted_through(1.0)
+    other_pupil, far = replace(fitted, pupil_scale=0.3), 2 * checks.FITTED_PITCH  # as of planes in the wrong order
+    with pytest.raises(lfpiv.InputError, match=r"60 of 100 dots that would need its pupil scaled by 0\.30"):
+        checks.check_pupil(Of, Setup, HalfFound, other_pupil, far)
+    assert residual_pitch < checks.FITTED_PITCH
+
+
+@pytest.mark.slow
+def test_a_camera_that_looks_into_oil_is_calibrated(tmp_path, device):
+    window = """
+[camera.window]
+point_mm = [-8.17, 0.0, 12.58]
+normal = [-0.5446, 0.0, 0.8387]
+thickness_mm = 3.0
+index = 1.5
+medium_index = 1.5
+"""
+    (tmp_path / "scene.toml").write_text(CALIBRATION_SCENE + window)
+    experiment = lfpiv.open_experiment(simulate(tmp_path / "scene.toml", tmp_path / "data"))
+    camera = lfpiv.calibrate(experiment).cameras["only"]
+    spec = json.loads((tmp_path / "data" / "truth" / "spec.json").read_text())["camera"][0]
+    assert [warning.code for warning in camera.warnings] == [Code.MEDIUM]
+    rng = np.random.default_rng(1)
+    points, pupil = rng.uniform((-1, -1, -0.8), (1, 1, 0.8), (5000, 3)), rng.uniform(-8, 8, (5000, 2))
+    miss = camera.map(points, pupil) - true_mapping(spec)(points, pupil)
+    assert np.linalg.norm(miss, axis=1).mean() / 0.1 < MAPPING_PITCH
