@@ -122,7 +122,7 @@ def _plan(run: Run, experiment: Experiment, pairs: int, workers: int, scratch: P
     whole = _volume(run, calibration, assumptions)
     step(0.1)
     forms, chosen = timed(whole.forms)
-    needed = _memory(whole, forms, workers, run.device)
+    needed = memory_of(whole, forms, workers, run.device)
     if needed.device_streamed:
         assumptions.append("the time in which weights are copied to the GPU in each pass is not in the plan")
     step(0.2)
@@ -273,16 +273,14 @@ def _prepared(
     return found
 
 
-def _memory(whole: Volume, forms: Mapping[str, Form], workers: int, device: Device) -> Memory:
+def memory_of(whole: Volume, forms: Mapping[str, Form], workers: int, device: Device) -> Memory:
     """Estimate the memory; refuse a volume that cannot fit into that of the GPU."""
     finest = whole.finest
     weights = sum(form.stored_bytes for form in forms.values()) + sum(map(rays_bytes, whole.cameras.values()))
     gpus = len(worker_plan.visible_gpus()) if device.kind == "cuda" else 1
     sharing = -(-workers // max(gpus, 1))
-    cameras = whole.cameras.values()
-    need = DeviceNeed(
-        sum(form.device_bytes for form in forms.values()), beside_bytes(cameras, finest.grid), len(cameras)
-    )
+    sizes = tuple(form.device_bytes for form in forms.values())
+    need = DeviceNeed(sizes, beside_bytes(whole.cameras.values(), finest.grid))
     streamed = device_memory.require(finest, need, device, sharing=sharing)
     free = runtime.free_bytes()
     return Memory(

@@ -30,7 +30,7 @@ def estimate_need(experiment: Experiment, *, weights: bool = True) -> DeviceNeed
     from lfpiv.weights.checks import estimate_device_need
 
     need = estimate_device_need(memory.nominal_cameras(experiment), experiment.grid, memory.weights_form(experiment))
-    return need if weights else replace(need, weights=0)
+    return need if weights else replace(need, cameras=())
 
 
 def require(experiment: Experiment, need: DeviceNeed, device: Device, *, sharing: int = 1) -> int:

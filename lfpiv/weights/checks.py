@@ -34,11 +34,11 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
 
 def estimate_device_need(calibration: Calibration, grid: Grid, form: str = "auto") -> DeviceNeed:
     """Do as `estimate_memory` for the memory of a GPU, volumes, images and correlation included."""
-    total = 0
-    for camera, (chosen, size, blocks, values) in _samples(calibration, grid, form):
-        total += device_bytes(chosen, size, int(blocks * size), int(values * size), edge=camera.microimages.edge)
-    cameras = calibration.cameras.values()
-    return DeviceNeed(total, beside_bytes(cameras, grid), len(cameras))
+    sizes = tuple(
+        device_bytes(chosen, size, int(blocks * size), int(values * size), edge=camera.microimages.edge)
+        for camera, (chosen, size, blocks, values) in _samples(calibration, grid, form)
+    )
+    return DeviceNeed(sizes, beside_bytes(calibration.cameras.values(), grid))
 
 
 def _samples(

@@ -43,27 +43,29 @@ BASE_BYTES = 1536 * MIB
 class DeviceNeed:
     """Memory that a process needs on its GPU [byte]."""
 
-    weights: int
-    """Of the weights of all cameras at once."""
+    cameras: tuple[int, ...]
+    """Of the weights of each camera at once."""
     beside: int
     """Of all that cannot be streamed."""
-    cameras: int
+
+    @property
+    def weights(self) -> int:
+        """Of the weights of all cameras at once."""
+        return sum(self.cameras)
 
     @property
     def whole(self) -> int:
-        """What is needed so that nothing is streamed."""
-        return self.beside + self.weights
+        """What is needed so that nothing is streamed. Each camera has room for the buffers at least."""
+        return self.beside + sum(max(size, least_bytes()) for size in self.cameras)
 
     @property
     def least(self) -> int:
         """What is needed if the weights are streamed."""
-        return self.beside + min(self.weights, self.cameras * least_bytes())
+        return self.beside + len(self.cameras) * least_bytes()
 
     def streamed(self, free: int) -> int:
         """Return the memory of the weights that each pass copies, and that the host holds for it, at a free memory."""
-        if free >= self.whole:
-            return 0
-        return self.weights - max(free - self.beside - self.cameras * least_bytes(), 0)
+        return 0 if free >= self.whole else max(self.weights - max(free - self.least, 0), 0)
 
     def slabs(self, free: int) -> int:
         """Return the number of slabs that are streamed at a free memory [byte], about."""
