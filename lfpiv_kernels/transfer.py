@@ -6,6 +6,7 @@ copied as a GPU would need it: an array that is not brought back shows as a wron
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,6 +16,8 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
+
+log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     DeviceArray: TypeAlias = wp.array[Any, Any]
@@ -96,6 +99,29 @@ def duplicate(array: wp.array) -> wp.array:
     if runtime.device().form == "gpu":
         return wp.clone(array)
     return to_device(to_host(array).copy(), array.dtype)
+
+
+def host_bytes(size: int, *, locked: bool) -> wp.array:
+    """Return memory of the host [byte], page-locked for copies to a GPU if asked for and CUDA allows it."""
+    if locked and runtime.device().kind == "cuda":
+        try:
+            return wp.empty(size, dtype=wp.uint8, device="cpu", pinned=True)
+        except RuntimeError:
+            log.info("device: CUDA locks no more of the host's memory; copies from the rest of it are slower")
+    return wp.empty(size, dtype=wp.uint8, device="cpu")
+
+
+def copy_bytes(to: wp.array, source: wp.array, begin: int, end: int, stream: wp.Stream | None = None) -> None:
+    """Copy some bytes of the host's memory to the same places of the device's, on a stream if one is given."""
+    for counted in _counts:
+        counted.to_device.append(end - begin)
+    wp.copy(to, source, begin, begin, end - begin, stream)
+
+
+def view(memory: wp.array, begin: int, values: np.ndarray) -> wp.array:
+    """Return the array of the kind of `values` that begins at a byte of a device's memory, which must outlive it."""
+    dtype = wp.dtype_from_numpy(values.dtype)
+    return wp.array(ptr=memory.ptr + begin, dtype=dtype, shape=values.shape, device=memory.device)
 
 
 def to_host(array: Values) -> np.ndarray:

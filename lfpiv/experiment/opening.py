@@ -30,8 +30,8 @@ DECODED_PIXELS = 100_000_000
 CHECKED_PAIRS = 100
 """Largest number of pairs whose images `open_experiment` checks, evenly spread over all."""
 
-LEAST_BYTES_PER_VOXEL = 64
-"""Memory that a run needs at least for each voxel, and again for each voxel and camera [byte]."""
+LEAST_BYTES_PER_VOXEL, LEAST_BYTES_PER_CAMERA = 120, 24
+"""Memory that a run needs at least for each voxel, and for each voxel and camera [byte], see `lfpiv.runs.memory`."""
 
 
 def open_experiment(path: str | Path) -> Experiment:
@@ -235,7 +235,8 @@ def _grid(path: Path, volume: ExperimentVolume, cameras: int) -> Grid:
             f"{path}: volume: expected at most {bounds.MOST_VOXELS:.0e} voxels, guard layers included, found "
             f"{guarded.size:.1e}. Raise volume.voxel_mm, or shrink volume.size_mm or volume.guard_mm."
         )
-    needed, machine = LEAST_BYTES_PER_VOXEL * (1 + cameras) * guarded.size, _memory_of_machine()
+    needed = (LEAST_BYTES_PER_VOXEL + LEAST_BYTES_PER_CAMERA * cameras) * guarded.size
+    machine = _memory_of_machine()
     if (volume.mask is not None or volume.solid) and needed > machine:
         raise InputError(
             f"{path}: volume: expected voxels that fit into memory, found {guarded.size:.1e}, guard layers included, "

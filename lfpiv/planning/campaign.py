@@ -28,8 +28,8 @@ from lfpiv.reconstruction.refinement import LARGEST
 from lfpiv.runs import device_memory, memory, rig, worker_plan
 from lfpiv.runs.run import Run, open_run
 from lfpiv.velocity import vector_grid
-from lfpiv.weights.checks import rays_bytes
 from lfpiv.weights.depth_planes import FEWEST_VOXELS
+from lfpiv.weights.device_share import DeviceNeed, beside_bytes, rays_bytes
 from lfpiv_kernels import runtime
 from lfpiv_kernels.runtime import Device, cores
 
@@ -122,7 +122,9 @@ def _plan(run: Run, experiment: Experiment, pairs: int, workers: int, scratch: P
     whole = _volume(run, calibration, assumptions)
     step(0.1)
     forms, chosen = timed(whole.forms)
-    needed = _memory(whole, forms, workers, run.device)
+    needed = memory_of(whole, forms, workers, run.device)
+    if needed.device_streamed:
+        assumptions.append("the time in which weights are copied to the GPU in each pass is not in the plan")
     step(0.2)
     small, large = _parts(whole, forms, step)
     step(0.7)
@@ -271,20 +273,24 @@ def _prepared(
     return found
 
 
-def _memory(whole: Volume, forms: Mapping[str, Form], workers: int, device: Device) -> Memory:
+def memory_of(whole: Volume, forms: Mapping[str, Form], workers: int, device: Device) -> Memory:
     """Estimate the memory; refuse a volume that cannot fit into that of the GPU."""
     finest = whole.finest
     weights = sum(form.stored_bytes for form in forms.values()) + sum(map(rays_bytes, whole.cameras.values()))
     gpus = len(worker_plan.visible_gpus()) if device.kind == "cuda" else 1
     sharing = -(-workers // max(gpus, 1))
-    device_memory.require(finest, weights, device, sharing=sharing)
+    sizes = tuple(form.device_bytes for form in forms.values())
+    need = DeviceNeed(sizes, beside_bytes(whole.cameras.values(), finest.grid))
+    streamed = device_memory.require(finest, need, device, sharing=sharing)
     free = runtime.free_bytes()
     return Memory(
-        needed=memory.run_bytes(finest, weights, workers),
+        needed=memory.run_bytes(finest, weights + workers * streamed, workers),
         weights=weights,
         worker=memory.worker_bytes(finest),
         allowed=memory.allowed_bytes(finest),
-        device_needed=None if free is None else sharing * device_memory.needed_bytes(finest, weights),
+        device_needed=None if free is None else sharing * need.whole,
+        device_least=None if free is None else sharing * (need.whole if sharing > 1 else need.least),
+        device_streamed=streamed,
         device_free=free,
     )
 

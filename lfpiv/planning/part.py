@@ -37,6 +37,7 @@ from lfpiv.weights.depth_planes import NodeGrid, choose_planes, line_of_sight
 from lfpiv.weights.operator import Weights, build_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.projector import Projector
+from lfpiv_kernels.reconstruction.projector_gpu import device_bytes
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -73,6 +74,8 @@ class Form:
     """Number of voxels, or of nodes."""
     stored_bytes: int
     """Memory of the stored blocks [byte]."""
+    device_bytes: int
+    """Memory of the same on a GPU [byte]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +167,14 @@ class Volume:
             require_numbers(blocks * places.size, self.finest.grid.shape)
             size = int(places.size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES))
             distance = None if nodes is None else nodes.distance
-            found[name] = Form(choice=choice, distance=distance, size=places.size, stored_bytes=size)
+            counts = int(places.size * blocks), int(places.size * values)
+            found[name] = Form(
+                choice=choice,
+                distance=distance,
+                size=places.size,
+                stored_bytes=size,
+                device_bytes=device_bytes(choice.form, places.size, *counts, edge=camera.microimages.edge),
+            )
         return found
 
     def weights(self, forms: Mapping[str, Form]) -> Weights:

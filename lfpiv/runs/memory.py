@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.experiment.opening import LEAST_BYTES_PER_VOXEL
+from lfpiv.experiment.opening import LEAST_BYTES_PER_CAMERA, LEAST_BYTES_PER_VOXEL
 from lfpiv.experiment.segments import REACH
 from lfpiv.files import MIB, size_text
 
@@ -24,11 +24,15 @@ log = logging.getLogger(__name__)
 
 GIB = 1 << 30
 
-BYTES_PER_VOXEL = LEAST_BYTES_PER_VOXEL
-"""Least memory per voxel [byte]: two volumes, and the float32 arrays that SMART or the correlation works on."""
+KEPT_BYTES = 20
+"""Memory per voxel that the solver keeps between instants [byte]: sum of the weights, lit voxels, two step sizes."""
 
-BYTES_PER_VOXEL_AND_CAMERA = LEAST_BYTES_PER_VOXEL
-"""Ray model of a voxel in one camera [byte]: chief ray, slopes, second-order terms, widths."""
+BYTES_PER_VOXEL = LEAST_BYTES_PER_VOXEL
+"""Memory per voxel [byte]: `KEPT_BYTES`, and 100 that the correlation works on, both volumes included; SMART less."""
+
+BYTES_PER_VOXEL_AND_CAMERA = LEAST_BYTES_PER_CAMERA
+"""Memory per voxel and camera that is kept [byte]: sums of the weights of all and of half of the lenses, step sizes of
+these."""
 
 BYTES_PER_PIXEL = 72
 """Memory per sensor pixel [byte]: images, those of the next pair, light-field blocks, the decoder's arrays."""
@@ -46,12 +50,6 @@ OWN_GROUPS = Path("/proc/self/cgroup")
 """File that names the control groups of this process."""
 
 
-def least_bytes(experiment: Experiment) -> int:
-    """Estimate the least memory a run of the experiment takes [byte], from the volume and the sensors only."""
-    rays = BYTES_PER_VOXEL_AND_CAMERA * len(experiment.cameras) * experiment.grid.size
-    return worker_bytes(experiment) + rays
-
-
 def weights_bytes(experiment: Experiment) -> int:
     """Estimate the memory of the weights [byte] from the nominal rig, before any image is read.
 
@@ -59,19 +57,29 @@ def weights_bytes(experiment: Experiment) -> int:
     """
     from lfpiv.weights.checks import estimate_memory
 
-    cameras, grid, compute = _nominal_cameras(experiment), experiment.grid, experiment.compute
-    form = compute.weights_form if compute.weights == "footprint" else "pixels"  # counts: as pixels, without planes
+    cameras, grid, form = nominal_cameras(experiment), experiment.grid, weights_form(experiment)
     weights = estimate_memory(cameras, grid, form)
     if form == "auto" and (most := estimate_memory(cameras, grid, "pixels")) > weights:
         log.info("memory: %s for weights, up to %s where rays bend", size_text(weights), size_text(most))
     return weights
 
 
+def weights_form(experiment: Experiment) -> str:
+    """Return the form of the weights as far as the experiment states it."""
+    compute = experiment.compute
+    return compute.weights_form if compute.weights == "footprint" else "pixels"  # counts: as pixels, without planes
+
+
 def worker_bytes(experiment: Experiment) -> int:
     """Estimate the memory of one worker process without the weights, which all workers share [byte]."""
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
-    pair = BYTES_PER_VOXEL * experiment.grid.size + BYTES_PER_PIXEL * pixels
-    return BASE_BYTES + pair + _sequence_bytes(experiment, pixels)
+    return BASE_BYTES + _volumes_bytes(experiment) + BYTES_PER_PIXEL * pixels + _sequence_bytes(experiment, pixels)
+
+
+def _volumes_bytes(experiment: Experiment) -> int:
+    """Estimate the memory of a process for what it has of each voxel, but the weights [byte]."""
+    each = BYTES_PER_VOXEL + BYTES_PER_VOXEL_AND_CAMERA * len(experiment.cameras)
+    return each * experiment.grid.size
 
 
 def _sequence_bytes(experiment: Experiment, pixels: int) -> int:
@@ -88,11 +96,9 @@ def _sequence_bytes(experiment: Experiment, pixels: int) -> int:
 
 
 def run_bytes(experiment: Experiment, weights: int, workers: int) -> int:
-    """Estimate the memory of a run [byte]. With several workers: the larger of building and of using the weights."""
-    build = least_bytes(experiment) + weights
-    if workers == 1:
-        return build
-    return max(build, BASE_BYTES + weights + workers * worker_bytes(experiment))
+    """Estimate the memory of a run [byte]. Several workers have a process beside them, which made the weights."""
+    beside = BASE_BYTES if workers > 1 else 0
+    return beside + weights + workers * worker_bytes(experiment)
 
 
 def fitting_workers(experiment: Experiment, weights: int, workers: int) -> int:
@@ -119,9 +125,9 @@ def available_bytes() -> int:
 
 def left_for_weights(experiment: Experiment) -> int:
     """Return the memory left for the weights [byte], after the volumes, which are allocated later."""
-    left = available_bytes() - BYTES_PER_VOXEL * experiment.grid.size
+    left = available_bytes() - _volumes_bytes(experiment)
     if experiment.compute.memory_gib is not None:
-        left = min(left, int(experiment.compute.memory_gib * GIB) - least_bytes(experiment))
+        left = min(left, int(experiment.compute.memory_gib * GIB) - worker_bytes(experiment))
     return left
 
 
@@ -203,7 +209,7 @@ def _left_in(group: Path, names: tuple[str, str, str, str]) -> int:
     return left
 
 
-def _nominal_cameras(experiment: Experiment) -> Calibration:
+def nominal_cameras(experiment: Experiment) -> Calibration:
     """Return the nominal rig of the experiment file. Reads no image."""
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.calibration.thin_lens_model import thin_lens_model

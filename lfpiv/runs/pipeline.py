@@ -24,6 +24,7 @@ from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.todo import Todo
 from lfpiv.runs.unchanged import Command
 from lfpiv.runs.worker_plan import Plan
+from lfpiv_kernels import runtime
 
 if TYPE_CHECKING:
     from lfpiv.weights.operator import Weights
@@ -219,10 +220,11 @@ def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None)
         if workers is None:
             planned = worker_plan.fit_installation(planned, current.device)
             planned = worker_plan.fit_memory(planned, finest, needed, current.device)
-        worker_plan.require_memory(finest, needed, 1 if scheduler else planned.workers)
-        if not scheduler:
+        if not scheduler and runtime.free_bytes() is not None:
+            need = device_memory.estimate_need(finest, weights=needed > 0)
             sharing = -(-planned.workers // max(len(gpus), 1))
-            device_memory.require(finest, needed, current.device, sharing=sharing)
+            needed += planned.workers * device_memory.require(finest, need, current.device, sharing=sharing)
+        worker_plan.require_memory(finest, needed, 1 if scheduler else planned.workers)
         if planned.workers > 1 and not scheduler:
             local_workers.start_preloading(planned.kind)
     return _Checked(todo=todo, failed=failed, workers=scheduler or planned)

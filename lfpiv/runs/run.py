@@ -61,7 +61,7 @@ def open_run(
         experiment = read_experiment(experiment)
     folder = Folder(Path(out), experiment.series)
     numbers = _select(experiment, pairs)
-    memory.require(memory.least_bytes(experiment), experiment, "volumes of")
+    memory.require(memory.worker_bytes(experiment), experiment, "volumes of")
     made = make_writable(folder.path)
     try:
         with contextlib.ExitStack() as stack:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from lfpiv.geometry.grid import Grid
 from lfpiv.weights.blocks import BLOCK_BYTES, CHUNK_VOXELS, VOXEL_BYTES, PackedCamera, sample_blocks
 from lfpiv.weights.choice import warn_of_errors
 from lfpiv.weights.depth_planes import choose_planes
+from lfpiv.weights.device_share import DeviceNeed, beside_bytes, rays_bytes
 from lfpiv.weights.operator import Weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
+from lfpiv_kernels.reconstruction.projector_gpu import device_bytes
 from lfpiv_kernels.weights.ray_model import MODEL_SIZE
 
 if TYPE_CHECKING:
@@ -22,21 +25,32 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") ->
 
     Nothing large is allocated. The form "auto" is taken for profiles if the microlens layout is square.
     """
-    runtime.device()
     total = 0.0
+    for camera, (_, size, blocks, values) in _samples(calibration, grid, form):
+        rays = rays_bytes(camera)
+        total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
+    return int(total)
+
+
+def estimate_device_need(calibration: Calibration, grid: Grid, form: str = "auto") -> DeviceNeed:
+    """Do as `estimate_memory` for the memory of a GPU, volumes, images and correlation included."""
+    sizes = tuple(
+        device_bytes(chosen, size, int(blocks * size), int(values * size), edge=camera.microimages.edge)
+        for camera, (chosen, size, blocks, values) in _samples(calibration, grid, form)
+    )
+    return DeviceNeed(sizes, beside_bytes(calibration.cameras.values(), grid))
+
+
+def _samples(
+    calibration: Calibration, grid: Grid, form: str
+) -> Iterator[tuple[CalibratedCamera, tuple[str, int, float, float]]]:
+    """Yield each camera, its form, its number of voxels or nodes, and the mean numbers of their blocks and values."""
+    runtime.device()
     stored = StoredGrid(grid, (0, 1, 2))
     for camera in calibration.cameras.values():
         chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
         places = choose_planes(stored, camera, chosen) or stored
-        blocks, values = sample_blocks(PackedCamera.of(camera), places, chosen)
-        rays = rays_bytes(camera)
-        total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * places.size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
-    return int(total)
-
-
-def rays_bytes(camera: CalibratedCamera) -> int:
-    """Return the memory of a camera's rays and of the map between them and the pixels [byte]."""
-    return 4 * (5 + 2) * camera.microimages.size + 24 * runtime.CHUNKS
+        yield camera, (chosen, places.size, *sample_blocks(PackedCamera.of(camera), places, chosen))
 
 
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:

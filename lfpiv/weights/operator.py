@@ -34,6 +34,7 @@ from lfpiv.weights.choice import Choice, choose_form, choose_uncounted, memory_c
 from lfpiv.weights.counted_grid import count_blocks
 from lfpiv.weights.counting import CountedVoxels, add_entries
 from lfpiv.weights.depth_planes import choose_planes
+from lfpiv.weights.device_share import DeviceShare
 from lfpiv.weights.even_light import EvenLight, project_even_light
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
@@ -354,7 +355,8 @@ def build_weights(
     ValueError
         If `method`, `form` or `rays` is unknown, or profiles are requested for a hexagonal microlens layout.
     InputError
-        If the weights would not fit into `limit_bytes`. Raised before they are computed.
+        If the weights would not fit into `limit_bytes`, raised before they are computed. If volumes and images leave no
+        memory of the GPU for streamed weights.
     StorageError
         If parts of a count cannot be written to `finished`.
     """
@@ -368,6 +370,7 @@ def build_weights(
         raise ValueError(f"form: 'profiles' need square microlenses, those of camera {hexagonal[0]!r} are hexagonal.")
     stored = StoredGrid.for_cameras(grid, cameras.values())
     runtime.device()
+    share = DeviceShare(cameras.values(), grid)
     projectors, choices, counted = dict[str, Projector](), dict[str, Choice](), dict[str, CountedVoxels]()
     whole = progress or (lambda fraction: None)
     for number, (name, camera) in enumerate(cameras.items()):
@@ -375,7 +378,7 @@ def build_weights(
         step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
         if method == "count":
             allow = memory_check(name, grid, Choice(form="pixels"), limit_bytes - used)
-            projectors[name] = Projector(count_blocks(stored, camera, rays, step, allow, finished))
+            projectors[name] = share.projector(name, count_blocks(stored, camera, rays, step, allow, finished))
             continue
         if form == "auto" and camera.lattice.layout == "square":
             counted[name] = CountedVoxels(stored, camera)
@@ -386,7 +389,7 @@ def build_weights(
         allow = memory_check(name, grid, chosen, limit_bytes - used)
         nodes = choose_planes(stored, camera, chosen.form, chosen.cuts) if planes else None
         blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
-        projectors[name] = Projector(blocks, nodes.shares if nodes else None)
+        projectors[name] = share.projector(name, blocks, nodes.shares if nodes else None)
     if finished is not None:
         shutil.rmtree(finished, ignore_errors=True)
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)

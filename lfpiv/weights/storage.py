@@ -19,10 +19,11 @@ from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
+from lfpiv.weights.device_share import DeviceShare
 from lfpiv.weights.operator import Weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import PlaneShares
-from lfpiv_kernels.reconstruction.projector import Blocks, Projector
+from lfpiv_kernels.reconstruction.projector import Blocks
 from lfpiv_kernels.weights.microimages import Microimages
 
 if TYPE_CHECKING:
@@ -134,7 +135,8 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
     stored = StoredGrid(grid, _tuple(header["order"]))
-    projectors = {name: Projector(part, planes[name]) for name, part in blocks.items()}
+    share = DeviceShare(cameras.values(), grid)
+    projectors = {name: share.projector(name, part, planes[name]) for name, part in blocks.items()}
     return Weights(stored, cameras, projectors, header["method"], camera_sums=np.array(camera_sums))
 
 

@@ -171,7 +171,8 @@ struct TileLight {
 };
 
 /// Write the light of all voxels on one tile's rays; dark if the tile's lens is none of `lenses`. The warp goes through
-/// the list of the tile's blocks, 32 at a time, in the order of the voxels.
+/// the list of the tile's blocks, 32 at a time, in the order of the voxels. A matrix that adds goes on from the light
+/// on the rays, so that slabs of voxels, one after the other, give the same sums as all at once.
 template <class Matrix>
 LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const float* volume, float* rays_out) {
 #if defined(__CUDA_ARCH__)
@@ -181,13 +182,19 @@ LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const
     float light_of_warp[TILE * TILE];
     const TileLight light{light_of_warp};
 #endif
-    for_lanes([&](int lane) {
-        for (int k = lane; k < TILE * TILE; k += LANES_OF_WARP) light.ray[k] = 0.0f;
-    });
-    sync_lanes();
     const int head = read_together(matrix.tile_size.data + tile), rows = head & 0xff, columns = (head >> 8) & 0xff,
               set = head >> 16;
     const bool lit = lenses == 2 || lenses == set;
+    if (matrix.adds && !lit) return;  // the whole warp
+    float* const out = rays_out + read_together(matrix.tile_ray.data + tile);
+    for_lanes([&](int lane) {
+        for (int k = lane; k < TILE * TILE; k += LANES_OF_WARP) {
+            const int row = k / TILE, column = k % TILE;
+            const float* const at = out + (int64_t)row * matrix.pitch + column;
+            light.ray[k] = matrix.adds ? read_if(row < rows && column < columns, at, 0.0f) : 0.0f;
+        }
+    });
+    sync_lanes();
     const int64_t end = lit ? read_together(matrix.tile_entry.data + tile + 1) : 0;
     for (int64_t begin = lit ? read_together(matrix.tile_entry.data + tile) : 0; begin < end; begin += LANES_OF_WARP) {
         const int count = (int)min(end - begin, (int64_t)LANES_OF_WARP);
@@ -226,7 +233,6 @@ LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const
             sync_lanes();  // the next block's lanes add to the same rays
         }
     }
-    float* const out = rays_out + read_together(matrix.tile_ray.data + tile);
     for_lanes([&](int lane) {
         for (int row = 0; row < rows; ++row) {
             float* const to = out + (int64_t)row * matrix.pitch + lane;

@@ -21,6 +21,7 @@ from lfpiv_kernels.reconstruction import voxels
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes, PlaneShares
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
+from lfpiv_kernels.reconstruction.projector_streamed import StreamedProjector, fits_whole
 from lfpiv_kernels.reconstruction.weight_blocks import Blocks
 from lfpiv_kernels.transfer import Array, empty, overwrite, to_device, to_host, zeros
 from lfpiv_kernels.weights.microimages import Microimages
@@ -144,13 +145,15 @@ class Projector:
 
     With `planes` the blocks are those of nodes on planes across the line of sight: voxels -> nodes -> rays, and back.
 
+    On a GPU whose `limit_bytes` do not hold all weights they are streamed, see `projector_streamed`. Results are equal.
+
     `project` and `back_project` may be called from several threads, which take turns. A caller of `scatter` and
     `gather` that needs the light on the rays in between calls them inside `reserved`.
 
     Arrays in and out are float32, C-contiguous and flat. Those of the device, and all on the CPU, are used in place.
     """
 
-    def __init__(self, blocks: Blocks, planes: PlaneShares | None = None):
+    def __init__(self, blocks: Blocks, planes: PlaneShares | None = None, limit_bytes: int | None = None):
         self._turn, self._reserved = threading.RLock(), False
         self.blocks = blocks
         self.planes = planes
@@ -159,7 +162,10 @@ class Projector:
         self._on_cpu = runtime.device().form == "cpu"
         self.lens_sets = 1 if blocks.even_blocks is None else 2
         """Sets of lenses that can be taken alone."""
-        self._tiled = None if self._on_cpu else TiledProjector(blocks)
+        self._tiled: TiledProjector | StreamedProjector | None = None
+        if not self._on_cpu:
+            whole = limit_bytes is None or fits_whole(blocks, limit_bytes)
+            self._tiled = TiledProjector(blocks) if whole else StreamedProjector(blocks, limit_bytes)
         if self._tiled is not None:
             self.rays = self._tiled.rays
             self.map = self._map_rays()
@@ -188,6 +194,16 @@ class Projector:
     def microimages(self) -> Microimages:
         """Where the rays lie in memory."""
         return self.blocks.microimages
+
+    @property
+    def device_bytes(self) -> int:
+        """Memory of the weights on a GPU [byte]; 0 on the CPU, where they are those of the host."""
+        return 0 if self._tiled is None else self._tiled.nbytes
+
+    @property
+    def streamed(self) -> StreamedProjector | None:
+        """The slabs of weights that do not fit into the memory of the GPU; None where all weights are there."""
+        return self._tiled if isinstance(self._tiled, StreamedProjector) else None
 
     def _find_spans(self) -> list[tuple[int, int]]:
         """Return the first ray that each part of the voxels can touch, and the end of its rays."""

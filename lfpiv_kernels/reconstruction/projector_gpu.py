@@ -55,6 +55,8 @@ class TiledMatrix:
     sectors: int
     pitch: int
     profiles: bool
+    adds: bool
+    """Whether a scatter adds to the light on the rays: for one slab of voxels after the other."""
 
 
 @wp.func_native("lfpiv::gather_voxel(matrix, voxel, lenses, rays.data, active.data, volume_out.data);")
@@ -200,7 +202,106 @@ def _write_entries(
     _write_entries_of(matrix, level, edge, side, next_out, voxel_out, start_out, place_out)
 
 
-class TiledProjector:
+class TiledRays:
+    """The light on a camera's rays as it lies in the memory of a GPU: rows of rays begin sectors."""
+
+    def __init__(self, blocks: Blocks):
+        self._edge = blocks.microimages.edge
+        self._rows = -(-blocks.microimages.size // self._edge)
+        self._pitch = -(-self._edge // ALIGNED_RAYS) * ALIGNED_RAYS
+        beyond = int(blocks.height.max(initial=0)) + 1  # rows of zero levels are read as well
+        size = (self._rows + beyond) * self._pitch
+        self.rays = wp.zeros(size, dtype=float, device=runtime.device().warp)
+        """The light on the rays. Those that no voxel lights stay dark."""
+
+    def places(self, ray: np.ndarray) -> np.ndarray:
+        """Return where rays lie in memory, int32."""
+        row, column = np.divmod(ray, self._edge)
+        return (row * self._pitch + column).astype(np.int32)
+
+    def in_order(self, rays: np.ndarray) -> np.ndarray:
+        """Return values of rays as they lie in memory in the order of the rays, shape (ray,)."""
+        return rays[: self._rows * self._pitch].reshape(self._rows, self._pitch)[:, : self._edge].ravel()
+
+    def matrix_of(self, blocks: Blocks) -> tuple[TiledMatrix, dict[str, np.ndarray]]:
+        """Return a matrix of the camera's blocks, or of those of a slab, that has no arrays yet, and all but `word`.
+
+        The arrays are made by one thread of the host: bound by memory.
+        """
+        matrix = TiledMatrix()
+        matrix.profiles = blocks.form == "profiles"
+        matrix.pitch = self._pitch
+        starts = np.zeros(0, np.int64)
+        if matrix.profiles:
+            matrix.sectors = profile_sectors(blocks)
+        else:
+            sizes = -(-blocks.height.astype(np.int64) * blocks.width // SECTOR)
+            starts = np.append(0, sizes.cumsum())
+        even = np.diff(blocks.first_block) if blocks.even_blocks is None else blocks.even_blocks
+        arrays = {
+            "first_block": blocks.first_block,
+            "even_blocks": even.astype(np.int32),
+            "height": blocks.height,
+            "width": blocks.width,
+            "start": starts[:-1].astype(np.int32),
+            "scale": blocks.scale,
+        }
+        tiles = self._tiles(blocks, matrix, arrays)
+        return matrix, {**arrays, "ray": self.places(blocks.ray), **tiles}
+
+    def _tiles(self, blocks: Blocks, matrix: TiledMatrix, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the arrays of the tiles that are lit and of their entries."""
+        per_edge = tiles_per_edge(self._edge)
+        side = -(-self._edge // per_edge)
+        count = np.zeros(-(-self._rows // self._edge) * per_edge**2, np.int64)
+        tile_set = np.zeros(len(count), np.uint8)
+        work = TiledMatrix()
+        work.profiles, work.sectors = matrix.profiles, matrix.sectors
+        for name, array in (arrays | {"ray": blocks.ray}).items():
+            setattr(work, name, to_device(array, device="cpu"))
+        inputs = [work, to_device(blocks.value, device="cpu"), self._edge, side]
+        _run_on_host(_count_entries, inputs, [count, tile_set])
+        (lit,) = np.nonzero(count)
+        first = np.append(0, count[lit].cumsum())
+        following = np.zeros_like(count)
+        following[lit] = first[:-1]
+        entries = [np.empty(first[-1], np.int32) for _ in range(3)]
+        _run_on_host(_write_entries, inputs, [following, *entries])
+        band, column = np.divmod(lit, per_edge)
+        lens, band = np.divmod(band, per_edge)
+        first_row = lens * self._edge + band * side
+        rows, columns = (np.minimum(self._edge - side * at, side) for at in (band, column))
+        rows = np.minimum(rows, self._rows - first_row)
+        ray = first_row * self._pitch + column * side
+        return {
+            "tile_entry": first,
+            "tile_ray": ray.astype(np.int32),
+            "tile_size": (rows | columns << 8 | tile_set[lit].astype(np.int64) << 16).astype(np.int32),
+            **dict(zip(("entry_voxel", "entry_start", "entry_place"), entries, strict=True)),
+        }
+
+    def scatter_of(self, matrix: TiledMatrix, volume: wp.array, lenses: int) -> None:
+        """Launch a matrix's scatter of the light of `volume` to the rays of some lenses."""
+        tiles = len(matrix.tile_ray)
+        launch(Call(_scatter, tiles, [matrix, volume, lenses], [self.rays], inner=lanes_of_warp()))
+
+    def gather_of(self, matrix: TiledMatrix, volume_out: wp.array, active: wp.array, lenses: int) -> None:
+        """Launch a matrix's gather of the light on the rays of some lenses."""
+        inputs = [matrix, self.rays, active, lenses]
+        launch(Call(_gather, len(volume_out), inputs, [volume_out], inner=lanes_of_warp()))
+
+    def count_of(self, matrix: TiledMatrix, share: wp.array, count_out: wp.array) -> None:
+        """Launch a matrix's count of the rays that each voxel lights, those whose placed `share` is not zero."""
+        launch(Call(_count_lit, len(count_out), [matrix, share], [count_out], inner=lanes_of_warp()))
+
+    def placed(self, share: np.ndarray) -> wp.array:
+        """Return values of the rays on the device where the rays lie in memory."""
+        placed = np.zeros(len(self.rays), np.float32)
+        placed[self.places(np.arange(len(share)))] = share
+        return to_device(placed)
+
+
+class TiledProjector(TiledRays):
     """The weights of one camera as a GPU reads them, and the light on its rays.
 
     Parameters
@@ -210,111 +311,66 @@ class TiledProjector:
     """
 
     def __init__(self, blocks: Blocks):
-        self._edge = blocks.microimages.edge
-        self._rows = -(-blocks.microimages.size // self._edge)
-        matrix = TiledMatrix()
-        matrix.profiles = blocks.form == "profiles"
-        matrix.pitch = -(-self._edge // ALIGNED_RAYS) * ALIGNED_RAYS
-        heads = int(blocks.height.max(initial=0)) + int(blocks.width.max(initial=0))
-        matrix.sectors = -(-heads // SECTOR)
-        starts = np.zeros(0, np.int64)
-        if not matrix.profiles:
-            sizes = -(-blocks.height.astype(np.int64) * blocks.width // SECTOR)
-            starts = np.append(0, sizes.cumsum())
-        even = np.diff(blocks.first_block) if blocks.even_blocks is None else blocks.even_blocks
-        host = {  # what both the host's list of entries and the device need
-            "first_block": blocks.first_block,
-            "even_blocks": even.astype(np.int32),
-            "height": blocks.height,
-            "width": blocks.width,
-            "start": starts[:-1].astype(np.int32),
-            "scale": blocks.scale,
-        }
-        tiles = self._tiles(blocks, matrix, host)
-        placed = {"ray": self.places(blocks.ray), **tiles}
-        for name, array in (host | placed).items():
+        super().__init__(blocks)
+        matrix, arrays = self.matrix_of(blocks)
+        for name, array in arrays.items():
             setattr(matrix, name, to_device(array))
-        sectors = matrix.sectors * len(blocks.ray) if matrix.profiles else int(starts[-1])
-        matrix.word = wp.zeros(max(sectors, 1) * SECTOR // 4, dtype=wp.uint32, device=runtime.device().warp)
+        matrix.word = wp.zeros(word_count(matrix, arrays), dtype=wp.uint32, device=runtime.device().warp)
         values = [to_device(blocks.first_value), to_device(blocks.value)]
         launch(Call(_align, len(blocks.scale), [matrix, *values], [matrix.word]))
         self.matrix = matrix
         """The weights on the device."""
-        beyond = int(blocks.height.max(initial=0)) + 1  # rows of zero levels are read as well
-        size = (self._rows + beyond) * matrix.pitch
-        self.rays = wp.zeros(size, dtype=float, device=runtime.device().warp)
-        """The light on the rays. Those that no voxel lights stay dark."""
 
     @property
     def nbytes(self) -> int:
         """Memory of the weights on the device [byte]."""
-        return sum(value.size * wp.types.type_size_in_bytes(value.dtype) for value in self._arrays())
-
-    def _arrays(self) -> list[wp.array]:
         values = (getattr(self.matrix, name) for name in TiledMatrix.vars)
-        return [value for value in values if isinstance(value, wp.array)]
-
-    def _tiles(self, blocks: Blocks, matrix: TiledMatrix, host: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the arrays of the tiles and of their entries, made by one thread of the host: bound by memory."""
-        per_edge = -(-self._edge // TILE)
-        side = -(-self._edge // per_edge)
-        count = np.zeros(-(-self._rows // self._edge) * per_edge**2, np.int64)
-        tile_set = np.zeros(len(count), np.uint8)
-        work = TiledMatrix()
-        work.profiles, work.sectors = matrix.profiles, matrix.sectors
-        for name, array in (host | {"ray": blocks.ray}).items():
-            setattr(work, name, to_device(array, device="cpu"))
-        inputs = [work, to_device(blocks.value, device="cpu"), self._edge, side]
-        _run_once(_count_entries, inputs, [count, tile_set])
-        (lit,) = np.nonzero(count)
-        first = np.append(0, count[lit].cumsum())
-        following = np.zeros_like(count)
-        following[lit] = first[:-1]
-        entries = [np.empty(first[-1], np.int32) for _ in range(3)]
-        _run_once(_write_entries, inputs, [following, *entries])
-        band, column = np.divmod(lit, per_edge)
-        lens, band = np.divmod(band, per_edge)
-        first_row = lens * self._edge + band * side
-        rows, columns = (np.minimum(self._edge - side * at, side) for at in (band, column))
-        rows = np.minimum(rows, self._rows - first_row)
-        ray = first_row * matrix.pitch + column * side
-        return {
-            "tile_entry": first,
-            "tile_ray": ray.astype(np.int32),
-            "tile_size": (rows | columns << 8 | tile_set[lit].astype(np.int64) << 16).astype(np.int32),
-            **dict(zip(("entry_voxel", "entry_start", "entry_place"), entries, strict=True)),
-        }
-
-    def places(self, ray: np.ndarray) -> np.ndarray:
-        """Return where rays lie in memory, int32: rows begin sectors."""
-        row, column = np.divmod(ray, self._edge)
-        return (row * self._pitch + column).astype(np.int32)
-
-    @property
-    def _pitch(self) -> int:
-        return -(-self._edge // ALIGNED_RAYS) * ALIGNED_RAYS
-
-    def in_order(self, rays: np.ndarray) -> np.ndarray:
-        """Return values of rays as they lie in memory in the order of the rays, shape (ray,)."""
-        return rays[: self._rows * self._pitch].reshape(self._rows, self._pitch)[:, : self._edge].ravel()
+        arrays = (value for value in values if isinstance(value, wp.array))
+        return sum(value.size * wp.types.type_size_in_bytes(value.dtype) for value in arrays)
 
     def scatter(self, volume: wp.array, lenses: int) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
-        tiles = len(self.matrix.tile_ray)
-        launch(Call(_scatter, tiles, [self.matrix, volume, lenses], [self.rays], inner=lanes_of_warp()))
+        self.scatter_of(self.matrix, volume, lenses)
 
     def gather(self, volume_out: wp.array, active: wp.array, lenses: int) -> None:
         """Add the weighted sum of the light on each active voxel's rays of some lenses to `volume_out`."""
-        inputs = [self.matrix, self.rays, active, lenses]
-        launch(Call(_gather, len(volume_out), inputs, [volume_out], inner=lanes_of_warp()))
+        self.gather_of(self.matrix, volume_out, active, lenses)
 
     def count_lit(self, share: np.ndarray) -> wp.array:
         """Count the rays that each voxel lights, shape (voxel,), int32. Those whose `share` is zero do not count."""
-        placed = np.zeros(len(self.rays), np.float32)
-        placed[self.places(np.arange(len(share)))] = share
         count = wp.zeros(len(self.matrix.scale), dtype=int, device=runtime.device().warp)
-        launch(Call(_count_lit, len(count), [self.matrix, to_device(placed)], [count], inner=lanes_of_warp()))
+        self.count_of(self.matrix, self.placed(share), count)
         return count
+
+
+def profile_sectors(blocks: Blocks) -> int:
+    """Return the sectors of each block of profiles: those of the highest."""
+    return -(-(int(blocks.height.max(initial=0)) + int(blocks.width.max(initial=0))) // SECTOR)
+
+
+def tiles_per_edge(edge: int) -> int:
+    """Return the number of tiles along a microimage's edge."""
+    return -(-edge // TILE)
+
+
+def word_count(matrix: TiledMatrix, arrays: dict[str, np.ndarray]) -> int:
+    """Return the number of words that a matrix's values take, of one sector at least."""
+    sectors = matrix.sectors * len(arrays["ray"])
+    if not matrix.profiles and len(arrays["ray"]):
+        sectors = int(arrays["start"][-1]) - (-int(arrays["height"][-1]) * int(arrays["width"][-1]) // SECTOR)
+    return max(sectors, 1) * SECTOR // 4
+
+
+def align_on_host(matrix: TiledMatrix, arrays: dict[str, np.ndarray], blocks: Blocks) -> np.ndarray:
+    """Return the values of a matrix's blocks in the host's memory, uint32: each block begins a sector."""
+    word = np.zeros(word_count(matrix, arrays), np.uint32)
+    work = TiledMatrix()
+    work.profiles, work.sectors = matrix.profiles, matrix.sectors
+    for name in ("first_block", "height", "width", "start"):
+        setattr(work, name, to_device(arrays[name], device="cpu"))
+    values = [to_device(array, device="cpu") for array in (blocks.first_value, blocks.value)]
+    _run_on_host(_align, [work, *values, 0], [word], len(blocks.scale))
+    return word
 
 
 def device_bytes(form: str, voxels: int, blocks: int, values: int, *, edge: int) -> int:
@@ -325,8 +381,8 @@ def device_bytes(form: str, voxels: int, blocks: int, values: int, *, edge: int)
     return aligned + (ENTRY_BYTES + HEAD_BYTES) * blocks + 12 * voxels
 
 
-def _run_once(kernel: wp.Kernel, inputs: list[object], outputs: list[np.ndarray]) -> None:
-    """Run one thread of a kernel on arrays in the host's memory."""
+def _run_on_host(kernel: wp.Kernel, inputs: list[object], outputs: list[np.ndarray], threads: int = 1) -> None:
+    """Run a kernel on arrays in the host's memory, one thread after the other."""
     runtime.device()
     arrays = [to_device(array, device="cpu") for array in outputs]
-    wp.launch(kernel, dim=1, inputs=inputs, outputs=arrays, device="cpu")
+    wp.launch(kernel, dim=threads, inputs=inputs, outputs=arrays, device="cpu")

@@ -280,7 +280,7 @@ def test_log_lines_state_the_remaining_time(caplog, monkeypatch):
 
 def test_memory_is_counted_before_the_work(tiny_experiment):
     experiment = lfpiv.open_experiment(tiny_experiment)
-    needed = memory.least_bytes(experiment)
+    needed = memory.worker_bytes(experiment)
     assert needed > 4 * experiment.grid.size
     memory.require(needed, experiment, "volumes of")
     with pytest.raises(InputError, match=r"8 x 12 x 16 voxels.* 1,024\.0 GiB"):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.plain_rays import plain
+from support.random_blocks import VOXELS, matrix_of, random_blocks
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.reconstruction import blur_gpu, depth_planes_gpu, pixel_rays_gpu
@@ -14,10 +15,8 @@ from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector, device_by
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
 from lfpiv_kernels.transfer import to_device, to_host
-from lfpiv_kernels.weights.microimages import LAYERS, lens_rays
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, ROW_GROUP
 
-VOXELS, LENSES = 70, 4
 EDGES = {"small": 7, "usual": 20, "tile": 24, "two tiles": 31, "three tiles": 50}
 """Rays along a microimage. Above 24 rays a block has more than one sector, and a lens more than one tile."""
 TOLERANCE_SUM = 2e-6
@@ -26,67 +25,6 @@ TOLERANCE_ADJOINT = 1e-6
 """Relative difference of two sums of positive terms in float64 over float32 results."""
 TOLERANCE_MISFIT = 1e-6
 """Float32 terms that differ by rounding, summed in float64."""
-
-
-def random_blocks(form: str, edge: int, seed: int = 0) -> Blocks:
-    """Blocks of lenses of two sets, some outside of their microimage's lit part, some voxels without any."""
-    runtime.device()
-    rng = np.random.default_rng(seed)
-    centre = np.stack(np.meshgrid(*[(np.arange(LENSES) + 0.5) * (edge - 1)] * 2), axis=-1)
-    microimages = lens_rays((0, 0), centre, 0.45 * edge, edge, (LENSES * edge, LENSES * edge))
-    first_block, first_value, even_blocks, even_values = [0], [0], [], []
-    rays, heights, widths, values = [], [], [], []
-    for _ in range(VOXELS):
-        blocks = []
-        for _ in range(int(rng.integers(0, 40))):
-            lens, layer = rng.integers(0, LENSES, 2), int(rng.integers(LAYERS))
-            width = BLOCK_WIDTH if form == "profiles" else int(rng.integers(1, min(BLOCK_WIDTH, edge) + 1))
-            lit = int(rng.integers(1, edge + 1))
-            row, lit_columns = int(rng.integers(0, edge - lit + 1)), int(rng.integers(1, min(width, edge) + 1))
-            column = int(rng.integers(0, edge - (lit_columns if form == "profiles" else width) + 1))
-            ray = (((lens[0] * LAYERS + layer) * LENSES) + lens[1]) * edge**2 + row * edge + column
-            if form == "profiles":
-                height = -(-lit // ROW_GROUP) * ROW_GROUP
-                across, down = np.zeros(width, np.uint8), np.zeros(height, np.uint8)
-                across[:lit_columns] = rng.integers(1, 256, lit_columns)
-                down[:lit] = rng.integers(1, 256, lit)
-                value = np.concatenate([across, down])
-            else:
-                height, value = lit, rng.integers(0, 256, lit * width).astype(np.uint8)
-            blocks.append((int(lens.sum()) % 2, height, width, int(ray), value))
-        blocks.sort(key=lambda block: block[:2])
-        even = [block for block in blocks if block[0] == 0]
-        even_blocks.append(len(even))
-        even_values.append(sum(len(block[4]) for block in even))
-        for _, height, width, ray, value in blocks:
-            heights.append(height), widths.append(width), rays.append(ray), values.append(value)
-        first_block.append(len(rays))
-        first_value.append(first_value[-1] + sum(len(block[4]) for block in blocks))
-    return Blocks(
-        form=form,
-        first_block=np.array(first_block, np.int32),
-        first_value=np.array(first_value, np.int64),
-        ray=np.array(rays, np.int32),
-        height=np.array(heights, np.uint8),
-        width=np.array(widths, np.uint8),
-        value=np.concatenate([*values, np.zeros(BLOCK_WIDTH, np.uint8)]),
-        scale=rng.uniform(0.5, 1.5, VOXELS).astype(np.float32) / 65025,
-        microimages=microimages,
-        even_blocks=np.array(even_blocks, np.int32),
-        even_values=np.array(even_values, np.int32),
-    )
-
-
-def matrix_of(blocks: Blocks, lenses: int = ALL) -> np.ndarray:
-    """Weights (ray, voxel) in float64."""
-    matrix = np.zeros((blocks.microimages.size, len(blocks.scale)))
-    edge, row = blocks.microimages.edge, LAYERS * LENSES * blocks.microimages.edge**2
-    for voxel in range(len(blocks.scale)):
-        ray, weight = blocks.entries(voxel)
-        lens = ray // edge**2 % LENSES + ray // row
-        kept = (weight > 0) & ((lenses == ALL) | (lens % 2 == lenses))
-        np.add.at(matrix[:, voxel], ray[kept], weight[kept])
-    return matrix
 
 
 @pytest.fixture(params=["profiles", "pixels"])

@@ -36,8 +36,7 @@ wp.array.__init__ = counted
 import lfpiv
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.planning import part
-from lfpiv.runs import device_memory
-from lfpiv.weights.checks import rays_bytes
+from lfpiv.weights.device_share import BASE_BYTES, beside_bytes
 from lfpiv_kernels import runtime
 
 assert runtime.start("cpu").form == "gpu"
@@ -52,9 +51,9 @@ whole = part.Volume(
 forms = whole.forms()
 peak = alive
 part.measure(whole, forms, whole.per_voxel())
-weights = sum(form.stored_bytes for form in forms.values()) + sum(map(rays_bytes, whole.cameras.values()))
-needed = device_memory.needed_bytes(whole.finest, weights) - device_memory.BASE_BYTES
-print(json.dumps({"peak": peak, "weights": sum(form.stored_bytes for form in forms.values()), "needed": needed}))
+weights = sum(form.device_bytes for form in forms.values())
+needed = weights + beside_bytes(whole.cameras.values(), whole.finest.grid) - BASE_BYTES
+print(json.dumps({"peak": peak, "weights": weights, "needed": needed}))
 """
 
 

@@ -19,8 +19,9 @@ from lfpiv.report.summary import DeviceFigures
 from lfpiv.results import netcdf
 from lfpiv.runs import device_memory, memory
 from lfpiv.runs.memory import GIB
-from lfpiv.weights.checks import rays_bytes
+from lfpiv.weights.device_share import beside_bytes, rays_bytes
 from lfpiv_kernels import runtime
+from lfpiv_kernels.reconstruction import projector_streamed
 from lfpiv_kernels.runtime import Device
 
 COMPRESSION = 0.15
@@ -59,7 +60,9 @@ def test_the_memory_is_what_a_run_announces(planned, small_run):
     built = small_run.summary["weights"]["memory_mib"] * 2**20
     assert planned.memory.weights - maps == pytest.approx(built, rel=SAMPLED)
     assert built < planned.disk.weights < planned.memory.weights
-    assert planned.memory.device_needed is None and planned.memory.device_free is None
+    memory_of = planned.memory
+    assert memory_of.device_needed is memory_of.device_least is memory_of.device_free is None
+    assert memory_of.device_streamed == 0
 
 
 def test_two_workers_share_pairs_and_threads(planned):
@@ -147,6 +150,31 @@ def test_a_part_has_the_middle_of_the_volume_and_the_weights_of_the_whole(small_
     assert estimated == pytest.approx(whole.weights(forms).memory_bytes, rel=SAMPLED)
 
 
+def test_weights_that_a_gpu_does_not_hold_are_planned_to_pass_through_it(planned, small_run, monkeypatch):
+    experiment = read_experiment(small_run.experiment)
+    whole = part.Volume(
+        experiment=experiment,
+        guard=((1, 1),) * 3,
+        refinement=1.0,
+        calibration=lfpiv.thin_lens(experiment),
+        particle_voxel=0.9,
+    )
+    forms = whole.forms()
+    weights = sum(form.device_bytes for form in forms.values())
+    beside = beside_bytes(whole.cameras.values(), whole.finest.grid)
+    monkeypatch.setattr(projector_streamed, "SLAB_BYTES", weights // 16)
+    monkeypatch.setattr(runtime, "free_bytes", lambda: beside + weights // 2)
+    found = campaign.memory_of(whole, forms, 1, GPU)
+    buffers = 2 * len(forms) * (weights // 16)
+    assert found.device_streamed == weights - (weights // 2 - buffers)
+    assert found.device_least == beside + buffers < found.device_free < found.device_needed
+    fits = dataclasses.replace(found, device_streamed=0)
+    assert found.needed - found.device_streamed == memory.run_bytes(whole.finest, found.weights, 1)
+    text = dataclasses.replace(planned, memory=found).card().text()
+    assert "of the weights pass through it in slabs, in each pass" in text
+    assert "in slabs" not in dataclasses.replace(planned, memory=fits).card().text()
+
+
 def test_costs_that_are_affine_are_extrapolated_exactly():
     def cost(size):
         return Cost(2 + 3 * size, 1 + 5 * size)
@@ -160,15 +188,31 @@ def test_costs_that_are_affine_are_extrapolated_exactly():
 GPU = Device("cuda", 8, "gpu", name="NVIDIA TEST", memory_bytes=4 * GIB, driver="12.8")
 
 
-def test_a_volume_that_cannot_fit_into_the_gpu_is_refused(small_run):
+def test_a_volume_that_cannot_fit_into_the_gpu_is_refused(small_run, monkeypatch):
     experiment = read_experiment(small_run.experiment)
-    needed = device_memory.needed_bytes(experiment, GIB)
-    assert needed > GIB + 4 * experiment.grid.size
-    device_memory.require(experiment, GIB, GPU, free=needed)
-    with pytest.raises(InputError, match=r"GiB of the GPU's memory, .* free on NVIDIA TEST\. Raise volume\.voxel_mm"):
-        device_memory.require(experiment, GIB, GPU, free=needed - 1)
+    need = dataclasses.replace(device_memory.estimate_need(experiment), cameras=(GIB // 4, 3 * GIB // 4))
+    assert need.weights == GIB and need.least < need.whole and need.whole > GIB + 4 * experiment.grid.size
+
+    def require(free, sharing=1):
+        monkeypatch.setattr(runtime, "free_bytes", lambda: free)
+        return device_memory.require(experiment, need, GPU, sharing=sharing)
+
+    assert require(need.whole) == 0
+    assert require(need.least) == GIB  # nothing stays on the GPU
+    assert require((need.whole + need.least) // 2) == GIB - (need.whole - need.least) // 2
+    with pytest.raises(InputError, match=r"even if the weights are streamed; .* free on NVIDIA TEST\. Raise"):
+        require(need.least - 1)
     with pytest.raises(InputError, match="Use at most 2 workers per GPU"):
-        device_memory.require(experiment, GIB, GPU, sharing=3, free=2 * needed)
+        require(2 * need.whole, sharing=3)
+
+
+def test_a_run_says_that_weights_are_streamed(small_run, monkeypatch, caplog):
+    experiment = read_experiment(small_run.experiment)
+    need = dataclasses.replace(device_memory.estimate_need(experiment), cameras=(GIB // 4, 3 * GIB // 4))
+    monkeypatch.setattr(runtime, "free_bytes", lambda: need.least)
+    caplog.set_level("INFO", "lfpiv")
+    device_memory.require(experiment, need, GPU)
+    assert "of the weights' 1.0 GiB about 1.0 GiB are streamed, in 16 slabs that each pass copies anew" in caplog.text
 
 
 def test_a_run_that_cannot_fit_into_the_gpu_begins_no_work(small_run, tmp_path, monkeypatch, capfd):

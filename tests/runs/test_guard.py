@@ -58,7 +58,7 @@ def test_a_warning_names_the_face_and_whether_layers_hold_the_light(experiment):
 def test_estimates_of_memory_count_the_guard_layers(experiment):
     padded = guard.with_guard(experiment, ((6, 6), (0, 0), (0, 0)))
     assert padded.grid.shape[0] == experiment.grid.shape[0] + 12
-    assert memory.least_bytes(padded) > memory.least_bytes(experiment)
+    assert memory.worker_bytes(padded) > memory.worker_bytes(experiment)
     assert memory.weights_bytes(padded) > memory.weights_bytes(experiment)
 
 

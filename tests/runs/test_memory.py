@@ -1,14 +1,25 @@
 """Memory that control groups leave, by trees of files in the forms that the kernel gives them."""
 
 import dataclasses
+import gc
 import math
+import tracemalloc
 
+import numpy as np
 import pytest
+from support.ideal_rig import optics, two_cameras
 
+import lfpiv
 from lfpiv.experiment.opening import read_experiment
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.runs import memory
 from lfpiv.runs.memory import GIB
 from lfpiv.settings.particles import Series
+from lfpiv_kernels import runtime
+
+LEAST_KEPT = 0.9
+"""Share of the estimated constants that a solver keeps at least: the estimate is rounded up."""
 
 PROGRAMS, CACHE, SHARED = 1, 12, 2
 """What a group holds [GiB]: programs, files that the kernel may drop, and shared memory, which counts as a file, too,
@@ -75,3 +86,27 @@ def test_a_sequence_holds_the_instants_between_those_of_a_pair(small_run):
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
     assert needed(8, predicting) - needed(1, predicting) == 7 * 4 * (experiment.grid.size + pixels)
     assert needed(1, predicting) > needed(1, experiment.smart)
+
+
+def test_the_estimate_has_room_for_what_a_solver_keeps_and_works_on(device):
+    """Both volumes are held, as in a run; two cameras whose rays are cut into four subsets."""
+    if runtime.device().form == "gpu":
+        pytest.skip("memory of a device is not traced")
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.4,) * 3, voxel_mm=0.08)
+    weights = lfpiv.build_weights(two_cameras(optics=optics(rows=300, columns=320)), grid, form="profiles")
+    images = weights(np.random.default_rng(0).random(grid.shape, np.float32))
+    pixels = sum(image.size for image in images.values())
+    gc.collect()
+    tracemalloc.start()
+    solver = SmartSolver(weights, SmartSettings(iterations=6, sieve_voxel=0.6, intensity_cap=0.0))
+    both = [solver.solve(images) for _ in range(2)]
+    peak = tracemalloc.get_traced_memory()[1]
+    del both
+    gc.collect()
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert len(solver.subsets) == 4
+    constants = (memory.KEPT_BYTES + 2 * memory.BYTES_PER_VOXEL_AND_CAMERA) * grid.size
+    per_pixel = memory.BYTES_PER_PIXEL * pixels
+    assert LEAST_KEPT * constants < kept < constants + per_pixel
+    assert peak < (memory.BYTES_PER_VOXEL + 2 * memory.BYTES_PER_VOXEL_AND_CAMERA) * grid.size + per_pixel
