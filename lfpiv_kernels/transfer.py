@@ -24,10 +24,8 @@ if TYPE_CHECKING:
 else:
     DeviceArray = wp.array
 """An array on the device."""
-Array = TypeVar("Array", np.ndarray, DeviceArray)
-"""An array of the host, or one on the device."""
 Values = np.ndarray | DeviceArray
-"""The same, where a call may take both."""
+"""An array of the host, or one on the device."""
 Given = TypeVar("Given", bound=Values)
 """The kind of array that a function was given, and returns."""
 
@@ -69,12 +67,7 @@ def to_device(values: Values, dtype: type | None = None, device: str | None = No
     return wp.array(values, device=device or runtime.device().warp, copy=moved, **kind)
 
 
-def like(given: Array, found: wp.array) -> Array:
-    """Return `found` where the caller works on the device; one of NumPy where `given` is one."""
-    return found if isinstance(given, wp.array) else to_host(found)
-
-
-def overwrite(given: np.ndarray | wp.array, found: wp.array) -> None:
+def overwrite(given: Values, found: wp.array) -> None:
     """Bring what was made of ``to_device(given)`` back into `given`; nothing is to be done for a device's array."""
     if not isinstance(given, wp.array) and runtime.device().form == "gpu":
         given[:] = to_host(found)

@@ -409,5 +409,6 @@ OPERATIONS = {
     "train": (_train, {"epochs": 10}),
 }
 CASES = {f"{name}_{scale}": (*how, scale) for scale in SCALES for name, how in OPERATIONS.items()}
+CASES["count_paper"] = (_count, {"edge": SCALES["paper"]["voxels"]}, "paper")  # 8.2e9 rays
 CASES["demo"] = (_demo, {}, "small")
 """Name -> the function that prepares the case, its settings, its scale."""

@@ -3,8 +3,8 @@ Weights of one voxel
 ====================
 
 The weights of a voxel are the shares of its light that reach each pixel (Eq. 10; Fig. 10 of the paper draws those of
-one voxel). `lfpiv.build_weights` integrates them in closed form; ``method="count"`` traces rays and counts them, and
-judges the other.
+one voxel). `lfpiv.build_weights` integrates them in closed form; with ``method="count"`` it traces rays and counts
+them, as the paper does. Counts have noise, so many rays are taken here.
 """
 
 from pathlib import Path

@@ -16,7 +16,7 @@ import numpy as np
 
 from lfpiv_kernels.reconstruction.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.voxels import divide, multiply
-from lfpiv_kernels.transfer import Array, DeviceArray, duplicate, to_device, to_host
+from lfpiv_kernels.transfer import DeviceArray, Given, duplicate, to_device, to_host
 
 TRUNCATE = 3.5
 """Reach of the sieve's Gaussian [standard deviation]."""
@@ -37,7 +37,7 @@ class Sieve:
     shape: tuple[int, int, int]
     """Voxel counts in stored order."""
 
-    def __call__(self, volume: Array) -> Array:
+    def __call__(self, volume: Given) -> Given:
         """Return the blurred volume, on the device if `volume` is. The identity returns `volume` itself."""
         if self.sigma_voxel == 0:
             return volume

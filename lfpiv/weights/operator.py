@@ -2,7 +2,7 @@
 
 ``weights(volume)`` projects a volume onto images (Eq. 4), ``weights.T(images)`` is the adjoint. Two methods give the
 weights: "footprint" integrates them in closed form (`lfpiv.weights.blocks`), "count" traces rays and counts them, as
-the paper does (`lfpiv.weights.counting`). Both are stored as 8-bit blocks with one scale per voxel.
+the paper does (`lfpiv.weights.counted_grid`). Both are stored as 8-bit blocks with one scale per voxel.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction import blur_gpu
 from lfpiv_kernels.reconstruction.blur_layout import Axis
 from lfpiv_kernels.reconstruction.voxels import parts_of
-from lfpiv_kernels.transfer import Array, empty, like, to_device
+from lfpiv_kernels.transfer import Given, as_given, empty, to_device
 
 wp.set_module_options(native.options("blur.h", contract="fast"))
 
@@ -82,7 +82,7 @@ class GaussianBlur:
         self.shape = shape
         self._axes = [_axis(profile / profile.sum(), size, border) for size in shape]
 
-    def __call__(self, volume: Array) -> Array:
+    def __call__(self, volume: Given) -> Given:
         """Return the blurred volume, on the device if `volume` is; both float32, C-contiguous, shape (voxel,)."""
         source, work, blurred = to_device(volume, float), empty(volume.size), empty(volume.size)
         if runtime.device().form == "gpu":
@@ -90,7 +90,7 @@ class GaussianBlur:
         else:
             call = Call(_blur, self.shape[0], [*self._axes, source], [work, blurred])
             launch(call, parts=parts_of(volume.size, FEWEST_VOXELS))
-        return like(volume, blurred)
+        return as_given(blurred, volume)
 
 
 def _axis(profile: np.ndarray, size: int, border: str) -> Axis:

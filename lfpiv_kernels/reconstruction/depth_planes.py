@@ -15,7 +15,7 @@ from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction import depth_planes_gpu
 from lfpiv_kernels.reconstruction.plane_layout import PlaneMap
-from lfpiv_kernels.transfer import Array, empty, like, to_device, to_host
+from lfpiv_kernels.transfer import Given, as_given, empty, to_device, to_host
 
 wp.set_module_options(native.options("depth_planes.h", contract="fast"))
 
@@ -113,7 +113,7 @@ class DepthPlanes:
         self._map.node_rows, self._map.planes, self._map.node_columns = shares.nodes
         self._layers_of = to_device(depth_planes_gpu.layers_of_planes(shares.plane, shares.nodes[1]))
 
-    def spread(self, volume: Array, *, absolute: bool = False) -> Array:
+    def spread(self, volume: Given, *, absolute: bool = False) -> Given:
         """Return the nodes' light R volume, shape (node,), float32, on the device if `volume` is.
 
         With `absolute` the shares count as positive.
@@ -125,9 +125,9 @@ class DepthPlanes:
             depth_planes_gpu.spread(self._map, self._layers_of, absolute, voxels, nodes)
         else:
             launch(Call(_spread, self.shares.nodes[0] * self.shares.nodes[1], [self._map, absolute, voxels], [nodes]))
-        return like(volume, nodes)
+        return as_given(nodes, volume)
 
-    def collect(self, nodes: Array) -> Array:
+    def collect(self, nodes: Given) -> Given:
         """Return the adjoint's sum R^T nodes, shape (voxel,), float32, on the device if `nodes` are."""
         found = empty(math.prod(self.shares.voxels))
         light = to_device(nodes, float)
@@ -139,7 +139,7 @@ class DepthPlanes:
             rows, layers, columns = (self.shares.voxels[axis] for axis in self.shares.axes)
             first, second, third = (self.shares.axes.index(axis) for axis in range(3))
             found = _transposed(found, (rows, layers, columns), (first, second, third))
-        return like(nodes, found)
+        return as_given(found, nodes)
 
 
 def _transposed(volume: wp.array, shape: tuple[int, int, int], axes: tuple[int, int, int]) -> wp.array:

@@ -23,7 +23,7 @@ from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
 from lfpiv_kernels.reconstruction.projector_streamed import StreamedProjector, fits_whole
 from lfpiv_kernels.reconstruction.weight_blocks import Blocks
-from lfpiv_kernels.transfer import Array, empty, overwrite, to_device, to_host, zeros
+from lfpiv_kernels.transfer import Given, Values, empty, overwrite, to_device, to_host, zeros
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
@@ -249,7 +249,7 @@ class Projector:
             finally:
                 self._reserved = False
 
-    def scatter(self, volume: np.ndarray | wp.array, lenses: int = ALL) -> None:
+    def scatter(self, volume: Values, lenses: int = ALL) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
         light = to_device(volume, float)
         self._scatter(light if self._planes is None else self._planes.spread(light), lenses)
@@ -268,7 +268,7 @@ class Projector:
 
         runtime.run_chunks(light.size, scatter_part)
 
-    def gather(self, out: Array, active: np.ndarray | wp.array | None = None, lenses: int = ALL) -> Array:
+    def gather(self, out: Given, active: Values | None = None, lenses: int = ALL) -> Given:
         """Add the weighted sum of the light on each voxel's rays of some lenses to `out`, shape (voxel,). Return `out`.
 
         Voxels whose `active`, shape (voxel,), float32, is zero do not change.
@@ -299,7 +299,7 @@ class Projector:
         runtime.run_chunks(volume.size, gather_part)
         return volume
 
-    def project(self, volume: np.ndarray | wp.array, out: Array, lenses: int = ALL) -> Array:
+    def project(self, volume: Values, out: Given, lenses: int = ALL) -> Given:
         """Write the image of `volume`, shape (voxel,), through some lenses into `out`, shape (pixel,). Return `out`."""
         with self.reserved():
             self.scatter(volume, lenses)
@@ -309,7 +309,7 @@ class Projector:
         overwrite(out, image)
         return out
 
-    def back_project(self, image: np.ndarray | wp.array, out: Array, lenses: int = ALL) -> Array:
+    def back_project(self, image: Values, out: Given, lenses: int = ALL) -> Given:
         """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
 
         Rays of other lenses than `lenses` do not count. Return `out`.

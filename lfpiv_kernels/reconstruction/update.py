@@ -12,7 +12,7 @@ from lfpiv_kernels.reconstruction.pixel_rays import PixelRays
 from lfpiv_kernels.reconstruction.projector import ALL, Projector
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of, sweep
-from lfpiv_kernels.transfer import empty, to_device, zeros
+from lfpiv_kernels.transfer import Values, empty, to_device, zeros
 
 wp.set_module_options(native.options("update.h"))
 
@@ -194,7 +194,7 @@ class Comparison:
         Noise floor [counts].
     """
 
-    def __init__(self, projector: Projector, image: np.ndarray, gain: np.ndarray | wp.array, floor: float):
+    def __init__(self, projector: Projector, image: np.ndarray, gain: Values, floor: float):
         self.projector = projector
         self.floor = float(floor)
         pixel = projector.map.pixel
@@ -220,7 +220,7 @@ class Comparison:
         """Forget the volumes that are held."""
         self._held.zero_()
 
-    def compare(self, volume: np.ndarray | wp.array, totals: Totals, lenses: int = ALL) -> None:
+    def compare(self, volume: Values, totals: Totals, lenses: int = ALL) -> None:
         """Project `volume`, shape (voxel,), and write gain * log((image + floor) / (projection + floor)) on the rays.
 
         With `lenses` only the pixels that see no other lenses count. The other rays become dark. Add to the first two

@@ -1,6 +1,7 @@
 """Compare volumes and vectors from counted rays with those from footprints, on the same images.
 
-    python perf/accuracy/counted_weights.py --cases blobs --conditions clean --flows ring --rays 4096,16384
+    python perf/accuracy/counted_weights.py --cases blobs --conditions clean --flows ring --rays 4096,16384 \\
+        --cameras 2 --seeds 11,12,13
 
 The other options are those of ``reconstruction_bench.py``. No figure is kept.
 """
@@ -44,12 +45,13 @@ def main() -> None:
     parser.add_argument("--rays", default="4096,16384")
     parser.set_defaults(angles=None, scale="small", frames=2)
     arguments = parser.parse_args()
-    for case in parse_cases(arguments):
-        for rays in (None, *map(int, arguments.rays.split(","))):
-            with counted(rays):
+    for rays in (None, *map(int, arguments.rays.split(","))):
+        with counted(rays):  # of all cases: seeds share their rig's weights
+            for case in parse_cases(arguments):
                 found = measure(case, WAYS["ours"], CACHE)
-            text = ", ".join(f"{name} {found[name]:.4g}" for name in FIGURES)
-            print(f"{case.label}, {'footprints' if rays is None else f'{rays} rays'}: {text}", flush=True)
+                text = ", ".join(f"{name} {found[name]:.4g}" for name in FIGURES)
+                of = "footprints" if rays is None else f"{rays} rays"
+                print(f"{case.label}, seed {case.seed}, {of}: {text}", flush=True)
 
 
 if __name__ == "__main__":

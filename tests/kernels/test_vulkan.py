@@ -30,7 +30,7 @@ def computed(file, arch):
 
 def test_results_on_vulkan_are_those_of_the_processor(tmp_path):
     vulkan, processor = computed(tmp_path / "vulkan.npz", "vulkan"), computed(tmp_path / "cpu.npz", "")
-    assert set(vulkan) == set(processor) and len(processor.files) == 13
+    assert set(vulkan) == set(processor) and len(processor.files) == 15
     np.testing.assert_allclose(
         vulkan["rays"], processor["rays"], rtol=0, atol=ROUNDING * np.abs(processor["rays"]).max()
     )

@@ -4,12 +4,15 @@ import sys
 from itertools import pairwise
 
 import numpy as np
+from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
 from support.simulated_cameras import camera
 
+import lfpiv
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.thin_lens_model import thin_lens_model
+from lfpiv.geometry.grid import Grid
 from lfpiv.simulation.camera_images import render_camera
-from lfpiv_kernels import runtime
+from lfpiv_kernels import reference, runtime
 from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.rendering import collect, render, surfaces
 
@@ -21,6 +24,14 @@ RIGS = {
 }
 """Cameras of `simulated_cameras`, and what is changed, so that every branch of the kernels is taken."""
 BOARD = {"dots": (9, 9), "spacing_mm": 0.1, "dot_diameter_mm": 0.05, "dot_light": 1.0, "board_light": 0.1}
+COUNTED = {
+    "square": IdealCamera("square", rotation(45), optics=optics(110, 150), coma=0.01),
+    "hexagonal": IdealCamera(
+        "hexagonal", rotation(-45), optics=optics(110, 150, "hexagonal"), lattice=lattice("hexagonal", roll_deg=0.4)
+    ),
+}
+VOXELS = Grid(shape=(5, 3, 5), voxel_mm=0.1, first_centre_mm=(-0.1, -0.1, -0.2))
+"""Cameras whose rays are counted, and the voxels: in focus, out of focus and partly beside the sensor."""
 PATCH = (np.eye(3)[:2], (0.2, 0.05), (False, True))
 """Axes, half extents [mm], and whether the edges are Gaussian."""
 
@@ -48,6 +59,9 @@ def results():
         found[f"{name} white"] = collect.render_white(renderer, samples=32, seed=1)
         found[f"{name} board"] = collect.render_board(renderer, 0.1, **BOARD, samples=32, seed=1)
         found[f"{name} patch"] = surfaces.render_patch(renderer, place, *PATCH, samples=32, seed=1)
+    for name, ideal in COUNTED.items():
+        weights = lfpiv.build_weights(IdealRig({name: ideal}), VOXELS, "count", rays=4096)
+        found[f"{name} counted"] = reference.dense(weights.projector(name).blocks)
     return found
 
 

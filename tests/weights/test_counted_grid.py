@@ -61,7 +61,7 @@ def count(camera=RIGS["square"], grid=GRID, **more):
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_kernel_equals_its_twin(name):
+def test_count_kernel_equals_its_twin(name):
     camera, first, rays = RIGS[name], 7, 4096
     runtime.device()
     models = ray_models(camera, np.array([centre_of(camera, place) for place in PLACES_MM]), VOXEL_MM, degree=3)
