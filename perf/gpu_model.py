@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 from cases import CASES, SCALES
+from gpu_traffic import LAUNCH_S, MEMORY_BYTES_S, Traffic, count_sectors, total
 from inputs import grid, rig
 
 import lfpiv
@@ -38,7 +39,7 @@ from lfpiv_kernels.reconstruction import depth_planes_gpu
 from lfpiv_kernels.reconstruction.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.blur_layout import Axis
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
-from lfpiv_kernels.reconstruction.lanes import LANES
+from lfpiv_kernels.lanes import LANES
 from lfpiv_kernels.reconstruction.pixel_layout import PixelRays
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.reconstruction.pixel_rays_gpu import WARPS
@@ -64,12 +65,6 @@ SAMPLED_BLOCKS = 32
 """Thread blocks that stand for a launch."""
 EVENTS = 1 << 24
 """Accesses of a sample at most."""
-MEMORY_BYTES_S, L2_BYTES_S = 3.35e12, 5.5e12
-"""Bandwidths of an H100's memory and second cache."""
-MULTIPROCESSORS, CLOCK_HZ, L1_BYTES_CLOCK = 132, 1.6e9, 128
-"""Of an H100: a clock that it keeps under load, and bytes from the first cache per clock and multiprocessor."""
-LAUNCH_S = 3e-6
-"""Time of a launch that does nothing."""
 SWEEPS_OF_STEP, BYTES_OF_SWEEP = 6, 12
 """Element-wise sweeps over the volume in one step of SMART, and bytes per voxel of each."""
 
@@ -227,98 +222,6 @@ def _trace_planes(
     _planes_of(kernel, map, layers_of, volume, warps, volume_out, events_out, used_out)
 
 
-@dataclass(frozen=True)
-class Traffic:
-    """What one launch moves."""
-
-    kernel: str
-    touched: float
-    """Sectors, the distinct ones of each instruction of a warp."""
-    needed: float
-    """Sectors that the distinct bytes of each instruction fill, each contiguous run of them from the first."""
-    by_block: float
-    """Distinct sectors of each thread block."""
-    used: float
-    """Distinct bytes of each thread block, in sectors."""
-    memory: float
-    """Bytes through the GPU's memory."""
-    atomics: float
-    exchanges: float
-    """Instructions that go through shared memory or from lane to lane."""
-    launches: int = 1
-
-    @property
-    def ratio(self) -> float:
-        """Sectors touched per sector needed."""
-        return self.touched / max(self.needed, 1.0)
-
-    @property
-    def filled(self) -> float:
-        """Distinct sectors of thread blocks per sector that their distinct bytes would fill."""
-        return self.by_block / max(self.used, 1.0)
-
-    @property
-    def limits_s(self) -> dict[str, float]:
-        """Time [s] at each of the four limits."""
-        clocks = MULTIPROCESSORS * CLOCK_HZ
-        return {
-            "memory": self.memory / MEMORY_BYTES_S,
-            "second cache": SECTOR * self.by_block / L2_BYTES_S,
-            "first cache": SECTOR * self.touched / (clocks * L1_BYTES_CLOCK),
-            "shared memory": self.exchanges / clocks,
-        }
-
-    @property
-    def seconds(self) -> float:
-        """Predicted time [s]."""
-        return max(self.limits_s.values()) + self.launches * LAUNCH_S
-
-
-def _runs(groups: np.ndarray, address: np.ndarray, size: np.ndarray) -> tuple[int, int]:
-    """Return the sectors that the distinct bytes of each group fill: by contiguous runs rounded up, and not rounded."""
-    if not len(address):
-        return 0, 0
-    order = np.lexsort((address, groups))
-    groups, address, size = groups[order], address[order], size[order]
-    new = np.append(True, (groups[1:] != groups[:-1]) | (address[1:] != address[:-1]))
-    groups, address, size = groups[new], address[new], size[new]  # aligned, so two accesses are one or apart
-    begins = np.append(True, (groups[1:] != groups[:-1]) | (address[1:] != (address + size)[:-1]))
-    length = np.add.reduceat(size, np.flatnonzero(begins))
-    return int((-(-length // SECTOR)).sum()), int(length.sum() / SECTOR)
-
-
-def count_sectors(kernel: str, events: np.ndarray, exchanges: int, scale: float, memory: float) -> Traffic:
-    """Count the sectors of a sample of thread blocks.
-
-    Parameters
-    ----------
-    kernel : str
-        Name of the kernel.
-    events : ndarray, shape (access, 2), uint64
-        Accesses, see ``Trace`` in ``lanes.h``.
-    exchanges : int
-        Instructions through shared memory or from lane to lane.
-    scale : float
-        Thread blocks of the launch per one of the sample.
-    memory : float
-        Bytes of the whole launch through the GPU's memory.
-    """
-    size = (events[:, 1] >> np.uint64(2) & np.uint64(63)).astype(np.int64)
-    events, size = events[size > 0], size[size > 0]
-    address = (events[:, 1] >> np.uint64(8)).astype(np.int64)
-    address -= address.min(initial=1 << 60) // SECTOR * SECTOR
-    _, instruction = np.unique(events[:, 0] >> np.uint64(8), return_inverse=True)
-    block = (events[:, 0] >> np.uint64(40)).astype(np.int64) // WARPS_OF_BLOCK
-    kind = events[:, 1] & np.uint64(3)
-    sector = address // SECTOR
-    touched = len(np.unique(instruction * (np.int64(1) << 43) + sector))
-    by_block = len(np.unique(block * (np.int64(1) << 43) + sector))
-    needed, _ = _runs(instruction, address, size)
-    _, used = _runs(block, address, size)
-    counts = (scale * count for count in (touched, needed, by_block, used))
-    return Traffic(kernel, *counts, memory, scale * int((kind == 2).sum()), scale * exchanges)
-
-
 def _aligned(value: object) -> object:
     """Return an array, or a struct with its arrays, that begins a sector as on a GPU: a copy if it does not."""
     if isinstance(value, np.ndarray):
@@ -356,8 +259,8 @@ class Tracer:
         RuntimeError
             If the sample has more accesses than there is room for.
         """
-        total = -(-warps // WARPS_OF_BLOCK)
-        chosen = np.unique(np.linspace(0, total - 1, min(self._blocks, total)).round().astype(np.int64))
+        blocks = -(-warps // WARPS_OF_BLOCK)
+        chosen = np.unique(np.linspace(0, blocks - 1, min(self._blocks, blocks)).round().astype(np.int64))
         sample = (chosen[:, None] * WARPS_OF_BLOCK + np.arange(WARPS_OF_BLOCK)).ravel()
         sample = sample[sample < warps].astype(np.int32)
         _launch_traced(kernel, [*call(sample), self._events, self._used])
@@ -365,7 +268,7 @@ class Tracer:
         if accesses > EVENTS:
             raise RuntimeError(f"{name}: {accesses} accesses in the sample, room for {EVENTS}; sample fewer blocks.")
         events = self._events[: 2 * accesses].reshape(-1, 2)
-        return count_sectors(name, events, exchanges, warps / len(sample), memory)
+        return count_sectors(name, events, exchanges, warps / len(sample), memory, warps, WARPS_OF_BLOCK)
 
 
 def trace_gather(tiled: TiledProjector, voxel: int) -> tuple[np.ndarray, float]:
@@ -447,7 +350,7 @@ def model_volume(tracer: Tracer, shape: tuple[int, int, int], sigma_voxel: float
                 8 * size,
             )
         )
-    return _sum(f"blur {sigma_voxel}", axes)
+    return total(f"blur {sigma_voxel}", axes)
 
 
 def model_planes(tracer: Tracer, projector: Projector) -> list[Traffic]:
@@ -469,12 +372,6 @@ def model_planes(tracer: Tracer, projector: Projector) -> list[Traffic]:
         )
         for number, (name, out, into) in enumerate(sides)
     ]
-
-
-def _sum(name: str, parts: list[Traffic]) -> Traffic:
-    """Return the traffic of several launches."""
-    fields = [field.name for field in dataclasses.fields(Traffic)][1:]
-    return Traffic(name, *(sum(getattr(part, field) for part in parts) for field in fields))
 
 
 @dataclass(frozen=True)
