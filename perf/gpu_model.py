@@ -1,16 +1,13 @@
-"""Model the memory traffic and time of reconstruction's kernels on a GPU, on a machine without one.
+"""Model the memory traffic and time of a pair's kernels on a GPU, on a machine without one.
 
     python perf/gpu_model.py [--scale small|medium|paper] [--form profiles|pixels] [--json FILE]
+    python perf/gpu_model.py --cases CASE ...  # of the benchmark: their times
 
 The kernels' own C++ runs here, lane after lane, on the real arrays of a rig, and notes the address of every access to
 the GPU's memory (`LFPIV_TRACE` in ``lanes.h``). A sample of thread blocks stands for a launch.
 
-Memory moves in sectors of 32 bytes. `touched` are the distinct sectors of each instruction of a warp, `needed` the
-sectors that its distinct bytes would fill if each contiguous run of them began one. The time of a kernel is the longest
-of four: the distinct sectors of each thread block through the second cache (the first cache holds what a block
-reads twice); the distinct bytes of the launch through the GPU's memory (the second cache holds the rest); all touched
-sectors through the first cache; shuffles and shared memory, one instruction per clock and multiprocessor. Launches take
-`LAUNCH_S`. The work of the arithmetic units, and waiting where few warps have little to do, are left out.
+``gpu_traffic`` says how sectors are counted and times follow. ``gpu_correlation`` models the correlation. The work of
+the arithmetic units is left out.
 """
 
 from __future__ import annotations
@@ -23,9 +20,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import gpu_correlation
 import numpy as np
 import warp as wp
-from cases import CASES, SCALES
+from cases import CASES, SCALES, prepare
 from gpu_traffic import LAUNCH_S, MEMORY_BYTES_S, Traffic, count_sectors, total
 from inputs import grid, rig
 
@@ -35,11 +33,11 @@ from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.sieve import TRUNCATE
 from lfpiv.reconstruction.steps import SHARPENED_VOXEL
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.lanes import LANES
 from lfpiv_kernels.reconstruction import depth_planes_gpu
 from lfpiv_kernels.reconstruction.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.blur_layout import Axis
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
-from lfpiv_kernels.lanes import LANES
 from lfpiv_kernels.reconstruction.pixel_layout import PixelRays
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.reconstruction.pixel_rays_gpu import WARPS
@@ -442,6 +440,10 @@ def model(scale: str, form: str = "profiles", refinement: float = 1.0) -> Model:
     )
 
 
+CORRELATION = ("_correlate", "_deform", "_vectors")
+"""Functions that prepare the cases of the correlation."""
+
+
 def predicted(case: str) -> float | None:
     """Return the predicted time of a benchmark's case [s]; None if it is not modelled."""
     maker, settings, scale = CASES[case]
@@ -457,6 +459,9 @@ def predicted(case: str) -> float | None:
         forward = sum(map(of.seconds, ("spread to planes", "scatter", "compare")))
         back = sum(map(of.seconds, ("gather", "collect from planes")))
         return of.cameras * ((settings["iterations"] + 1) * forward + settings["iterations"] * back)
+    if maker.__name__ in CORRELATION:
+        found = gpu_correlation.trace(prepare(case).run)
+        return found.seconds + found.host_s
     return None
 
 
@@ -466,7 +471,13 @@ def main() -> None:
     parser.add_argument("--form", choices=("profiles", "pixels"), default="profiles")
     parser.add_argument("--refinement", type=float, default=1.0, help="how much finer voxels are than the case's")
     parser.add_argument("--json", type=Path, help="file for the table")
+    parser.add_argument(
+        "--cases", nargs="+", choices=CASES, metavar="CASE", help="print their times [s] as JSON instead"
+    )
     given = parser.parse_args()
+    if given.cases:
+        print(json.dumps({case: predicted(case) for case in given.cases}))
+        return
     found = model(given.scale, given.form, given.refinement)
     print("kernel                 touched /needed  by block /filled atomics       ms  limit")
     for one in found.kernels:
@@ -476,10 +487,14 @@ def main() -> None:
             f"{one.atomics:7.0f} {1e3 * one.seconds:8.4f}  {limit}"
         )
     print(f"weights: {found.weights_bytes / 2**20:.0f} MiB, on the CPU {found.stored_bytes / 2**20:.0f} MiB")
-    print(f"epoch {1e3 * found.epoch_s:.2f} ms, whole pass {1e3 * found.whole_s:.2f} ms, pair {found.pair_s:.3f} s")
+    work = gpu_correlation.model(given.scale)
+    pair = found.pair_s + work.seconds
+    print(f"epoch {1e3 * found.epoch_s:.2f} ms, whole pass {1e3 * found.whole_s:.2f} ms")
+    print(f"pair {pair:.3f} s: volumes {found.pair_s:.3f} s, correlation {work.seconds:.3f} s;")
+    print(f"{work.host_s:.3f} s of this processor between the correlation's launches besides")
     if given.json:
         rows = [dataclasses.asdict(one) | {"seconds": one.seconds, "ratio": one.ratio} for one in found.kernels]
-        given.json.write_text(json.dumps({"kernels": rows, "epoch_s": found.epoch_s, "pair_s": found.pair_s}, indent=1))
+        given.json.write_text(json.dumps({"kernels": rows, "epoch_s": found.epoch_s, "pair_s": pair}, indent=1))
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ class Traffic:
     packed: float
     """Sectors that as many bytes would fill side by side, of each instruction."""
     by_block: float
-    """Distinct sectors of each thread block; those of each instruction where a block reads more than `BLOCK_SECTORS`."""
+    """Distinct sectors of each thread block; those of each instruction if a block has more than `BLOCK_SECTORS`."""
     used: float
     """Distinct bytes of each thread block, in sectors."""
     memory: float

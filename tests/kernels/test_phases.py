@@ -1,4 +1,4 @@
-"""A volume and the statistics of its windows stored by phase, against loops over all places; both forms of the loops."""
+"""A volume and the statistics of its windows stored by phase, against a loop over all places."""
 
 import itertools
 
