@@ -181,7 +181,7 @@ class Tracer(Generic[Counted]):
         preamble = f'#define LFPIV_EMULATE_GPU\n#include "traced.h"\n{build.extra_cpu_preamble}'
         traced = wp.ModuleBuildOptions(
             extra_cpu_include_dirs=[native.FOLDER, FOLDER],
-            extra_cpu_preamble=preamble.replace("#define LFPIV_EMULATE_GPU\n#define", "#define"),
+            extra_cpu_preamble=preamble,
             extra_build_dependencies=[*build.extra_build_dependencies, FOLDER / "traced.h"],
         )
         if str(native.FOLDER / "lanes.h") in map(str, build.extra_build_dependencies):

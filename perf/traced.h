@@ -58,7 +58,8 @@ __attribute__((always_inline, no_sanitize("coverage"))) inline void note(uint64_
     const int time = site.times[lane]++;
     if (time / TOGETHER % thinned) return;
     if (used < capacity) {
-        events[2 * used] = (uint64_t)warp << 40 | (uint64_t)number << 28 | (uint64_t)(time & 0xfffff) << 8 | (uint64_t)lane;
+        events[2 * used] =
+            (uint64_t)warp << 40 | (uint64_t)number << 28 | (uint64_t)(time & 0xfffff) << 8 | (uint64_t)lane;
         events[2 * used + 1] = (range->place + (at - range->begin)) << 8 | (uint64_t)bytes << 2 | kind;
     }
     ++used;
@@ -66,13 +67,9 @@ __attribute__((always_inline, no_sanitize("coverage"))) inline void note(uint64_
 
 }  // namespace traced
 
-#define LFPIV_HOOK(bytes)                                                                             \
-    void __sanitizer_cov_load##bytes(void* at) {                                                      \
-        traced::note((uint64_t)at, bytes, 0, __builtin_return_address(0));                            \
-    }                                                                                                 \
-    void __sanitizer_cov_store##bytes(void* at) {                                                     \
-        traced::note((uint64_t)at, bytes, 1, __builtin_return_address(0));                            \
-    }
+#define LFPIV_HOOK(bytes)                                                                                             \
+    void __sanitizer_cov_load##bytes(void* at) { traced::note((uint64_t)at, bytes, 0, __builtin_return_address(0)); } \
+    void __sanitizer_cov_store##bytes(void* at) { traced::note((uint64_t)at, bytes, 1, __builtin_return_address(0)); }
 extern "C" {
 LFPIV_HOOK(1) LFPIV_HOOK(2) LFPIV_HOOK(4) LFPIV_HOOK(8) LFPIV_HOOK(16)
 }
