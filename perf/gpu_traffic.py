@@ -5,7 +5,8 @@ sectors that its distinct bytes would fill if each contiguous run of them began 
 of five: the distinct sectors of each thread block through the second cache (the first cache holds what a block
 reads twice, if it is not too much); the distinct bytes of the launch through the GPU's memory (the second cache holds
 the rest); all touched sectors through the first cache; shuffles and shared memory, one instruction per clock and
-multiprocessor; the accesses of each warp, which waits for them where few warps are at work. Launches take `LAUNCH_S`.
+multiprocessor; the accesses of a single warp, which waits for each: few warps with much to do take long. Launches take
+`LAUNCH_S`.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ MULTIPROCESSORS, CLOCK_HZ, L1_BYTES_CLOCK = 132, 1.6e9, 128
 """Of an H100: a clock that it keeps under load, and bytes from the first cache per clock and multiprocessor."""
 BLOCK_SECTORS = 1024
 """Sectors of the first cache that a thread block has: 256 KiB for eight blocks of 256 threads."""
-LATENCY_CLOCKS, IN_FLIGHT, RESIDENT_WARPS = 300, 4, 32
-"""Clocks until the second cache answers, accesses of a warp that wait at once, and warps of a multiprocessor."""
+LATENCY_CLOCKS, IN_FLIGHT = 300, 4
+"""Clocks until the second cache answers, and accesses of a warp that wait for it at once."""
 LAUNCH_S = 3e-6
 """Time of a launch that does nothing."""
 
@@ -50,7 +51,7 @@ class Traffic:
     exchanges: float
     """Instructions that go through shared memory or from lane to lane."""
     waits: float
-    """Accesses that a warp makes one after the other, times the rounds in which all warps have their turn."""
+    """Accesses that a warp makes one after the other."""
     launches: int = 1
 
     @property
@@ -141,8 +142,7 @@ def count_sectors(
     needed, packed, _ = _runs(instruction, address, size)
     *_, used = _runs(block, address, size)
     counts = (scale * count for count in (len(moved), needed, packed, by_block, used))
-    rounds = -(-warps // (MULTIPROCESSORS * RESIDENT_WARPS))
-    waits = scale * (int(instruction.max(initial=-1)) + 1) / warps * rounds
+    waits = scale * (int(instruction.max(initial=-1)) + 1) / warps
     return Traffic(kernel, *counts, memory, scale * int((kind == 2).sum()), scale * exchanges, waits)
 
 
