@@ -1,16 +1,13 @@
-"""Model the memory traffic and time of reconstruction's kernels on a GPU, on a machine without one.
+"""Model the memory traffic and time of a pair's kernels on a GPU, on a machine without one.
 
     python perf/gpu_model.py [--scale small|medium|paper] [--form profiles|pixels] [--json FILE]
+    python perf/gpu_model.py --cases CASE ...  # of the benchmark: their times
 
 The kernels' own C++ runs here, lane after lane, on the real arrays of a rig, and notes the address of every access to
 the GPU's memory (`LFPIV_TRACE` in ``lanes.h``). A sample of thread blocks stands for a launch.
 
-Memory moves in sectors of 32 bytes. `touched` are the distinct sectors of each instruction of a warp, `needed` the
-sectors that its distinct bytes would fill if each contiguous run of them began one. The time of a kernel is the longest
-of four: the distinct sectors of each thread block through the second cache (the first cache holds what a block
-reads twice); the distinct bytes of the launch through the GPU's memory (the second cache holds the rest); all touched
-sectors through the first cache; shuffles and shared memory, one instruction per clock and multiprocessor. Launches take
-`LAUNCH_S`. The work of the arithmetic units, and waiting where few warps have little to do, are left out.
+``gpu_traffic`` says how sectors are counted and times follow. ``gpu_correlation`` models the correlation. The work of
+the arithmetic units is left out.
 """
 
 from __future__ import annotations
@@ -23,9 +20,11 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import gpu_correlation
 import numpy as np
 import warp as wp
-from cases import CASES, SCALES
+from cases import CASES, SCALES, prepare
+from gpu_traffic import LAUNCH_S, MEMORY_BYTES_S, Traffic, count_sectors, total
 from inputs import grid, rig
 
 import lfpiv
@@ -34,11 +33,11 @@ from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.sieve import TRUNCATE
 from lfpiv.reconstruction.steps import SHARPENED_VOXEL
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.lanes import LANES
 from lfpiv_kernels.reconstruction import depth_planes_gpu
 from lfpiv_kernels.reconstruction.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.blur_layout import Axis
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
-from lfpiv_kernels.reconstruction.lanes import LANES
 from lfpiv_kernels.reconstruction.pixel_layout import PixelRays
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.reconstruction.pixel_rays_gpu import WARPS
@@ -64,12 +63,6 @@ SAMPLED_BLOCKS = 32
 """Thread blocks that stand for a launch."""
 EVENTS = 1 << 24
 """Accesses of a sample at most."""
-MEMORY_BYTES_S, L2_BYTES_S = 3.35e12, 5.5e12
-"""Bandwidths of an H100's memory and second cache."""
-MULTIPROCESSORS, CLOCK_HZ, L1_BYTES_CLOCK = 132, 1.6e9, 128
-"""Of an H100: a clock that it keeps under load, and bytes from the first cache per clock and multiprocessor."""
-LAUNCH_S = 3e-6
-"""Time of a launch that does nothing."""
 SWEEPS_OF_STEP, BYTES_OF_SWEEP = 6, 12
 """Element-wise sweeps over the volume in one step of SMART, and bytes per voxel of each."""
 
@@ -227,98 +220,6 @@ def _trace_planes(
     _planes_of(kernel, map, layers_of, volume, warps, volume_out, events_out, used_out)
 
 
-@dataclass(frozen=True)
-class Traffic:
-    """What one launch moves."""
-
-    kernel: str
-    touched: float
-    """Sectors, the distinct ones of each instruction of a warp."""
-    needed: float
-    """Sectors that the distinct bytes of each instruction fill, each contiguous run of them from the first."""
-    by_block: float
-    """Distinct sectors of each thread block."""
-    used: float
-    """Distinct bytes of each thread block, in sectors."""
-    memory: float
-    """Bytes through the GPU's memory."""
-    atomics: float
-    exchanges: float
-    """Instructions that go through shared memory or from lane to lane."""
-    launches: int = 1
-
-    @property
-    def ratio(self) -> float:
-        """Sectors touched per sector needed."""
-        return self.touched / max(self.needed, 1.0)
-
-    @property
-    def filled(self) -> float:
-        """Distinct sectors of thread blocks per sector that their distinct bytes would fill."""
-        return self.by_block / max(self.used, 1.0)
-
-    @property
-    def limits_s(self) -> dict[str, float]:
-        """Time [s] at each of the four limits."""
-        clocks = MULTIPROCESSORS * CLOCK_HZ
-        return {
-            "memory": self.memory / MEMORY_BYTES_S,
-            "second cache": SECTOR * self.by_block / L2_BYTES_S,
-            "first cache": SECTOR * self.touched / (clocks * L1_BYTES_CLOCK),
-            "shared memory": self.exchanges / clocks,
-        }
-
-    @property
-    def seconds(self) -> float:
-        """Predicted time [s]."""
-        return max(self.limits_s.values()) + self.launches * LAUNCH_S
-
-
-def _runs(groups: np.ndarray, address: np.ndarray, size: np.ndarray) -> tuple[int, int]:
-    """Return the sectors that the distinct bytes of each group fill: by contiguous runs rounded up, and not rounded."""
-    if not len(address):
-        return 0, 0
-    order = np.lexsort((address, groups))
-    groups, address, size = groups[order], address[order], size[order]
-    new = np.append(True, (groups[1:] != groups[:-1]) | (address[1:] != address[:-1]))
-    groups, address, size = groups[new], address[new], size[new]  # aligned, so two accesses are one or apart
-    begins = np.append(True, (groups[1:] != groups[:-1]) | (address[1:] != (address + size)[:-1]))
-    length = np.add.reduceat(size, np.flatnonzero(begins))
-    return int((-(-length // SECTOR)).sum()), int(length.sum() / SECTOR)
-
-
-def count_sectors(kernel: str, events: np.ndarray, exchanges: int, scale: float, memory: float) -> Traffic:
-    """Count the sectors of a sample of thread blocks.
-
-    Parameters
-    ----------
-    kernel : str
-        Name of the kernel.
-    events : ndarray, shape (access, 2), uint64
-        Accesses, see ``Trace`` in ``lanes.h``.
-    exchanges : int
-        Instructions through shared memory or from lane to lane.
-    scale : float
-        Thread blocks of the launch per one of the sample.
-    memory : float
-        Bytes of the whole launch through the GPU's memory.
-    """
-    size = (events[:, 1] >> np.uint64(2) & np.uint64(63)).astype(np.int64)
-    events, size = events[size > 0], size[size > 0]
-    address = (events[:, 1] >> np.uint64(8)).astype(np.int64)
-    address -= address.min(initial=1 << 60) // SECTOR * SECTOR
-    _, instruction = np.unique(events[:, 0] >> np.uint64(8), return_inverse=True)
-    block = (events[:, 0] >> np.uint64(40)).astype(np.int64) // WARPS_OF_BLOCK
-    kind = events[:, 1] & np.uint64(3)
-    sector = address // SECTOR
-    touched = len(np.unique(instruction * (np.int64(1) << 43) + sector))
-    by_block = len(np.unique(block * (np.int64(1) << 43) + sector))
-    needed, _ = _runs(instruction, address, size)
-    _, used = _runs(block, address, size)
-    counts = (scale * count for count in (touched, needed, by_block, used))
-    return Traffic(kernel, *counts, memory, scale * int((kind == 2).sum()), scale * exchanges)
-
-
 def _aligned(value: object) -> object:
     """Return an array, or a struct with its arrays, that begins a sector as on a GPU: a copy if it does not."""
     if isinstance(value, np.ndarray):
@@ -356,8 +257,8 @@ class Tracer:
         RuntimeError
             If the sample has more accesses than there is room for.
         """
-        total = -(-warps // WARPS_OF_BLOCK)
-        chosen = np.unique(np.linspace(0, total - 1, min(self._blocks, total)).round().astype(np.int64))
+        blocks = -(-warps // WARPS_OF_BLOCK)
+        chosen = np.unique(np.linspace(0, blocks - 1, min(self._blocks, blocks)).round().astype(np.int64))
         sample = (chosen[:, None] * WARPS_OF_BLOCK + np.arange(WARPS_OF_BLOCK)).ravel()
         sample = sample[sample < warps].astype(np.int32)
         _launch_traced(kernel, [*call(sample), self._events, self._used])
@@ -365,7 +266,7 @@ class Tracer:
         if accesses > EVENTS:
             raise RuntimeError(f"{name}: {accesses} accesses in the sample, room for {EVENTS}; sample fewer blocks.")
         events = self._events[: 2 * accesses].reshape(-1, 2)
-        return count_sectors(name, events, exchanges, warps / len(sample), memory)
+        return count_sectors(name, events, exchanges, warps / len(sample), memory, warps, WARPS_OF_BLOCK)
 
 
 def trace_gather(tiled: TiledProjector, voxel: int) -> tuple[np.ndarray, float]:
@@ -447,7 +348,7 @@ def model_volume(tracer: Tracer, shape: tuple[int, int, int], sigma_voxel: float
                 8 * size,
             )
         )
-    return _sum(f"blur {sigma_voxel}", axes)
+    return total(f"blur {sigma_voxel}", axes)
 
 
 def model_planes(tracer: Tracer, projector: Projector) -> list[Traffic]:
@@ -469,12 +370,6 @@ def model_planes(tracer: Tracer, projector: Projector) -> list[Traffic]:
         )
         for number, (name, out, into) in enumerate(sides)
     ]
-
-
-def _sum(name: str, parts: list[Traffic]) -> Traffic:
-    """Return the traffic of several launches."""
-    fields = [field.name for field in dataclasses.fields(Traffic)][1:]
-    return Traffic(name, *(sum(getattr(part, field) for part in parts) for field in fields))
 
 
 @dataclass(frozen=True)
@@ -545,6 +440,10 @@ def model(scale: str, form: str = "profiles", refinement: float = 1.0) -> Model:
     )
 
 
+CORRELATION = ("_correlate", "_deform", "_vectors")
+"""Functions that prepare the cases of the correlation."""
+
+
 def predicted(case: str) -> float | None:
     """Return the predicted time of a benchmark's case [s]; None if it is not modelled."""
     maker, settings, scale = CASES[case]
@@ -560,6 +459,9 @@ def predicted(case: str) -> float | None:
         forward = sum(map(of.seconds, ("spread to planes", "scatter", "compare")))
         back = sum(map(of.seconds, ("gather", "collect from planes")))
         return of.cameras * ((settings["iterations"] + 1) * forward + settings["iterations"] * back)
+    if maker.__name__ in CORRELATION:
+        found = gpu_correlation.trace(prepare(case).run)
+        return found.seconds + found.host_s
     return None
 
 
@@ -569,7 +471,13 @@ def main() -> None:
     parser.add_argument("--form", choices=("profiles", "pixels"), default="profiles")
     parser.add_argument("--refinement", type=float, default=1.0, help="how much finer voxels are than the case's")
     parser.add_argument("--json", type=Path, help="file for the table")
+    parser.add_argument(
+        "--cases", nargs="+", choices=CASES, metavar="CASE", help="print their times [s] as JSON instead"
+    )
     given = parser.parse_args()
+    if given.cases:
+        print(json.dumps({case: predicted(case) for case in given.cases}))
+        return
     found = model(given.scale, given.form, given.refinement)
     print("kernel                 touched /needed  by block /filled atomics       ms  limit")
     for one in found.kernels:
@@ -579,10 +487,14 @@ def main() -> None:
             f"{one.atomics:7.0f} {1e3 * one.seconds:8.4f}  {limit}"
         )
     print(f"weights: {found.weights_bytes / 2**20:.0f} MiB, on the CPU {found.stored_bytes / 2**20:.0f} MiB")
-    print(f"epoch {1e3 * found.epoch_s:.2f} ms, whole pass {1e3 * found.whole_s:.2f} ms, pair {found.pair_s:.3f} s")
+    work = gpu_correlation.model(given.scale)
+    pair = found.pair_s + work.seconds
+    print(f"epoch {1e3 * found.epoch_s:.2f} ms, whole pass {1e3 * found.whole_s:.2f} ms")
+    print(f"pair {pair:.3f} s: volumes {found.pair_s:.3f} s, correlation {work.seconds:.3f} s;")
+    print(f"{work.host_s:.3f} s of this processor between the correlation's launches besides")
     if given.json:
         rows = [dataclasses.asdict(one) | {"seconds": one.seconds, "ratio": one.ratio} for one in found.kernels]
-        given.json.write_text(json.dumps({"kernels": rows, "epoch_s": found.epoch_s, "pair_s": found.pair_s}, indent=1))
+        given.json.write_text(json.dumps({"kernels": rows, "epoch_s": found.epoch_s, "pair_s": pair}, indent=1))
 
 
 if __name__ == "__main__":

@@ -14,14 +14,22 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
 import pkgutil
 import re
+import signal
 import subprocess
+import sys
 import sysconfig
 import tempfile
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
 
 REGISTERS = 65536
 """Of a multiprocessor."""
@@ -33,6 +41,8 @@ REGISTER_UNIT = 256
 """Registers are given to warps of 32 threads in units of this many."""
 ARCHITECTURES = (75, 80, 90, 100)
 """Compute capabilities. The compiler in Warp no longer knows 7.0."""
+AT_ONCE = 2
+"""Architectures that are compiled side by side, each by a process of some 1 GiB."""
 CPU_ONLY = {
     "blocks": ("_split", "_correlate_blocks", "_gather_blocks"),
     "blur": ("_blur",),
@@ -133,6 +143,53 @@ def _assemble(module: object, short: str, architecture: int) -> Iterator[Kernel]
         yield Kernel(short, name, architecture, *numbers)
 
 
+@contextmanager
+def _leaving_nothing() -> Iterator[None]:
+    """Let a signal to terminate raise `SystemExit`, so that folders are removed and processes ended on the way out."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def measure_all(architectures: Sequence[int]) -> list[Kernel]:
+    """Compile and assemble all kernels for several architectures, each in a process of its own.
+
+    Raises
+    ------
+    RuntimeError
+        If a process fails; with the end of what it said.
+    """
+    waiting, running = list(architectures), {}
+    paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    with _leaving_nothing(), tempfile.TemporaryDirectory() as folder:
+        table = {one: Path(folder) / f"{one}.json" for one in architectures}
+        try:
+            while waiting or running:
+                while waiting and len(running) < AT_ONCE:
+                    one = waiting.pop(0)
+                    command = [sys.executable, __file__, "--arch", str(one), "--json", str(table[one])]
+                    with table[one].with_suffix(".txt").open("w") as said:
+                        environment = os.environ | {"PYTHONPATH": paths}
+                        running[one] = subprocess.Popen(command, env=environment, stdout=said, stderr=said)
+                time.sleep(0.1)
+                for one in [one for one, process in running.items() if process.poll() is not None]:
+                    if running.pop(one).returncode:
+                        said = table[one].with_suffix(".txt").read_text("utf-8", "replace")
+                        raise RuntimeError(f"sm_{one}: the kernels could not be measured: {said[-2000:]}")
+        finally:
+            for process in running.values():
+                process.terminate()
+            for process in running.values():
+                process.wait()
+        rows = [row for path in table.values() for row in json.loads(path.read_text("utf-8"))]
+    return [Kernel(**{name: value for name, value in row.items() if name != "occupancy"}) for row in rows]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
@@ -145,7 +202,11 @@ def main() -> None:
     )
     parser.add_argument("--json", type=Path, help="file for the table")
     given = parser.parse_args()
-    rows = [kernel for architecture in given.arch for kernel in measure(architecture)]
+    if len(given.arch) > 1:
+        rows = measure_all(given.arch)
+    else:
+        with _leaving_nothing():
+            rows = list(measure(*given.arch))
     print(f"{'kernel':36s} {'sm':>4s} {'registers':>9s} {'occupancy':>9s} {'stack':>6s} {'spilled':>7s}")
     for row in sorted(rows, key=lambda row: (row.occupancy, row.module, row.name)):
         name = f"{row.module}.{row.name.lstrip('_')}"

@@ -77,6 +77,36 @@ class Layers:
     lanes: int  # lanes per lag
 
 
+@wp.struct
+class Sums:
+    """Sums of products of blocks, (layer, lag, lane)."""
+
+    ahead: wp.array(dtype=float)  # of blocks of the first volume
+    behind: wp.array(dtype=float)  # of blocks of the second volume: lags count backwards
+    symmetric: int  # 1: average both; 0: `behind` is not read
+
+
+@wp.struct
+class Windows:
+    """Windows whose peaks a launch finds, and the memory of their sums, coefficients and peaks."""
+
+    voxels: int  # in a window
+    blocks: wp.vec3i  # blocks per window and axis that are still to be added up
+    block_step: int  # layers of blocks from one layer of windows to the next
+    stride: int  # distance of layers of blocks [voxel]
+    reach: int  # lags around the highest coefficient that belong to its peak
+    lags: wp.vec3i
+    begin: int  # first layer of windows
+    ring: int  # layers of blocks that the sums have memory for: layer i lies at i % ring
+    groups: int  # groups of lanes
+    group: int  # lanes per group: a multiple of `LANES` on the CPU, 1 on CUDA
+    pitch: int  # lanes per row
+    lanes: int  # lanes per lag
+    slot_pitch: wp.int64  # elements of scratch memory per slot
+    score_pitch: int  # elements from one lag's coefficients to the next
+    peak_pitch: wp.int64  # elements per value of the peaks
+
+
 @dataclass(frozen=True)
 class Storage:
     """Memory layout of values at every offset from a lattice, (plane, phase y, phase x, lane)."""

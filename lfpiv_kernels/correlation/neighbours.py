@@ -18,7 +18,7 @@ from lfpiv_kernels.transfer import Values, to_device, to_host
 wp.set_module_options(native.options("neighbours.h"))
 
 VECTORS = native.constant("neighbours.h", "VECTORS")
-"""Vectors that a CPU task predicts at once; a GPU's thread predicts one component of one."""
+"""Vectors that a CPU task predicts at once; a GPU's warp predicts one component of one."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.lanes import lanes_of_warp
 from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("neighbours_gpu.h"))
@@ -22,10 +23,10 @@ def _predict_one(
 ): ...
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=64)
 def _predict_vectors(
     # in
-    field: wp.array(dtype=float),  # as in `_predict`; a thread per component of a vector
+    field: wp.array(dtype=float),  # as in `_predict`; a warp per component of a vector
     keep: wp.array(dtype=int),
     points: wp.array(dtype=int),
     shape: wp.vec3i,
@@ -34,10 +35,11 @@ def _predict_vectors(
     prediction_out: wp.array(dtype=float),
     count_out: wp.array(dtype=int),
 ):
-    _predict_one(field, keep, points, shape, first + wp.tid(), prediction_out, count_out)
+    task, _lane = wp.tid()
+    _predict_one(field, keep, points, shape, first + task, prediction_out, count_out)
 
 
 def prediction_call(inputs: list[object], outputs: list[wp.array]) -> Call:
-    """Return the call that predicts vectors: a thread per component of each."""
+    """Return the call that predicts vectors: a warp per component of each."""
     _, count = outputs
-    return Call(_predict_vectors, 3 * len(count), inputs, outputs)
+    return Call(_predict_vectors, 3 * len(count), inputs, outputs, inner=lanes_of_warp())

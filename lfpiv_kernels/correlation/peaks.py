@@ -12,8 +12,9 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation import peaks_gpu
 from lfpiv_kernels.correlation.blocks import is_gathered
-from lfpiv_kernels.correlation.layout import Statistics
+from lfpiv_kernels.correlation.layout import Statistics, Sums, Windows
 from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import LANES, Plan
 from lfpiv_kernels.correlation.sides import Side
@@ -24,36 +25,6 @@ wp.set_module_options(native.options("peaks.h", contract="fast"))
 
 SCORE_BYTES = 1 << 23
 """Memory for the coefficients of a CPU task [byte]."""
-
-
-@wp.struct
-class Sums:
-    """Sums of products of blocks, (layer, lag, lane)."""
-
-    ahead: wp.array(dtype=float)  # of blocks of the first volume
-    behind: wp.array(dtype=float)  # of blocks of the second volume: lags count backwards
-    symmetric: int  # 1: average both; 0: `behind` is not read
-
-
-@wp.struct
-class Windows:
-    """Windows whose peaks a launch finds, and the memory of their sums, coefficients and peaks."""
-
-    voxels: int  # in a window
-    blocks: wp.vec3i  # blocks per window and axis that are still to be added up
-    block_step: int  # layers of blocks from one layer of windows to the next
-    stride: int  # distance of layers of blocks [voxel]
-    reach: int  # lags around the highest coefficient that belong to its peak
-    lags: wp.vec3i
-    begin: int  # first layer of windows
-    ring: int  # layers of blocks that the sums have memory for: layer i lies at i % ring
-    groups: int  # groups of lanes
-    group: int  # lanes per group: a multiple of `LANES` on the CPU, 1 on CUDA
-    pitch: int  # lanes per row
-    lanes: int  # lanes per lag
-    slot_pitch: wp.int64  # elements of scratch memory per slot
-    score_pitch: int  # elements from one lag's coefficients to the next
-    peak_pitch: wp.int64  # elements per value of the peaks
 
 
 @wp.func_native("lfpiv::find_peaks(sums, first, second, windows, slot, task, scratch_out.data, peak_out.data);")
@@ -124,6 +95,8 @@ class PeakFinder:
         sums, windows = Sums(), self._windows(layers)
         sums.ahead, sums.behind, sums.symmetric = ahead, behind, int(self.symmetric)
         inputs = [sums, first.statistics, second.statistics, windows]
+        if runtime.device().form == "gpu":
+            launch(peaks_gpu.score_call(inputs, math.prod(self.plan.lags) * windows.score_pitch, self.scratch))
         launch(Call(_find_peaks, len(layers) * windows.groups, inputs, [self.scratch, self.peaks], scratch=True))
 
     def _windows(self, layers: range) -> Windows:

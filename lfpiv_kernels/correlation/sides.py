@@ -12,7 +12,7 @@ from lfpiv_kernels.correlation.blocks import split_call
 from lfpiv_kernels.correlation.layout import Phased, Statistics, Storage
 from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.correlation.plan import Plan, Triple
-from lfpiv_kernels.correlation.windows import plane_sums_calls, plane_sums_shape, signal_floor, statistics_call
+from lfpiv_kernels.correlation.windows import plane_sums_calls, plane_sums_shape, signal_floor, statistics_calls
 from lfpiv_kernels.launch import Call, launch
 
 
@@ -63,8 +63,8 @@ class _Volume:
         split = split_call(self.flat, plan, self.voxels.lattice(plan, corner), self.split)
         first, *more = plane_sums_calls(self.flat, plan, self.search, windows, self.sums)
         floor = signal_floor(mean, square, plan)
-        last = statistics_call(self.sums, plan, self.search, windows, floor, self.measured)
-        return [[split, first], *([call] for call in more), [last]]
+        last = statistics_calls(self.sums, plan, self.search, windows, floor, self.measured)
+        return [[split, first], *([call] for call in (*more, *last))]
 
     def side(self) -> Side:
         """Describe voxels and statistics for the kernels."""

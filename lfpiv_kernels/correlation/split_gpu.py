@@ -4,18 +4,19 @@ import warp as wp
 
 from lfpiv_kernels import native
 from lfpiv_kernels.correlation.layout import Lattice
+from lfpiv_kernels.lanes import LANES, lanes_of_warp
 from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("split_gpu.h"))
 
 
-@wp.func_native("lfpiv::split_voxel(volume.data, shape, lattice, plane, place, split_out.data);")
-def _split_voxel(
+@wp.func_native("lfpiv::split_lanes(volume.data, shape, lattice, plane, task, split_out.data);")
+def _split_lanes(
     volume: wp.array(dtype=float),
     shape: wp.vec3i,
     lattice: Lattice,
     plane: int,
-    place: int,
+    task: int,
     split_out: wp.array(dtype=float),
 ): ...
 
@@ -23,18 +24,18 @@ def _split_voxel(
 @wp.kernel
 def _split_voxels(
     # in
-    volume: wp.array(dtype=float),  # flat, (z, y, x); a thread per element of `split_out`
+    volume: wp.array(dtype=float),  # flat, (z, y, x); a warp per plane, phase along y and 32 lanes
     shape: wp.vec3i,
     lattice: Lattice,
     begin: int,
     # out
     split_out: wp.array(dtype=float),
 ):
-    plane, place = wp.tid()
-    _split_voxel(volume, shape, lattice, begin + plane, place, split_out)
+    plane, task, _lane = wp.tid()
+    _split_lanes(volume, shape, lattice, begin + plane, task, split_out)
 
 
 def split_call(inputs: list[object], lattice: Lattice, split: wp.array) -> Call:
-    """Return the call that stores a volume by phase: a thread per element of `split`."""
-    plane = lattice.phases[1] * lattice.phases[2] * lattice.lanes
-    return Call(_split_voxels, lattice.planes, inputs, [split], inner=(plane,))
+    """Return the call that stores a volume by phase: a warp per plane, phase along y and group of lanes."""
+    tasks = lattice.phases[1] * -(-lattice.lanes // LANES)
+    return Call(_split_voxels, lattice.planes, inputs, [split], inner=(tasks, *lanes_of_warp()))

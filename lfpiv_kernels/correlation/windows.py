@@ -119,16 +119,16 @@ def signal_floor(mean: float, square: float, plan: Plan) -> float:
     return SIGNAL_FLOOR * math.prod(plan.window) * variance + float(np.finfo(np.float32).tiny)
 
 
-def statistics_call(
+def statistics_calls(
     sums: tuple[wp.array, wp.array],
     plan: Plan,
     search: Triple,
     lattice: Lattice,
     floor: float,
     statistics: tuple[wp.array, wp.array],
-) -> Call:
-    """Return the call that finds mean and scale of windows from the sums of their planes."""
+) -> list[Call]:
+    """Return the calls, one after the other, that find mean and scale of windows from the sums of their planes."""
     inputs, fitting = [*sums, _extent(plan, search), floor, lattice], plane_sums_shape(plan, search)
     if runtime.device().form == "gpu":
-        return windows_gpu.statistics_call(inputs, fitting, statistics)
-    return Call(_window_statistics, fitting[1], inputs, statistics)
+        return windows_gpu.statistics_calls(inputs, lattice, fitting, statistics)
+    return [Call(_window_statistics, fitting[1], inputs, statistics)]

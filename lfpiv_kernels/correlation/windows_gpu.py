@@ -3,6 +3,7 @@
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.correlation import split_gpu
 from lfpiv_kernels.correlation.layout import Extent, Lattice
 from lfpiv_kernels.correlation.memory import new_array
 from lfpiv_kernels.launch import Call
@@ -93,8 +94,8 @@ def _window_statistics(
     lattice: Lattice,
     begin: int,
     # out
-    mean_out: wp.array(dtype=float),
-    scale_out: wp.array(dtype=float),
+    mean_out: wp.array(dtype=float),  # (plane, y, x) with as many y and x as windows fit
+    scale_out: wp.array(dtype=float),  # the same
 ):
     y, x = wp.tid()
     _measure_column(sum, square, extent, floor, lattice, begin + y, x, mean_out, scale_out)
@@ -115,7 +116,21 @@ def sums_calls(
     ]
 
 
-def statistics_call(inputs: list[object], fitting: tuple[int, int, int], statistics: tuple[wp.array, wp.array]) -> Call:
-    """Return the call that finds mean and scale of windows: a thread for those at one row and column."""
+def statistics_calls(
+    inputs: list[object], lattice: Lattice, fitting: tuple[int, int, int], statistics: tuple[wp.array, wp.array]
+) -> list[Call]:
+    """Return the calls, one after the other, that find mean and scale of windows and store them by phase.
+
+    A thread measures the windows of one row and column; `fitting` as in `sums_calls`.
+    """
     _, rows, columns = fitting
-    return Call(_window_statistics, rows, inputs, statistics, inner=(columns,))
+    at_rows = [new_array(lattice.planes * rows * columns) for _ in range(2)]
+    measured, shape = Lattice(), wp.vec3i(lattice.planes, rows, columns)
+    measured.corner, measured.stride = wp.vec3i(0, lattice.corner[1], lattice.corner[2]), lattice.stride
+    measured.phases, measured.planes = lattice.phases, lattice.planes
+    measured.pitch, measured.lanes = lattice.pitch, lattice.lanes
+    pairs = zip(at_rows, statistics, strict=True)
+    return [
+        Call(_window_statistics, rows, inputs, at_rows, inner=(columns,)),
+        *(split_gpu.split_call([one, shape, measured], measured, to) for one, to in pairs),
+    ]

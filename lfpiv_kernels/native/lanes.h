@@ -37,7 +37,14 @@ enum AccessKind { READ = 0, WRITE = 1 };
 
 #else
 #define LFPIV_TRACED(address, bytes, kind) (void)0
+#if !defined(LFPIV_EXCHANGED)
 #define LFPIV_EXCHANGED(count) (void)0
+#endif
+#endif
+
+/// Say which lane of a warp comes next; ``perf/traced.h`` notes it.
+#if !defined(LFPIV_LANE)
+#define LFPIV_LANE(number) (void)0
 #endif
 
 /// Read the GPU's memory. Every lane of a phase must read, so that lanes stay in step; see `read_if`.
@@ -134,6 +141,7 @@ LFPIV_INLINE void for_lanes(Phase phase) {
 #if defined(LFPIV_TRACE)
         trace.lane = lane, trace.number = 0;
 #endif
+        LFPIV_LANE(lane);
         phase(lane);
     }
 }

@@ -1,84 +1,91 @@
-// Robust predictions of vectors from their 26 neighbours on a GPU, a thread per component of a vector.
+// Robust predictions of vectors from their 26 neighbours on a GPU: a warp per component of a vector, a lane per
+// neighbour, so that a sorted list takes one register.
 #ifndef LFPIV_NEIGHBOURS_GPU_H
 #define LFPIV_NEIGHBOURS_GPU_H
 
-#include "sorting.h"
+#include "lanes.h"
 
 namespace lfpiv {
 
-/// One component of a vector's neighbours, read where they are needed: a thread's registers hold one sorted list.
-template <class Triple>
-struct Surroundings {
-    const float* field;  // of the component, at the vector
-    Triple shape;
-    unsigned present = 0;  // a bit for each of the 27 vectors
-    int count = 0;         // of neighbours
-
-    LFPIV_INLINE Surroundings(const float* field, const int* keep, const Triple& shape, int point, int component)
-        : field(field + 3 * (int64_t)point + component), shape(shape) {
-        const int nx = shape[2], ny = shape[1], z = point / (ny * nx), y = point / nx % ny, x = point % nx;
-#pragma unroll
-        for (int i = 0; i < 27; ++i) {
-            const int pz = z + i / 9 - 1, py = y + i / 3 % 3 - 1, px = x + i % 3 - 1;
-            const bool inside = pz >= 0 && py >= 0 && px >= 0 && pz < shape[0] && py < ny && px < nx;
-            const bool kept = i != 13 && inside && keep[point + away(i)];
-            present |= (unsigned)kept << i;
-            count += kept;
+/// Sort the lanes' values, least first, by Batcher's bitonic network.
+LFPIV_INLINE void sort_lanes(PerLane<float>& value) {
+    for (int size = 2; size <= LANES_OF_WARP; size *= 2)
+        for (int away = size / 2; away > 0; away /= 2) {
+            PerLane<float> other;
+            for_lanes([&](int lane) { other[lane] = value.of(lane ^ away); });
+            for_lanes([&](int lane) {
+                const bool upper = (lane & away) != 0, ascending = (lane & size) == 0;
+                value[lane] = upper == ascending ? max(value[lane], other[lane]) : min(value[lane], other[lane]);
+            });
         }
-    }
+}
 
-    /// Return the distance of a neighbour [vector].
-    LFPIV_INLINE int away(int i) const { return ((i / 9 - 1) * shape[1] + i / 3 % 3 - 1) * shape[2] + i % 3 - 1; }
-    LFPIV_INLINE bool has(int i) const { return present >> i & 1; }
-    /// Return a neighbour's value, infinite where there is none.
-    LFPIV_INLINE float value(int i) const { return has(i) ? field[3 * away(i)] : INFINITY; }
+/// Return the median of the first `count` of the lanes' sorted values.
+LFPIV_INLINE float median_of_lanes(const PerLane<float>& sorted, int count) {
+    return 0.5f * (sorted.of((count - 1) / 2) + sorted.of(count / 2));
+}
 
-    /// Return the median difference of adjacent neighbours along an axis, 0 without any.
-    template <int STRIDE>
-    LFPIV_INLINE float median_slope() const {
-        float difference[18];
-        int pairs = 0;
-#pragma unroll
-        for (int i = 0, n = 0; i < 27 - STRIDE; ++i) {
-            if (i / STRIDE % 3 == 2) continue;
-            const bool both = has(i) && has(i + STRIDE);
-            difference[n++] = both ? value(i + STRIDE) - value(i) : INFINITY;
-            pairs += both;
-        }
-        sort<18>(difference);
-        return pairs > 0 ? median<18>(difference, pairs) : 0.0f;
-    }
+/// Median of `count` values, the median distance of the values from it, least and greatest.
+struct Spread {
+    float median, scatter, lowest, highest;
 };
 
+/// Return what the lanes' `count` values spread over; the others are infinite. Overwrites the values.
+LFPIV_INLINE Spread spread_of_lanes(PerLane<float>& value, int count) {
+    sort_lanes(value);
+    const float median = median_of_lanes(value, count), lowest = value.of(0), highest = value.of(max(count - 1, 0));
+    for_lanes([&](int lane) { value[lane] = fabsf(value[lane] - median); });
+    sort_lanes(value);
+    return {median, median_of_lanes(value, count), lowest, highest};
+}
+
+/// Return the median difference of neighbours `stride` lanes apart along an axis, 0 without any.
+LFPIV_INLINE float median_slope(PerLane<float>& value, PerLane<int>& has, int stride) {
+    PerLane<float> difference;
+    PerLane<int> both;
+    for_lanes([&](int lane) {
+        const int next = lane + stride < LANES_OF_WARP ? lane + stride : lane;
+        const float ahead = value.of(next);
+        const int is_there = has.of(next);
+        both[lane] = lane < 27 - stride && lane / stride % 3 != 2 && has[lane] && is_there;
+        difference[lane] = both[lane] ? ahead - value[lane] : INFINITY;
+    });
+    const int pairs = sum_lanes(both);
+    sort_lanes(difference);
+    return pairs > 0 ? median_of_lanes(difference, pairs) : 0.0f;
+}
+
 /// Predict one component of a vector from its neighbours, as `predict_component` of ``neighbours.h`` does.
+/// Tasks are numbered (vector, component).
 template <class Triple>
 LFPIV_INLINE void predict_vector(const float* field, const int* keep, const int* points, const Triple& shape, int task,
                                  float* prediction, int* neighbours) {
-    const int point = task / 3, component = task % 3;
-    const Surroundings<Triple> around(field, keep, shape, points[point], component);
-    const int count = around.count;
-    float* out = prediction + 6 * (int64_t)task;
-    float v[26], lowest = INFINITY, highest = -INFINITY;
-#pragma unroll
-    for (int n = 0; n < 26; ++n) {
-        const int i = n < 13 ? n : n + 1;
-        v[n] = around.value(i);
-        lowest = min(v[n], lowest);
-        highest = around.has(i) ? max(v[n], highest) : highest;
-    }
-    const Robust<float> plain = robust(v, count);
-    const float slope_z = around.template median_slope<9>(), slope_y = around.template median_slope<3>(),
-                slope_x = around.template median_slope<1>();
-#pragma unroll
-    for (int n = 0; n < 26; ++n) {
-        const int i = n < 13 ? n : n + 1;
-        v[n] = around.value(i) - (slope_z * (i / 9 - 1) + slope_y * (i / 3 % 3 - 1) + slope_x * (i % 3 - 1));
-    }
-    const Robust<float> level = robust(v, count);
-    const float result[6] = {plain.median, plain.scatter, level.median, level.scatter, lowest, highest};
-#pragma unroll
-    for (int j = 0; j < 6; ++j) out[j] = count ? result[j] : NAN;
-    if (component == 0) neighbours[point] = count;
+    const int point = points[task / 3], component = task % 3, nx = shape[2], ny = shape[1];
+    const int z = point / (ny * nx), y = point / nx % ny, x = point % nx;
+    PerLane<float> value, level;
+    PerLane<int> has;
+    for_lanes([&](int lane) {
+        const int pz = z + lane / 9 - 1, py = y + lane / 3 % 3 - 1, px = x + lane % 3 - 1;
+        const bool inside = pz >= 0 && py >= 0 && px >= 0 && pz < shape[0] && py < ny && px < nx;
+        const int at = (pz * ny + py) * nx + px;
+        has[lane] = lane < 27 && lane != 13 && inside && keep[at];
+        value[lane] = has[lane] ? field[3 * (int64_t)at + component] : INFINITY;
+    });
+    const int count = sum_lanes(has);
+    const float slope_z = median_slope(value, has, 9), slope_y = median_slope(value, has, 3),
+                slope_x = median_slope(value, has, 1);
+    for_lanes([&](int lane) {
+        level[lane] =
+            value[lane] - (slope_z * (lane / 9 - 1) + slope_y * (lane / 3 % 3 - 1) + slope_x * (lane % 3 - 1));
+    });
+    const Spread plain = spread_of_lanes(value, count), moved = spread_of_lanes(level, count);
+    for_lanes([&](int lane) {
+        float own = lane == 0 ? plain.median : plain.scatter;
+        own = lane == 2 ? moved.median : lane == 3 ? moved.scatter : own;
+        own = lane == 4 ? plain.lowest : lane == 5 ? plain.highest : own;
+        if (lane < 6) prediction[6 * (int64_t)task + lane] = count ? own : NAN;
+        if (lane == 0 && component == 0) neighbours[task / 3] = count;
+    });
 }
 
 }  // namespace lfpiv

@@ -79,36 +79,31 @@ struct Scores {
     LFPIV_INLINE const float* at(int lag) const { return score + (int64_t)lag * pitch; }
 };
 
-/// Form the coefficients of a task's windows from the sums of products of their blocks, in one direction or in both.
+/// Form the coefficients of a task's windows at one lag from the sums of products of their blocks, in one direction or
+/// in both.
 template <class Sums, class Statistics, class Windows>
-LFPIV_INLINE void score_windows(const Sums& sums, const Statistics& first, const Statistics& second,
-                                const Windows& windows, const WindowTask& task, const Scores& scores) {
-    const int nz = scores.nz, ny = scores.ny, nx = scores.nx, lags = nz * ny * nx;
+LFPIV_INLINE void score_lag(const Sums& sums, const Statistics& first, const Statistics& second, const Windows& windows,
+                            const WindowTask& task, int z, int y, int x, const Scores& scores) {
+    const int nz = scores.nz, ny = scores.ny, nx = scores.nx, lags = nz * ny * nx, lag = (z * ny + y) * nx + x;
     const int plane = task.layer * windows.stride;
     const float voxels = (float)windows.voxels;
     float* columns = scores.highest + (int64_t)nz * ny * scores.pitch;
+    float* to = scores.score + (int64_t)lag * scores.pitch;
     const int64_t first_at = place_of(first, plane, first.centre[0], first.centre[1], first.centre[2], task.lane);
+    const int64_t around = place_of(second, plane, z, y, x, task.lane);
+    sum_blocks(sums.ahead.data, windows, task, lag, lags, columns, [&](int k, V total) {
+        const V expected = voxels * load(first.mean.data + first_at + k) * load(second.mean.data + around + k);
+        const V scale = load(first.scale.data + first_at + k) * load(second.scale.data + around + k);
+        store(to + k, (total - expected) * scale);
+    });
+    if (!sums.symmetric) return;
     const int64_t second_at = place_of(second, plane, nz / 2, ny / 2, nx / 2, task.lane);
-    for (int z = 0, lag = 0; z < nz; ++z)
-        for (int y = 0; y < ny; ++y)
-            for (int x = 0; x < nx; ++x, ++lag) {
-                float* to = scores.score + (int64_t)lag * scores.pitch;
-                const int64_t around = place_of(second, plane, z, y, x, task.lane);
-                sum_blocks(sums.ahead.data, windows, task, lag, lags, columns, [&](int k, V total) {
-                    const V expected =
-                        voxels * load(first.mean.data + first_at + k) * load(second.mean.data + around + k);
-                    const V scale = load(first.scale.data + first_at + k) * load(second.scale.data + around + k);
-                    store(to + k, (total - expected) * scale);
-                });
-                if (!sums.symmetric) continue;
-                const int64_t back = place_of(first, plane, nz - 1 - z, ny - 1 - y, nx - 1 - x, task.lane);
-                sum_blocks(sums.behind.data, windows, task, lags - 1 - lag, lags, columns, [&](int k, V total) {
-                    const V expected =
-                        voxels * load(second.mean.data + second_at + k) * load(first.mean.data + back + k);
-                    const V scale = load(second.scale.data + second_at + k) * load(first.scale.data + back + k);
-                    store(to + k, 0.5f * (load(to + k) + (total - expected) * scale));
-                });
-            }
+    const int64_t back = place_of(first, plane, nz - 1 - z, ny - 1 - y, nx - 1 - x, task.lane);
+    sum_blocks(sums.behind.data, windows, task, lags - 1 - lag, lags, columns, [&](int k, V total) {
+        const V expected = voxels * load(second.mean.data + second_at + k) * load(first.mean.data + back + k);
+        const V scale = load(second.scale.data + second_at + k) * load(first.scale.data + back + k);
+        store(to + k, 0.5f * (load(to + k) + (total - expected) * scale));
+    });
 }
 
 /// Highest coefficient, the highest one beyond the reach of its peak, and the second peak, of a vector of windows.
@@ -226,18 +221,45 @@ LFPIV_INLINE void write_peaks(const Scores& scores, int k, const Peaks& peaks, i
     }
 }
 
-/// Find the peaks of a group of windows. Tasks are numbered (layer, group of lanes); a negative `slot` shares the
-/// scratch memory between all tasks, element by element.
-template <class Sums, class Statistics, class Windows>
-LFPIV_INLINE void find_peaks(const Sums& sums, const Statistics& first, const Statistics& second,
-                             const Windows& windows, int slot, int task, float* scratch, float* out) {
-    const int layer = windows.begin + task / windows.groups, lane = task % windows.groups * windows.group;
-    const WindowTask where{layer * windows.block_step, lane, min(windows.group, windows.lanes - lane)};
+/// Return where the coefficients of a task's windows lie.
+template <class Windows>
+LFPIV_INLINE Scores scores_of(const Windows& windows, float* score) {
     const int nz = windows.lags[0], ny = windows.lags[1], nx = windows.lags[2];
-    float* score = scratch + (slot < 0 ? (int64_t)task : slot * windows.slot_pitch);
-    const Scores scores{score, score + (int64_t)nz * ny * nx * windows.score_pitch, windows.score_pitch, nz, ny, nx};
-    score_windows(sums, first, second, windows, where, scores);
-    float* peak = out + (int64_t)layer * windows.lanes + lane;
+    return {score, score + (int64_t)nz * ny * nx * windows.score_pitch, windows.score_pitch, nz, ny, nx};
+}
+
+/// Return the windows of a task, numbered (layer, group of lanes).
+template <class Windows>
+LFPIV_INLINE WindowTask windows_of(const Windows& windows, int task) {
+    const int layer = windows.begin + task / windows.groups, lane = task % windows.groups * windows.group;
+    return {layer * windows.block_step, lane, min(windows.group, windows.lanes - lane)};
+}
+
+/// Form the coefficient of one window at one lag on a GPU. Tasks are numbered (lag, layer, lane): neighbouring threads
+/// read and write neighbouring places.
+template <class Sums, class Statistics, class Windows>
+LFPIV_INLINE void score_window(const Sums& sums, const Statistics& first, const Statistics& second,
+                               const Windows& windows, int task, float* scratch) {
+    const int lag = task / windows.score_pitch, at = task - lag * windows.score_pitch;
+    const Scores scores = scores_of(windows, scratch + at);
+    const int z = lag / (scores.ny * scores.nx), y = lag / scores.nx % scores.ny, x = lag % scores.nx;
+    score_lag(sums, first, second, windows, windows_of(windows, at), z, y, x, scores);
+}
+
+/// Find the peaks of a group of windows. Tasks are numbered (layer, group of lanes); a negative `slot` shares the
+/// scratch memory between all tasks, element by element. A GPU has the coefficients from `score_window`.
+template <class Sums, class Statistics, class Windows>
+LFPIV_INLINE void find_peaks([[maybe_unused]] const Sums& sums, [[maybe_unused]] const Statistics& first,
+                             [[maybe_unused]] const Statistics& second, const Windows& windows, int slot, int task,
+                             float* scratch, float* out) {
+    const WindowTask where = windows_of(windows, task);
+    const Scores scores = scores_of(windows, scratch + (slot < 0 ? (int64_t)task : slot * windows.slot_pitch));
+#if !LFPIV_GPU
+    for (int z = 0; z < scores.nz; ++z)
+        for (int y = 0; y < scores.ny; ++y)
+            for (int x = 0; x < scores.nx; ++x) score_lag(sums, first, second, windows, where, z, y, x, scores);
+#endif
+    float* peak = out + (int64_t)(windows.begin + task / windows.groups) * windows.lanes + where.lane;
     for (int k = 0; k < where.lanes; k += WIDTH) {
         Peaks peaks = find_best(scores, k);
         find_rival(scores, k, windows.reach, peaks);

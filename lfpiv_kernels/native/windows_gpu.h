@@ -41,15 +41,14 @@ LFPIV_INLINE void sum_column(const float* along_x, const float* squares_along_x,
     squares[to] = square;
 }
 
-/// Measure mean and scale of the windows that start at row y and column x, as `measure_row` does.
-/// Neighbouring threads have neighbouring columns, whose sums and, within a phase, statistics are neighbours in memory.
+/// Measure mean and scale of the windows that start at row y and column x of every plane, as `measure_row` does, and
+/// store them (plane, y, x) with as many y and x as windows fit. Neighbouring threads have neighbouring columns.
 template <class Extent, class Lattice>
 LFPIV_INLINE void measure_column(const float* sums, const float* squares, const Extent& extent, float floor,
                                  const Lattice& lattice, int y, int x, float* mean, float* scale) {
+    if (y < lattice.corner[1] || (y - lattice.corner[1]) % lattice.stride[1] >= lattice.phases[1]) return;
     const StatisticsRow<Extent, Lattice> row(extent, lattice, y);
-    const int column = x - lattice.corner[2], phase = column % lattice.stride[2], lane = column / lattice.stride[2];
-    if (!row.wanted || column < 0 || phase >= lattice.phases[2] || lane >= lattice.pitch) return;
-    const int64_t from = (int64_t)y * row.columns + x, to = row.to_row + (int64_t)phase * lattice.lanes + lane;
+    const int64_t from = (int64_t)y * row.columns + x;
     const int depth = extent.window[0];
     double total = 0.0, square = 0.0;
     for (int plane = 1 - depth; plane < lattice.planes; ++plane) {
@@ -58,10 +57,10 @@ LFPIV_INLINE void measure_column(const float* sums, const float* squares, const 
         const int64_t add = from + ahead * row.plane_pitch, drop = from + behind * row.plane_pitch;
         total += (adds ? (double)sums[add] : 0.0) - (drops ? (double)sums[drop] : 0.0);
         square += (adds ? (double)squares[add] : 0.0) - (drops ? (double)squares[drop] : 0.0);
-        if (plane < 0 || plane % lattice.stride[0] >= lattice.phases[0]) continue;
+        if (plane < 0) continue;
         const double m = total * row.share;
-        mean[plane * row.to_plane + to] = (float)m;
-        scale[plane * row.to_plane + to] = window_scale(total, square, m, floor);
+        mean[plane * row.plane_pitch + from] = (float)m;
+        scale[plane * row.plane_pitch + from] = window_scale(total, square, m, floor);
     }
 }
 

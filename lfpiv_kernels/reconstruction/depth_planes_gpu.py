@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.lanes import LANES, lanes_of_warp
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.lanes import LANES, lanes_of_warp
 from lfpiv_kernels.reconstruction.plane_layout import PlaneMap
 
 wp.set_module_options(native.options("depth_planes_gpu.h", contract="fast"))

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.lanes import lanes_of_warp
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.lanes import lanes_of_warp
 from lfpiv_kernels.reconstruction.pixel_layout import PixelRays
 
 wp.set_module_options(native.options("pixel_rays_gpu.h"))

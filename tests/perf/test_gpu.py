@@ -9,6 +9,8 @@ import pytest
 from gpu import table
 
 SCRIPT = Path(gpu.__file__)
+MOST_SECONDS = 0.1
+"""Of a small case: a processor takes as long."""
 LINES = [
     {"case": "machine", "cores": 2},
     {"case": "smart_small", "metric": "wall", "value": 0.5},
@@ -27,9 +29,12 @@ def test_table_has_measured_and_predicted_times_and_no_time_of_a_wrong_result():
     ]
 
 
-def test_no_case_is_predicted_without_the_model(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gpu_model", None)  # its import fails
-    assert gpu.predictor()("smart_small") is None
+@pytest.mark.slow
+def test_the_model_predicts_the_cases_that_it_knows():
+    times = gpu.predicted_times(["project_small", "deform_small", "footprint_small"])
+    assert 0 < times["project_small"] < MOST_SECONDS
+    assert 0 < times["deform_small"] < MOST_SECONDS
+    assert times["footprint_small"] is None
 
 
 def test_without_a_gpu_the_script_says_so_and_writes_nothing(device, tmp_path):

@@ -27,8 +27,9 @@ def test_sectors_of_instructions_and_of_thread_blocks():
     again = [(1, 1, 0, lane, 4096 + 4 * lane, 4, 0) for lane in range(32)]  # another warp of the same block
     askew = [(8, 1, 0, lane, 8208 + 4 * lane, 4, 0) for lane in range(32)]  # half a sector on: five
     apart = [(8, 2, 0, lane, 65536 + 64 * lane, 4, 2) for lane in range(3)]  # three atomics, far apart
-    found = gpu_model.count_sectors("kernel", accesses(*row, *again, *askew, *apart), 7, 2.0, 100.0)
+    found = gpu_model.count_sectors("kernel", accesses(*row, *again, *askew, *apart), 7, 2.0, 100.0, 18, 8)
     assert (found.touched, found.needed) == (2 * (4 + 4 + 5 + 3), 2 * (4 + 4 + 4 + 3))
+    assert found.packed == 2 * (4 + 4 + 4 + 1)
     assert (found.by_block, found.used) == (2 * (4 + 5 + 3), 2 * (4 + 4))  # 12 bytes of the atomics fill no sector
     assert (found.atomics, found.exchanges, found.memory) == (6, 14, 100.0)
 

@@ -1,10 +1,16 @@
 """What the CUDA compiler makes of the kernels; needs ptxas, from the extra `gpu-check`."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
+import gpu_static
 import pytest
-from gpu_static import ARCHITECTURES, Kernel, assembler, measure
+from gpu_static import ARCHITECTURES, Kernel, assembler, measure_all
 
 LEAST_OCCUPANCY = 0.25
 """With fewer threads a multiprocessor waits for memory: a quarter of them hides some 400 clocks of it."""
@@ -17,7 +23,9 @@ EVERY_PASS = {
     ("depth_planes_gpu", "_collect"),
     ("depth_planes_gpu", "_spread"),
     ("filters_gpu", "_filter"),
+    ("neighbours_gpu", "_predict_vectors"),
     ("peaks", "_find_peaks"),
+    ("peaks_gpu", "_score_windows"),
     ("pixel_rays_gpu", "_collect"),
     ("pixel_rays_gpu", "_compare"),
     ("pixel_rays_gpu", "_spread"),
@@ -41,11 +49,17 @@ STORED = Path(__file__).resolve().parents[2] / "docs" / "figures" / "gpu_static.
 """The table of the pages; not installed."""
 
 
-@pytest.fixture(scope="module", params=ARCHITECTURES)
-def kernels(request):
+@pytest.fixture(scope="module")
+def measured():
+    """Measure all architectures; pytest-xdist gives this file to one process."""
     if assembler() is None:
         pytest.skip("ptxas is not installed; pip install 'lfpiv[gpu-check]'")
-    return {(kernel.module, kernel.name): kernel for kernel in measure(request.param)}
+    return measure_all(ARCHITECTURES)
+
+
+@pytest.fixture(params=ARCHITECTURES)
+def kernels(request, measured):
+    return {(one.module, one.name): one for one in measured if one.architecture == request.param}
 
 
 @pytest.mark.slow
@@ -68,6 +82,21 @@ def test_the_table_of_the_pages_has_these_kernels(kernels):
     rows = json.loads(STORED.read_text("utf-8"))
     assert {row["architecture"] for row in rows} == set(ARCHITECTURES)
     assert {(row["module"], row["name"]) for row in rows} == set(kernels)
+
+
+@pytest.mark.slow
+def test_a_signal_to_terminate_leaves_no_file_and_no_process(tmp_path):
+    if assembler() is None:
+        pytest.skip("ptxas is not installed; pip install 'lfpiv[gpu-check]'")
+    command = [sys.executable, gpu_static.__file__, "--arch", "80", "90"]
+    running = subprocess.Popen(command, env=os.environ | {"TMPDIR": str(tmp_path)}, stdout=subprocess.DEVNULL)
+    for _ in range(600):  # until both architectures have a module in work
+        if len([one for one in tmp_path.iterdir() if one.is_dir()]) == 3:
+            break
+        time.sleep(0.1)
+    running.terminate()
+    assert running.wait(120) == 128 + signal.SIGTERM
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_occupancy_follows_from_the_registers():
