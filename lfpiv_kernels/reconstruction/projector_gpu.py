@@ -11,8 +11,8 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.lanes import lanes_of_warp
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.lanes import lanes_of_warp
 from lfpiv_kernels.reconstruction.weight_blocks import Blocks
 from lfpiv_kernels.transfer import to_device
 
