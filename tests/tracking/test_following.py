@@ -3,19 +3,17 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.spatial import cKDTree
 from support.found_particles import VOXEL_MM, cloud, field, scattered
-from support.tracking_rig import READ_NOISE, SIGMA_VOXEL, TrackingRig
 
 from lfpiv import link_particles
 from lfpiv.metrics.particles import match_particles
-from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.following import Candidates, follow
-from lfpiv.tracking.refinement import Cloud
 from lfpiv.tracking.tracks import REASONS, SHORTEST, track_table
 
 SPEED_MM = np.array([0.03, -0.02, 0.04])
 ERROR_MM = 0.001
-COUNT, INSTANTS = 30, 8
+COUNT, INSTANTS = 24, 7
 
 
 def places(instant):
@@ -60,32 +58,39 @@ def followed(lost=(), wrong=None, order=None):
     return follow(((instant, candidates(instant)) for instant in range(INSTANTS)), look)
 
 
+@pytest.fixture(scope="module")
+def clean():
+    return followed()
+
+
+def nearest(positions, true):
+    """Distance of each position from the nearest true one; those of one particle differ by far more than errors."""
+    return cKDTree(true).query(positions)[0]
+
+
 def table_of(found):
     return track_table(found, voxel_mm=VOXEL_MM, dt_s=0.5)
 
 
-def test_all_particles_are_followed_with_velocity_and_acceleration():
-    table = table_of(followed())
+def test_all_particles_are_followed_with_velocity_and_acceleration(clean):
+    table = table_of(clean)
     assert table["valid"].all() and np.bincount(table["track"]).tolist() == [INSTANTS] * COUNT
     middle = table.isel(particle=(table["instant"] > 1) & (table["instant"] < INSTANTS - 2))
     exact = 1e-3 * (0.04 * middle["instant"] / 10 - 0.02) / 0.5
     assert np.abs(middle["v"] - exact).max() < 6 * middle["uncertainty_v"].max()
     assert np.abs(middle["acceleration_y"] - 1e-3 * 0.004 / 0.25).median() < 2e-3 * 1e-3 / 0.25
-    smoothed, raw = (
-        np.stack([table[f"{name}{axis}"].values for axis in "xyz"], 1)
-        - np.stack([places(instant)[0] for instant in table["instant"].values])
-        for name in ("", "found_")
-    )
-    offset = np.stack([np.median(raw[table["track"].values == track], axis=0) for track in table["track"].values])
-    assert np.square(smoothed - offset).mean() <= np.square(raw - offset).mean()
+    smoothed, raw = (np.stack([table[f"{name}{axis}"].values for axis in "xyz"], 1) for name in ("", "found_"))
+    true = np.concatenate([places(instant) for instant in range(INSTANTS)])
+    miss = [np.square(nearest(one, true)).mean() for one in (smoothed, raw)]
+    assert miss[0] < 0.8 * miss[1], "the fit along the track lessens the error of a position"
 
 
 def test_a_particle_missed_once_stays_on_its_track_and_one_missed_twice_does_not():
-    once, twice = (table_of(followed(lost)) for lost in ({(4, 7)}, {(3, 7), (4, 7), (5, 7)}))
+    once, twice = (table_of(followed(lost)) for lost in ({(4, 7)}, {(2, 7), (3, 7), (4, 7)}))
     assert once["track"].max() == COUNT - 1 and sorted(np.bincount(once["track"]))[0] == INSTANTS - 1
     assert twice["track"].max() == COUNT
     short = twice.isel(particle=~twice["valid"].values)
-    assert set(short["reason"].values) == {REASONS.index("short")} and short.sizes["particle"] == 3 + 2
+    assert set(short["reason"].values) == {REASONS.index("short")} and short.sizes["particle"] == 2 + 2
 
 
 def test_a_ghost_of_two_instants_is_left_out_with_its_reason():
@@ -95,13 +100,13 @@ def test_a_ghost_of_two_instants_is_left_out_with_its_reason():
     assert set(short["reason"].values) == {REASONS.index("short")}
 
 
-def test_tracks_do_not_depend_on_the_order_of_the_particles():
-    one, other = table_of(followed()), table_of(followed(order=-1))
+def test_tracks_do_not_depend_on_the_order_of_the_particles(clean):
+    one, other = table_of(clean), table_of(followed(order=-1))
     xr.testing.assert_identical(one, other)
 
 
-def test_a_particle_that_leaves_its_neighbours_is_unlike_them():
-    found = followed()
+def test_a_particle_that_leaves_its_neighbours_is_unlike_them(clean):
+    found = clean
     moved = found.positions_voxel.copy()
     own = found.track == 4
     moved[own] += np.arange(INSTANTS)[:, None] * np.array([0.0, 0.0, 2.0])
@@ -121,16 +126,3 @@ def test_copies_of_a_candidate_are_one_and_a_valid_link_counts_first():
     both = Candidates.of([(links.assign(valid=~links["valid"]), 0), (links, 0)], 2)
     assert both.positions_voxel == pytest.approx(np.zeros((1, 3))) and both.valid.tolist() == [True]
     assert both.moved_voxel == pytest.approx(np.array([[0.2, 0, 0]]))
-
-
-def test_images_confirm_candidates_and_show_others(device):
-    rig = TrackingRig()
-    at = 0.9 * rig.random(8, 6)
-    search = ParticleSearch(rig.weights, sigma_voxel=SIGMA_VOXEL, rounds=2)
-    absent = np.array([[0.0, 0.7, 0.0]])
-    assert np.linalg.norm(at - absent, axis=1).min() > 2 * VOXEL_MM
-    start = np.concatenate([at[1:] + 0.03, absent])
-    noise = dict.fromkeys(rig.cameras, READ_NOISE)
-    light = np.full((len(start), 2), 5000.0)
-    found = search.look(rig.images(at, 1), Cloud(positions_mm=start, light=light), noise=noise)
-    assert len(match_particles(found.positions_mm, at, 0.5 * VOXEL_MM)) == len(at) == len(found)
