@@ -50,7 +50,8 @@ def section(figures: TrackFigures | None, folder: Path) -> str:
 def _drawn(valid: xr.Dataset) -> np.ndarray:
     """Return the tracks of the picture, an even choice."""
     every = np.unique(valid["track"].values)
-    return every[np.unique(np.linspace(0, len(every) - 1, MOST_DRAWN).round().astype(int))]
+    chosen: np.ndarray = every[np.unique(np.linspace(0, len(every) - 1, MOST_DRAWN).round().astype(int))]
+    return chosen
 
 
 def _panel(shown: xr.Dataset, side: str, speed: np.ndarray, unit: str) -> str:

@@ -343,7 +343,7 @@ class Run:
         )
         with writing(self.folder.pairs):
             result = summary.build(self.experiment, self.device, calibrated, contents, done, self.earlier, self.folder)
-        result |= {"tracks": track_figures(self.folder.tracks)} | self._usage(done, result["timings_s"])
+        result |= {"tracks": self._tracks()} | self._usage(done, result["timings_s"])
         if report:
             from lfpiv.report import write_report
 
@@ -377,6 +377,14 @@ class Run:
             damping=bootstrap.stored(self.experiment, self.folder, self.damping_stamp),
             refinement=self.refinement,
         )
+
+    def _tracks(self) -> dict[str, Any] | None:
+        """Return the figures of the tracks; None if there are none that fit."""
+        if self.experiment.tracking is None or not self.folder.tracks.is_file():
+            return None
+        pairs, marks = self.pairs_with_particles(), provenance.read_marks(self.folder.tracks)
+        fits = bool(pairs) and marks is not None and self.tracks_stamp(pairs).fits(marks)
+        return track_figures(self.folder.tracks) if fits else None
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:
         """Return the time and the peak memory so far, in the form of the summary."""

@@ -12,7 +12,7 @@ successive instants.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import xarray as xr
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from lfpiv.tracking.found import FoundParticles
 from lfpiv.tracking.linking import FIRST_SPREAD_VOXEL, NEIGHBOURS, matched, nearby
-from lfpiv.tracking.trajectory import Measured, Motion, State, fit_motion
+from lfpiv.tracking.trajectory import TELLING_TRACKS, Measured, Motion, State, fit_motion
 
 LONGEST_GAP = 2
 """Largest number of instants from one in which the particle of a track is found to the next one."""
@@ -116,10 +116,19 @@ class Followed:
     motion: Motion
     """How the particles move."""
 
-    @property
-    def measured(self) -> Measured:
-        """Positions of the tracks one after the other."""
-        return Measured.of(self.track, self.instant.astype(float), self.positions_voxel, self.errors_voxel)
+    def measured(self, tracks: np.ndarray) -> Measured:
+        """Return the positions of some tracks, of rising numbers, one after the other."""
+        rows = np.isin(self.track, tracks)
+        _, number = np.unique(self.track[rows], return_inverse=True)
+        return Measured.of(
+            number, self.instant[rows].astype(float), self.positions_voxel[rows], self.errors_voxel[rows]
+        )
+
+    def refitted(self) -> Followed:
+        """Return the same with the motion that the longest tracks show."""
+        length = np.bincount(self.track)
+        longest = np.argsort(-length, kind="stable")[:TELLING_TRACKS]
+        return replace(self, motion=fit_motion(self.measured(np.sort(longest)), self.motion))
 
 
 def follow(instants: Iterable[tuple[int, Candidates]], look: Look) -> Followed:
@@ -140,16 +149,14 @@ def follow(instants: Iterable[tuple[int, Candidates]], look: Look) -> Followed:
     tracks = _Tracks()
     for count, (instant, candidates) in enumerate(instants):
         ahead = tracks.predicted(instant)
-        positions, light = ahead.mean[..., 0], tracks.light[tracks.alive]
+        positions, light = ahead.mean[..., 0], tracks.light
         free = _apart(positions, candidates.positions_voxel)  # what was found is better known than what is predicted
         positions = np.concatenate([candidates.positions_voxel, positions[free]])
         found = look(instant, positions, np.concatenate([candidates.light, light[free]]))
         tracks.go_on(instant, ahead, found, candidates)
         if count + 1 >= FIRST_FIT and (count + 1) & count == 0:
-            tracks.motion = fit_motion(tracks.followed().measured, tracks.motion)
-    followed = tracks.followed()
-    tracks.motion = fit_motion(followed.measured, tracks.motion)
-    return tracks.followed()
+            tracks.motion = tracks.followed().refitted().motion
+    return tracks.followed().refitted()
 
 
 def _apart(positions: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -163,25 +170,27 @@ def _apart(positions: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 @dataclass
 class _Tracks:
-    """Tracks that have begun, and those that go on."""
+    """The tracks that go on, and the particles of all."""
 
     motion: Motion = field(default_factory=Motion)
+    begun: int = 0
+    """Number of tracks that have begun."""
+    numbers: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """Numbers of the tracks that go on, shape (track,)."""
     state: State = field(default_factory=lambda: State(np.zeros((0, 3, 3)), np.zeros((0, 3, 3, 3))))
-    """State of all tracks at the last instant in which each was found."""
+    """Their state at the last instant in which each was found."""
     seen: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    """That instant."""
+    """That instant, shape (track,)."""
     light: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """Light of each track in that instant [counts]."""
-    alive: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    """Numbers of the tracks that go on."""
+    """Their light in that instant [counts], shape (track,)."""
     rows: list[tuple[np.ndarray, ...]] = field(default_factory=list)
 
     def predicted(self, instant: int) -> State:
-        """Return the states at an instant of the tracks that go on."""
-        self.alive = self.alive[instant - self.seen[self.alive] <= LONGEST_GAP]
-        if not len(self.alive):
-            return self.state[self.alive]
-        return self.state[self.alive].after(self.motion, (instant - self.seen[self.alive]).astype(float))
+        """End the tracks that were not found lately; return the states of the others at an instant."""
+        alive = instant - self.seen <= LONGEST_GAP
+        self.numbers, self.seen, self.light = self.numbers[alive], self.seen[alive], self.light[alive]
+        self.state = self.state[alive]
+        return self.state.after(self.motion, (instant - self.seen).astype(float)) if alive.any() else self.state
 
     def go_on(self, instant: int, ahead: State, found: FoundParticles, candidates: Candidates) -> None:
         """Continue tracks by the particles of an instant, and begin tracks with the others."""
@@ -189,24 +198,23 @@ class _Tracks:
         found = found[order]
         positions, errors = found.positions_mm / found.voxel_mm, found.errors_mm / found.voxel_mm
         noise = np.square(errors * self.motion.factor)
-        spread = np.einsum("taii->tai", ahead.variance)[..., 0]
-        pairs = matched(ahead.mean[..., 0], positions, (spread, noise), (self.light[self.alive], found.light))
-        old, known = self.alive[pairs[:, 0]], pairs[:, 1]
-        corrected = ahead[pairs[:, 0]].measured(self.motion, positions[known], errors[known])
+        spread = ahead.variance[..., 0, 0]
+        old, known = matched(ahead.mean[..., 0], positions, (spread, noise), (self.light, found.light)).T
+        corrected = ahead[old].measured(self.motion, positions[known], errors[known])
         self.state.mean[old], self.state.variance[old] = corrected.mean, corrected.variance
         self.seen[old], self.light[old] = instant, found.light[known]
         new = np.setdiff1d(np.arange(len(found)), known)
-        begun = len(self.seen) + np.arange(len(new))
-        flow, flow_error = candidates.velocity(positions[new])
-        self.state = self.state.joined(State.first(self.motion, positions[new], errors[new], flow, flow_error))
-        self.seen = np.concatenate([self.seen, np.full(len(new), instant)])
-        self.light = np.concatenate([self.light, found.light[new]])
-        self.alive = np.concatenate([self.alive, begun])
+        numbers = self.begun + np.arange(len(new))
         chosen = np.concatenate([known, new])
         arrays = (positions, errors, found.light, found.signal_to_noise)
-        self.rows.append(
-            (np.concatenate([old, begun]), np.full(len(chosen), instant), *(one[chosen] for one in arrays))
-        )
+        track = np.concatenate([self.numbers[old], numbers])
+        self.rows.append((track, np.full(len(chosen), instant), *(one[chosen] for one in arrays)))
+        flow, flow_error = candidates.velocity(positions[new])
+        self.state = self.state.joined(State.first(self.motion, positions[new], errors[new], flow, flow_error))
+        self.numbers = np.concatenate([self.numbers, numbers])
+        self.seen = np.concatenate([self.seen, np.full(len(new), instant)])
+        self.light = np.concatenate([self.light, found.light[new]])
+        self.begun += len(new)
 
     def followed(self) -> Followed:
         """Return the particles of all tracks."""

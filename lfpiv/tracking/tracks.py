@@ -20,6 +20,8 @@ SHORTEST = 4
 """Least number of instants in which the particle of a track is found."""
 REASONS = ("none", "short", "unlike_neighbours")
 """Why a track is left out, by the number in the table."""
+FITTED_ROWS = 50_000
+"""About the largest number of positions that are fitted at once."""
 MOST_UNLIKE = 0.5
 """Largest share of the instants of a track in which it moves unlike its neighbours."""
 
@@ -98,16 +100,24 @@ def _about(units: str, words: str) -> dict[str, Any]:
 
 def _fitted(followed: Followed) -> State:
     """Return the state of each row, shapes (row, axis, 3) and (row, axis, 3, 3)."""
-    measured = followed.measured
-    state, there = smooth(followed.motion, measured), measured.there
-    return State(state.mean[there], state.variance[there])
+    count = len(followed.track)
+    mean, variance = np.zeros((count, 3, 3)), np.zeros((count, 3, 3, 3))
+    length = np.bincount(followed.track)
+    order = np.argsort(length, kind="stable")  # tracks of about one length together
+    for part in np.array_split(order, -(-count // FITTED_ROWS)) if count else ():
+        measured = followed.measured(np.sort(part))
+        state, there = smooth(followed.motion, measured), measured.there
+        rows = np.isin(followed.track, part)
+        mean[rows], variance[rows] = state.mean[there], state.variance[there]
+    return State(mean, variance)
 
 
 def _unlike(followed: Followed, state: State, long: np.ndarray) -> np.ndarray:
     """Return the rows of long tracks that move unlike their neighbours in most of their instants, bool."""
     unlike = np.zeros(len(long), bool)
-    for instant in np.unique(followed.instant[long]):
-        rows = np.flatnonzero(long & (followed.instant == instant))
+    rows_of_long = np.flatnonzero(long)
+    ordered = rows_of_long[np.argsort(followed.instant[long], kind="stable")]
+    for rows in np.split(ordered, np.flatnonzero(np.diff(followed.instant[ordered])) + 1):
         error = np.sqrt(state.variance[rows, :, 1, 1])
         unlike[rows] = ~agreeing(state.mean[rows, :, 0], state.mean[rows, :, 1], error)
     count = followed.track.max(initial=-1) + 1

@@ -28,8 +28,9 @@ FIRST_ACCELERATION = 0.5
 """Standard deviation of the acceleration before tracks show it [voxel/instant^2]."""
 FIRST_MEMORY = 5.0
 """Memory of the acceleration before tracks show it [instant]."""
-ACCELERATIONS, MEMORIES, FACTORS = (1e-4, 2.0), (1.0, 30.0), (0.5, 10.0)
-"""Limits of the three figures that tracks show."""
+ACCELERATIONS, MEMORIES, FACTORS = (1e-4, 2.0), (1.0, 30.0), (1.0, 10.0)
+"""Limits of the three figures that tracks show. Positions are never surer than their images say: errors of most may be
+smaller, but those of particles that overlap are not."""
 DIFFUSE_SPEED = 10.0
 """Standard deviation of a velocity that is not known [voxel/instant]."""
 TELLING_TRACKS, TELLING_INSTANTS = 300, 40
@@ -221,11 +222,10 @@ def unlikeliness(motion: Motion, measured: Measured) -> np.ndarray:
 
 
 def fit_motion(measured: Measured, start: Motion) -> Motion:
-    """Return the motion that makes the longest tracks most likely; `start` where too few tracks tell it."""
+    """Return the motion that makes tracks most likely; `start` where too few of them are long enough to tell it."""
     long = np.flatnonzero(measured.length >= TELLING_LENGTH)
     if len(long) < LEAST_TELLING:
         return start
-    long = long[np.argsort(-measured.length[long], kind="stable")[:TELLING_TRACKS]]
     some = measured[long]
     span = slice(int(min(some.length.max(), TELLING_INSTANTS)))
     limits = np.log([ACCELERATIONS, MEMORIES, FACTORS])
