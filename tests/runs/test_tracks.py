@@ -1,34 +1,67 @@
-"""Tracks of a run on a time series: made after its pairs, kept, made anew when settings change, and removed."""
+"""Tracks of a run on a time series: kept while they fit, removed where none are asked for."""
 
-import numpy as np
+from types import SimpleNamespace
+
 import pytest
-from support.series_run import FIRST, write_series
 
-import lfpiv
-from lfpiv.runs import pipeline
+from lfpiv.experiment.experiment import Frame
+from lfpiv.results.folder import Folder
+from lfpiv.results.provenance import Stamp
+from lfpiv.runs import tracks
+from lfpiv.settings.particles import Series
+
+PAIRS = [3, 4, 5]
 
 
-@pytest.mark.slow
-def test_tracks_follow_the_pairs_of_a_series(small_run, tmp_path):
-    """Two successive instants show the same particles, so that every track is short."""
-    experiment, out = write_series(small_run, tmp_path / "data"), small_run.calibrated(tmp_path / "out")
-    text = experiment.read_text("utf-8")
-    experiment.write_text(f"{text}\n[tracking]\nrounds = 1\n", "utf-8")
-    summary = pipeline.run(experiment, out)
-    table = lfpiv.open_tracks(out)
-    last = FIRST + int(table["instant"].max()) - FIRST
-    assert summary["tracks"]["tracks"] == table.attrs["tracks"] == len(np.unique(table["track"][table["valid"]]))
-    assert set(table["instant"].values.tolist()) == set(range(FIRST, last + 1)) and last > FIRST
-    assert np.allclose(table["time"], (table["instant"] - FIRST) * table.attrs["dt_s"])
-    first = table.isel(particle=table["track_length"].values == 2)
-    moved = np.stack([first[f"found_{axis}"].values for axis in "xyz"], axis=1)
-    assert np.abs(np.median(moved[1::2] - moved[::2], axis=0) - (0.08, -0.06, 0.04)).max() < 0.02
-    assert "<h3>Tracks</h3>" in (out / "report.html").read_text("utf-8")
+def experiment(*, tracking=True, step=1):
+    """Return what is asked of an experiment."""
+    return SimpleNamespace(
+        tracking=object() if tracking else None,
+        series=Series(instants=6, first=3, step=step),
+        pair_frames=lambda pair: (Frame(pair, "a"), Frame(pair + step, "a")),
+    )
 
-    made = (out / "tracks.nc").stat().st_mtime_ns
-    pipeline.run(experiment, out, pairs=(FIRST, FIRST + 1))
-    assert (out / "tracks.nc").stat().st_mtime_ns == made, "tracks are of all finished pairs, not of the chosen ones"
 
-    experiment.write_text(text, "utf-8")
-    assert pipeline.run(experiment, out)["tracks"] is None
-    assert not (out / "tracks.nc").exists()
+def stamp(*, images="known"):
+    return lambda pairs: Stamp({"images": images, "tracks": list(pairs)})
+
+
+def unwanted():
+    raise AssertionError("no weights are needed")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder whose stored tracks are of `PAIRS`."""
+    found = Folder(tmp_path)
+    found.tracks.write_bytes(b"stored")
+    monkeypatch.setattr(
+        tracks.provenance,
+        "read_marks",
+        lambda path: SimpleNamespace(
+            settings_hash=stamp()(PAIRS).hash, depends_on=stamp()(PAIRS).attributes["depends_on"]
+        ),
+    )
+    return found
+
+
+def decide(folder, pairs=PAIRS, **changed):
+    images = changed.pop("images", "known")
+    tracks.decide(experiment(**changed), folder, stamp(images=images), pairs, unwanted, lambda fraction: None)
+    return folder.tracks.is_file()
+
+
+def test_tracks_that_fit_are_kept(folder):
+    assert decide(folder)
+
+
+def test_tracks_that_nobody_asks_for_or_that_cannot_be_are_removed(folder):
+    assert not decide(folder, tracking=False)
+    folder.tracks.write_bytes(b"stored")
+    assert not decide(folder, pairs=[3]), "two instants are no track"
+
+
+def test_other_pairs_need_new_tracks_and_missing_images_leave_them(folder, caplog):
+    with pytest.raises(AssertionError, match="weights"):
+        decide(folder, pairs=[*PAIRS, 6])
+    assert decide(folder, pairs=[*PAIRS, 6], images=None) and "missing" in caplog.text

@@ -8,6 +8,7 @@ from support.found_particles import VOXEL_MM, cloud, field, scattered
 
 from lfpiv import link_particles
 from lfpiv.metrics.particles import match_particles
+from lfpiv.tracking import trajectory
 from lfpiv.tracking.following import Candidates, follow
 from lfpiv.tracking.tracks import REASONS, SHORTEST, track_table
 
@@ -56,6 +57,14 @@ def followed(lost=(), wrong=None, order=None):
         return Candidates.of(ends, 1)
 
     return follow(((instant, candidates(instant)) for instant in range(INSTANTS)), look)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_fits():
+    """A few steps of the fit of the motion are enough here; `test_trajectory` tests it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trajectory, "FIT_STEPS", 15)
+        yield
 
 
 @pytest.fixture(scope="module")

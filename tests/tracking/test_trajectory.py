@@ -104,7 +104,7 @@ def test_two_steps_are_one_of_twice_the_time():
 
 
 def test_the_motion_is_found_and_a_few_outliers_do_not_change_it():
-    measured, _ = simulated(150, 12, seed=1)
+    measured, _ = simulated(100, 10, seed=1)
     found = fit_motion(measured, Motion())
     assert unlikeliness(found, measured).sum() <= unlikeliness(MOTION, measured).sum() + 1
     assert np.allclose(found.factor, MOTION.factor, rtol=0.25) and np.allclose(
