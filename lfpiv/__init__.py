@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.results.export import export_results as export_results
     from lfpiv.results.particles import open_particles as open_particles
     from lfpiv.results.reader import open_results as open_results
+    from lfpiv.results.track_files import open_tracks as open_tracks
     from lfpiv.runs.measurement import Rig as Rig
     from lfpiv.runs.measurement import measure_pair as measure_pair
     from lfpiv.runs.measurement import prepare as prepare
@@ -42,7 +43,6 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.selfcalibration.movements import self_calibrate as self_calibrate
     from lfpiv.tracking.finding import find_particles as find_particles
     from lfpiv.tracking.linking import link_particles as link_particles
-    from lfpiv.tracking.tracks import particle_tracks as particle_tracks
     from lfpiv.velocity.cross_correlation import correlate as correlate
     from lfpiv.weights.operator import build_weights as build_weights
 
@@ -68,7 +68,7 @@ _MODULES = {
     "open_experiment": "lfpiv.experiment.opening",
     "open_results": "lfpiv.results.reader",
     "open_particles": "lfpiv.results.particles",
-    "particle_tracks": "lfpiv.tracking.tracks",
+    "open_tracks": "lfpiv.results.track_files",
     "plan": "lfpiv.planning.campaign",
     "prepare": "lfpiv.runs.measurement",
     "reconstruct": "lfpiv.reconstruction.volume",

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from lfpiv import files
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.report import background, markup, overview, pairs, volumes
+from lfpiv.report import background, markup, overview, pairs, tracks, volumes
 from lfpiv.report import calibration as calibration_section
 from lfpiv.report import vectors as vector_section
 from lfpiv.report.naming import Naming
@@ -70,10 +70,11 @@ def write_report(
     """
     figures = Summary.model_validate(summary)
     naming = Naming.of(experiment)
+    every = pairs.section(figures.pairs, figures.failed, figures.finished_count, naming) if figures.pairs else ""
     sections = {
         "vectors": vector_section.section(vectors, naming, figures.damping),
         "volumes": volumes.section(figures.pairs, vectors, naming) if vectors else "",
-        "pairs": pairs.section(figures.pairs, figures.failed, figures.finished_count, naming) if figures.pairs else "",
+        "pairs": every + tracks.section(figures.tracks, path.parent) if figures.pairs else "",
         "run": overview.run_facts(experiment, figures),
         "calibration": calibration_section.section(experiment, calibration, figures.calibration),
         "background": background.section(experiment, calibration),

@@ -112,6 +112,16 @@ class PairFigures(_Figures):
     """None without tracking."""
 
 
+class TrackFigures(_Figures):
+    """Figures of the tracks of single particles over a time series."""
+
+    tracks: int
+    """Tracks that are not left out."""
+    rows: int
+    """Their positions at all instants."""
+    left_out: int
+
+
 class Failure(_Figures):
     """A pair without result, and the reason."""
 
@@ -177,6 +187,8 @@ class Summary(_Figures):
     weights: WeightFigures = WeightFigures()
     damping: DampingFigures | None = None
     """None if it was not measured."""
+    tracks: TrackFigures | None = None
+    """None without tracks."""
     pairs: tuple[PairFigures, ...]
     """Finished pairs; of very many an evenly chosen part."""
     pairs_finished: int | None = None

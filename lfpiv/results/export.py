@@ -20,7 +20,17 @@ from lfpiv.errors import InputError
 from lfpiv.files import writing
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.records import read_object
-from lfpiv.results import image_identity, left_out, netcdf, paraview, particles, pivpy_planes, provenance, stores
+from lfpiv.results import (
+    image_identity,
+    left_out,
+    netcdf,
+    paraview,
+    particles,
+    pivpy_planes,
+    provenance,
+    stores,
+    track_files,
+)
 from lfpiv.results import tables as csv_tables
 from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
 from lfpiv.results.left_out import LeftOut
@@ -44,8 +54,8 @@ class Format(enum.Enum):
     ZARR = (
         "vectors.zarr, one Zarr store of all pairs or instants, to which a later export adds what is new: xarray, dask"
     )
-    CSV = "one table per pair or instant, a row per vector, and one of its linked particles; units in the header"
-    VTP = "one .vtp file of linked particles per pair or instant, with a .pvd collection: ParaView, pyvista"
+    CSV = "one table per pair or instant, a row per vector, one of its linked particles, one of tracks; with units"
+    VTP = "one .vtp file of linked particles per pair or instant, with a .pvd collection; one of tracks: ParaView"
     PIVPY = "one NetCDF file per depth, planes of u and v of all pairs or instants: pivpy"
 
 
@@ -156,9 +166,9 @@ def export(
             elif form in (Format.NETCDF, Format.ZARR):
                 written = _write_stacked(form, files, target, interval_s, step)
             elif form is Format.CSV:
-                written = _write_tables(results, tables, target, step)
+                written = _write_tables(results, tables, Path(folder), target, step)
             elif form is Format.VTP:
-                written = _write_vtp(tables, target, _times_by_number(results, interval_s))
+                written = _write_vtp(tables, Path(folder), target, _times_by_number(results, interval_s))
             else:
                 written = _write_pivpy(results, planes, target, interval_s, step)
             return Exported(written, omitted)
@@ -315,12 +325,18 @@ def _write_stacked(
     return [path]
 
 
-def _write_tables(results: xr.Dataset, tables: dict[int, Path], target: Path, progress: StepProgress) -> list[Path]:
+def _write_tables(
+    results: xr.Dataset, tables: dict[int, Path], folder: Path, target: Path, progress: StepProgress
+) -> list[Path]:
     written, of_particles = _write_csv(results, target, progress), _write_particle_csv(tables, target)
     columns = {name: {"units": unit} for name, unit in particles.PARTICLE_UNITS.items()}
-    described = dict.fromkeys(written, csv_tables.columns_of(results))
-    csv_tables.describe(described | dict.fromkeys(of_particles, columns), target)
-    return written + of_particles
+    described = dict.fromkeys(written, csv_tables.columns_of(results)) | dict.fromkeys(of_particles, columns)
+    of_tracks = [target / "tracks.csv"] if Folder(folder).tracks.is_file() else []
+    for path in of_tracks:
+        track_files.write_track_csv(track_files.open_tracks(folder), path, csv_tables.DIGITS)
+        described[path] = {name: {"units": unit} for name, unit in track_files.TRACK_UNITS.items()}
+    csv_tables.describe(described, target)
+    return written + of_particles + of_tracks
 
 
 def _write_pivpy(
@@ -363,7 +379,7 @@ def _write_particle_csv(tables: dict[int, Path], target: Path) -> list[Path]:
     return written
 
 
-def _write_vtp(tables: dict[int, Path], target: Path, times: dict[int, float]) -> list[Path]:
+def _write_vtp(tables: dict[int, Path], folder: Path, target: Path, times: dict[int, float]) -> list[Path]:
     files = {}
     for number, path in tables.items():
         written = target / f"particles_{path.stem}.vtp"
@@ -371,4 +387,7 @@ def _write_vtp(tables: dict[int, Path], target: Path, times: dict[int, float]) -
         files[written] = times.get(number, float(number))
     collection = target / "particles.pvd"
     paraview.write_collection(files, collection)
-    return [collection]
+    if not Folder(folder).tracks.is_file():
+        return [collection]
+    track_files.write_track_vtp(track_files.open_tracks(folder), target / "tracks.vtp")
+    return [collection, target / "tracks.vtp"]

@@ -29,6 +29,9 @@ log = logging.getLogger(__name__)
 FRAME_NAMES = "ab"
 """Names of the two frames in output files, independent of the names of the images."""
 
+TRACKS = "tracks.nc"
+"""Name of the table of tracks in the folder of a run."""
+
 MOST_DIGITS = 19
 """Digits from which on the number in a file's name is no number of a pair."""
 
@@ -84,6 +87,11 @@ class Folder:
     def refinement(self) -> Path:
         """Size of the particles, and the voxels that it demands."""
         return self.path / "refinement.json"
+
+    @property
+    def tracks(self) -> Path:
+        """Tracks of single particles over a time series."""
+        return self.path / TRACKS
 
     @property
     def summary(self) -> Path:
@@ -298,7 +306,7 @@ def make_writable(path: Path) -> list[Path]:
                 f"{place}: expected a folder for results, found a file. Remove it or choose another --out."
             )
     results = (folder.calibration, folder.self_calibration, folder.background, folder.guard, folder.refinement)
-    for place in (*results, folder.summary, folder.report):
+    for place in (*results, folder.tracks, folder.summary, folder.report):
         if place.is_dir():
             raise InputError(
                 f"{place}: expected a place for a file, found a folder. Remove it or choose another --out."

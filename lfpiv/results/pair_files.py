@@ -221,6 +221,13 @@ class PairFiles:
         marks = self.vector_marks
         return marks if self.stamp.fits(marks) else None
 
+    def has_particles(self) -> bool:
+        """Return whether the linked particles are there and fit."""
+        if self.particles is None or self.particles_stamp is None:
+            return False
+        marks = provenance.read_marks(self.particles)
+        return marks is not None and self.particles_stamp.fits(marks)
+
     def fitting_volumes(self) -> tuple[Marks, ...] | None:
         """Return the marks of both volumes; None if one is missing or does not fit."""
         marks = tuple(found for frame in self.frames if (found := frame.fitting()) is not None)

@@ -39,17 +39,26 @@ def check_particles(table: xr.Dataset) -> None:
     ValueError
         If a variable or a unit is missing or wrong, or a value is not finite.
     """
-    for name, unit in PARTICLE_UNITS.items():
+    check_columns(table, PARTICLE_UNITS, "particles")
+
+
+def check_columns(table: xr.Dataset, units: Mapping[str, str], what: str) -> None:
+    """Check that a table has finite variables with their units, and which of its rows are valid.
+
+    Raises
+    ------
+    ValueError
+        If not; the message begins with `what` the table holds.
+    """
+    for name, unit in units.items():
         if name not in table or table[name].dims != (PARTICLE,):
-            raise ValueError(
-                f"particles: expected the variable {name!r} over {PARTICLE}, found {list(table.data_vars)}."
-            )
+            raise ValueError(f"{what}: expected the variable {name!r} over {PARTICLE}, found {list(table.data_vars)}.")
         if (found := table[name].attrs.get("units")) != unit:
-            raise ValueError(f"particles: expected {name!r} in {unit}, found {found}.")
+            raise ValueError(f"{what}: expected {name!r} in {unit}, found {found}.")
         if not np.isfinite(table[name].values).all():
-            raise ValueError(f"particles: expected finite numbers in {name!r}, found others.")
+            raise ValueError(f"{what}: expected finite numbers in {name!r}, found others.")
     if table["valid"].dtype != bool:
-        raise ValueError(f"particles: expected 'valid' to be boolean, found {table['valid'].dtype}.")
+        raise ValueError(f"{what}: expected 'valid' to be boolean, found {table['valid'].dtype}.")
 
 
 def write_particles(table: xr.Dataset, path: Path, *, attributes: Mapping[str, Any]) -> None:
@@ -151,11 +160,16 @@ def figures(path: Path) -> dict[str, Any]:
 
 def write_csv(table: xr.Dataset, path: Path, digits: int) -> None:
     """Write a table of particles as text, a row per particle, units in the header."""
-    names = list(PARTICLE_UNITS)
-    titles = [name if (unit := PARTICLE_UNITS[name]) == "1" else f"{name} [{unit}]" for name in names]
+    write_columns(table, path, PARTICLE_UNITS, digits)
+
+
+def write_columns(table: xr.Dataset, path: Path, units: Mapping[str, str], digits: int) -> None:
+    """Write the variables of a table that have units as text, a row per particle, units in the header."""
+    titles = [name if unit == "1" else f"{name} [{unit}]" for name, unit in units.items()]
     frame = table.assign(valid=table["valid"].astype(np.uint8)).to_dataframe()
     with replacing(path) as scratch:
-        frame.to_csv(scratch, columns=names, header=titles, index=False, float_format=f"%.{digits}g", encoding="utf-8")
+        form = f"%.{digits}g"
+        frame.to_csv(scratch, columns=list(units), header=titles, index=False, float_format=form, encoding="utf-8")
 
 
 def write_vtp(table: xr.Dataset, path: Path) -> None:
@@ -173,21 +187,21 @@ def write_vtp(table: xr.Dataset, path: Path) -> None:
     piece = ElementTree.SubElement(whole, "Piece", {name: str(size) for name, size in sizes.items()})
     data = ElementTree.SubElement(piece, "PointData", Vectors="velocity")
     for name, parts in (("velocity", "uvw"), ("displacement", [f"displacement_{axis}" for axis in "xyz"])):
-        _array(data, name, np.stack([table[part].values for part in parts], axis=1))
+        add_array(data, name, np.stack([table[part].values for part in parts], axis=1))
     for name in ("intensity", "residual", "valid", *(f"uncertainty_{axis}" for axis in "xyz")):
-        _array(data, name, table[name].values)
+        add_array(data, name, table[name].values)
     points = ElementTree.SubElement(piece, "Points")
-    _array(points, "position", np.stack([table[axis].values for axis in "xyz"], axis=1))
+    add_array(points, "position", np.stack([table[axis].values for axis in "xyz"], axis=1))
     vertices = ElementTree.SubElement(piece, "Verts")
-    _array(vertices, "connectivity", np.arange(count, dtype=np.int64))
-    _array(vertices, "offsets", np.arange(1, count + 1, dtype=np.int64))
+    add_array(vertices, "connectivity", np.arange(count, dtype=np.int64))
+    add_array(vertices, "offsets", np.arange(1, count + 1, dtype=np.int64))
     with replacing(path) as scratch:
         ElementTree.ElementTree(root).write(scratch, encoding="utf-8", xml_declaration=True)
         state_origin(scratch)
 
 
-def _array(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:
-    """Add an array as text."""
+def add_array(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:
+    """Add an array to an element of a VTK file, as text."""
     whole = values.dtype.kind in "iub"
     kind = "Int64" if whole else "Float64"
     about = {"type": kind, "Name": name, "format": "ascii"}

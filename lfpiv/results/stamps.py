@@ -204,6 +204,18 @@ def of_bootstrap(experiment: Experiment, vectors: Stamp, pairs: Sequence[int]) -
     return Stamp(parts | {"images": images, "bootstrap": experiment.simulated_pairs})
 
 
+def of_tracks(experiment: Experiment, particles: Stamp, pairs: Sequence[int]) -> Stamp:
+    """Return the stamp of the tracks that the linked particles of some pairs begin.
+
+    It has the parts of `particles`, the stamp of a pair's particles; but the images are those of all the pairs.
+    """
+    frames = dict.fromkeys(frame for pair in pairs for frame in experiment.pair_frames(pair))
+    sources = [image for frame in frames for image in experiment.frame_images(frame)]
+    parts = {name: part for name, part in particles.parts.items() if name not in OF_PAIR}
+    images = look_at(sources, experiment.path.parent, condensed=True)
+    return Stamp(parts | {"images": images, "tracks": list(pairs)})
+
+
 def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp | None:
     """Return the stamp of the linked particles, for which the vectors are the predictor."""
     tracking = experiment.tracking

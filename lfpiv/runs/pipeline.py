@@ -15,7 +15,18 @@ from typing import TYPE_CHECKING, Any
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.progress import Progress
-from lfpiv.runs import bootstrap, device_memory, dispatch, local_workers, memory, rig, task, unchanged, worker_plan
+from lfpiv.runs import (
+    bootstrap,
+    device_memory,
+    dispatch,
+    local_workers,
+    memory,
+    rig,
+    task,
+    tracks,
+    unchanged,
+    worker_plan,
+)
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
@@ -31,6 +42,8 @@ if TYPE_CHECKING:
 
 PAIRS = "image pairs"
 """Name of the step that works on pairs, for progress."""
+TRACKS = "tracks"
+"""The same for tracks over a time series."""
 SIMULATED = "simulated pairs"
 """The same for pairs that are simulated."""
 INSTANTS = "instants"
@@ -100,6 +113,7 @@ def run(
             checked = _check(current, todo, workers, scheduler)
         calibrated = replace(calibrated, calibration=prepared.board)
         done, weights = _process(current, prepared, checked, keep_volumes)
+        done, weights = _follow(current, prepared, done, weights)
         done = _bootstrap(current, prepared, done, weights)
         summary = current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
         if not isinstance(experiment, Experiment):
@@ -270,26 +284,49 @@ def _known(weights: Weights | None) -> _Weights:
     return lambda: weights
 
 
+def _follow(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> tuple[Invocation, _Weights]:
+    """Make the tracks of a time series; return the invocation, and the weights if they were built for them."""
+    lazy = _Lazily(current, prepared, weights)
+    pairs = current.pairs_with_particles() if current.experiment.series is not None else []
+    step = current.step(TRACKS)
+    tracks.decide(current.experiment, current.folder, current.tracks_stamp, pairs, lazy.work, step)
+    return lazy.after(done), lazy.weights
+
+
 def _bootstrap(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> Invocation:
     """Measure the damping by ghosts in simulated pairs; return the invocation with the weights built for them."""
-    built: list[WeightsFigures] = []
-
-    def work() -> PairWork:
-        known = weights()
-        if known is None:
-            known, figures = rig.build_weights(current, prepared, list(current.numbers[:1]))
-            built.append(figures)
-        return rig.pair_work(current, known, keep_volumes=False, calibration=prepared.calibration)
-
+    lazy = _Lazily(current, prepared, weights)
     bootstrap.decide(
         current.experiment,
         current.folder,
         current.damping_stamp,
         current.pairs_with_vectors,
-        work,
+        lazy.work,
         current.step(SIMULATED),
     )
-    return replace(done, weights=built[0]) if built else done
+    return lazy.after(done)
+
+
+@dataclass
+class _Lazily:
+    """Work on pairs after all of them are done; weights are built only if it needs them and nobody has."""
+
+    current: Run
+    prepared: Prepared
+    weights: _Weights
+    built: WeightsFigures | None = None
+
+    def work(self) -> PairWork:
+        """Return the work on pairs, with weights."""
+        known = self.weights()
+        if known is None:
+            known, self.built = rig.build_weights(self.current, self.prepared, list(self.current.numbers[:1]))
+            self.weights = _known(known)
+        return rig.pair_work(self.current, known, keep_volumes=False, calibration=self.prepared.calibration)
+
+    def after(self, done: Invocation) -> Invocation:
+        """Return the invocation with the weights that were built."""
+        return done if self.built is None else replace(done, weights=self.built)
 
 
 def _with_reused(current: Run, done: Invocation, todo: Todo, kind: str) -> Invocation:

@@ -28,6 +28,7 @@ from lfpiv.results import finished, provenance, stamps, summary_file
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
+from lfpiv.results.track_files import track_figures
 from lfpiv.runs import bootstrap, guard, memory, pair_figures, refinement, summary
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.guard import Guard
@@ -178,6 +179,17 @@ class Run:
         """Return the stamp of the damping by ghosts that was measured with some pairs."""
         first = next(iter(pairs), self.numbers[0])
         return stamps.of_bootstrap(self.experiment, self.files(first).stamp, pairs)
+
+    def tracks_stamp(self, pairs: Sequence[int]) -> Stamp:
+        """Return the stamp of the tracks that the linked particles of some pairs begin."""
+        particles = self.files(next(iter(pairs))).particles_stamp
+        assert particles is not None
+        return stamps.of_tracks(self.experiment, particles, pairs)
+
+    def pairs_with_particles(self) -> list[int]:
+        """Return all pairs of the experiment whose linked particles are finished and fit."""
+        files = (self.files(pair) for pair in self.experiment.numbers)
+        return [one.pair for one in files if one.has_particles()]
 
     def pairs_with_vectors(self) -> list[int]:
         """Return the selected pairs whose vectors are finished and fit."""
@@ -331,7 +343,7 @@ class Run:
         )
         with writing(self.folder.pairs):
             result = summary.build(self.experiment, self.device, calibrated, contents, done, self.earlier, self.folder)
-        result |= self._usage(done, result["timings_s"])
+        result |= {"tracks": self._tracks()} | self._usage(done, result["timings_s"])
         if report:
             from lfpiv.report import write_report
 
@@ -365,6 +377,14 @@ class Run:
             damping=bootstrap.stored(self.experiment, self.folder, self.damping_stamp),
             refinement=self.refinement,
         )
+
+    def _tracks(self) -> dict[str, Any] | None:
+        """Return the figures of the tracks; None if there are none that fit."""
+        if self.experiment.tracking is None or not self.folder.tracks.is_file():
+            return None
+        pairs, marks = self.pairs_with_particles(), provenance.read_marks(self.folder.tracks)
+        fits = bool(pairs) and marks is not None and self.tracks_stamp(pairs).fits(marks)
+        return track_figures(self.folder.tracks) if fits else None
 
     def _usage(self, done: Invocation, timings_s: dict[str, float]) -> dict[str, Any]:
         """Return the time and the peak memory so far, in the form of the summary."""

@@ -181,7 +181,7 @@ def _read_files(experiment: Experiment) -> Iterator[Path]:
 def _written_files(folder: Folder) -> Iterable[Path]:
     """Return the files of results, and the places of those that a run may write."""
     single = [folder.calibration, folder.self_calibration, folder.background, folder.guard, folder.refinement]
-    single += [folder.bootstrap, folder.summary, folder.pairs, folder.report]
+    single += [folder.bootstrap, folder.tracks, folder.summary, folder.pairs, folder.report]
     places = (folder.vectors(0).parent, folder.volume(0, 0).parent, folder.particles(0).parent)
     return [*single, *(path for place in places for path in sorted(place.glob("*.nc")))]
 

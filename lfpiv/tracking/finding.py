@@ -25,7 +25,7 @@ from lfpiv.tracking import candidates, confirmation
 from lfpiv.tracking.fit import Fit, faint_light, scene_of
 from lfpiv.tracking.found import FoundParticles
 from lfpiv.tracking.particle_images import ParticleImages
-from lfpiv.tracking.refinement import Cloud, light_scatter
+from lfpiv.tracking.refinement import Cloud, Scene, light_scatter
 from lfpiv.tracking.size_fit import LARGEST_RATIO, USUAL_SIGMA_VOXEL, fit_size
 from lfpiv.tracking.surroundings import whole_pixels
 from lfpiv.weights.operator import Weights
@@ -159,7 +159,10 @@ class ParticleSearch:
     ) -> Fit:
         """Fit particles to the images of one instant; arguments and exceptions as of `find_particles`."""
         images = checked_images(self.weights, images)
-        fit = self._start(images, volume, _noise(images, noise), _clipped(images, clipped))
+        return self._fitted(self._start(images, volume, _noise(images, noise), _clipped(images, clipped)))
+
+    def _fitted(self, fit: Fit) -> Fit:
+        """Refine and confirm candidates, and add those that the light they leave shows."""
         for number in range(self.rounds):
             new = self._new(fit) if number else self._nothing
             if number and not len(new):
@@ -174,6 +177,22 @@ class ParticleSearch:
             fit_size(fit)
         self._settle(fit)
         return fit
+
+    def look(
+        self,
+        images: Mapping[str, np.ndarray],
+        cloud: Cloud,
+        *,
+        noise: Mapping[str, float],
+        clipped: Mapping[str, np.ndarray] | None = None,
+    ) -> FoundParticles:
+        """Return the candidates that the images of one instant confirm, and particles in the light that they leave.
+
+        The size of the particles must be known; arguments and exceptions as of `find_particles`.
+        """
+        images = checked_images(self.weights, images)
+        scene = scene_of(images, noise, _clipped(images, clipped), self._whole, self._standing)
+        return self.particles(self._fitted(self._fit(self.images, scene, cloud, images, noise)))
 
     def add(self, fit: Fit, cloud: Cloud, replaced: np.ndarray) -> None:
         """Fit further particles to the images, in place of some of those that are there.
@@ -230,7 +249,16 @@ class ParticleSearch:
             volume = candidates.reconstructed(self.weights, dark, noise, candidates.FIRST_ITERATIONS)
         cloud = self._nothing if volume is None else candidates.volume_peaks(self.weights, volume)
         cloud = cloud[cloud.light[:, 0] > CANDIDATE * faint_light(model, scene, cloud)]
-        largest = LARGEST_RATIO * model.sigma_voxel
+        return self._fit(model, scene, cloud, images, noise)
+
+    def _fit(
+        self,
+        model: ParticleImages,
+        scene: Scene,
+        cloud: Cloud,
+        images: Mapping[str, np.ndarray],
+        noise: Mapping[str, float],
+    ) -> Fit:
         return Fit(
             model=model,
             scene=scene,
@@ -239,7 +267,7 @@ class ParticleSearch:
             noise=noise,
             whole=self._whole,
             standing=self._standing,
-            largest_voxel=largest,
+            largest_voxel=LARGEST_RATIO * model.sigma_voxel,
         )
 
     def _round(self, fit: Fit, number: int) -> bool:

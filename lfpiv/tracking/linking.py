@@ -199,16 +199,40 @@ class _Predictor:
 def _matched(
     first: FoundParticles, second: FoundParticles, predicted: np.ndarray, spread_voxel: np.ndarray
 ) -> np.ndarray:
-    """Return unambiguous mutual best matches, shape (link, 2), in the order of the first particles."""
+    """Return the links of particles about a prediction, shape (link, 2), in the order of the first particles."""
     at = first.positions_mm / first.voxel_mm + predicted
     to = second.positions_mm / first.voxel_mm
-    error_a, error_b = first.errors_mm / first.voxel_mm, second.errors_mm / first.voxel_mm
-    widest = np.sqrt(np.square(spread_voxel).max() + np.square(error_a).max() + np.square(error_b).max())
+    variances = [np.square(one.errors_mm / first.voxel_mm) for one in (first, second)]
+    return matched(at, to, (variances[0] + np.square(spread_voxel), variances[1]), (first.light, second.light))
+
+
+def matched(
+    at: np.ndarray, to: np.ndarray, variances: tuple[np.ndarray, np.ndarray], lights: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Return unambiguous mutual best matches of predicted and found particles.
+
+    Parameters
+    ----------
+    at, to : ndarray, shape (predicted, 3) and (found, 3)
+        Positions [voxel].
+    variances : tuple of ndarray, shapes as of the positions
+        Variances of both [voxel^2].
+    lights : tuple of ndarray, shape (predicted,) and (found,)
+        Light of both [counts].
+
+    Returns
+    -------
+    ndarray, shape (link, 2)
+        Numbers of both, in the order of the predicted particles.
+    """
+    if not (len(at) and len(to)):
+        return np.zeros((0, 2), int)
+    widest = np.sqrt(variances[0].max() + variances[1].max())
     near = cKDTree(at).sparse_distance_matrix(cKDTree(to), REACH * widest, output_type="coo_matrix")
     row, column = near.row, near.col
-    variance = np.square(spread_voxel) + np.square(error_a[row]) + np.square(error_b[column])
+    variance = variances[0][row] + variances[1][column]
     distance = (np.square(to[column] - at[row]) / variance).sum(1)
-    ratio = np.log(np.maximum(second.light[column], 1e-9) / np.maximum(first.light[row], 1e-9))
+    ratio = np.log(np.maximum(lights[1][column], 1e-9) / np.maximum(lights[0][row], 1e-9))
     cost = distance + np.square(ratio / LIGHT_SPREAD) + np.log(variance).sum(1)
     close = distance < REACH**2
     row, column, cost = row[close], column[close], cost[close]
@@ -246,12 +270,28 @@ def _corrected(
 
 
 def _validated(first: FoundParticles, second: FoundParticles, links: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Return which links agree with those nearby, normalised by their scatter and the standard error."""
-    if len(links) <= NEIGHBOURS:
-        return np.ones(len(links), bool)
+    """Return which links agree with those nearby."""
     places = first.positions_mm[links[:, 0]] / first.voxel_mm
     off = second.positions_mm[links[:, 1]] / first.voxel_mm - places - predicted[links[:, 0]]
     error = np.sqrt(np.square(first.errors_mm[links[:, 0]]) + np.square(second.errors_mm[links[:, 1]])) / first.voxel_mm
+    return agreeing(places, off, error)
+
+
+def agreeing(places: np.ndarray, off: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return which displacements agree with those nearby, normalised by their scatter and the standard error.
+
+    Parameters
+    ----------
+    places, off, error : ndarray, shape (link, 3)
+        Places, displacements beyond a predictor, and their standard errors [voxel].
+
+    Returns
+    -------
+    ndarray, shape (link,), bool
+        All true where there are too few to tell.
+    """
+    if len(places) <= NEIGHBOURS:
+        return np.ones(len(places), bool)
     around, scatter = nearby(places, off)
     usual = NORMAL_MAD * np.median(np.abs(off - around), axis=0)  # a plane fits few links closely
     scatter = np.maximum(scatter, usual)

@@ -62,12 +62,14 @@ class Measured:
 
 def search(case: Case, rig: Rig, recorded: Recorded, **settings: float) -> Measured:
     """Find the particles of both frames with settings of `ParticleSearch`, and link them."""
-    grid = rig.grid.padded(_lit_layers(case, rig))
+    grid = rig.grid.padded(lit_layers(case, rig))
     particles = ParticleSearch(weights_of(rig, grid), rig.grid, **settings)
     start = time.process_time()
     fits = [
-        particles.fit(_light(case, rig, images), noise={name: rig.noise(name, image) for name, image in images.items()})
-        for images in recorded.images
+        particles.fit(
+            subtracted_light(case, rig, one), noise={name: rig.noise(name, image) for name, image in one.items()}
+        )
+        for one in recorded.images
     ]
     found = exchange(particles, fits, spread_voxel=SPREAD_VOXEL)
     cpu_s = (time.process_time() - start) / len(found)
@@ -99,14 +101,14 @@ def figures_of(case: Case, rig: Rig, recorded: Recorded, measured: Measured) -> 
     return figures | _displacements(case, rig, measured.links, figures["particles"])
 
 
-def _lit_layers(case: Case, rig: Rig) -> Layers:
+def lit_layers(case: Case, rig: Rig) -> Layers:
     """Return guard layers as wide as particles are lit beyond the volume, which a user knows from the light sheet."""
     beyond = CONDITIONS[case.condition].beyond
     along_z, aside = (max(1, round(count)) for count in (beyond * rig.grid.shape[0], ASIDE_VOXEL if beyond else 0))
     return (along_z, along_z), (aside, aside), (aside, aside)
 
 
-def _light(case: Case, rig: Rig, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def subtracted_light(case: Case, rig: Rig, images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the light of each camera above the dark level and smooth stray light."""
     light = {name: rig.light(name, image) for name, image in images.items()}
     stray = CONDITIONS[case.condition].stray

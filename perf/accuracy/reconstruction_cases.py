@@ -6,7 +6,7 @@ those of a whole measurement, and only differences between methods count.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -46,6 +46,10 @@ RAYS = 16_384
 """Rays per particle."""
 WHITE_RAYS, WHITE_COUNTS = 256, 3000.0
 FLOWS = ("ring", "swirl", "shear", "uniform", "turbulent")
+TRACERS = "dns"
+"""Flow of a series, not of a pair, that moves tracers of the sample data, and the edge of their cube [mm]."""
+TRACERS_MM = 8.0
+TRACERS_FILE = Path(__file__).resolve().parents[3] / "shared" / "data" / "dns-tracers" / "rayleigh_benard_series.npz"
 IMAGES_FORM = 1
 """Raised when the same case is recorded otherwise, so that stored images are made anew."""
 
@@ -242,6 +246,9 @@ def _particles(case: Case, condition: Condition, cameras: int) -> tuple[tuple[np
     seeded = size + (2 * np.array([0.5, 0.5, condition.beyond * size[2]]) if condition.beyond else 0.0)
     count = round(case.ppm * size[0] * size[1] / VOXEL_MM**2 * float(np.prod(seeded / size)))
     rng = np.random.default_rng([case.seed, 31, round(1000 * case.ppm)])
+    if case.flow == TRACERS:
+        tracers = _tracers(case, count / float(np.prod(seeded)), seeded, rng)
+        return tracers, _light(condition, cameras, size, tracers, rng)
     middle, flow = rng.uniform(-0.5, 0.5, (count, 3)) * seeded, make_flow(case)
     if case.frames == 2:
         half = flow(middle) / 2
@@ -251,15 +258,31 @@ def _particles(case: Case, condition: Condition, cameras: int) -> tuple[tuple[np
         for _ in range(case.frames - 1):
             before = positions[-1]
             positions.append(before + flow(before + flow(before) / 2))
-    scatter = condition.brightness
+    return tuple(positions), _light(condition, cameras, size, positions, rng)
+
+
+def _tracers(case: Case, per_mm3: float, seeded: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Return the positions [mm] at successive instants of the sample data's tracers that come into a region."""
+    with np.load(TRACERS_FILE) as stored:
+        every = (stored["positions"][: case.frames].astype(float) - 0.5) * TRACERS_MM
+    if len(every) < case.frames:
+        raise ValueError(f"frames: expected at most {len(every)} with the flow {TRACERS!r}, got {case.frames}.")
+    chosen = rng.random(every.shape[1]) < per_mm3 * TRACERS_MM**3 / every.shape[1]
+    chosen &= (np.abs(every) < seeded / 2).all(2).any(0)
+    return tuple(every[:, chosen])
+
+
+def _light(
+    condition: Condition, cameras: int, size: np.ndarray, positions: Sequence[np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
+    """Return the light of each particle in each camera (camera, n), at each frame."""
+    scatter, count = condition.brightness, len(positions[0])
     equal = scatter.of_diameters(scatter.diameters(count, rng)) * scatter.of_cameras(cameras, count, rng)
     if condition.sheet is None:
-        return tuple(positions), (equal,) * len(positions)
+        return (equal,) * len(positions)
     thickness, second = condition.sheet
     sheet = Sheet(profile="gaussian", thickness_mm=float(thickness * size[2]), power=(1.0, second))
-    return tuple(positions), tuple(
-        equal * sheet.power[frame % 2] * sheet.light(at, frame % 2) for frame, at in enumerate(positions)
-    )
+    return tuple(equal * sheet.power[frame % 2] * sheet.light(at, frame % 2) for frame, at in enumerate(positions))
 
 
 def _image(case: Case, rig: Rig, number: int, frame: int, positions_mm: np.ndarray, light: np.ndarray) -> np.ndarray:

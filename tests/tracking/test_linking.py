@@ -1,48 +1,11 @@
-"""Links between two frames and tracks over many: displacements, ambiguity, outliers, gaps."""
+"""Links between two frames: displacements, ambiguity, outliers."""
 
 import numpy as np
 import pytest
-import xarray as xr
+from support.found_particles import VOXEL_MM, cloud, field, scattered
 
-from lfpiv import link_particles, particle_tracks
-from lfpiv.tracking.found import FoundParticles
+from lfpiv import link_particles
 from lfpiv.tracking.linking import NEIGHBOURS, linked, nearby
-
-VOXEL_MM = 0.1
-
-
-def cloud(positions_mm, light=None, error_mm=0.001):
-    count = len(positions_mm)
-    return FoundParticles(
-        positions_mm=np.asarray(positions_mm, float),
-        errors_mm=np.full((count, 3), error_mm),
-        light=np.full(count, 100.0) if light is None else np.asarray(light, float),
-        residual=np.ones(count),
-        sigma_voxel=0.7,
-        voxel_mm=VOXEL_MM,
-        explained=1.0,
-        crowding=0.0,
-        hidden=0.0,
-        per_microlens=0.05,
-        signal_to_noise=np.full(count, 30.0),
-    )
-
-
-def scattered(count=60, seed=0):
-    return np.random.default_rng(seed).uniform(-2, 2, (count, 3))
-
-
-def field(displacement_voxel):
-    """A correlation's vectors of one displacement everywhere."""
-    axis = np.array([-1.5, 0.0, 1.5])
-    dims = ("z", "y", "x")
-    data = {
-        f"displacement_{name}": (dims, np.full((3, 3, 3), value))
-        for name, value in zip("xyz", displacement_voxel, strict=True)
-    }
-    return xr.Dataset(
-        {**data, "valid": (dims, np.ones((3, 3, 3), bool))}, {name: axis for name in dims}, {"voxel_mm": [VOXEL_MM] * 3}
-    )
 
 
 def moved(table):
@@ -101,43 +64,6 @@ def test_empty_frames_give_an_empty_table():
 def test_bad_arguments_are_named(arguments):
     with pytest.raises(ValueError, match="expected a number > 0"):
         link_particles(cloud([[0, 0, 0]]), cloud([[0, 0, 0]]), **arguments)
-
-
-def series(instants=6, count=30, lost=()):
-    """Links of particles that move evenly; `lost` are (instant, particle)."""
-    at, speed = scattered(count, 3), np.array([0.03, -0.02, 0.04])
-    tables = []
-    for instant in range(instants):
-        kept = [particle for particle in range(count) if (instant, particle) not in lost]
-        first, second = at[kept] + instant * speed, at[kept] + (instant + 1) * speed
-        table = link_particles(cloud(first), cloud(second), field(speed / VOXEL_MM), dt_s=1.0)
-        tables.append(
-            table.drop_vars("particle").assign(instant=("particle", np.full(table.sizes["particle"], instant)))
-        )
-    joined = xr.concat(tables, "particle", combine_attrs="override")
-    return joined.assign_attrs(step=1)
-
-
-def test_tracks_join_links_and_bridge_one_gap():
-    table = particle_tracks(series(lost={(3, 4)}))
-    assert table["track"].max() == 29 and (table["track"] >= 0).all()
-    length = table["track_length"].values[np.unique(table["track"], return_index=True)[1]]
-    assert sorted(length) == [5] + [6] * 29
-    broken = particle_tracks(series(lost={(3, 4)}), gap_voxel=0.0)
-    assert broken["track"].max() == 30
-
-
-def test_tracks_do_not_depend_on_the_order_of_the_links():
-    table = series()
-    mixed = table.isel(particle=np.random.default_rng(0).permutation(table.sizes["particle"]))
-    one, other = particle_tracks(table), particle_tracks(mixed)
-    assert one["track"].max() == other["track"].max()
-    assert np.bincount(one["track"]).tolist() == np.bincount(other["track"]).tolist()
-
-
-def test_tracks_need_a_series():
-    with pytest.raises(ValueError, match="time series"):
-        particle_tracks(link_particles(cloud([[0, 0, 0]]), cloud([[0, 0, 0]]), dt_s=1.0))
 
 
 def test_a_gradient_is_followed_and_an_outlier_is_not():

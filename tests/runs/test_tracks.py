@@ -1,0 +1,67 @@
+"""Tracks of a run on a time series: kept while they fit, removed where none are asked for."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from lfpiv.experiment.experiment import Frame
+from lfpiv.results.folder import Folder
+from lfpiv.results.provenance import Stamp
+from lfpiv.runs import tracks
+from lfpiv.settings.particles import Series
+
+PAIRS = [3, 4, 5]
+
+
+def experiment(*, tracking=True, step=1):
+    """Return what is asked of an experiment."""
+    return SimpleNamespace(
+        tracking=object() if tracking else None,
+        series=Series(instants=6, first=3, step=step),
+        pair_frames=lambda pair: (Frame(pair, "a"), Frame(pair + step, "a")),
+    )
+
+
+def stamp(*, images="known"):
+    return lambda pairs: Stamp({"images": images, "tracks": list(pairs)})
+
+
+def unwanted():
+    raise AssertionError("no weights are needed")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder whose stored tracks are of `PAIRS`."""
+    found = Folder(tmp_path)
+    found.tracks.write_bytes(b"stored")
+    monkeypatch.setattr(
+        tracks.provenance,
+        "read_marks",
+        lambda path: SimpleNamespace(
+            settings_hash=stamp()(PAIRS).hash, depends_on=stamp()(PAIRS).attributes["depends_on"]
+        ),
+    )
+    return found
+
+
+def decide(folder, pairs=PAIRS, **changed):
+    images = changed.pop("images", "known")
+    tracks.decide(experiment(**changed), folder, stamp(images=images), pairs, unwanted, lambda fraction: None)
+    return folder.tracks.is_file()
+
+
+def test_tracks_that_fit_are_kept(folder):
+    assert decide(folder)
+
+
+def test_tracks_that_nobody_asks_for_or_that_cannot_be_are_removed(folder):
+    assert not decide(folder, tracking=False)
+    folder.tracks.write_bytes(b"stored")
+    assert not decide(folder, pairs=[3]), "two instants are no track"
+
+
+def test_other_pairs_need_new_tracks_and_missing_images_leave_them(folder, caplog):
+    with pytest.raises(AssertionError, match="weights"):
+        decide(folder, pairs=[*PAIRS, 6])
+    assert decide(folder, pairs=[*PAIRS, 6], images=None) and "missing" in caplog.text
