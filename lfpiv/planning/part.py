@@ -19,7 +19,6 @@ from lfpiv.geometry.resampling import volume_on
 from lfpiv.planning.cost import NOTHING, Cost, timed
 from lfpiv.reconstruction.particle_size import VOXEL_VARIANCE, ParticleSizer
 from lfpiv.runs.guard import with_guard
-from lfpiv.runs.pair_vectors import LastVectors
 from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.runs.refinement import refined
 from lfpiv.selfcalibration.disparity import CameraVolumes
@@ -240,7 +239,6 @@ def measure(part: Volume, forms: Mapping[str, Form], per_voxel: float, *, check_
         weights=weights,
         guard=part.guard,
         refinement=part.refinement,
-        between=LastVectors(part.experiment.dt_s),
     )
 
     def solve(number: int) -> xr.DataArray:

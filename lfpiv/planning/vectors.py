@@ -19,7 +19,7 @@ from lfpiv.results.folder import Folder
 from lfpiv.results.netcdf import RECONSTRUCTION
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairFiles, PairVolumes
 from lfpiv.runs import pair_figures
-from lfpiv.runs.pair_vectors import LastVectors, measure_vectors
+from lfpiv.runs.pair_vectors import measure_vectors
 from lfpiv.settings.processing import DEFAULT_WINDOWS
 from lfpiv.velocity import vector_grid
 from lfpiv.velocity.multi_pass import COARSE_OVERLAP
@@ -68,9 +68,8 @@ def plan_vectors(whole: Volume, per_voxel: float, volume: xr.DataArray, scratch:
         )
         for shift in (0.0, SHIFT_VOXEL)
     )
-    between = LastVectors(experiment.dt_s)
-    measure_vectors(first[:24, :24, :24], second[:24, :24, :24], _with_windows(block.experiment, (24, 24, 24)), between)
-    vectors, correlate = timed(lambda: measure_vectors(first, second, block.experiment, between))
+    measure_vectors(first[:24, :24, :24], second[:24, :24, :24], _with_windows(block.experiment, (24, 24, 24)))
+    vectors, correlate = timed(lambda: measure_vectors(first, second, block.experiment))
     growth = passed_voxels(experiment, grid.shape) / passed_voxels(experiment, block.experiment.grid.shape)
     vectors.attrs |= {"reconstruction_s": 0.0, "correlation_s": 0.0, "warnings": "[]"}
     names = experiment.frames if experiment.series is None else ("a", "b")

@@ -62,15 +62,13 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, np.ndarray], flow: xr
         return volume
     dark = np.float32(DARK_SHARE * np.square(blurred, dtype=np.float64).sum() / blurred.sum(dtype=np.float64))
     logarithm, ratio = np.log(blurred + dark), np.zeros_like(volume)
-    inside = deform.spline_coefficients(np.ones_like(volume))
+    motion = MotionField(own.to_dataarray(), flow)
     for steps, other in others.items():
-        motion = MotionField(own.to_dataarray(), times(flow, steps))
-        field = motion.displacement(-1)
-        moved = np.maximum(motion.carried(deform.spline_coefficients(other), field), 0)
+        moved, inside = motion.carried(deform.spline_coefficients(other), motion.displacement(-steps))
+        np.maximum(moved, 0, out=moved)
         total = float(moved.sum(dtype=np.float64))
         if total > 0:
-            there = np.clip(motion.carried(inside, field), 0, 1)
-            trust = motion.trust * np.where(there > 0.5, there, 0)
+            trust = motion.trust * np.where(inside > 0.5, inside, 0)
             ratio += trust * (np.log(_blurred(moved * np.float32(light / total)) + dark) - logarithm)
     gain = np.minimum(np.exp(np.float32(SHARPNESS / (len(others) + 1)) * ratio), np.float32(LARGEST_GAIN))
     guess = coefficients(volume, own.sieve_voxel) * gain
@@ -104,11 +102,6 @@ def roughness(flow: xr.Dataset) -> float:
     curved = [np.diff(field, 2, axis=axis) for axis in range(3) if field.shape[axis] > 2]
     squares = [float(np.nanmean(part**2)) for part in curved if np.isfinite(part).any()]
     return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
-
-
-def times(flow: xr.Dataset, steps: int) -> xr.Dataset:
-    """Return a flow of which each displacement is `steps` as long."""
-    return flow.assign({f"displacement_{axis}": steps * flow[f"displacement_{axis}"] for axis in "zyx"})
 
 
 def _blurred(volume: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +19,7 @@ from lfpiv.reconstruction.recording import Recording
 from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
 from lfpiv.reconstruction.settings import SmartSettings
-from lfpiv.reconstruction.smart import ImageEquations, State, iterate
+from lfpiv.reconstruction.smart import ImageEquations, Misfit, State, iterate
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.sums import largest
 from lfpiv_kernels.reconstruction.voxels import multiply, part_bright
@@ -48,11 +49,15 @@ class PreparedInstant:
         iterations: int | None = None,
         whole_passes: int = WHOLE_PASSES,
         first: np.ndarray | None = None,
+        brief: bool = False,
         progress: Callable[[float], None] | None = None,
     ) -> Reconstruction:
         """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
 
-        `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes.
+        `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes. A
+        `brief` reconstruction over subsets leaves out what does not pay for few of them: the projection before the
+        first one, whose misfit is then the sum over the subsets, that after the last one, whose misfit is then NaN,
+        and voxels that rest.
         """
         settings, normalisation = self.settings, self.normalisation
         guess = duplicate(self._from_images) if first is None else self._given(first)
@@ -67,8 +72,12 @@ class PreparedInstant:
         partitions = normalisation.partitions if epochs else ()
         with self.equations.locked():
             if partitions:
-                state = self._solve_subsets(state, partitions, history, epochs, progress)
-            volume, stop = self._solve_whole(state, history, progress)
+                state = self._solve_subsets(state, partitions, history, epochs, brief, progress)
+            if brief and history.epochs == count:
+                volume, stop = normalisation.sieve(state.coefficients), None
+                history.append(Misfit(math.nan, math.nan))
+            else:
+                volume, stop = self._solve_whole(state, history, progress)
         if stop is SmartStop.DIVERGED:
             log.warning("SMART: %s", stop.value)
         last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
@@ -88,11 +97,21 @@ class PreparedInstant:
             settings=settings,
         )
 
-    def misfit(self, first: np.ndarray) -> float:
-        """Return the misfit of a first guess, shape (z, y, x) [counts]; raise ValueError as `solve`."""
-        guess = self._given(first)
+    def sampled_misfit(self, first: np.ndarray | None = None) -> float:
+        """Return the misfit of a first guess (z, y, x) in a part of the rays [counts]; raise ValueError as `solve`.
+
+        The part is half of each camera's lenses where the rays are divided so, else all. Default: the guess from the
+        images.
+        """
+        guess = self._from_images if first is None else self._given(first)
+        volume, sample = self.normalisation.sieve(guess), self.normalisation.sample
         with self.equations.locked():
-            return self.equations.compare(self.normalisation.sieve(guess)).divergence
+            if not sample:
+                return self.equations.compare(volume).divergence
+            self.equations.begin()
+            for subset in sample:
+                self.equations.compare_subset(subset.camera, subset.lenses, volume)
+            return self.equations.measured().divergence
 
     def _given(self, first: np.ndarray) -> DeviceArray:
         """Return the caller's first guess, shape (z, y, x), on the device, without light that no camera sees."""
@@ -122,25 +141,26 @@ class PreparedInstant:
         partitions: Sequence[Partition],
         history: History,
         epochs: int,
+        brief: bool,
         progress: Callable[[float], None] | None,
     ) -> State:
         """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
-        history.append(
-            self.equations.compare(self.normalisation.sieve(state.coefficients))
-        )  # exact, as all steps begin here
-        resting = RestingVoxels(self.equations)
+        if not brief:  # exact, as all steps begin here
+            history.append(self.equations.compare(self.normalisation.sieve(state.coefficients)))
+        resting = None if brief else RestingVoxels(self.equations)
         for epoch in iterate_epochs(
             self.equations, state, self.normalisation.sieve, partitions=partitions, epochs=epochs, resting=resting
         ):
             state = epoch.state
-            if history.epochs:
+            if brief or history.epochs:
                 history.append(epoch.misfit)
             history.subsets.append(epoch.subsets)
             if progress is not None:
                 progress(history.epochs / (history.iterations + 1))
             if history.settled:
                 break
-        resting.wake()
+        if resting is not None:
+            resting.wake()
         return state
 
     def _solve_whole(

@@ -16,7 +16,7 @@ from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve, Smoothing
 from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
 from lfpiv.weights.operator import Weights
-from lfpiv_kernels.reconstruction.projector import ALL
+from lfpiv_kernels.reconstruction.projector import ALL, ODD
 from lfpiv_kernels.transfer import DeviceArray, to_device
 
 LEAST_COLUMN_SUM = 1e-6
@@ -67,6 +67,11 @@ class Normalisation:
     def has_subsets(self) -> bool:
         """Whether the rays are divided into subsets."""
         return len(self._subsets) > 1
+
+    @property
+    def sample(self) -> tuple[Subset, ...]:
+        """Subsets by which guesses are compared: of each camera one. None without subsets."""
+        return tuple(subset for subset in self._subsets if subset.lenses != ODD) if self.has_subsets else ()
 
     @cached_property
     def gains(self) -> dict[str, DeviceArray]:

@@ -31,15 +31,14 @@ import xarray as xr
 
 from lfpiv.reconstruction.fixed_lag import ITERATIONS as CORRECTIONS
 from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
+from lfpiv.reconstruction.flow import measure_flow
 from lfpiv.reconstruction.instant import PreparedInstant
 from lfpiv.reconstruction.motion import LEAST_VALID
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import MotionField
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.reconstruction.solver import SmartSolver
-from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation
-from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.velocity.settings import cut_windows
+from lfpiv.settings.processing import Correlation
 from lfpiv_kernels.correlation import deform
 
 PERSISTENCE = 0.9
@@ -58,14 +57,8 @@ FAINTEST = 1e-6
 LEAST_AGREEMENT = 0.9
 """Largest misfit of a prediction, as a share of the misfit of particles in other places."""
 
-WINDOWS = (*DEFAULT_WINDOWS[:-1], 8, 8)
-"""Windows in which the flow is measured where none are stated [voxel], cut to the volume. They are smaller than those
-of vectors: the motion within them is not resolved, and the scatter of few particles is averaged over the instants."""
-OVERLAP = 0.6
-"""Overlap of these windows."""
-
-Correlate = Callable[[xr.DataArray, xr.DataArray, Mapping[str, Any]], xr.Dataset]
-"""Takes two volumes and settings of `correlate`; returns the vectors between them."""
+MeasureFlow = Callable[[xr.DataArray, xr.DataArray, Mapping[str, Any], xr.Dataset | None], xr.Dataset]
+"""Takes two successive volumes, settings of `correlate` and the flow known before; returns the flow between them."""
 
 
 class Start(enum.Enum):
@@ -125,20 +118,20 @@ class SequenceSolver:
         Solver of each instant. One that starts from the instant before has `ITERATION_SHARE` of its iterations.
     correlation : mapping, optional
         Settings of `correlate`, which measures the flow; default: those of an experiment without such a table. Windows
-        that are None are `WINDOWS`.
-    correlate : callable, optional
-        Replaces `lfpiv.correlate`, for a caller that has the vectors already.
+        that are None are those of `lfpiv.reconstruction.flow`.
+    measure : callable, optional
+        Replaces `lfpiv.reconstruction.flow.measure_flow`, for a caller that knows the flow.
     """
 
     def __init__(
         self,
         smart: SmartSolver,
         correlation: Mapping[str, Any] | None = None,
-        correlate: Correlate | None = None,
+        measure: MeasureFlow = measure_flow,
     ):
         self.smart = smart
         self.correlation = Correlation().model_dump() if correlation is None else dict(correlation)
-        self._correlate = _correlate if correlate is None else correlate
+        self._measure = measure
 
     def solve(
         self,
@@ -160,26 +153,28 @@ class SequenceSolver:
         prepared = self.smart.prepare(images, floor=floor)
         flow, vectors = (None, None) if before is None else self._flow(before)
 
-        def solved(start: Start, share: float, first: np.ndarray | None = None, ratio: float = math.nan) -> Solved:
+        def solved(
+            start: Start, share: float, first: np.ndarray | None = None, *, brief: bool = False, ratio: float = math.nan
+        ) -> Solved:
             if share == 1:
                 found = prepared.solve(progress=progress)
             else:
                 count = math.ceil(share * self.smart.settings.iterations)
-                found = prepared.solve(iterations=count, whole_passes=0, first=first, progress=progress)
+                found = prepared.solve(iterations=count, whole_passes=0, first=first, brief=brief, progress=progress)
             return Solved(prepared=prepared, found=found, start=start, flow=flow, vectors=vectors, misfit_ratio=ratio)
 
         if before is None or flow is None:
             return solved(Start.FIRST, FIRST_SHARE)
         if roughness(flow) > ROUGHEST:
             return solved(Start.UNRESOLVED, 1)
-        plain = prepared.solve(iterations=0)
-        predicted = solved(Start.PREDICTED, ITERATION_SHARE, predicted_guess(before.volume, plain, flow))
-        misfit = predicted.found.misfit[0]
-        if not misfit < plain.misfit[0]:
-            chance = prepared.misfit(predicted_guess(_exchanged(before.volume), plain, flow))
+        plain = prepared.solve(iterations=0, brief=True)
+        guess = predicted_guess(before.volume, plain, flow)
+        misfit = prepared.sampled_misfit(guess)
+        if not misfit < prepared.sampled_misfit():
+            chance = prepared.sampled_misfit(predicted_guess(_exchanged(before.volume), plain, flow))
             if not misfit < LEAST_AGREEMENT * chance:
                 return solved(Start.MISSED, FIRST_SHARE, ratio=misfit / chance if chance > 0 else 1.0)
-        return predicted
+        return solved(Start.PREDICTED, ITERATION_SHARE, guess, brief=True)
 
     def correct(
         self, trail: Sequence[Solved], at: int, progress: Callable[[float], None] | None = None
@@ -211,18 +206,14 @@ class SequenceSolver:
         if flow is None or not others:
             return alone or own.prepared.solve(progress=progress)
         guess = agreed_guess(own.found, others, flow)
-        after = own.prepared.solve(iterations=CORRECTIONS, whole_passes=1, first=guess, progress=progress)
+        after = own.prepared.solve(iterations=CORRECTIONS, whole_passes=1, first=guess, brief=True, progress=progress)
         return own.found.continued_by(after)
 
     def _flow(self, before: Before) -> tuple[xr.Dataset | None, xr.Dataset | None]:
         """Return the displacement by which the next instant is predicted, and the last one measured, if known."""
         if before.earlier is None:
             return before.flow, None
-        settings = self.correlation
-        if settings.get("windows") is None:
-            windows = cut_windows(WINDOWS, before.measured.shape)
-            settings = {**settings, "windows": windows, "overlap": OVERLAP}
-        found = self._correlate(before.earlier, before.measured, settings)
+        found = self._measure(before.earlier, before.measured, self.correlation, before.flow)
         if found.attrs["valid_fraction"] < LEAST_VALID * found.attrs["measurable_fraction"]:
             return before.flow, None
         if before.flow is None:
@@ -252,12 +243,12 @@ def predicted_guess(volume: np.ndarray, plain: Reconstruction, flow: xr.Dataset)
     own, light = plain.volume, float(plain.volume.sum(dtype=np.float64))
     motion = MotionField(plain.to_dataarray(), flow)
     field = motion.displacement(-1)
-    moved = np.maximum(motion.carried(deform.spline_coefficients(volume), field), 0)
+    moved, inside = motion.carried(deform.spline_coefficients(volume), field)
+    np.maximum(moved, 0, out=moved)
     total = float(moved.sum(dtype=np.float64))
     if not (light > 0 and total > 0):
         return own
     moved = coefficients(moved, plain.sieve_voxel)
-    inside = np.clip(motion.carried(deform.spline_coefficients(np.ones_like(volume)), field), 0, 1)
     exponent = np.float32(PERSISTENCE) * motion.trust * np.where(inside > 0.5, inside, 0)
     moved = np.maximum(moved * np.float32(light / total), np.float32(DIMMEST * own.mean(dtype=np.float64)))
     guess: np.ndarray = np.where(own > 0, moved**exponent * np.maximum(own, FAINTEST * own.max()) ** (1 - exponent), 0)
@@ -274,7 +265,3 @@ def _within_reach(trail: Sequence[Solved], at: int, rough: float) -> dict[int, n
 def _exchanged(volume: np.ndarray) -> np.ndarray:
     """Return a volume (z, y, x) with its quarters exchanged along y and x: the same particles in other places."""
     return np.roll(volume, (volume.shape[1] // 2, volume.shape[2] // 2), (1, 2))
-
-
-def _correlate(first: xr.DataArray, second: xr.DataArray, settings: Mapping[str, Any]) -> xr.Dataset:
-    return correlate(first, second, dt_s=1.0, **settings)

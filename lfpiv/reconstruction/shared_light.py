@@ -16,6 +16,7 @@ from scipy import ndimage
 from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.validation import fill
 from lfpiv_kernels.correlation import deform
+from lfpiv_kernels.correlation.carry import carry
 
 SMOOTHING_VOXEL = 0.7
 """Standard deviation of the Gaussian that smooths both volumes before they are compared [voxel]: about the size of a
@@ -54,15 +55,13 @@ def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list
     values = [np.asarray(volume.values, np.float32) for volume in volumes]
     light = [float(value.sum(dtype=np.float64)) for value in values]
     coefficients = [deform.spline_coefficients(value) for value in values]
-    everywhere = deform.spline_coefficients(np.ones_like(values[0]))
     motion = MotionField(volumes[0], vectors)
     guesses = []
     for number, own in enumerate(values):
         field = motion.displacement(1 if number == 0 else -1)
-        partner = motion.carried(coefficients[1 - number], field)
+        partner, inside = motion.carried(coefficients[1 - number], field)
         partner *= np.float32(light[number] / light[1 - number])
-        trusted = motion.trust * np.clip(motion.carried(everywhere, field), 0, 1)
-        guess = own * _gain(own, np.maximum(partner, 0)) ** trusted
+        guess = own * _gain(own, np.maximum(partner, 0)) ** (motion.trust * inside)
         np.maximum(guess, FAINTEST * guess.max(), out=guess, where=own > 0)
         guesses.append(guess * np.float32(light[number] / guess.sum(dtype=np.float64)))
     return guesses
@@ -103,23 +102,25 @@ class MotionField:
         self.trust = trust.astype(np.float32)
         """1 among valid vectors, 0 among replaced ones, shape (z, y, x)."""
 
-    def displacement(self, sign: int) -> np.ndarray:
-        """Return the displacement of what is at the control points of one frame to the other frame; (3, z, y, x).
+    def displacement(self, steps: int) -> np.ndarray:
+        """Return the displacement of what is at the control points of a frame to another one; (3, z, y, x) [voxel].
 
-        `sign` is 1 from the first frame to the second, -1 back.
+        `steps` is 1 from the first frame to the second, -1 back, and any other number for a frame so many times as far.
         """
         points, spacing = self.midway.points, np.array(self.midway.spacing)[:, None, None, None]
-        start = np.stack(np.meshgrid(*points, indexing="ij")) - deform.OFFSET  # the kernel's field at x + OFFSET
-        middle = moved = np.moveaxis(self.midway.field.astype(float), -1, 0)
+        start = np.stack(np.meshgrid(*points, indexing="ij"))
+        middle = moved = np.moveaxis(steps * self.midway.field.astype(float), -1, 0)
         for _ in range(FOLLOWED):
-            halfway = (start + sign * moved / 2) / spacing
+            halfway = (start + moved / 2) / spacing
             moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in middle])
-        return sign * moved
+        return moved
 
-    def carried(self, coefficients: np.ndarray, field: np.ndarray) -> np.ndarray:
-        """Sample a volume, given by its spline coefficients, at x + field(x) for all voxels x; 0 outside."""
-        half = np.moveaxis(2 * (field - deform.OFFSET), 0, -1)  # the kernel samples at x + OFFSET + half / 2
-        return deform.deform_pair(coefficients, coefficients, half.astype(np.float32), self.midway.spacing)[1]
+    def carried(self, coefficients: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sample a volume, given by its spline coefficients, at x + field(x) for all voxels x.
+
+        Returns its light, 0 outside, and how far inside the volume the place is: 1 inside, 0 a voxel beyond it.
+        """
+        return carry(coefficients, np.moveaxis(field, 0, -1).astype(np.float32), self.midway.spacing)
 
 
 def _linear(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:

@@ -32,7 +32,7 @@ from lfpiv.runs import pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.instants import Instants, failure
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
-from lfpiv.runs.pair_vectors import LastVectors, measure_vectors, without_unmeasured
+from lfpiv.runs.pair_vectors import measure_vectors, without_unmeasured
 from lfpiv.runs.pair_volumes import Followed, Reconstructor, reconstruction_s
 from lfpiv.runs.particles import track
 from lfpiv.runs.sequences import SequentialInstants
@@ -164,13 +164,7 @@ class PairWork:
             weights=self.weights,
             guard=self.guard,
             refinement=self.refinement,
-            between=self.between,
         )
-
-    @cached_property
-    def between(self) -> LastVectors:
-        """Correlation along a sequence, which may need the same vectors as a result and to predict an instant."""
-        return LastVectors(self.experiment.dt_s)
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
@@ -328,12 +322,12 @@ class PairWork:
             If the images cannot be reconstructed.
         """
         first, second = (reconstructor or self.reconstructor).volumes(images, noise)
-        return measure_vectors(first, second, self.experiment, self.between)
+        return measure_vectors(first, second, self.experiment)
 
     def vectors_between(self, pair: int, volumes: PairVolumes) -> xr.Dataset:
         """Return the vectors of a pair, with the warnings about its images and with times [s] as attributes."""
         start = time.perf_counter()
-        vectors = without_unmeasured(measure_vectors(*volumes.volumes, self.experiment, self.between), volumes)
+        vectors = without_unmeasured(measure_vectors(*volumes.volumes, self.experiment), volumes)
         vectors.attrs["warnings"] = warn.to_text(volumes.warnings)
         vectors.attrs["reconstruction_s"] = reconstruction_s(self.experiment, pair, volumes)
         vectors.attrs["correlation_s"] = time.perf_counter() - start

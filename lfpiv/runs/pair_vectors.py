@@ -6,10 +6,6 @@ vectors are worth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import xarray as xr
 
@@ -23,35 +19,9 @@ NO_PARTICLES = "no particles in the images: none of the vectors counts"
 """Verdict on the vectors of a pair if the images of one frame show only noise."""
 
 
-@dataclass(eq=False)
-class LastVectors:
-    """Correlation of two volumes, which is not repeated if it was the last one."""
-
-    dt_s: float
-    """Time between the volumes [s]."""
-    _last: tuple[xr.DataArray, xr.DataArray, dict[str, Any], xr.Dataset] | None = None
-
-    def __call__(self, first: xr.DataArray, second: xr.DataArray, settings: Mapping[str, Any]) -> xr.Dataset:
-        """Return the vectors between two volumes; `settings` are those of `correlate`."""
-        known = self._last
-        if known is None or known[0] is not first or known[1] is not second or known[2] != settings:
-            known = first, second, dict(settings), correlate(first, second, dt_s=self.dt_s, **settings)
-            self._last = known
-        return known[3].copy()
-
-
-def measure_vectors(
-    first: xr.DataArray, second: xr.DataArray, experiment: Experiment, between: LastVectors
-) -> xr.Dataset:
-    """Correlate the volumes of two frames.
-
-    `between` correlates those of a sequence, where the second volume may follow from the same vectors.
-    """
-    settings = experiment.correlation.model_dump()
-    if experiment.in_sequence:
-        vectors = between(first, second, settings)
-    else:
-        vectors = correlate(first, second, dt_s=experiment.dt_s, **settings)
+def measure_vectors(first: xr.DataArray, second: xr.DataArray, experiment: Experiment) -> xr.Dataset:
+    """Correlate the volumes of two frames."""
+    vectors = correlate(first, second, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
     return _with_motion(vectors, (first, second))
 
 

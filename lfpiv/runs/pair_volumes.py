@@ -28,7 +28,6 @@ from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.runs.guard import with_guard
-from lfpiv.runs.pair_vectors import LastVectors
 from lfpiv.runs.refinement import refined
 from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation
 from lfpiv.velocity.settings import FIRST_SEARCH
@@ -65,8 +64,6 @@ class Reconstructor:
     """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
     refinement: float
     """Edge of a voxel of the experiment over that of the weights, which volumes are sampled from."""
-    between: LastVectors
-    """Correlation along a sequence."""
 
     @cached_property
     def solver(self) -> PairSolver:
@@ -99,7 +96,7 @@ class Reconstructor:
         """SMART along a series, made once."""
         farthest = self.experiment.correlation.max_displacement_voxel
         correlation = Correlation(max_displacement_voxel=farthest).model_dump()
-        return SequenceSolver(self.solver.smart, correlation, self.between)
+        return SequenceSolver(self.solver.smart, correlation)
 
     def pair(
         self, light: tuple[FrameLight, FrameLight], pair: int, progress: StepProgress

@@ -24,7 +24,6 @@ from lfpiv.reconstruction.intensity_cap import PEAK_SIGMA, typical_peak
 from lfpiv.report.preview import Level, Preview, draw
 from lfpiv.runs import guard, rig
 from lfpiv.runs.frame_light import FrameLight, pair_light, read_darks
-from lfpiv.runs.pair_vectors import LastVectors
 from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.runs.run import Run, open_run
 from lfpiv.weights.operator import Weights, build_weights
@@ -112,8 +111,7 @@ def _reconstruct(
     grid, form = guard.with_guard(coarse, layers).grid, _form(calibration.cameras)
     weights = build_weights(calibration, grid, form=form, progress=current.step("coarse weights"))
     current.progress("coarse volumes", 0.0)
-    between = LastVectors(coarse.dt_s)
-    work = Reconstructor(experiment=coarse, weights=weights, guard=layers, refinement=1.0, between=between)
+    work = Reconstructor(experiment=coarse, weights=weights, guard=layers, refinement=1.0)
     try:
         volumes = work.volumes([frame.images for frame in light], [frame.noise for frame in light])
     except ValueError as error:

@@ -17,26 +17,11 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import is_finite
-from lfpiv.velocity.coverage import Voxels
 from lfpiv.velocity.multi_pass import Pass, correlate_passes, peak_ratio
-from lfpiv.velocity.seeding import unseeded_voxels
+from lfpiv.velocity.prepared_pair import CheckedPair
 from lfpiv.velocity.settings import DEFAULTS, CorrelationSettings, triple, windows_of
-from lfpiv.velocity.standing_light import on_standing_light
 from lfpiv.velocity.systematic import image_residual, with_systematic
-from lfpiv.velocity.volume_pair import (
-    VoxelAxes,
-    missing_smoothing,
-    moves_beyond,
-    normalise,
-    numbers_of,
-    preprocess,
-    seen_by_two,
-    solid_voxels,
-    voxel_axes,
-    without,
-)
-from lfpiv_kernels.correlation.light import powered
-from lfpiv_kernels.correlation.memory import on_device
+from lfpiv.velocity.volume_pair import VoxelAxes, moves_beyond
 
 log = logging.getLogger(__name__)
 
@@ -172,15 +157,12 @@ def correlate(
     .. [1] B. Wieneke, "PIV uncertainty quantification from correlation statistics", Meas. Sci. Technol. 26 (2015)
        074002, doi:10.1088/0957-0233/26/7/074002.
     """
-    first, second = numbers_of(volume_a, "volume_a"), numbers_of(volume_b, "volume_b")
-    axes = voxel_axes(volume_a, volume_b, voxel_mm)
-    solid = solid_voxels(mask, volume_a, volume_b, axes)
-    first, second = normalise(first, "volume_a", solid), normalise(second, "volume_b", solid)
+    checked = CheckedPair.of(volume_a, volume_b, voxel_mm=voxel_mm, mask=mask)
+    axes, shape = checked.axes, triple(checked.values[0].shape)
     if dt_s is not None and not (is_finite(dt_s) and dt_s > 0):
         raise ValueError(f"dt_s: expected a positive time [s], got {dt_s!r}.")
     if dt_s is not None and axes.spacing_mm is None:
         raise ValueError("dt_s: velocities of arrays need the voxel edge too: state voxel_mm [mm], or leave dt_s out.")
-    shape = triple(first.shape)
     settings = CorrelationSettings(
         windows=windows_of(windows, shape),
         overlap=overlap,
@@ -189,24 +171,15 @@ def correlate(
         intensity_power=intensity_power,
     )
     first_search = settings.first_search(shape)
-    seen = seen_by_two(volume_a, volume_b)
-    voxels = Voxels(seen=seen, solid=solid, unseeded=unseeded_voxels((first, second), without(solid, seen)))
-    missing = missing_smoothing(smoothing_voxel, volume_a, volume_b)
-    one, other = (preprocess(on_device(volume), missing, intensity_power) for volume in (first, second))
-    last, figures = correlate_passes(one, other, settings, voxels)
-    lights = powered(one, 1 / intensity_power), powered(other, 1 / intensity_power)
-    standing = on_standing_light(*lights, last.given.windows, last.field, last.valid)
-    if standing.any():
-        log.warning(
-            "correlation: light brighter than particles stays in place in %d windows: their vectors are not valid",
-            standing.sum(),
-        )
-        last = last.without(standing)
+    pair = checked.prepared(settings)
+    voxels = pair.voxels
+    last, figures = correlate_passes(pair.first, pair.second, settings, voxels)
+    last = pair.without_standing_light(last)
     measurable = last.coverage.measurable
     share = float(last.valid[measurable].mean()) if measurable.any() else 0.0
     verdict = Verdict.GOOD if share >= GOOD_SHARE else Verdict.POOR if share >= POOR_SHARE else Verdict.FAILED
     if verdict is not Verdict.GOOD:
-        if moves_beyond(one, other, first_search):
+        if moves_beyond(pair.first, pair.second, first_search):
             verdict = Verdict.TOO_FAR
         log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
     if voxels.unseeded is not None:

@@ -194,6 +194,29 @@ def correlate_passes(
     return result, tuple(figures)
 
 
+def correlate_known(
+    first: Values, second: Values, settings: CorrelationSettings, voxels: Voxels, known: Predictor
+) -> Pass:
+    """Correlate two volumes in one pass in the last window of the settings, near a displacement that is known.
+
+    Parameters
+    ----------
+    first, second, settings, voxels
+        As of `correlate_passes`. The overlap is that of the last pass.
+    known : Predictor
+        Displacement by which the volumes are deformed. Lags up to `refine_search` around it are searched.
+
+    Returns
+    -------
+    Pass
+        The only pass.
+    """
+    window = settings.windows[-1]
+    pair = UndeformedPair((on_device(first), on_device(second)), voxels.solid_on_device)
+    given = _deform_by(known, pair, window, settings.overlap, peak_reach(*pair.volumes, window))
+    return _correlate_pass(given, voxels.coverage(given.windows, window, predicts=False), symmetric=True)
+
+
 @dataclass(frozen=True)
 class UndeformedPair:
     """The two volumes before any deformation, and the voxels that hold no fluid."""
@@ -233,17 +256,22 @@ class UndeformedPair:
 def _deform(pair: UndeformedPair, before: Pass, window: Triple, overlap: float) -> PassInput:
     """Deform both volumes by the field of the pass before, and lay out the windows of the next one."""
     shape = triple(before.given.volumes[0].shape)
-    windows = Windows.overlapping(shape, window, overlap)
     predictor = Predictor.between(before.given.centres, before.next_guess, shape)
+    return _deform_by(predictor, pair, window, overlap, before.given.reach)
+
+
+def _deform_by(predictor: Predictor, pair: UndeformedPair, window: Triple, overlap: float, reach: int) -> PassInput:
+    """Deform both volumes by a predicted field, and lay out the windows of the next pass."""
+    windows = Windows.overlapping(predictor.shape, window, overlap)
     volumes, fluid = pair.deformed(predictor, window)
     return PassInput(
         windows=windows,
         overlap=overlap,
         centres=[centre + deform.OFFSET for centre in windows.centres],
-        search=refine_search(before.given.reach),
+        search=refine_search(reach),
         volumes=volumes,
         fluid=fluid,
-        reach=before.given.reach,
+        reach=reach,
         predicted=predictor.window_means(windows),
     )
 

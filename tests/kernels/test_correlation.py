@@ -10,6 +10,7 @@ from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, unifor
 from lfpiv_kernels import runtime
 from lfpiv_kernels.correlation import (
     box_sum,
+    carry,
     correlate,
     deform,
     neighbours,
@@ -20,6 +21,7 @@ from lfpiv_kernels.correlation import (
 pytestmark = pytest.mark.usefixtures("device")
 
 TOLERANCE_SUM = 2e-5  # float32 sums of up to 4096 products and their square root: 4096 ** 0.5 * 1.2e-7, rounded up
+TOLERANCE_PLACE = 1e-5  # places up to 20 voxels, float32
 TOLERANCE_SPLINE = 1e-5  # 64 float32 products, coefficients up to 2.5 times the values
 TOLERANCE_MEDIAN = 1e-6  # order statistics of float32 values near 1
 
@@ -218,6 +220,23 @@ def test_deformation_samples_the_spline():
         wide = np.pad(volume.astype(float), 20)  # zero outside
         expected = scipy.ndimage.map_coordinates(wide, place + sign * shift + 20, order=3)
         np.testing.assert_allclose(result[inside], expected[inside], atol=TOLERANCE_SPLINE)
+
+
+def test_a_carried_volume_is_the_spline_at_the_displaced_places():
+    rng = np.random.default_rng(5)
+    volume = rng.random((14, 17, 19), dtype=np.float32)
+    field = rng.normal(0, 1, (3, 4, 5, 3)).astype(np.float32)
+    spacing = (13 / 2, 16 / 3, 18 / 4)  # the last control points lie on the last voxels
+    carried, inside = carry.carry(deform.spline_coefficients(volume), field, spacing)
+    voxels = np.stack(np.meshgrid(*map(np.arange, volume.shape), indexing="ij")).astype(float)
+    cell = voxels / np.reshape(spacing, (3, 1, 1, 1))
+    place = voxels + [scipy.ndimage.map_coordinates(field[..., k], cell, order=1) for k in range(3)]
+    wide = np.pad(volume.astype(float), 20)  # zero outside
+    np.testing.assert_allclose(carried, scipy.ndimage.map_coordinates(wide, place + 20, order=3), atol=TOLERANCE_SPLINE)
+    beyond = np.maximum(-place, place - np.reshape(volume.shape, (3, 1, 1, 1)) + 1)
+    expected = np.prod(1 - np.clip(beyond, 0, 1), axis=0)
+    assert 0 < (expected == 0).mean() < 0.5 and (expected == 1).any()
+    np.testing.assert_allclose(inside, expected, atol=TOLERANCE_PLACE)
 
 
 def predictions_twin(field, keep):

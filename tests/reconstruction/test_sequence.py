@@ -92,7 +92,7 @@ def along(solver, images):
 
 def test_volumes_gain_by_fewer_iterations_if_the_flow_is_known(solver, series):
     positions, images, _ = series
-    exact = SequenceSolver(solver.smart, CORRELATION, lambda first, second, settings: vectors_of(FLOW))
+    exact = SequenceSolver(solver.smart, CORRELATION, lambda first, second, settings, known: vectors_of(FLOW))
     done, _ = along(exact, images)
     assert [one.start for one in done] == [Start.FIRST] * 2 + [Start.PREDICTED] * (INSTANTS - 2)
     most = np.ceil(sequence.ITERATION_SHARE * ITERATIONS)
@@ -117,7 +117,7 @@ def test_a_flow_that_is_not_resolved_moves_nothing(solver, series):
     rough = vectors_of(FLOW)
     bumps = (-1.0) ** np.arange(rough.sizes["x"]) * sequence.ROUGHEST
     rough = rough.assign({f"displacement_{axis}": rough[f"displacement_{axis}"] + bumps for axis in "xyz"})
-    unresolved = SequenceSolver(solver.smart, CORRELATION, lambda first, second, settings: rough)
+    unresolved = SequenceSolver(solver.smart, CORRELATION, lambda first, second, settings, known: rough)
     done, _ = along(unresolved, images[:3])
     assert done[2].start is Start.UNRESOLVED
     expected = solver.smart.solve(images[2]).volume
@@ -198,14 +198,15 @@ def test_the_flow_is_a_mean_over_time(solver, series):
     known = found.assign({f"displacement_{axis}": found[f"displacement_{axis}"] + 1 for axis in "zyx"})
     given = []
 
-    def correlate(first, second, settings):
-        given.append((first, second, settings))
+    def measure(*arguments):
+        given.append(arguments)
         return found
 
-    averaging = SequenceSolver(solver.smart, CORRELATION, correlate)
+    averaging = SequenceSolver(solver.smart, CORRELATION, measure)
     images = series[1][2]
     before = Before(volume=volumes[1].values, measured=volumes[1], earlier=volumes[0], flow=known)
     solved = averaging.solve(images, before)
     shift = solved.flow["displacement_x"] - found["displacement_x"]
     assert np.allclose(shift, sequence.FLOW_MEMORY, atol=1e-5)
-    assert given[0][0] is volumes[0] and given[0][1] is volumes[1] and given[0][2] == CORRELATION
+    assert given[0][0] is volumes[0] and given[0][1] is volumes[1]
+    assert given[0][2] == CORRELATION and given[0][3] is known

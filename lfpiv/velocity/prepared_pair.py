@@ -1,0 +1,90 @@
+"""`PreparedPair`: two volumes checked, normalised and smoothed for correlation, and what their voxels hold."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.velocity.coverage import Voxels
+from lfpiv.velocity.multi_pass import Pass
+from lfpiv.velocity.seeding import unseeded_voxels
+from lfpiv.velocity.settings import CorrelationSettings
+from lfpiv.velocity.standing_light import on_standing_light
+from lfpiv.velocity.volume_pair import (
+    VoxelAxes,
+    missing_smoothing,
+    normalise,
+    numbers_of,
+    preprocess,
+    seen_by_two,
+    solid_voxels,
+    voxel_axes,
+    without,
+)
+from lfpiv_kernels.correlation.light import powered
+from lfpiv_kernels.correlation.memory import on_device
+from lfpiv_kernels.transfer import DeviceArray
+
+log = logging.getLogger(__name__)
+
+Volume = xr.DataArray | np.ndarray
+"""Intensities, shape (z, y, x), finite, of any sign."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckedPair:
+    """Two volumes as `lfpiv.correlate` takes them, checked and without background."""
+
+    given: tuple[Volume, Volume]
+    axes: VoxelAxes
+    solid: np.ndarray | None
+    """True for voxels without fluid, shape (z, y, x); None without a mask."""
+    values: tuple[np.ndarray, np.ndarray]
+    """Intensities without background, shape (z, y, x), float32."""
+
+    @classmethod
+    def of(
+        cls, first: Volume, second: Volume, *, voxel_mm: float | None = None, mask: Volume | None = None
+    ) -> CheckedPair:
+        """Check two volumes; arguments and exceptions as of `lfpiv.correlate`."""
+        one, other = numbers_of(first, "volume_a"), numbers_of(second, "volume_b")
+        axes = voxel_axes(first, second, voxel_mm)
+        solid = solid_voxels(mask, first, second, axes)
+        values = normalise(one, "volume_a", solid), normalise(other, "volume_b", solid)
+        return cls(given=(first, second), axes=axes, solid=solid, values=values)
+
+    def prepared(self, settings: CorrelationSettings) -> PreparedPair:
+        """Smooth the volumes, and find what their voxels hold."""
+        seen = seen_by_two(*self.given)
+        unseeded = unseeded_voxels(self.values, without(self.solid, seen))
+        missing, power = missing_smoothing(settings.smoothing_voxel, *self.given), settings.intensity_power
+        first, second = (preprocess(on_device(volume), missing, power) for volume in self.values)
+        voxels = Voxels(seen=seen, solid=self.solid, unseeded=unseeded)
+        return PreparedPair(first=first, second=second, voxels=voxels, settings=settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedPair:
+    """Two volumes ready for correlation."""
+
+    first: DeviceArray
+    """Shape (z, y, x), on the device."""
+    second: DeviceArray
+    voxels: Voxels
+    settings: CorrelationSettings
+
+    def without_standing_light(self, last: Pass) -> Pass:
+        """Return the last pass without the vectors of windows in which light brighter than particles stays in place."""
+        power = 1 / self.settings.intensity_power
+        lights = powered(self.first, power), powered(self.second, power)
+        standing = on_standing_light(*lights, last.given.windows, last.field, last.valid)
+        if not standing.any():
+            return last
+        log.warning(
+            "correlation: light brighter than particles stays in place in %d windows: their vectors are not valid",
+            standing.sum(),
+        )
+        return last.without(standing)
