@@ -17,6 +17,7 @@ EVERY_PASS = {
     ("depth_planes_gpu", "_collect"),
     ("depth_planes_gpu", "_spread"),
     ("filters_gpu", "_filter"),
+    ("line_shares_gpu", "_share"),
     ("peaks", "_find_peaks"),
     ("pixel_rays_gpu", "_collect"),
     ("pixel_rays_gpu", "_compare"),
