@@ -3,8 +3,8 @@
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.lanes import LANES, lanes_of_warp
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.lanes import LANES, lanes_of_warp
 from lfpiv_kernels.reconstruction.line_layout import LineMap
 
 wp.set_module_options(native.options("line_shares_gpu.h", contract="fast"))
