@@ -80,8 +80,9 @@ def test_a_pass_copies_what_it_reads_of_the_slabs_that_do_not_stay(form, small_s
     slabs = StreamedProjector(blocks, 3 * small_slabs(blocks))
     ones = to_device(np.ones(VOXELS, np.float32), float)
     for expected, work in zip(slabs.pass_bytes, (slabs.scatter, lambda v, s: slabs.gather(v, ones, s)), strict=True):
+        volume = to_device(np.ones(VOXELS, np.float32), float)
         with count_transfers() as counted:
-            work(to_device(np.ones(VOXELS, np.float32), float), ALL)
+            work(volume, ALL)
         assert len(counted.to_device) == slabs.count - slabs.resident
         assert sum(counted.to_device) == expected < slabs.host_bytes
         assert counted.to_host == []
