@@ -69,6 +69,9 @@ class Device:
         return "cuda:0" if self.kind == "cuda" else "cpu"
 
 
+TAICHI_SHARE = 512
+"""Least number of a loop's turns that Taichi gives to a CPU thread. A shorter loop runs on one thread."""
+
 _device: Device | None = None
 _pool: ThreadPoolExecutor | None = None
 _taichi_folder: Path | None = None  # for the kernels of Taichi, if it held none at the start

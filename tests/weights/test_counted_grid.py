@@ -1,6 +1,7 @@
 """Counted weights of a grid: kernel against its twin, noise, threads, batches, and a count that was killed."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -159,6 +160,32 @@ def test_counts_do_not_depend_on_threads_lanes_batches_or_room(monkeypatch):
             patch.setattr(counted_blocks, "CHUNK_VOXELS", 4)
             patch.setattr(counted_blocks, "FIRST_ROOM", (1, 1))
             assert same(count(camera, rays=1024), expected)
+
+
+def busy_threads(run):
+    """Return how many threads of this process worked at least a quarter as long as the one that worked longest."""
+
+    def work():
+        tasks = Path("/proc/self/task").iterdir()
+        return {task.name: int((task / "schedstat").read_text().split()[0]) for task in tasks}  # [ns]
+
+    before = work()
+    run()
+    shares = np.array([spent - before.get(thread, 0) for thread, spent in work().items()])
+    return int((shares >= 0.25 * shares.max()).sum())
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the system does not tell the work of a thread")
+def test_every_thread_counts():
+    """A loop of few turns runs on one of Taichi's threads: see `runtime.TAICHI_SHARE`."""
+    device = runtime.device_of_taichi()
+    if device.kind != "cpu" or device.form == "gpu" or device.threads < 2:
+        pytest.skip("the kernel has no threads of the processor to share its voxels")
+    camera = RIGS["square"]
+    models = ray_models(camera, np.tile(centre_of(camera, "in focus"), (50, 1)), VOXEL_MM, degree=3)
+    counter, _ = counter_of(camera, counted_blocks.MOST_RAYS)
+    list(counter.compute(models[:1]))  # compile
+    assert busy_threads(lambda: list(counter.compute(models))) >= min(device.threads, len(models) // 2)
 
 
 def test_a_killed_count_goes_on_at_its_last_finished_batch(monkeypatch, tmp_path):
