@@ -56,7 +56,7 @@ def followed(
 ) -> Followed:
     """Follow the particles over all instants."""
     size = float(np.median([table.attrs["sigma_voxel"] for table in tables]))
-    sized = ParticleSearch(search.weights, search.grid, sigma_voxel=size, rounds=search.rounds, weakest=search.weakest)
+    sized = replace(search, sigma_voxel=size)
     cameras = len(search.weights.cameras)
 
     def look(instant: int, positions: np.ndarray, light: np.ndarray) -> FoundParticles:

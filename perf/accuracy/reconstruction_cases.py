@@ -46,9 +46,8 @@ RAYS = 16_384
 """Rays per particle."""
 WHITE_RAYS, WHITE_COUNTS = 256, 3000.0
 FLOWS = ("ring", "swirl", "shear", "uniform", "turbulent")
-TRACERS = "dns"
+TRACERS, TRACERS_MM = "dns", 8.0
 """Flow of a series, not of a pair, that moves tracers of the sample data, and the edge of their cube [mm]."""
-TRACERS_MM = 8.0
 TRACERS_FILE = Path(__file__).resolve().parents[3] / "shared" / "data" / "dns-tracers" / "rayleigh_benard_series.npz"
 IMAGES_FORM = 1
 """Raised when the same case is recorded otherwise, so that stored images are made anew."""
