@@ -194,13 +194,23 @@ def smooth(motion: Motion, measured: Measured) -> State:
     smoothed = [filtered[-1]]
     for place in range(count - 1, 0, -1):
         before, ahead, later = filtered[place - 1], predicted[place - 1], smoothed[-1]
-        moved, _ = motion.steps(measured.time[:, place] - measured.time[:, place - 1])
-        gain = before.variance @ moved.swapaxes(2, 3) @ np.linalg.pinv(ahead.variance, hermitian=True)
+        moved, added = motion.steps(measured.time[:, place] - measured.time[:, place - 1])
+        gain = before.variance @ moved.swapaxes(2, 3) @ _inverse(ahead.variance)
         mean = before.mean + np.einsum("taij,taj->tai", gain, later.mean - ahead.mean)
-        variance = before.variance + gain @ (later.variance - ahead.variance) @ gain.swapaxes(2, 3)
+        kept = np.eye(3) - gain @ moved
+        variance = kept @ before.variance @ kept.swapaxes(2, 3)  # Joseph's form: no difference, so none below 0
+        variance += gain @ (later.variance + added) @ gain.swapaxes(2, 3)
         smoothed.append(later.where(there[:, place], State(mean, variance)))
     smoothed.reverse()
     return State(np.stack([one.mean for one in smoothed], 1), np.stack([one.variance for one in smoothed], 1))
+
+
+def _inverse(variance: np.ndarray) -> np.ndarray:
+    """Return the inverse of covariances (..., 3, 3) by way of their correlations, whose condition is better."""
+    scale = np.sqrt(np.einsum("...ii->...i", variance))
+    product = scale[..., :, None] * scale[..., None, :]
+    inverse: np.ndarray = np.linalg.pinv(variance / product, hermitian=True) / product
+    return inverse
 
 
 def unlikeliness(motion: Motion, measured: Measured) -> np.ndarray:

@@ -16,6 +16,8 @@ from lfpiv.tracking.trajectory import (
 MOTION = Motion((0.2, 0.1, 0.3), (4.0, 2.0, 8.0), (1.0, 1.5, 2.0))
 ROUNDING = 1e-7
 """Of a Kalman smoother with a diffuse beginning, relative to the dense solution."""
+STEADY = 1e-3
+"""Of variances where a matrix of condition 1e10 is inverted, relative."""
 SIGMAS = 4.0
 """Standard errors of a mean within which it must lie, for fixed seeds."""
 
@@ -75,6 +77,18 @@ def test_the_smoother_gives_the_dense_solution_with_gaps_and_short_tracks():
                 block = covariance[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
                 assert found.mean[track, place, axis] == pytest.approx(mean[place], rel=ROUNDING, abs=ROUNDING)
                 assert np.allclose(found.variance[track, place, axis], block, rtol=1e4 * ROUNDING, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("error", [1e-3, 0.03])
+def test_standard_errors_of_particles_that_hardly_accelerate_are_those_of_the_dense_solution(error):
+    """Their variances differ from those of an unknown velocity by ten orders: differences of such would be below 0."""
+    steady = Motion((1e-4,) * 3, (1.0, 5.0, 30.0))
+    measured, _ = simulated(20, 6, steady, error)
+    found = np.einsum("tpaii->tpai", smooth(steady, measured).variance)
+    for axis in range(3):
+        _, covariance = dense(steady, measured, 0, axis)
+        expected = np.broadcast_to(np.diag(covariance).reshape(6, 3), (20, 6, 3))
+        assert found[:, :, axis] == pytest.approx(expected, rel=STEADY)
 
 
 def test_standard_errors_are_the_scatter():
