@@ -72,14 +72,8 @@ def whole(out):
     return left <= results | kept and not (out / ".shared").exists()
 
 
-@pytest.fixture
-def no_report(monkeypatch):
-    """Leave the report out where it is not what is tested: it takes longer than the rest."""
-    monkeypatch.setattr("lfpiv.report.write_report", lambda *arguments: None)
-
-
 @pytest.mark.slow
-def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path, no_report):
+def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path):
     """Kill -9 with two workers at work: they die too, nothing is half-written, and one process does the rest."""
     out = small_run.calibrated(tmp_path / "out")
     run = start("run", small_run.experiment, "--out", out, "--workers", 2)
@@ -167,7 +161,7 @@ def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_ru
 
 
 @pytest.mark.slow
-def test_a_lost_scheduler_ends_the_run_with_one_message(small_run, tmp_path, cluster, no_report):
+def test_a_lost_scheduler_ends_the_run_with_one_message(small_run, tmp_path, cluster):
     """Kill -9: status 1, all files whole, and the same command goes on, here without the cluster."""
     address, scheduler, start_worker = cluster
     out, worker = small_run.calibrated(tmp_path / "out"), start_worker()
@@ -289,7 +283,7 @@ with Folder(Path(sys.argv[1])).held():
 """
 
 
-def test_a_second_run_on_one_folder_is_refused(small_run, tmp_path, capfd, no_report):
+def test_a_second_run_on_one_folder_is_refused(small_run, tmp_path, capfd):
     """It names who holds the folder; a report may be made meanwhile; kill -9 leaves no stale lock."""
     out = small_run.results(tmp_path / "out")
     holder = subprocess.Popen([sys.executable, "-c", HOLDER, out], stdout=subprocess.PIPE, text=True)
@@ -309,7 +303,7 @@ def test_a_second_run_on_one_folder_is_refused(small_run, tmp_path, capfd, no_re
     assert not (out / ".lock").exists()
 
 
-def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatch, no_report):
+def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatch):
     """Missing, of another shape, not finite, gone when its turn comes; the first pair must be whole."""
     import numpy as np
     import tifffile
@@ -340,7 +334,7 @@ def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatc
 
 
 @pytest.mark.slow
-def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(small_run, tmp_path, capfd, no_report):
+def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(small_run, tmp_path, capfd):
     """Each status tells of its own invocation; results of other images than there are now are put aside."""
     experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
     spoilt = next((tmp_path / "data").rglob("*0002*"))
@@ -376,7 +370,7 @@ def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(sm
 
 
 @pytest.mark.slow
-def test_a_run_that_goes_on_does_not_end_at_the_first_damaged_pair(small_run, tmp_path, capfd, no_report):
+def test_a_run_that_goes_on_does_not_end_at_the_first_damaged_pair(small_run, tmp_path, capfd):
     """Stopped after pair 0; pair 1 is damaged, and its volumes are not needed where its images are gone."""
     experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
     for pair in (1, 2, 3):
@@ -397,7 +391,7 @@ def test_a_bad_image_of_the_calibration_is_bad_input(small_run, tmp_path, capfd)
     assert Path(plane).name in capfd.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_more_pairs_than_there_are_images_are_refused_before_any_work(small_run, tmp_path, capfd, no_report):
+def test_more_pairs_than_there_are_images_are_refused_before_any_work(small_run, tmp_path, capfd):
     """A selection of those that are there is done, with a warning of the others."""
     experiment, out = small_run.images(tmp_path / "data"), tmp_path / "out"
     experiment.write_text(experiment.read_text().replace(f"pairs = {PAIRS}", f"pairs = {PAIRS + 3}"))

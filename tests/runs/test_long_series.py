@@ -159,6 +159,7 @@ def test_a_long_experiment_starts_with_its_first_pairs(tiny_experiment, tmp_path
     assert 0 < len(asked) <= 100 and length_hint(todo) == MANY - 1 and peak < BYTES_PER_PAIR * MANY
 
 
+@pytest.mark.whole_report
 def test_a_summary_of_many_pairs_lists_some_and_names_the_file_of_all(small_run, tmp_path, monkeypatch):
     out = small_run.results(tmp_path / "out")
     monkeypatch.setattr(summary, "MOST_LISTED", 2)

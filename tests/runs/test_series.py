@@ -17,7 +17,6 @@ from support.series_run import FIRST, chained, changed, in_processes, make_work,
 from support.small_run import PAIRS, damage, same_vectors
 from xarray.testing import assert_equal
 
-import lfpiv
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, Frame
@@ -305,9 +304,8 @@ def test_a_background_image_of_a_series_is_one(small_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_runs_a_series_in_two_processes(small_run, tmp_path, capfd, monkeypatch):
+def test_the_command_runs_a_series_in_two_processes(small_run, tmp_path, capfd):
     """From images to summary; a bad instant, its mending, and what is printed, in the words of a series."""
-    monkeypatch.setattr(lfpiv.report, "write_report", lambda *arguments: None)
     file, out = write_series(small_run, tmp_path / "data"), small_run.calibrated(tmp_path / "out")
     file.write_text(file.read_text().replace(f"instants = {2 * PAIRS}", f"instants = {INSTANTS}"))
     spoilt = file.parent / f"run/right/{FIRST + 3:05d}.tif"
