@@ -47,13 +47,15 @@ def limits() -> dict[str, float | str]:
 
 
 def predicted_times(cases: Sequence[str]) -> dict[str, float | None]:
-    """Return the times [s] that ``gpu_model`` predicts; None for cases of which there is no model.
+    """Return the times [s] that ``gpu_model`` predicts; None for cases of which there is no model, or where it fails.
 
     The model runs the kernels on the processor, so it has a process of its own that sees no GPU.
     """
     command = [sys.executable, str(ROOT / "perf/gpu_model.py"), "--cases", *cases]
-    done = subprocess.run(command, env=os.environ | {"CUDA_VISIBLE_DEVICES": ""}, stdout=subprocess.PIPE, check=True)
-    times: dict[str, float | None] = json.loads(done.stdout)
+    done = subprocess.run(command, env=os.environ | {"CUDA_VISIBLE_DEVICES": ""}, stdout=subprocess.PIPE, text=True)
+    times: dict[str, float | None] = dict.fromkeys(cases)
+    for line in done.stdout.splitlines():
+        times |= json.loads(line)
     return times
 
 

@@ -43,29 +43,18 @@ ARCHITECTURES = (75, 80, 90, 100)
 """Compute capabilities. The compiler in Warp no longer knows 7.0."""
 AT_ONCE = 2
 """Architectures that are compiled side by side, each by a process of some 1 GiB."""
-CPU_ONLY = {
-    "blocks": ("_split", "_correlate_blocks", "_gather_blocks"),
-    "blur": ("_blur",),
-    "box_sum": ("_box_sum",),
-    "deform": ("_deform_pair",),
-    "depth_planes": ("_spread", "_collect"),
-    "footprint": ("_fill_blocks", "_pack_blocks"),
-    "neighbours": ("_predict",),
-    "particle_normal": ("_multiply_images",),
-    "pixel_rays": ("_collect", "_spread", "_number_pixels", "_sort_rays"),
-    "planes": ("_transform_planes",),
-    "projector": ("_project", "_back_project", "_count_lit"),
-    "projector_gpu": ("_count_entries", "_write_entries"),
-    "spectra": ("_correlate_spectra",),
-    "update": ("_compare",),
-    "windows": ("_sum_planes", "_window_statistics"),
-}
-"""Kernels by module that a GPU never runs: it has other kernels in their place."""
 CPU_MODULES = (
     "blocks", "blur", "box_sum", "deform", "depth_planes", "neighbours", "pixel_rays", "planes", "projector", "spectra",
     "windows",
 )  # fmt: skip
 """Modules without a kernel for a GPU; their headers need not compile for one."""
+CPU_ONLY = {
+    "footprint": ("_fill_blocks", "_pack_blocks"),
+    "particle_normal": ("_multiply_images",),
+    "projector_gpu": ("_count_entries", "_write_entries"),
+    "update": ("_compare",),
+}
+"""Kernels of the other modules that a GPU never runs: it has other kernels in their place."""
 
 
 @dataclass(frozen=True)

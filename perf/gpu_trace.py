@@ -1,9 +1,9 @@
 """Run Warp kernels written for a GPU on the processor, and note which of their arrays' memory they read and write.
 
 `Tracer` compiles kernel modules so that the compiler calls a function before each load and store (``traced.h``), and
-takes the place of ``wp.launch``: host code runs as on a GPU, each kernel on all of its threads, and a sample of the
-blocks of threads is noted. Loads that the compiler saves by keeping values in registers are not noted, as on a GPU.
-Accesses of a warp are one instruction if they come from the same place of the code, each lane's for the same time.
+takes the place of ``wp.launch``: host code runs as on a GPU, and a sample of the blocks of threads is noted. Loads that
+the compiler saves by keeping values in registers are not noted, as on a GPU. Accesses of a warp are one instruction if
+they come from the same place of the code, each lane's for the same time.
 """
 
 from __future__ import annotations
@@ -31,10 +31,14 @@ FLAGS = (
 """Options of the compiler: an access at a time, all threads by the same instructions, and a call before each access."""
 THREADS_OF_BLOCK = 256
 """Warp's default."""
-BLOCKS = 12
+BLOCKS = 32
 """Blocks of threads that are noted of a launch, about."""
-EVENTS = 1 << 22
+EVENTS = 1 << 23
 """Accesses of a launch that are noted at most."""
+GOLDEN, MOST = np.uint64(2654435769), (1 << 32) - 1
+"""By which blocks of threads are chosen, see ``is_noted`` of ``traced.h``."""
+PLACE_BITS = 40
+"""Array k of a launch lies at (k + 1) 2^`PLACE_BITS`."""
 ALIGNMENT = 256
 """Multiple of bytes at which memory of a GPU begins."""
 
@@ -52,15 +56,18 @@ class Accesses:
     warps: int
     """Of the launch."""
     warps_of_block: int
-    nbytes: int
-    """Of all arrays of the launch."""
+    nbytes: np.ndarray
+    """Of each of the launch's arrays, shape (array,), int64."""
 
 
+# Modules keep the kernels that begin and end notes when they are compiled without ``traced.h`` again.
 @wp.func_native("""
+#if defined(LFPIV_TRACED_H)
     traced::events = events.data, traced::capacity = events.shape[0] / 2, traced::used = traced::exchanges = 0;
     traced::ranges = (const traced::Range*)ranges.data, traced::range_count = ranges.shape[0] / 3;
     traced::tasks_of_block = tasks_of_block, traced::tasks_of_warp = tasks_of_warp, traced::apart = apart;
-    traced::thinned = thinned;
+    traced::thinned = thinned, traced::whole = whole;
+#endif
 """)
 def _set(
     events: wp.array(dtype=wp.uint64),
@@ -69,10 +76,15 @@ def _set(
     tasks_of_warp: int,
     apart: int,
     thinned: int,
+    whole: bool,
 ): ...
 
 
-@wp.func_native("found_out.data[0] = traced::used, found_out.data[1] = traced::exchanges, traced::noted = false;")
+@wp.func_native("""
+#if defined(LFPIV_TRACED_H)
+    found_out.data[0] = traced::used, found_out.data[1] = traced::exchanges, traced::noted = false;
+#endif
+""")
 def _get(found_out: wp.array(dtype=wp.int64)): ...
 
 
@@ -84,8 +96,9 @@ def _begin_notes(
     tasks_of_warp: int,
     apart: int,
     thinned: int,
+    whole: bool,
 ):
-    _set(events, ranges, tasks_of_block, tasks_of_warp, apart, thinned)
+    _set(events, ranges, tasks_of_block, tasks_of_warp, apart, thinned, whole)
 
 
 def _end_notes(
@@ -95,13 +108,14 @@ def _end_notes(
     _get(found_out)
 
 
-def _arrays(values: Sequence[object]) -> Iterator[wp.array]:
-    """Yield the arrays of arguments and of their structures."""
+def _members(values: Sequence[object]) -> Iterator[object]:
+    """Yield arguments, and of structures their members."""
     for value in values:
-        if isinstance(value, wp.array):
+        names = getattr(getattr(value, "_cls", None), "vars", None)
+        if names is None:
             yield value
         else:
-            yield from _arrays([getattr(value, name) for name in getattr(getattr(value, "_cls", None), "vars", ())])
+            yield from _members([getattr(value, name) for name in names])
 
 
 def _ranges(arrays: Sequence[wp.array]) -> np.ndarray:
@@ -120,10 +134,20 @@ def _ranges(arrays: Sequence[wp.array]) -> np.ndarray:
             ranges[-1][1] = max(ranges[-1][1], end)
         else:
             ranges.append([begin, end, root])
-    return np.array(
-        [(begin, end, (1 + k << 40) + (begin - root) % ALIGNMENT) for k, (begin, end, root) in enumerate(ranges)],
-        np.uint64,
-    ).reshape(-1, 3)
+    places = [(1 + k << PLACE_BITS) + (begin - root) % ALIGNMENT for k, (begin, _, root) in enumerate(ranges)]
+    bounds = [(begin, end, place) for (begin, end, _), place in zip(ranges, places, strict=True)]
+    return np.array(bounds, np.uint64).reshape(-1, 3)
+
+
+@contextmanager
+def loops_for_a_gpu() -> Iterator[None]:
+    """Let host code take the loops for a GPU, on one thread of the processor."""
+    before = runtime.device()
+    runtime._device = dataclasses.replace(before, form="gpu", threads=1)
+    try:
+        yield
+    finally:
+        runtime._device = before
 
 
 class Tracer(Generic[Counted]):
@@ -135,13 +159,14 @@ class Tracer(Generic[Counted]):
         Names of kernel modules. Launches of others are not noted.
     count : callable
         Takes a kernel's name and the `Accesses` of a launch, and returns what becomes of them in `launches`. Launches
-        with equal shapes are counted once. One that has too many accesses is noted anew, and less of it, when its
-        like comes again: so run all twice.
+        with equal shapes and numbers are counted once.
+    sampled : sequence of str
+        Names of those modules of which only the threads that are noted run. So their results are incomplete.
 
     A launch that has too many accesses is noted anew, and less of it, when its like comes again. So run all twice.
     """
 
-    def __init__(self, modules: Sequence[str], count: Callable[[str, Accesses], Counted]):
+    def __init__(self, modules: Sequence[str], count: Callable[[str, Accesses], Counted], sampled: Sequence[str] = ()):
         self._count = count
         self.launches: list[Counted | None] = []
         """Of every launch in turn, what `count` returned; None where there was no room for its accesses."""
@@ -152,7 +177,7 @@ class Tracer(Generic[Counted]):
         self._of_lanes: set[str] = set()  # modules whose kernels walk the lanes of a warp
         self._samples: dict[tuple[object, ...], tuple[int, int]] = {}
         self._options: dict[str, dict[str, object]] = {}
-        self._modules = tuple(modules)
+        self._modules, self._sampled = tuple(modules), frozenset(sampled)
         self._launch = wp.launch
         self.kernel_s = 0.0
         """Processor time of launches and notes [s]."""
@@ -160,15 +185,14 @@ class Tracer(Generic[Counted]):
     @contextmanager
     def running(self) -> Iterator[None]:
         """Take the place of ``wp.launch``; kernels' loops are those for a GPU meanwhile."""
-        before = runtime.device()
         for name in self._modules:
             self._prepare(name)
-        runtime._device = dataclasses.replace(before, form="gpu", threads=1)
         wp.launch = self._traced
         try:
-            yield
+            with loops_for_a_gpu():
+                yield
         finally:
-            wp.launch, runtime._device = self._launch, before
+            wp.launch = self._launch
             for name, options in self._options.items():
                 wp.set_module_options(options, module=name)
 
@@ -200,8 +224,9 @@ class Tracer(Generic[Counted]):
             self._launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **where)
             return
         start, short = time.process_time(), f"{name.rpartition('.')[2]}.{kernel.key}"
-        arrays = list(_arrays([*inputs, *outputs]))
-        scalars = tuple(value for value in inputs if isinstance(value, (int, float)))
+        members = list(_members([*inputs, *outputs]))
+        arrays = [one for one in members if isinstance(one, wp.array)]
+        scalars = tuple(one for one in members if isinstance(one, (int, float)))
         known = (name, kernel.key, tuple(dim), tuple(array.shape for array in arrays), scalars)
         lanes = LANES if name in self._of_lanes else 1
         tasks = int(np.prod(dim))
@@ -210,7 +235,7 @@ class Tracer(Generic[Counted]):
         noted = 0 if known in self._known else apart
         begin, end = self._notes[name]
         ranges = _ranges(arrays).ravel()
-        numbers = THREADS_OF_BLOCK // lanes, LANES // lanes, noted, thinned
+        numbers = THREADS_OF_BLOCK // lanes, LANES // lanes, noted, thinned, name not in self._sampled
         self._launch(begin, dim=1, inputs=[_wrap(self._events), _wrap(ranges), *numbers], device="cpu")
         self._launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **where)
         self._launch(end, dim=1, outputs=[_wrap(self._found)], device="cpu")
@@ -220,15 +245,16 @@ class Tracer(Generic[Counted]):
                 fewer = min(share, blocks / apart)
                 self._samples[known] = int(np.ceil(fewer * apart)), int(np.ceil(share / fewer)) * thinned
             else:
-                nbytes = int((ranges[1::3] - ranges[::3]).sum())
+                nbytes = (ranges[1::3] - ranges[::3]).astype(np.int64)
                 self._known[known] = self._count(short, self._accesses(tasks, lanes, nbytes, apart, thinned))
         self.launches.append(self._known.get(known))
         self.kernel_s += time.process_time() - start
 
-    def _accesses(self, tasks: int, lanes: int, nbytes: int, apart: int, thinned: int) -> Accesses:
+    def _accesses(self, tasks: int, lanes: int, nbytes: np.ndarray, apart: int, thinned: int) -> Accesses:
         """Return what was noted."""
         per_block, warps = THREADS_OF_BLOCK // LANES, -(-tasks * lanes // LANES)
-        sampled = int((np.arange(warps) // per_block % apart == apart // 2).sum())
+        block = np.arange(warps, dtype=np.uint64) // np.uint64(per_block)
+        sampled = int((block * GOLDEN & np.uint64(MOST) <= MOST // apart).sum())
         used, exchanges = map(int, self._found)
         events = self._events[: 2 * used].reshape(-1, 2).copy()
         return Accesses(events, exchanges // thinned, thinned * warps / sampled, warps, per_block, nbytes)

@@ -1,20 +1,28 @@
-"""What a launch of a kernel moves on a GPU, counted from the addresses that a sample of its threads access.
+"""What kernels move on a GPU, counted from the addresses that a sample of their threads access, and the time they take.
 
 Memory moves in sectors of 32 bytes. `touched` are the distinct sectors of each instruction of a warp, `needed` the
 sectors that its distinct bytes would fill if each contiguous run of them began one. The time of a kernel is the longest
-of five: the distinct sectors of each thread block through the second cache (the first cache holds what a block
-reads twice, if it is not too much); the distinct bytes of the launch through the GPU's memory (the second cache holds
-the rest); all touched sectors through the first cache; shuffles and shared memory, one instruction per clock and
-multiprocessor; the accesses of a single warp, which waits for each: few warps with much to do take long. Launches take
-`LAUNCH_S`.
+of five:
+
+- the distinct sectors of each thread block through the second cache: the first cache holds what a block reads twice,
+  if it is not too much;
+- the same of each array, at most the whole array, through the GPU's memory: the second cache holds the rest;
+- all touched sectors through the first cache;
+- shuffles and shared memory, one instruction per clock and multiprocessor;
+- the accesses of a single warp, which waits for each: few warps with much to do take long.
+
+Launches take `LAUNCH_S`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
+from gpu_trace import PLACE_BITS, Accesses, Tracer
 
 from lfpiv_kernels.reconstruction.projector_gpu import SECTOR
 
@@ -47,7 +55,6 @@ class Traffic:
     """Distinct bytes of each thread block, in sectors."""
     memory: float
     """Bytes through the GPU's memory."""
-    atomics: float
     exchanges: float
     """Instructions that go through shared memory or from lane to lane."""
     waits: float
@@ -104,49 +111,88 @@ def _runs(groups: np.ndarray, address: np.ndarray, size: np.ndarray) -> tuple[in
     return int((-(-runs // SECTOR)).sum()), int((-(-whole // SECTOR)).sum()), int(whole.sum() / SECTOR)
 
 
-def count_sectors(
-    kernel: str, events: np.ndarray, exchanges: int, scale: float, memory: float, warps: int, warps_of_block: int
-) -> Traffic:
-    """Count the sectors of a sample of thread blocks.
-
-    Parameters
-    ----------
-    kernel : str
-        Name of the kernel.
-    events : ndarray, shape (access, 2), uint64
-        Accesses, see ``Trace`` in ``lanes.h``.
-    exchanges : int
-        Instructions through shared memory or from lane to lane.
-    scale : float
-        Thread blocks of the launch per one of the sample.
-    memory : float
-        Bytes of the whole launch through the GPU's memory.
-    warps, warps_of_block : int
-        Warps of the launch and of a thread block.
-    """
-    size = (events[:, 1] >> np.uint64(2) & np.uint64(63)).astype(np.int64)
-    events, size = events[size > 0], size[size > 0]
+def count_sectors(kernel: str, found: Accesses) -> Traffic:
+    """Count what a launch of a kernel moves from the accesses of a sample of its thread blocks."""
+    events, size = found.events, (found.events[:, 1] >> np.uint64(2) & np.uint64(63)).astype(np.int64)
     address = (events[:, 1] >> np.uint64(8)).astype(np.int64)
-    address -= address.min(initial=1 << 60) // SECTOR * SECTOR
     _, instruction = np.unique(events[:, 0] >> np.uint64(8), return_inverse=True)
-    block = (events[:, 0] >> np.uint64(40)).astype(np.int64) // warps_of_block
-    kind = events[:, 1] & np.uint64(3)
-    _, sector = np.unique(address // SECTOR, return_inverse=True)
-    apart = np.int64(sector.max(initial=0) + 1)
+    block = (events[:, 0] >> np.uint64(40)).astype(np.int64) // found.warps_of_block
+    numbers, sector = np.unique(address // SECTOR, return_inverse=True)
+    apart = np.int64(len(numbers) + 1)
     moved = np.unique(instruction * apart + sector)
     block_of = np.zeros(int(instruction.max(initial=0)) + 1, np.int64)
     block_of[instruction] = block
     of_blocks = np.bincount(block_of[moved // apart]) if len(moved) else np.zeros(1, np.int64)
-    distinct = np.bincount(np.unique(block * apart + sector) // apart, minlength=len(of_blocks))
+    distinct = np.unique(block * apart + sector)
+    array = (numbers * SECTOR >> PLACE_BITS)[distinct % apart] - 1
+    of_arrays = SECTOR * found.scale * np.bincount(array, minlength=len(found.nbytes))
+    distinct = np.bincount(distinct // apart, minlength=len(of_blocks))
     by_block = int(np.where(distinct > BLOCK_SECTORS, of_blocks, distinct).sum())
     needed, packed, _ = _runs(instruction, address, size)
     *_, used = _runs(block, address, size)
-    counts = (scale * count for count in (len(moved), needed, packed, by_block, used))
-    waits = scale * (int(instruction.max(initial=-1)) + 1) / warps
-    return Traffic(kernel, *counts, memory, scale * int((kind == 2).sum()), scale * exchanges, waits)
+    counts = (found.scale * count for count in (len(moved), needed, packed, by_block, used))
+    waits = found.scale * (int(instruction.max(initial=-1)) + 1) / found.warps
+    memory = float(np.minimum(of_arrays, found.nbytes).sum())
+    return Traffic(kernel, *counts, memory, found.scale * found.exchanges, waits)
 
 
 def total(name: str, parts: Sequence[Traffic]) -> Traffic:
     """Return the traffic of several launches."""
     names = [field.name for field in fields(Traffic)][1:]
     return Traffic(name, *(sum(getattr(part, field) for part in parts) for field in names))
+
+
+@dataclass(frozen=True)
+class Work:
+    """Traffic of some work."""
+
+    launches: list[Traffic]
+    host_s: float
+    """Processor time between the launches [s]."""
+
+    @property
+    def seconds(self) -> float:
+        """Predicted time of the launches [s]."""
+        return sum(one.seconds for one in self.launches)
+
+    def by_kernel(self) -> list[tuple[Traffic, float]]:
+        """Return the traffic and the time [s] of each kernel, slowest first."""
+        names = dict.fromkeys(one.kernel for one in self.launches)
+        groups = [[one for one in self.launches if one.kernel == name] for name in names]
+        rows = [(total(of[0].kernel, of), sum(one.seconds for one in of)) for of in groups]
+        return sorted(rows, key=lambda row: -row[1])
+
+    def table(self) -> list[str]:
+        """Return a row per kernel, for people."""
+        rows = [f"{'kernel':36s} launches  touched /needed /packed by block /filled       ms  limit"]
+        for one, seconds in self.by_kernel():
+            limit = max(one.limits_s, key=lambda name: one.limits_s[name])
+            rows.append(
+                f"{one.kernel:36s} {one.launches:8d} {one.touched / 1e6:8.2f}M {one.ratio:6.2f} {one.strict:7.2f} "
+                f"{one.by_block / 1e6:7.2f}M {one.filled:7.2f} {1e3 * seconds:8.3f}  {limit}"
+            )
+        return rows
+
+    def rows(self) -> list[dict[str, object]]:
+        """Return a row per kernel, for a file."""
+        return [dataclasses.asdict(one) | {"seconds": seconds} for one, seconds in self.by_kernel()]
+
+
+def trace(run: Callable[[], object], tracer: Tracer[Traffic]) -> Work:
+    """Run some work twice, and return the traffic of the second time.
+
+    Raises
+    ------
+    RuntimeError
+        If the accesses of a launch could not be noted.
+    """
+    with tracer.running():
+        run()  # finds out how much of a launch can be noted
+        tracer.launches.clear()
+        start, tracer.kernel_s = time.process_time(), 0.0
+        run()
+        host = time.process_time() - start - tracer.kernel_s
+    launches = [one for one in tracer.launches if one is not None]
+    if len(launches) < len(tracer.launches):
+        raise RuntimeError("a launch has more accesses than can be noted.")
+    return Work(launches, host)

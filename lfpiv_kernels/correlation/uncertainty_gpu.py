@@ -1,6 +1,6 @@
 """Sums over windows for the uncertainty on a GPU; host functions and CPU form: ``uncertainty``.
 
-Products of voxels are not stored: the first sum along x forms them.
+Products of voxels are not stored: the first sum forms them. It goes along z: neighbouring threads read neighbours.
 """
 
 import numpy as np
@@ -30,20 +30,20 @@ def _sum_products(
     one: wp.array3d(dtype=float),
     other: wp.array3d(dtype=float),
     lag: wp.vec3i,  # of the other volume, >= 0
-    window: int,  # voxels along x per sum
+    window: int,  # voxels along z per sum
     origin: int,  # first voxel of sum 0
     step: int,  # distance of the sums [voxel]
     begin: int,
     # out
     sum_out: wp.array3d(dtype=float),  # a thread per sum
 ):
-    layer, y, k = wp.tid()
-    z = begin + layer
+    layer, y, x = wp.tid()
+    k = begin + layer
     first = origin + k * step
     total = float(0.0)
-    for x in range(first, first + window):
+    for z in range(first, first + window):
         total += one[z, y, x] * _value(other, z + lag[0], y + lag[1], x + lag[2])
-    sum_out[z, y, k] = total
+    sum_out[k, y, x] = total
 
 
 @wp.kernel
@@ -89,17 +89,13 @@ def window_sums(
     taps = tuple(np.ones(edge) for edge in window)
     sums = empty_volume((12, *count))
 
-    def along_y_and_x(volume: wp.array, out: wp.array) -> None:
-        for axis in (1, 0):
-            layout = {"step": step[axis], "count": count[axis], "border": filters_gpu.WHOLE}
-            to = out if axis == 0 else None
-            volume = filters_gpu.filter_along(volume, axis, taps[axis], origin[axis], **layout, out=to)
-
     def product_sums(one: wp.array, other: wp.array, lag: wp.vec3i, out: wp.array) -> None:
-        rows = empty_volume((*one.shape[:2], count[2]))
-        inputs = [one, other, lag, window[2], origin[2], step[2]]
-        launch(Call(_sum_products, one.shape[0], inputs, [rows], inner=rows.shape[1:]))
-        along_y_and_x(rows, out)
+        volume = empty_volume((count[0], *one.shape[1:]))
+        inputs = [one, other, lag, window[0], origin[0], step[0]]
+        launch(Call(_sum_products, count[0], inputs, [volume], inner=tuple(one.shape[1:])))
+        for axis, to in ((1, None), (2, out)):
+            layout = {"step": step[axis], "count": count[axis], "border": filters_gpu.WHOLE}
+            volume = filters_gpu.filter_along(volume, axis, taps[axis], origin[axis], **layout, out=to)
 
     for k, volume in enumerate((first, second)):
         filters_gpu.window_sums(volume, origin, step, count, taps, sums[k])

@@ -14,11 +14,11 @@ LFPIV_INLINE void blur_lanes(const AxisBlur& axis, int stride, int warp, int siz
         const int voxel = warp * LANES_OF_WARP + lane;
         if (voxel >= size) return;
         const int k = voxel / stride % axis.size;
-        const float* const from = volume + voxel + (int64_t)(read(axis.first + k) - k) * stride;
+        const float* const from = volume + voxel + (int64_t)(axis.first[k] - k) * stride;
         const float* const weight = axis.weight + (k >= axis.begin && k < axis.end ? axis.begin : k) * axis.taps;
         float sum = 0.0f;
-        for (int t = 0; t < axis.taps; ++t) sum += read(weight + t) * read(from + (int64_t)t * stride);
-        write_if(true, out + voxel, sum);
+        for (int t = 0; t < axis.taps; ++t) sum += weight[t] * from[(int64_t)t * stride];
+        out[voxel] = sum;
     });
 }
 

@@ -19,19 +19,17 @@ LFPIV_INLINE void spread_nodes(const PlaneMap& map, const int* layers_of, int wa
         const int index = node / map.node_columns, column = node - index * map.node_columns;
         const int row = index / map.planes, plane = index - row * map.planes;
         float light = 0.0f;
-        const int begin = read(layers_of + 2 * plane), end = read(layers_of + 2 * plane + 1);
+        const int begin = layers_of[2 * plane], end = layers_of[2 * plane + 1];
         for (int layer = begin; layer < end; ++layer) {
-            in_step(2 + 5 * (layer - begin));
-            const int tap = plane - read(map.plane + layer), at = TAPS * layer + tap;
+            const int tap = plane - map.plane[layer], at = TAPS * layer + tap;
             if (tap < 0 || tap >= TAPS) continue;
-            const float share = read(map.share + at);
-            const int from = row - read(map.shift + 2 * at), k = column - read(map.shift + 2 * at + 1);
+            const float share = map.share[at];
+            const int from = row - map.shift[2 * at], k = column - map.shift[2 * at + 1];
             const bool inside = share != 0.0f && from >= 0 && from < map.rows && k >= 0 && k < map.columns;
             const float* const voxel = voxels + (int64_t)from * map.row_stride + (int64_t)layer * map.layer_stride + k;
-            light += (absolute && share < 0.0f ? -share : share) * read_if(inside, voxel, 0.0f);
+            light += (absolute && share < 0.0f ? -share : share) * (inside ? *voxel : 0.0f);
         }
-        in_step(4095);
-        write_if(true, nodes_out + node, light);
+        nodes_out[node] = light;
     });
 }
 
@@ -42,16 +40,16 @@ LFPIV_INLINE void collect_voxels(const PlaneMap& map, int warp, const float* nod
         const int voxel = warp * LANES_OF_WARP + lane;
         if (voxel >= size) return;
         const int index = voxel / map.columns, column = voxel - index * map.columns;
-        const int row = index / map.layers, layer = index - row * map.layers, plane = read(map.plane + layer);
+        const int row = index / map.layers, layer = index - row * map.layers, plane = map.plane[layer];
         float light = 0.0f;
         for (int tap = 0; tap < TAPS; ++tap) {
             const int at = TAPS * layer + tap;
-            const float share = read(map.share + at);
-            const int to_row = row + read(map.shift + 2 * at), to_column = column + read(map.shift + 2 * at + 1);
+            const float share = map.share[at];
+            const int to_row = row + map.shift[2 * at], to_column = column + map.shift[2 * at + 1];
             const int64_t node = ((int64_t)to_row * map.planes + plane + tap) * map.node_columns + to_column;
-            light += share * read_if(share != 0.0f, nodes + node, 0.0f);
+            light += share * (share != 0.0f ? nodes[node] : 0.0f);
         }
-        write_if(true, voxels_out + (int64_t)row * map.row_stride + (int64_t)layer * map.layer_stride + column, light);
+        voxels_out[(int64_t)row * map.row_stride + (int64_t)layer * map.layer_stride + column] = light;
     });
 }
 

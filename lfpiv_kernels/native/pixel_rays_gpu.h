@@ -28,22 +28,19 @@ struct RaysOfPixel {
     int first, end;
 
     LFPIV_INLINE RaysOfPixel(const Map& map, int pixel)
-        : map(map), first(read(map.first.data + pixel)), end(read(map.first.data + pixel + 1)) {}
+        : map(map), first(map.first.data[pixel]), end(map.first.data[pixel + 1]) {}
     /// Return the sum of the rays, each times its share.
     LFPIV_INLINE float collect(const float* rays) const {
         float light = 0.0f;
         for (int n = first; n < end; ++n) {
-            in_step(16 + 3 * (n - first));
-            light += read(map.share.data + n) * read(rays + read(map.place.data + n));
+            light += map.share.data[n] * rays[map.place.data[n]];
         }
-        in_step(1024);
         return light;
     }
     /// Write the light times their shares on the rays.
     LFPIV_INLINE void spread(float light, float* rays_out) const {
         for (int n = first; n < end; ++n) {
-            in_step(2048 + 3 * (n - first));
-            write_if(true, rays_out + read(map.place.data + n), read(map.share.data + n) * light);
+            rays_out[map.place.data[n]] = map.share.data[n] * light;
         }
     }
 };
@@ -52,8 +49,7 @@ struct RaysOfPixel {
 template <class Map>
 LFPIV_INLINE void darken_rays(const Map& map, int warp, float* rays_out) {
     for_pixels(warp, map.aside, map.asides, [&](int k) { RaysOfPixel<Map>(map, k).spread(0.0f, rays_out); });
-    for_pixels(warp, 0, (int)map.dark.shape[0],
-               [&](int k) { write_if(true, rays_out + read(map.dark.data + k), 0.0f); });
+    for_pixels(warp, 0, (int)map.dark.shape[0], [&](int k) { rays_out[map.dark.data[k]] = 0.0f; });
 }
 
 /// Sum the rays of every pixel of a warp.
@@ -61,7 +57,7 @@ template <class Map>
 LFPIV_INLINE void collect_pixels(const Map& map, int warp, const float* rays, float* image_out) {
     for_pixels(warp, map.start, map.end, [&](int k) {
         const float light = RaysOfPixel<Map>(map, k).collect(rays);
-        write_if(true, image_out + read(map.pixel.data + k), light);
+        image_out[map.pixel.data[k]] = light;
     });
 }
 
@@ -69,7 +65,7 @@ LFPIV_INLINE void collect_pixels(const Map& map, int warp, const float* rays, fl
 template <class Map>
 LFPIV_INLINE void spread_pixels(const Map& map, int warp, const float* image, float* rays_out) {
     for_pixels(warp, map.start, map.end, [&](int k) {
-        const float light = read(image + read(map.pixel.data + k));
+        const float light = image[map.pixel.data[k]];
         RaysOfPixel<Map>(map, k).spread(light, rays_out);
     });
     darken_rays(map, warp, rays_out);
@@ -88,16 +84,16 @@ LFPIV_INLINE void compare_pixels(const Map& map, int warp, const float* image, c
             const int k = (int)first + lane;
             if (first + lane >= map.end) return;
             const RaysOfPixel<Map> rays(map, k);
-            const float light = max(read(held + k) + rays.collect(rays_out), 0.0f);  // interpolation may undershoot
-            const Misfit misfit = compare_pixel(read(image + k), read(gain + k), floor, light);
+            const float light = max(held[k] + rays.collect(rays_out), 0.0f);  // interpolation may undershoot
+            const Misfit misfit = compare_pixel(image[k], gain[k], floor, light);
             squares[lane] += (double)misfit.square, divergence[lane] += (double)misfit.divergence;
             rays.spread(misfit.correction, rays_out);
         });
     darken_rays(map, warp, rays_out);
     const double square = sum_lanes(squares), term = sum_lanes(divergence);
     in_first_lane([&] {
-        write_if(true, squares_out + warp, square);
-        write_if(true, divergence_out + warp, term);
+        squares_out[warp] = square;
+        divergence_out[warp] = term;
     });
 }
 

@@ -46,7 +46,7 @@ struct Sectors {
     PerLane<unsigned> word[WORDS];
 
     LFPIV_INLINE void load(int lane, const unsigned* from) {
-        const Quad first = read((const Quad*)from), second = read((const Quad*)from + 1);
+        const Quad first = ((const Quad*)from)[0], second = ((const Quad*)from)[1];
         word[0][lane] = first.x, word[1][lane] = first.y, word[2][lane] = first.z, word[3][lane] = first.w;
         word[4][lane] = second.x, word[5][lane] = second.y, word[6][lane] = second.z, word[7][lane] = second.w;
     }
@@ -76,7 +76,7 @@ LFPIV_INLINE void for_steps(const Sectors& sectors, int holder, const unsigned c
     } else {
         for (int step = STEP; step < steps; ++step) {
             const int at = ROWS * step + row;
-            work(at, (float)read(level + COLUMNS + at));
+            work(at, (float)level[COLUMNS + at]);
         }
     }
 }
@@ -93,14 +93,14 @@ LFPIV_INLINE float sum_blocks(const Matrix& matrix, int begin, int end, Value va
         Sectors sectors;
         for_lanes([&](int lane) {
             const int block = begin + min(lane, count - 1);
-            ray[lane] = read(matrix.ray.data + block);
-            const int height = read(matrix.height.data + block);
+            ray[lane] = matrix.ray.data[block];
+            const int height = matrix.height.data[block];
             if (matrix.profiles) {
                 start[lane] = block * matrix.sectors, size[lane] = height;
                 sectors.load(lane, matrix.word.data + (int64_t)start[lane] * WORDS);
             } else {
-                start[lane] = read(matrix.start.data + block);
-                size[lane] = height | read(matrix.width.data + block) << 8;
+                start[lane] = matrix.start.data[block];
+                size[lane] = height | matrix.width.data[block] << 8;
             }
         });
         for (int holder = 0; holder < count; ++holder)
@@ -119,7 +119,7 @@ LFPIV_INLINE float sum_blocks(const Matrix& matrix, int begin, int end, Value va
                 for (int step = 0; step < rows; step += ROWS) {
                     const int at = step + row;
                     const bool inside = at < rows && column < columns;
-                    const float here = (float)read_if(inside, level + at * columns + column, (unsigned char)0);
+                    const float here = inside ? (float)level[at * columns + column] : 0.0f;
                     total[lane] += value(here, inside ? first + at * matrix.pitch : -1);
                 }
             });
@@ -130,9 +130,9 @@ LFPIV_INLINE float sum_blocks(const Matrix& matrix, int begin, int end, Value va
 /// Find a voxel's blocks under some lenses, see ``projector.EVEN``.
 template <class Matrix>
 LFPIV_INLINE void blocks_under(const Matrix& matrix, int voxel, int lenses, int& begin, int& end) {
-    begin = read_together(matrix.first_block.data + voxel), end = read_together(matrix.first_block.data + voxel + 1);
+    begin = matrix.first_block.data[voxel], end = matrix.first_block.data[voxel + 1];
     if (lenses == 2) return;
-    const int even = begin + read_together(matrix.even_blocks.data + voxel);
+    const int even = begin + matrix.even_blocks.data[voxel];
     (lenses == 0 ? end : begin) = even;
 }
 
@@ -140,13 +140,12 @@ LFPIV_INLINE void blocks_under(const Matrix& matrix, int voxel, int lenses, int&
 template <class Matrix>
 LFPIV_INLINE void gather_voxel(const Matrix& matrix, int voxel, int lenses, const float* rays, const float* active,
                                float* volume) {
-    if (read_together(active + voxel) == 0.0f) return;  // the whole warp
+    if (active[voxel] == 0.0f) return;  // the whole warp
     int begin, end;
     blocks_under(matrix, voxel, lenses, begin, end);
-    const float light = sum_blocks(matrix, begin, end,
-                                   [&](float level, int ray) { return level * read_if(ray >= 0, rays + ray, 0.0f); });
-    in_first_lane(
-        [&] { write_if(true, volume + voxel, read(volume + voxel) + read(matrix.scale.data + voxel) * light); });
+    const float light =
+        sum_blocks(matrix, begin, end, [&](float level, int ray) { return level * (ray >= 0 ? rays[ray] : 0.0f); });
+    in_first_lane([&] { volume[voxel] += matrix.scale.data[voxel] * light; });
 }
 
 /// Count the rays that a voxel lights; `share` is zero for those that no pixel sees.
@@ -155,9 +154,9 @@ LFPIV_INLINE void count_voxel(const Matrix& matrix, int voxel, const float* shar
     int begin, end;
     blocks_under(matrix, voxel, 2, begin, end);
     const float count = sum_blocks(matrix, begin, end, [&](float level, int ray) {
-        return level > 0.0f && read_if(ray >= 0, share + ray, 0.0f) > 0.0f ? 1.0f : 0.0f;
+        return level > 0.0f && ray >= 0 && share[ray] > 0.0f ? 1.0f : 0.0f;
     });
-    in_first_lane([&] { write_if(true, count_out + voxel, (int)count); });
+    in_first_lane([&] { count_out[voxel] = (int)count; });
 }
 
 /// A tile's rays, summed by one warp.
@@ -182,31 +181,30 @@ LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const
     float light_of_warp[TILE * TILE];
     const TileLight light{light_of_warp};
 #endif
-    const int head = read_together(matrix.tile_size.data + tile), rows = head & 0xff, columns = (head >> 8) & 0xff,
-              set = head >> 16;
+    const int head = matrix.tile_size.data[tile], rows = head & 0xff, columns = (head >> 8) & 0xff, set = head >> 16;
     const bool lit = lenses == 2 || lenses == set;
     if (matrix.adds && !lit) return;  // the whole warp
-    float* const out = rays_out + read_together(matrix.tile_ray.data + tile);
+    float* const out = rays_out + matrix.tile_ray.data[tile];
     for_lanes([&](int lane) {
         for (int k = lane; k < TILE * TILE; k += LANES_OF_WARP) {
             const int row = k / TILE, column = k % TILE;
             const float* const at = out + (int64_t)row * matrix.pitch + column;
-            light.ray[k] = matrix.adds ? read_if(row < rows && column < columns, at, 0.0f) : 0.0f;
+            light.ray[k] = matrix.adds && row < rows && column < columns ? *at : 0.0f;
         }
     });
     sync_lanes();
-    const int64_t end = lit ? read_together(matrix.tile_entry.data + tile + 1) : 0;
-    for (int64_t begin = lit ? read_together(matrix.tile_entry.data + tile) : 0; begin < end; begin += LANES_OF_WARP) {
+    const int64_t end = lit ? matrix.tile_entry.data[tile + 1] : 0;
+    for (int64_t begin = lit ? matrix.tile_entry.data[tile] : 0; begin < end; begin += LANES_OF_WARP) {
         const int count = (int)min(end - begin, (int64_t)LANES_OF_WARP);
         PerLane<float> intensity;
         PerLane<int> place, start;
         Sectors sectors;
         for_lanes([&](int lane) {
             const int64_t entry = begin + min(lane, count - 1);
-            const int voxel = read(matrix.entry_voxel.data + entry);
-            place[lane] = read(matrix.entry_place.data + entry);
-            start[lane] = read(matrix.entry_start.data + entry);
-            intensity[lane] = read(volume + voxel) * read(matrix.scale.data + voxel);
+            const int voxel = matrix.entry_voxel.data[entry];
+            place[lane] = matrix.entry_place.data[entry];
+            start[lane] = matrix.entry_start.data[entry];
+            intensity[lane] = volume[voxel] * matrix.scale.data[voxel];
             if (matrix.profiles) sectors.load(lane, matrix.word.data + (int64_t)start[lane] * WORDS);
         });
         for (int holder = 0; holder < count; ++holder) {
@@ -226,8 +224,8 @@ LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const
                 for (int step = 0; step < block.height; step += ROWS) {
                     const int at = step + row;
                     const bool inside = at < block.height && column < block.width;
-                    const auto here = read_if(inside, level + at * block.width + column, (unsigned char)0);
-                    light.add(block.row + at, block.column + column, factor * (float)here);
+                    const float here = inside ? (float)level[at * block.width + column] : 0.0f;
+                    light.add(block.row + at, block.column + column, factor * here);
                 }
             });
             sync_lanes();  // the next block's lanes add to the same rays
@@ -236,7 +234,7 @@ LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const
     for_lanes([&](int lane) {
         for (int row = 0; row < rows; ++row) {
             float* const to = out + (int64_t)row * matrix.pitch + lane;
-            write_if(lane < columns, to, lane < columns ? light.ray[row * TILE + lane] : 0.0f);
+            if (lane < columns) *to = light.ray[row * TILE + lane];
         }
     });
     sync_lanes();  // before the warp's next tile

@@ -37,6 +37,14 @@ def test_the_model_predicts_the_cases_that_it_knows():
     assert times["footprint_small"] is None
 
 
+def test_a_prediction_that_fails_is_none_and_the_others_stay(monkeypatch, tmp_path):
+    script = tmp_path / "perf" / "gpu_model.py"
+    script.parent.mkdir()
+    script.write_text("""print('{"smart_small": 0.125}', flush=True); raise MemoryError""")
+    monkeypatch.setattr(gpu, "ROOT", tmp_path)
+    assert gpu.predicted_times(["smart_small", "deform_small"]) == {"smart_small": 0.125, "deform_small": None}
+
+
 def test_without_a_gpu_the_script_says_so_and_writes_nothing(device, tmp_path):
     if device.kind == "cuda":
         pytest.skip("there is a GPU")

