@@ -173,7 +173,7 @@ def iterate_epochs(
             if active is not None:
                 volume = multiply(volume, active)
             equations.compare_subset(subset.camera, subset.lenses, volume)
-            exponent = equations.back_project_subset(subset.camera, subset.lenses, volume, matched=step.matched)
+            exponent = equations.back_project_subset(subset.camera, subset.lenses, volume)
             if agreement is not None:
                 agreement.add(exponent)
             coefficients, after = step(coefficients, exponent, momentum, length=length, over=over, in_place=True)

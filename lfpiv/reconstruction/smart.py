@@ -74,15 +74,11 @@ class ImageEquations:
             comparison.compare(volume, self._totals)
         return self.measured()
 
-    def back_project(self, volume: DeviceArray, *, matched: bool = True) -> DeviceArray:
-        """Back-project the logarithms that `compare` left: sum_i w log((I + b) / (P + b)); 0 where `volume` is 0.
-
-        Without `matched`, voxels that are shared among lines of sight have linear shares, see
-        `lfpiv.weights.line_shares`.
-        """
+    def back_project(self, volume: DeviceArray) -> DeviceArray:
+        """Back-project the logarithms that `compare` left: sum_i w log((I + b) / (P + b)); 0 where `volume` is 0."""
         exponent = zeros(volume.size)
         for camera in self.cameras:
-            camera.projector.gather(exponent, active=volume, linear=not matched)
+            camera.projector.gather(exponent, active=volume)
         return exponent
 
     def hold(self, volume: DeviceArray) -> None:
@@ -110,12 +106,10 @@ class ImageEquations:
         """Return the misfit that was summed since `begin`."""
         return Misfit(*self._totals.read())
 
-    def back_project_subset(
-        self, camera: int, lenses: int, volume: DeviceArray, *, matched: bool = True
-    ) -> DeviceArray:
+    def back_project_subset(self, camera: int, lenses: int, volume: DeviceArray) -> DeviceArray:
         """Do as `back_project` for the rays of one camera through some lenses only."""
         exponent = zeros(volume.size)
-        self.cameras[camera].projector.gather(exponent, active=volume, lenses=lenses, linear=not matched)
+        self.cameras[camera].projector.gather(exponent, active=volume, lenses=lenses)
         return exponent
 
 
@@ -170,7 +164,7 @@ def iterate(
     misfit = equations.compare(volume)
     for left in reversed(range(iterations)):
         yield volume, misfit
-        exponent = equations.back_project(volume, matched=state.steps[0].matched)
+        exponent = equations.back_project(volume)
         for proposal in state.proposals(exponent, smooth if left else None):
             volume = sieve(proposal.coefficients)
             proposed = equations.compare(volume)

@@ -4,9 +4,7 @@
 the misfit's gradient blurred once more. Each blur hides what is smaller than itself, so convergence is slow.
 `SharpenedStep` leaves that blur out and sharpens instead: log c' / c = mu F exponent / s with
 F = 1 + `SHARPENING` (1 - B), B a Gaussian blur of `SHARPENED_VOXEL`. This is an unmatched back projection [1]_. It is
-zero where the gradient is zero, so both steps have the same solutions. Where voxels are shared among lines of sight
-(`lfpiv.weights.line_shares`) its exponent is back-projected by linear shares, and the solutions differ by what these
-hide.
+zero where the gradient is zero, so both steps have the same solutions.
 
 .. [1] G. L. Zeng, G. T. Gullberg, "Unmatched projector/backprojector pairs in an iterative reconstruction algorithm",
    IEEE Trans. Med. Imaging 19 (2000) 548-555, doi:10.1109/42.870265.
@@ -16,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
@@ -38,9 +36,6 @@ LEAST_ACTIVE = 0.05
 
 class Step(Protocol):
     """Step of the iteration; arrays have shape (voxel,), float32, on the device."""
-
-    matched: ClassVar[bool]
-    """Whether the exponent is back-projected by the weights themselves, as in the misfit's gradient."""
 
     def __call__(
         self,
@@ -76,9 +71,8 @@ class Step(Protocol):
 
 @dataclass(frozen=True)
 class SmartStep:
-    """SMART's own step. For mu <= 1 and without smoothing the misfit cannot rise, unless weights are negative."""
+    """SMART's own step. For mu <= 1 and without smoothing the misfit cannot rise."""
 
-    matched = True
     size: DeviceArray
     """mu / G s, shape (voxel,), float32, on the device."""
     sieve: Sieve
@@ -107,7 +101,6 @@ class SmartStep:
 class SharpenedStep:
     """Step without the sieve's second blur, sharpened. The misfit may rise."""
 
-    matched = False
     size: DeviceArray
     """mu / s, shape (voxel,), float32, on the device."""
     shape: tuple[int, int, int]

@@ -5,11 +5,6 @@ The image of a voxel, as a function of its place on the row, is smooth only as f
 make a blob are interpolated well, a single voxel is not. So the shares are the best ones for a blob: those of universal
 kriging [1]_ with a Gaussian autocovariance, exact for images that change linearly with the place.
 
-These shares undo a blur, so some are negative, and their adjoint amplifies details. SMART's sharpened step
-(`lfpiv.reconstruction.steps`) sharpens once more, and may then raise the misfit from epoch to epoch, however short it
-is. So this step back-projects by linear shares between the two lines next to a voxel. Projections keep the shares of
-kriging.
-
 .. [1] N. Cressie, "Statistics for spatial data", Wiley 1993, section 3.4, doi:10.1002/9781119115151.
 """
 

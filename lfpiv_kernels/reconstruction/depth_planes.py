@@ -6,8 +6,7 @@ writes a row of nodes or of voxels, so that results do not depend on the number 
 ``depth_planes.h``; a GPU has ``depth_planes_gpu``. Twin: `PlaneShares.nodes_of`, voxel by voxel.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -15,7 +14,7 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction import depth_planes_gpu
-from lfpiv_kernels.reconstruction.line_shares import Layers, LineShares, linear_shares
+from lfpiv_kernels.reconstruction.line_shares import Layers, LineShares
 from lfpiv_kernels.reconstruction.plane_layout import PlaneMap
 from lfpiv_kernels.transfer import Given, as_given, empty, to_device, to_host
 
@@ -56,11 +55,6 @@ class PlaneShares:
     def size(self) -> int:
         """Number of nodes."""
         return int(np.prod(self.nodes))
-
-    @cached_property
-    def linear(self) -> "PlaneShares":
-        """The same nodes, shared linearly between the two lines of sight next to a voxel: never below 0 there."""
-        return replace(self, row_share=linear_shares(self.row_share), column_share=linear_shares(self.column_share))
 
     def nodes_of(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the nodes of a voxel and its shares, shapes (node,); shares of zero are left out."""
@@ -128,11 +122,10 @@ class DepthPlanes:
             layers * columns if self._moved else strides[shares.axes[0]],
             columns if self._moved else strides[shares.axes[1]],
         )
-        self._lines, self._linear = [], []
+        self._lines = []
         for share, along_rows in ((shares.row_share, True), (shares.column_share, False)):
             if share.shape[1] > 1:
                 self._lines.append(LineShares(share, along_rows, lattice))
-                self._linear.append(LineShares(linear_shares(share), along_rows, lattice))
                 lattice = self._lines[-1].shared
         self._map.rows, self._map.layers, self._map.columns = lattice.rows, layers, lattice.columns
         self._map.row_stride, self._map.layer_stride = lattice.row_stride, lattice.layer_stride
@@ -155,18 +148,15 @@ class DepthPlanes:
             launch(Call(_spread, self.shares.nodes[0] * self.shares.nodes[1], [self._map, absolute, voxels], [nodes]))
         return as_given(nodes, volume)
 
-    def collect(self, nodes: Given, *, linear: bool = False) -> Given:
-        """Return the adjoint's sum R^T nodes, shape (voxel,), float32, on the device if `nodes` are.
-
-        With `linear` it is the adjoint of `PlaneShares.linear`.
-        """
+    def collect(self, nodes: Given) -> Given:
+        """Return the adjoint's sum R^T nodes, shape (voxel,), float32, on the device if `nodes` are."""
         found = empty(self._map.rows * self._map.layers * self._map.columns)
         light = to_device(nodes, float)
         if runtime.device().form == "gpu":
             depth_planes_gpu.collect(self._map, light, found)
         else:
             launch(Call(_collect, self._map.rows * self._map.layers, [self._map, light], [found]))
-        for line in reversed(self._linear if linear else self._lines):
+        for line in reversed(self._lines):
             found = line.collect(found)
         if self._moved:
             rows, layers, columns = (self.shares.voxels[axis] for axis in self.shares.axes)

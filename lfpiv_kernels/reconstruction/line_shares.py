@@ -48,16 +48,6 @@ def _share(
     _share_row(map, first_row + wp.tid(), absolute, values, shared_out)
 
 
-def linear_shares(share: np.ndarray) -> np.ndarray:
-    """Return shares on the two places next to the mean place of given shares, shape (layer, tap), float32.
-
-    They have the same mean place and are not negative. The given shares sum to 1.
-    """
-    taps = np.arange(share.shape[1])
-    place = share.astype(np.float64) @ taps
-    return np.maximum(1 - np.abs(place[:, None] - taps), 0).astype(np.float32)
-
-
 class LineShares:
     """The linear map from the voxels of all layers to the elements of longer lines, and its adjoint.
 

@@ -268,11 +268,10 @@ class Projector:
 
         runtime.run_chunks(light.size, scatter_part)
 
-    def gather(self, out: Given, active: Values | None = None, lenses: int = ALL, *, linear: bool = False) -> Given:
+    def gather(self, out: Given, active: Values | None = None, lenses: int = ALL) -> Given:
         """Add the weighted sum of the light on each voxel's rays of some lenses to `out`, shape (voxel,). Return `out`.
 
-        Voxels whose `active`, shape (voxel,), float32, is zero do not change. With `linear`, nodes pass their sums to
-        the voxels by `PlaneShares.linear`.
+        Voxels whose `active`, shape (voxel,), float32, is zero do not change.
         """
         volume, mask = to_device(out, float), None if active is None else to_device(active, float)
         if self._planes is None:
@@ -281,7 +280,7 @@ class Projector:
             if mask is not None and self._on_cpu and to_host(mask).all():
                 mask = None
             lit = None if mask is None else self._planes.spread(voxels.indicator(mask), absolute=True)
-            found = self._planes.collect(self._gather(zeros(self._planes.shares.size), lit, lenses), linear=linear)
+            found = self._planes.collect(self._gather(zeros(self._planes.shares.size), lit, lenses))
             voxels.add(found, volume, mask)
         overwrite(out, volume)
         return out

@@ -26,8 +26,7 @@ from lfpiv.weights.ray_fit import ray_models
 from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
-from lfpiv_kernels.reconstruction.line_shares import linear_shares
-from lfpiv_kernels.reconstruction.projector import EVEN, ODD, Projector
+from lfpiv_kernels.reconstruction.projector import EVEN, ODD
 from lfpiv_kernels.transfer import to_device
 
 TOLERANCE_TWIN = 2e-6  # float32 sums of up to 64 shares
@@ -94,8 +93,6 @@ def test_voxels_are_shared_among_nodes_as_stated(pose, order, device):
     np.testing.assert_allclose(planes.spread(volume), matrix @ volume, atol=TOLERANCE_TWIN * 10)
     np.testing.assert_allclose(planes.spread(volume, absolute=True), np.abs(matrix) @ volume, atol=TOLERANCE_TWIN * 10)
     np.testing.assert_allclose(planes.collect(light), matrix.T @ light, atol=TOLERANCE_TWIN * 10)
-    linear = shares_matrix(nodes.shares.linear)
-    np.testing.assert_allclose(planes.collect(light, linear=True), linear.T @ light, atol=TOLERANCE_TWIN * 10)
 
 
 @pytest.mark.parametrize("pose", CAMERAS.values(), ids=CAMERAS)
@@ -140,30 +137,6 @@ def test_shares_among_lines_interpolate_blobs_better_than_a_polynomial():
     for at, ours, theirs in zip(place[1:-1], share[1:-1], polynomial[1:-1], strict=True):
         exact = np.exp(-((np.linspace(-8, 8, 321) - at) ** 2) / (2 * VARIANCE_VOXEL))
         assert np.linalg.norm(ours @ blobs - exact) < np.linalg.norm(theirs @ blobs - exact)
-
-
-def test_linear_shares_are_those_of_the_two_lines_next_to_a_voxel():
-    place = np.linspace(0, 1, 11)
-    expected = np.zeros((11, LINES))
-    expected[:, BEFORE], expected[:, BEFORE + 1] = 1 - place, place
-    np.testing.assert_allclose(linear_shares(line_shares(place)), expected, atol=TOLERANCE_TWIN)
-    np.testing.assert_array_equal(linear_shares(np.ones((3, 1))), 1)
-
-
-@pytest.mark.parametrize(("sieve_voxel", "linear"), [(0.8, True), (0.0, False)])
-def test_only_sharpened_steps_back_project_by_linear_shares(between, monkeypatch, sieve_voxel, linear):
-    asked, gather = [], Projector.gather
-
-    def recorded(self, out, active=None, *more, **options):
-        if active is not None:  # not the sums of the weights
-            asked.append(options["linear"])
-        return gather(self, out, active, *more, **options)
-
-    monkeypatch.setattr(Projector, "gather", recorded)
-    nodes, every = between
-    images = every(ndimage.gaussian_filter(np.random.default_rng(11).random(GRID.shape) ** 8, 0.9))
-    lfpiv.reconstruct(nodes, images, iterations=4, subsets=4, sieve_voxel=sieve_voxel)
-    assert asked and set(asked) == {linear}
 
 
 def lagrange_shares(place, lines):
