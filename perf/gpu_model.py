@@ -358,8 +358,7 @@ def model_planes(tracer: Tracer, projector: Projector) -> list[Traffic]:
     shares = projector.planes
     planes = DepthPlanes(shares)
     layers = depth_planes_gpu.layers_of_planes(shares.plane, shares.nodes[1])
-    lattice = planes._map.rows, planes._map.layers, planes._map.columns
-    voxels, nodes = (np.ones(int(np.prod(of)), np.float32) for of in (lattice, shares.nodes))
+    voxels, nodes = (np.ones(int(np.prod(of)), np.float32) for of in (shares.voxels, shares.nodes))
     sides = (("spread to planes", nodes, voxels), ("collect from planes", voxels, nodes))
     return [
         tracer.trace(

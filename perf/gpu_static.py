@@ -50,7 +50,6 @@ CPU_ONLY = {
     "deform": ("_deform_pair",),
     "depth_planes": ("_spread", "_collect"),
     "footprint": ("_fill_blocks", "_pack_blocks"),
-    "line_shares": ("_share",),
     "neighbours": ("_predict",),
     "particle_normal": ("_multiply_images",),
     "pixel_rays": ("_collect", "_spread", "_number_pixels", "_sort_rays"),
@@ -63,8 +62,8 @@ CPU_ONLY = {
 }
 """Kernels by module that a GPU never runs: it has other kernels in their place."""
 CPU_MODULES = (
-    "blocks", "blur", "box_sum", "deform", "depth_planes", "line_shares", "neighbours", "pixel_rays", "planes",
-    "projector", "spectra", "windows",
+    "blocks", "blur", "box_sum", "deform", "depth_planes", "neighbours", "pixel_rays", "planes", "projector", "spectra",
+    "windows",
 )  # fmt: skip
 """Modules without a kernel for a GPU; their headers need not compile for one."""
 

@@ -23,7 +23,6 @@ EVERY_PASS = {
     ("depth_planes_gpu", "_collect"),
     ("depth_planes_gpu", "_spread"),
     ("filters_gpu", "_filter"),
-    ("line_shares_gpu", "_share"),
     ("neighbours_gpu", "_predict_vectors"),
     ("peaks", "_find_peaks"),
     ("peaks_gpu", "_score_windows"),
