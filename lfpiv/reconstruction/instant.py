@@ -127,7 +127,9 @@ class PreparedInstant:
         """First guess from the images alone, in stored order, on the device."""
         peaks = [one.peak for one in self.recordings.values()]
         normalisation = self.normalisation
-        return multiplicative_guess(self.equations.comparisons, peaks, normalisation.column_sum, normalisation.lit)
+        return multiplicative_guess(
+            self.equations.comparisons, peaks, normalisation.column_sum, normalisation.lit, normalisation.shown
+        )
 
     @cached_property
     def _norm(self) -> float:
