@@ -57,7 +57,7 @@ class PreparedInstant:
         `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes. A
         `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first one, whose
         misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN. Voxels rest only
-        where the first guess is that of the images: one from other instants is dark where no particles are.
+        where the first guess is that of the images: few epochs follow another one.
         """
         settings, normalisation = self.settings, self.normalisation
         guess = duplicate(self._from_images) if first is None else self._given(first)

@@ -11,6 +11,8 @@ some bright voxel.
 No voxel is lost: one that rests and should be brighter is found in the next epoch of all voxels, or in the last passes,
 in which none rests. The light that the sieve spreads from active voxels into resting ones counts when these wake.
 
+A first guess from other instants shows where particles are. `without_dark` leaves its faintest voxels out for good.
+
 .. [1] C. Atkinson, J. Soria, "An efficient simultaneous reconstruction technique for tomographic particle image
    velocimetry", Exp. Fluids 47 (2009) 553-568, doi:10.1007/s00348-009-0728-0. It leaves such voxels out for good.
 """
