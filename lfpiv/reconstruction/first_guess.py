@@ -19,7 +19,11 @@ FAINTEST = 1e-6
 
 
 def multiplicative_guess(
-    comparisons: Sequence[Comparison], peaks: Sequence[float], column_sum: DeviceArray, lit: DeviceArray
+    comparisons: Sequence[Comparison],
+    peaks: Sequence[float],
+    column_sum: DeviceArray,
+    lit: DeviceArray,
+    shown: Sequence[DeviceArray],
 ) -> DeviceArray:
     """Return exp(sum_i w log(1 + I / b) / sum_i w) - 1, scaled so that its projections have the images' light.
 
@@ -33,6 +37,8 @@ def multiplicative_guess(
         sum_i w, on the device.
     lit : array, shape (voxel,), float32
         1 for voxels that some camera sees, on the device. The others are zero.
+    shown : sequence of array, shape (lit pixel,), float32
+        1 for pixels that such a voxel lights, else 0, of each image, on the device.
 
     Returns
     -------
@@ -43,7 +49,7 @@ def multiplicative_guess(
     for comparison, peak in zip(comparisons, peaks, strict=True):
         add_logarithms(comparison, max(comparison.floor, LEAST_FLOOR_SHARE * peak), logarithm)
     guess = exponentiate(logarithm, column_sum, lit, FAINTEST)
-    give_light(guess, comparisons)
+    give_light(guess, column_sum, comparisons, shown)
     return guess
 
 

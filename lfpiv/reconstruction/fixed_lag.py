@@ -26,9 +26,8 @@ from scipy import ndimage
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import FAINTEST, LARGEST_GAIN, SMOOTHING_VOXEL, MotionField
 from lfpiv.reconstruction.sieve import coefficients
-from lfpiv_kernels.correlation import deform
 
-SHARPNESS = 1.0
+SHARPNESS = 1.3
 """Exponent S of the mean's ratio to the volume."""
 DARK_SHARE = 0.005
 """Light added to all volumes before their ratio is taken, as a share of the smoothed volume's brightness,
@@ -39,15 +38,15 @@ ITERATIONS = 2
 """Iterations that follow. The last one is over all rays."""
 
 
-def agreed_guess(own: Reconstruction, others: Mapping[int, np.ndarray], flow: xr.Dataset) -> np.ndarray:
+def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow: xr.Dataset) -> np.ndarray:
     """Return the guess of an instant from its volume and those of the instants beside it.
 
     Parameters
     ----------
     own : Reconstruction
         The instant from its images and the instants before it.
-    others : mapping of int to ndarray, shape (z, y, x)
-        Number of instants from each to the present one, negative for later ones -> its volume.
+    others : mapping of int to Reconstruction
+        Number of instants from each to the present one, negative for later ones -> the instant.
     flow : Dataset
         From `mean_flow`: displacement from one instant to the next [voxel of the vectors' volumes].
 
@@ -64,7 +63,7 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, np.ndarray], flow: xr
     logarithm, ratio = np.log(blurred + dark), np.zeros_like(volume)
     motion = MotionField(own.to_dataarray(), flow)
     for steps, other in others.items():
-        moved, inside = motion.carried(deform.spline_coefficients(other), motion.displacement(-steps))
+        moved, inside = motion.carried(other.spline, motion.displacement(-steps))
         np.maximum(moved, 0, out=moved)
         total = float(moved.sum(dtype=np.float64))
         if total > 0:

@@ -55,9 +55,9 @@ class PreparedInstant:
         """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
 
         `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes. A
-        `brief` reconstruction over subsets leaves out what does not pay for few of them: the projection before the
-        first one, whose misfit is then the sum over the subsets, that after the last one, whose misfit is then NaN,
-        and voxels that rest.
+        `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first one, whose
+        misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN. Voxels rest only
+        where the first guess is that of the images: few epochs follow another one.
         """
         settings, normalisation = self.settings, self.normalisation
         guess = duplicate(self._from_images) if first is None else self._given(first)
@@ -72,7 +72,7 @@ class PreparedInstant:
         partitions = normalisation.partitions if epochs else ()
         with self.equations.locked():
             if partitions:
-                state = self._solve_subsets(state, partitions, history, epochs, brief, progress)
+                state = self._solve_subsets(state, partitions, history, epochs, brief, first is None, progress)
             if brief and history.epochs == count:
                 volume, stop = normalisation.sieve(state.coefficients), None
                 history.append(Misfit(math.nan, math.nan))
@@ -127,7 +127,9 @@ class PreparedInstant:
         """First guess from the images alone, in stored order, on the device."""
         peaks = [one.peak for one in self.recordings.values()]
         normalisation = self.normalisation
-        return multiplicative_guess(self.equations.comparisons, peaks, normalisation.column_sum, normalisation.lit)
+        return multiplicative_guess(
+            self.equations.comparisons, peaks, normalisation.column_sum, normalisation.lit, normalisation.shown
+        )
 
     @cached_property
     def _norm(self) -> float:
@@ -142,12 +144,13 @@ class PreparedInstant:
         history: History,
         epochs: int,
         brief: bool,
+        rest: bool,
         progress: Callable[[float], None] | None,
     ) -> State:
         """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
         if not brief:  # exact, as all steps begin here
             history.append(self.equations.compare(self.normalisation.sieve(state.coefficients)))
-        resting = None if brief else RestingVoxels(self.equations)
+        resting = RestingVoxels(self.equations) if rest or not brief else None
         for epoch in iterate_epochs(
             self.equations, state, self.normalisation.sieve, partitions=partitions, epochs=epochs, resting=resting
         ):

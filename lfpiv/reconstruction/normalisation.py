@@ -83,6 +83,16 @@ class Normalisation:
         return gains
 
     @cached_property
+    def shown(self) -> list[DeviceArray]:
+        """Of each camera 1 for pixels that a lit voxel lights, else 0, of the pixels that voxels light, float32."""
+        shown = []
+        for name in self._weights.cameras:
+            projector = self._weights.projector(name)
+            image = projector.project(self.lit, np.zeros(self._weights.gain(name).size, np.float32))
+            shown.append(to_device((image[projector.map.pixel] > 0).astype(np.float32), float))
+        return shown
+
+    @cached_property
     def steps(self) -> tuple[Step, ...]:
         """Steps of an iteration, the fastest first. Sharpened steps come with a sieve and momentum."""
         relaxation = self._settings.relaxation

@@ -87,8 +87,9 @@ class SubApertures:
         cut = (slice(None), *(slice(at[0], at[-1] + 1) for at in reversed(used)))
         self._first = np.where(seen, row * columns + column, 0)[cut]  # (sub-aperture, j, i), pixel of the sensor
         self._steps = (0, 1, columns)
-        self._even = [even.reshape(-1)[self._first + step] * seen[cut[1:]] for step in self._steps]
-        self._lit = self._even[0] > LIT_SHARE * self._even[0].max()
+        steady = [even.reshape(-1)[self._first + step] * seen[cut[1:]] for step in self._steps]
+        self._lit = steady[0] > LIT_SHARE * steady[0].max()
+        self._even = [(light * self._lit, _local_mean(light * self._lit)) for light in steady]
 
     def covariances(self, image: np.ndarray) -> np.ndarray:
         """Return sums of products of neighbours in the pupil, shape (2, sub-aperture): at the same lens, one away.
@@ -114,8 +115,8 @@ class SubApertures:
     def _fluctuations(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the fluctuations of the sub-apertures and of their neighbours to the right and below."""
         here, right, below = (
-            self._fluctuation(pixels[self._first + step], even)
-            for step, even in zip(self._steps, self._even, strict=True)
+            self._fluctuation(pixels[self._first + step] * self._lit, even, unit)
+            for step, (even, unit) in zip(self._steps, self._even, strict=True)
         )
         return here, right, below
 
@@ -127,15 +128,21 @@ class SubApertures:
         apart: np.ndarray = (along_i.sum((1, 2)) + along_j.sum((1, 2))) / 2
         return apart
 
-    def _fluctuation(self, light: np.ndarray, even: np.ndarray) -> np.ndarray:
-        """Subtract the mean light: that of an evenly lit volume times a slowly varying factor. 0 where it is dark."""
-        light, even = light * self._lit, even * self._lit
-        mean, unit = (
-            ndimage.gaussian_filter(values, (0, MEAN_LENSES, MEAN_LENSES), mode="constant") for values in (light, even)
-        )
+    def _fluctuation(self, light: np.ndarray, even: np.ndarray, unit: np.ndarray) -> np.ndarray:
+        """Subtract the mean light: that of an evenly lit volume times a slowly varying factor. 0 where it is dark.
+
+        `unit` is the local mean of `even`.
+        """
+        mean = _local_mean(light)
         slow = np.divide(mean, unit, out=np.zeros_like(mean), where=self._lit & (unit > 0))
         fluctuation: np.ndarray = light - slow * even
         return fluctuation
+
+
+def _local_mean(light: np.ndarray) -> np.ndarray:
+    """Return the mean of nearby lenses, shape (sub-aperture, j, i)."""
+    blurred: np.ndarray = ndimage.gaussian_filter(light, (0, MEAN_LENSES, MEAN_LENSES), mode="constant")
+    return blurred
 
 
 def _evenly_lit(weights: Weights) -> np.ndarray:

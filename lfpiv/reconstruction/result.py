@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import xarray as xr
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import MASKED, VIEWS
 from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv_kernels.correlation import deform
 
 
 class SmartStop(enum.Enum):
@@ -50,6 +52,11 @@ class Reconstruction:
     intensity_cap: float
     """Limit of the counts that was used, as a multiple of the typical peak; 0 for none."""
     settings: SmartSettings
+
+    @cached_property
+    def spline(self) -> np.ndarray:
+        """Spline coefficients of the volume, by which it is moved to other instants, float32."""
+        return deform.spline_coefficients(self.volume)
 
     @property
     def iterations(self) -> int:

@@ -34,6 +34,7 @@ from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, ro
 from lfpiv.reconstruction.flow import measure_flow
 from lfpiv.reconstruction.instant import PreparedInstant
 from lfpiv.reconstruction.motion import LEAST_VALID
+from lfpiv.reconstruction.resting_voxels import without_dark
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import MotionField
 from lfpiv.reconstruction.sieve import coefficients
@@ -45,7 +46,7 @@ PERSISTENCE = 0.9
 """Exponent of the moved volume in the first guess."""
 FLOW_MEMORY = 0.7
 """Weight of the flow known before in the flow that moves the next instant."""
-FIRST_SHARE = 0.5
+FIRST_SHARE = 0.35
 """Iterations of an instant that starts from its images, as a share of those of an instant by itself."""
 ITERATION_SHARE = 0.2
 """Iterations of an instant that starts from the one before, as a share of those of an instant by itself."""
@@ -153,14 +154,12 @@ class SequenceSolver:
         prepared = self.smart.prepare(images, floor=floor)
         flow, vectors = (None, None) if before is None else self._flow(before)
 
-        def solved(
-            start: Start, share: float, first: np.ndarray | None = None, *, brief: bool = False, ratio: float = math.nan
-        ) -> Solved:
+        def solved(start: Start, share: float, first: np.ndarray | None = None, ratio: float = math.nan) -> Solved:
             if share == 1:
                 found = prepared.solve(progress=progress)
             else:
                 count = math.ceil(share * self.smart.settings.iterations)
-                found = prepared.solve(iterations=count, whole_passes=0, first=first, brief=brief, progress=progress)
+                found = prepared.solve(iterations=count, whole_passes=0, first=first, brief=True, progress=progress)
             return Solved(prepared=prepared, found=found, start=start, flow=flow, vectors=vectors, misfit_ratio=ratio)
 
         if before is None or flow is None:
@@ -168,13 +167,14 @@ class SequenceSolver:
         if roughness(flow) > ROUGHEST:
             return solved(Start.UNRESOLVED, 1)
         plain = prepared.solve(iterations=0, brief=True)
-        guess = predicted_guess(before.volume, plain, flow)
+        guess = _concentrated(predicted_guess(before.volume, plain, flow), plain)
         misfit = prepared.sampled_misfit(guess)
         if not misfit < prepared.sampled_misfit():
-            chance = prepared.sampled_misfit(predicted_guess(_exchanged(before.volume), plain, flow))
+            exchanged = predicted_guess(_exchanged(before.volume), plain, flow)
+            chance = prepared.sampled_misfit(_concentrated(exchanged, plain))
             if not misfit < LEAST_AGREEMENT * chance:
                 return solved(Start.MISSED, FIRST_SHARE, ratio=misfit / chance if chance > 0 else 1.0)
-        return solved(Start.PREDICTED, ITERATION_SHARE, guess, brief=True)
+        return solved(Start.PREDICTED, ITERATION_SHARE, guess)
 
     def correct(
         self, trail: Sequence[Solved], at: int, progress: Callable[[float], None] | None = None
@@ -205,7 +205,7 @@ class SequenceSolver:
         others = {} if flow is None else _within_reach(trail, at, roughness(flow))
         if flow is None or not others:
             return alone or own.prepared.solve(progress=progress)
-        guess = agreed_guess(own.found, others, flow)
+        guess = _concentrated(agreed_guess(own.found, others, flow), own.found)
         after = own.prepared.solve(iterations=CORRECTIONS, whole_passes=1, first=guess, brief=True, progress=progress)
         return own.found.continued_by(after)
 
@@ -256,10 +256,15 @@ def predicted_guess(volume: np.ndarray, plain: Reconstruction, flow: xr.Dataset)
     return guess
 
 
-def _within_reach(trail: Sequence[Solved], at: int, rough: float) -> dict[int, np.ndarray]:
-    """Return the volumes of other instants from which particles are moved to one, by the number of steps to it."""
+def _concentrated(guess: np.ndarray, like: Reconstruction) -> np.ndarray:
+    """Return a first guess without its dark voxels. With a sieve these stay: it spreads light into them anyway."""
+    return guess if like.sieve_voxel > 0 else without_dark(guess)
+
+
+def _within_reach(trail: Sequence[Solved], at: int, rough: float) -> dict[int, Reconstruction]:
+    """Return other instants from which particles are moved to one, by the number of steps to it."""
     steps = {number: at - number for number in range(len(trail)) if number != at}
-    return {step: trail[number].found.volume for number, step in steps.items() if abs(step) * rough <= ROUGHEST}
+    return {step: trail[number].found for number, step in steps.items() if abs(step) * rough <= ROUGHEST}
 
 
 def _exchanged(volume: np.ndarray) -> np.ndarray:

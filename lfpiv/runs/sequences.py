@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 class SequentialInstants(Instants):
     """The instants of the present pair of a stretch, and those between them."""
 
-    sequences: dict[int, _Sequence] = field(default_factory=dict)
+    sequences: dict[int, SegmentInstants] = field(default_factory=dict)
     """Segment -> its instants so far."""
 
     def _obtain(self, files: PairFiles, progress: StepProgress, wanted: Sequence[VolumeFile] | None = None) -> None:
@@ -49,7 +49,7 @@ class SequentialInstants(Instants):
         self.work.require_weights(file)
         segment = segment_of(file.frame.number)
         if segment not in self.sequences:
-            self.sequences[segment] = _Sequence(self.work, segment)
+            self.sequences[segment] = SegmentInstants(self.work, segment)
         return self._handed_on(file, self.sequences[segment].reach(file.frame, progress))
 
     def clear(self) -> None:
@@ -59,7 +59,7 @@ class SequentialInstants(Instants):
 
 
 @dataclass(eq=False)
-class _Sequence:
+class SegmentInstants:
     """The instants of one segment, as far as they are reconstructed."""
 
     work: InstantWork

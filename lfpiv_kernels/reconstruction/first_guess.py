@@ -14,7 +14,7 @@ from lfpiv_kernels.reconstruction import sums
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
 from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of, sweep
-from lfpiv_kernels.transfer import empty, to_device, to_host, zeros
+from lfpiv_kernels.transfer import empty, to_device, to_host
 
 wp.set_module_options(native.quiet_options())
 
@@ -79,21 +79,16 @@ def _lift(
 
 
 @wp.kernel
-def _compare_light(
+def _multiply_light(
     # in
-    pixel: wp.array(dtype=int),
-    image: wp.array(dtype=float),
-    gain: wp.array(dtype=float),
-    projected: wp.array(dtype=float),
-    first_pixel: int,
+    one: wp.array(dtype=float),
+    other: wp.array(dtype=float),
+    first: int,
     # out
-    seen_out: wp.array(dtype=wp.float64),
-    light_out: wp.array(dtype=wp.float64),
+    product_out: wp.array(dtype=wp.float64),
 ):
-    k = first_pixel + wp.tid()
-    modelled = gain[k] * projected[pixel[k]]
-    seen_out[k] = wp.where(modelled > 0.0, wp.float64(image[k]), wp.float64(0.0))
-    light_out[k] = wp.float64(modelled)
+    k = first + wp.tid()
+    product_out[k] = wp.float64(one[k]) * wp.float64(other[k])
 
 
 @wp.kernel
@@ -135,15 +130,31 @@ def exponentiate(logarithm: wp.array, column_sum: wp.array, lit: wp.array, faint
     return logarithm
 
 
-def give_light(guess: wp.array, comparisons: Sequence[Comparison]) -> None:
-    """Scale a volume so that its projections have the light of the images where it lights them."""
+def give_light(
+    guess: wp.array, column_sum: wp.array, comparisons: Sequence[Comparison], shown: Sequence[wp.array]
+) -> None:
+    """Scale a volume so that its projections have the light of the images where it lights them.
+
+    The light of its projections is the sum of guess * column_sum: nothing is projected.
+
+    Parameters
+    ----------
+    guess, column_sum : array, shape (voxel,), float32
+        The volume, above 0 where voxels are lit, and the sum of each voxel's weights with gain.
+    comparisons : sequence of Comparison
+        The images.
+    shown : sequence of array, shape (lit pixel,), float32
+        1 for pixels that a lit voxel lights, else 0, of each image.
+    """
     totals = Totals(2)
-    for comparison in comparisons:
-        image, pixel = zeros(comparison.size), comparison.projector.map.rays.pixel
-        comparison.projector.project(guess, image)
-        light = [empty(pixel.size, wp.float64) for _ in range(2)]
-        call = Call(_compare_light, pixel.size, [pixel, comparison.image, comparison.gain, image], light)
-        launch(call, parts=parts_of(pixel.size, FEWEST_VOXELS))
-        for place, one in enumerate(light):
-            totals.add(place, one)
+    for comparison, seen in zip(comparisons, shown, strict=True):
+        _add_product(totals, 0, comparison.image, seen)
+    _add_product(totals, 1, guess, column_sum)
     sweep(_rescale, guess.size, [totals.values], [guess])
+
+
+def _add_product(totals: Totals, place: int, one: wp.array, other: wp.array) -> None:
+    """Add the sum of one * other to the total at `place`."""
+    product = empty(one.size, wp.float64)
+    launch(Call(_multiply_light, one.size, [one, other], [product]), parts=parts_of(one.size, FEWEST_VOXELS))
+    totals.add(place, product)

@@ -198,11 +198,12 @@ def _measure_way(scene: Scene, experiment: Experiment, out: Path, at: Sequence[n
     with counted_reconstructions(len(experiment.cameras)) as counts:
         summary = pipeline.run(experiment, out, keep_volumes=True)
     folder = Folder(out, experiment.series)
-    judged = [{"instant": number, **_judge(scene, number, folder.vectors(number))} for number in experiment.numbers]
+    fields = ((number, xr.load_dataset(folder.vectors(number), engine="h5netcdf")) for number in experiment.numbers)
+    each = [{"instant": number, **judged(scene, number, field)} for number, field in fields]
     volumes = {number: netcdf.read_volume(folder.volume(number, 0)) for number in _used(experiment)}
     return {
-        "instants": judged,
-        "quality": {str(number): _quality(volume, at[number], experiment.grid) for number, volume in volumes.items()},
+        "instants": each,
+        "quality": {str(number): quality(volume, at[number], experiment.grid) for number, volume in volumes.items()},
         "reconstructed": sorted(counts.instants.values()),
         "passes": counts.passes / len(volumes),
         "cpu_s": counts.cpu_s / len(volumes),
@@ -215,17 +216,15 @@ def _used(experiment: Experiment) -> list[int]:
     return sorted({frame.number for pair in experiment.numbers for frame in experiment.pair_frames(pair)})
 
 
-def _quality(volume: xr.DataArray, position_mm: np.ndarray, grid: Grid) -> float:
+def quality(volume: xr.DataArray, position_mm: np.ndarray, grid: Grid) -> float:
     """Return Q of a volume of points, after a blur, against blobs at the true positions."""
     truth = metrics.truth_volume(position_mm, None, grid, BLOB_VOXEL)
     blurred = ndimage.gaussian_filter(volume.values, BLUR_VOXEL, mode="constant")
     return float(metrics.reconstruction_quality(blurred, truth.values))
 
 
-def _judge(scene: Scene, number: int, path: Path) -> dict[str, float]:
+def judged(scene: Scene, number: int, vectors: xr.Dataset) -> dict[str, float]:
     """Compare the vectors of one instant with the mean displacement of all tracers over their windows."""
-    with xr.open_dataset(path, engine="h5netcdf") as stored:
-        vectors = stored.load()
     edge = np.array(json.loads(vectors.attrs["settings"])["windows"][-1][::-1]) * VOXEL_MM
     z, y, x = np.meshgrid(*(vectors[axis].values for axis in "zyx"), indexing="ij")
     centres = np.stack([x, y, z], axis=-1).reshape(-1, 3)
@@ -261,8 +260,8 @@ def _result(scene: Scene, measured: Mapping[str, Any]) -> dict[str, Any]:
     }
     alone, predicted = (mean[way] for way in WAYS)
     counts = measured["alone"]["reconstructed"]
-    judged = measured["alone"]["instants"]
-    needed = {instant for one in judged for instant in (one["instant"], one["instant"] + scene.particles.step)}
+    numbers = {one["instant"] for one in measured["alone"]["instants"]}
+    needed = numbers | {number + scene.particles.step for number in numbers}
     comparison = [
         page.compare("mean error of all vectors", alone["all"], unit="voxel"),
         page.compare("mean error of interior vectors", alone["interior"], unit="voxel"),

@@ -9,6 +9,7 @@ import xarray as xr
 import lfpiv
 from lfpiv import metrics
 from lfpiv.reconstruction import fixed_lag
+from lfpiv_kernels.correlation import deform
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=(2.4, 2.0, 1.6), voxel_mm=0.1)
 BLOB = 0.8  # standard deviation of particles [voxel]
@@ -28,7 +29,8 @@ def blobs(positions):
 
 def reconstruction(volume):
     array = xr.DataArray(volume, dims=("z", "y", "x"), coords=GRID.coordinates())
-    return SimpleNamespace(volume=volume, sieve_voxel=0.0, to_dataarray=lambda: array)
+    spline = deform.spline_coefficients(volume)
+    return SimpleNamespace(volume=volume, spline=spline, sieve_voxel=0.0, to_dataarray=lambda: array)
 
 
 def flow_of(displacement_voxel, valid=True):
@@ -51,7 +53,7 @@ def light_at(volume, position):
 
 
 def beside(steps):
-    return {step: blobs(PARTICLES - step * STEP) for step in steps}
+    return {step: reconstruction(blobs(PARTICLES - step * STEP)) for step in steps}
 
 
 def test_a_ghost_of_one_instant_fades_and_the_particles_stay():

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.usefixtures("device")
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.2, 1.2, 1.2), voxel_mm=0.1)
 SHIFT = 0.08  # [mm]
+TOLERANCE_LIGHT = 1e-5  # relative: float32 sums of the same terms in another order
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,18 @@ def test_a_mask_is_a_first_guess_without_light_there(recorded):
     zeros = plain_steps.reconstruct(weights, images, iterations=8, first=first.values)
     masked = plain_steps.reconstruct(weights, images, iterations=8, first=first.values, mask=solid)
     np.testing.assert_array_equal(masked.values, zeros.values)
+
+
+def test_the_first_guess_has_the_light_of_the_images_where_it_lights_them(recorded):
+    weights, solid, (images, _) = recorded
+    for mask in (None, solid):
+        guess = plain_steps.reconstruct(weights, images, iterations=0, mask=mask, intensity_cap=0.0)
+        images_of_guess = weights(guess.values)
+        gains = dict(zip(images_of_guess, guess.attrs["camera_gain"], strict=True))
+        projected = {name: np.float32(gains[name]) * image for name, image in images_of_guess.items()}
+        light = sum(one.sum(dtype=np.float64) for one in projected.values())
+        seen = sum(np.maximum(images[name], 0)[one > 0].sum(dtype=np.float64) for name, one in projected.items())
+        assert light == pytest.approx(seen, rel=TOLERANCE_LIGHT)
 
 
 def test_a_mask_is_given_as_flags_numbers_or_with_coordinates(recorded):

@@ -11,7 +11,7 @@ import lfpiv
 from lfpiv.reconstruction import resting_voxels, solver, steps
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.particle_size import ParticleSizer
-from lfpiv.reconstruction.resting_voxels import RestingVoxels
+from lfpiv.reconstruction.resting_voxels import RestingVoxels, without_dark
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
 from lfpiv_kernels.reconstruction.projector import EVEN, ODD
@@ -47,6 +47,21 @@ def equations(recorded):
         image[seen] = np.maximum(images[name].ravel()[seen], 0)
         cameras.append(CameraEquation(image=image, gain=gain, floor=5.0, projector=projector))
     return ImageEquations(cameras)
+
+
+def test_a_guess_without_dark_voxels_keeps_the_brightest_and_its_light():
+    guess = np.random.default_rng(2).lognormal(0, 3, (6, 8, 10)).astype(np.float32)
+    given = guess.copy()
+    found = without_dark(guess)
+    np.testing.assert_array_equal(guess, given)
+    dark = found == 0
+    below = np.cumsum(np.sort(guess[dark]), dtype=np.float64)[-1] / guess.sum(dtype=np.float64)
+    with_next = below + guess[~dark].min() / guess.sum(dtype=np.float64)
+    assert guess[dark].max() < guess[~dark].min() and below <= resting_voxels.DARK <= with_next
+    assert found.sum(dtype=np.float64) == pytest.approx(guess.sum(dtype=np.float64), rel=TOLERANCE_STEP)
+    assert np.ptp(found[~dark] / guess[~dark]) < TOLERANCE_STEP
+    nothing = np.zeros_like(guess)
+    assert np.array_equal(without_dark(nothing), nothing)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
