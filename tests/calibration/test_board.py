@@ -8,11 +8,12 @@ import pytest
 import tifffile
 from scipy.spatial import cKDTree
 
+from lfpiv.calibration.board import label
 from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.detect import on_lattice, search_radius_mm
-from lfpiv.calibration.board.dot_fit import DotFit
+from lfpiv.calibration.board.dot_fit import DotFit, converged
 from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
-from lfpiv.calibration.board.dot_shared import estimate_bend, follow_bend
+from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_pixels, follow_bend
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated
 from lfpiv.calibration.board.planes import HELD_BYTES, Planes
@@ -37,6 +38,8 @@ HONEST = (0.5, 2.0)  # limits of true over stated error; model errors are common
 DIAMETER_ERROR = 0.04  # 20 % cost 0.03 pitch in the labels, so 4 % cost as much as the noise
 SHARE_ERROR = 0.1  # a tenth hardly changes the weights
 GRADIENT_ERROR = 0.03  # differences over 2 % of a lens smooth the gradient's kinks
+FAINT = 0.25  # largest share of a dot that a pixel of an overexposed one sees
+FAINT_NOISE = 0.4  # faint pixels add the read-out noise: 2 counts, where a fifth of a dot has some 30 of shot noise
 FALSE_BENDS = 0.03  # 0.001 for many dots of equal information; more for five unequal ones
 F_ERROR = 5 * 0.5 / np.sqrt(20_000)  # five standard deviations of a count of 20,000 rays
 
@@ -275,6 +278,25 @@ def test_labels_follow_the_true_rays(name):
     noise = 1 / (WHITE_EXPOSURE * WHITE_PHOTONS)
     share = scene.response_sd**2 / (scene.response_sd**2 + noise)
     assert abs(dots.response_share - share) < SHARE_ERROR
+
+
+@pytest.mark.slow
+def test_noise_is_measured_where_all_bright_pixels_are_saturated(monkeypatch):
+    """Of an overexposed dot only pixels are fitted that see little of it."""
+    scene, found = SCENES["hexagonal, steep"], []
+
+    def faint(fit):
+        kept = fit.share < FAINT
+        return replace(fit, pixel=fit.pixel[kept], share=fit.share[kept], misfit=fit.misfit[kept])
+
+    def measure(pixels, fits):
+        found.append(estimate_pixels(pixels, [faint(fit) for fit in converged(fits)]))
+        return found[0]
+
+    monkeypatch.setattr(label, "estimate_pixels", measure)
+    dots = measured(scene)
+    assert found[0].counts_per_photon == pytest.approx(COUNTS_PER_PHOTON, rel=FAINT_NOISE)
+    assert np.array_equal(dots.found, scene.visible) and np.hypot(*label_errors(scene, dots).T).mean() < MEAN_ERROR
 
 
 @pytest.mark.slow

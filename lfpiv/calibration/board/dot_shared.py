@@ -31,7 +31,7 @@ _BEND_PRIOR_PITCHES = 0.5  # standard deviation of the prior on each term of the
 _NOTABLE = 0.1  # error of the stated diameter that is worth a warning [logarithm]
 _CHANCE = 1e-3  # probability that dots without a bend show one by chance
 _OUTLIER_CHI2 = 2.0  # fits with this many times the typical residual are left out
-_SHARE = 0.3  # pixels with at least this share of a dot measure noise and pixel response
+_SHARE = 0.3  # pixels with at least this part of the largest share of a dot measure noise and pixel response
 _CALM_SIGMA, _CALM_DEVIATION = 4.0, 0.5  # pixels further off in light or response are left out
 
 
@@ -142,7 +142,7 @@ def estimate_pixels(pixels: BoardPixels, fits: Sequence[DotFit | None]) -> Board
     decoder = pixels.decoder
     deviations, lights, misses = [], [], []
     for fit in converged(fits):
-        chosen = fit.share > _SHARE
+        chosen = fit.share > _SHARE * fit.share.max()  # the brightest pixels may be saturated, and are not fitted then
         at = tuple(fit.pixel[chosen].T)
         smooth = decoder.smooth_gain[at]
         light = (fit.base + fit.amplitude * fit.share[chosen]) * smooth
