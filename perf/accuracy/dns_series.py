@@ -22,6 +22,7 @@ import imperfect_scenes
 import numpy as np
 import xarray as xr
 from imperfections import BAD_VOXEL
+from reconstruction_cases import TRACERS_FILE
 from scipy import ndimage
 
 from lfpiv import metrics
@@ -46,7 +47,7 @@ from lfpiv_kernels.reconstruction.projector import ALL
 
 TITLE = "Time series of a turbulent flow"
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "dns-tracers" / "rayleigh_benard_series.npz"
+DATA = TRACERS_FILE
 """Tracers in Rayleigh-Benard convection: 20,000 at 12 instants, in the unit cube."""
 CUBE_MM = 8.0
 """Edge to which the cube is scaled."""
