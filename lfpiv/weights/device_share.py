@@ -28,8 +28,9 @@ log = logging.getLogger(__name__)
 VOLUMES, VOLUMES_PER_CAMERA = 10, 4
 """Largest number of volumes that SMART has on the GPU at once: coefficients, light, exponent, momentum, their sums and
 those that are copied; for each camera the sums of its weights and of its subsets, and the steps of these."""
-ARRAYS_PER_PIXEL = 6
-"""The same of images per camera: image, gain, light that is held, logarithm, and those that are copied."""
+ARRAYS_PER_PIXEL = 7
+"""The same of images per camera: image, gain, light that is held, logarithm, pixels that are shown, and those that are
+copied."""
 CORRELATED_BYTES, BATCH_BYTES = 100, 192 * MIB
 """Memory of the correlation per voxel, and beside that [byte]: both volumes, deformed and as splines, and windows with
 their spectra. Counted in volumes of 48 to 128 voxels along each edge, with windows up to 48."""
