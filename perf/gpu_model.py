@@ -92,7 +92,8 @@ class Passes:
 
         def run() -> None:
             comparisons, light = self._equations().comparisons, ones(self._size)
-            multiplicative_guess(comparisons, [1.0] * self._cameras, light, light)
+            shown = [ones(one.image.size) for one in comparisons]
+            multiplicative_guess(comparisons, [1.0] * self._cameras, light, light, shown)
 
         return trace(run, self._tracer)
 
