@@ -130,108 +130,102 @@ def _kernel(hexagonal, block, batch, share):
     ):
         ti.loop_config(block_dim=block)
         for task in range(lanes * share):
-            if task % share == 0:
-                lane = task // share
-                edge = ti.cast(camera[7], ti.i32)
-                tiles = (edge + BLOCK_WIDTH - 1) // BLOCK_WIDTH
-                lenses, rows_of_lenses = corner.shape[1], corner.shape[0]
-                columns_of_sensor, rows_of_sensor = ti.cast(camera[5], ti.i32), ti.cast(camera[6], ti.i32)
-                to_pixel = 1.0 / camera[1]
-                voxels = model.shape[0]
-                for turn in range((voxels - lane + lanes - 1) // lanes):
-                    v = lane + turn * lanes
-                    own = ti.Vector.zero(ti.f32, MODEL_SIZE)
-                    for k in range(MODEL_SIZE):
-                        own[k] = model[v, k]
-                    shift = ti.Vector.zero(ti.i32, DIMENSIONS)
-                    for k in ti.static(range(DIMENSIONS)):
-                        shift[k] = _hashed((first_voxel + v) * DIMENSIONS + k)
-                    most = 0
-                    lens_i, lens_j = ti.Vector.zero(ti.i32, batch), ti.Vector.zero(ti.i32, batch)
-                    at_x, at_y = ti.Vector.zero(ti.i32, batch), ti.Vector.zero(ti.i32, batch)
-                    for b in range(point.shape[1] // batch):
-                        for c in range(batch):
-                            n = b * batch + c
-                            at = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
-                            for k in ti.static(range(DIMENSIONS)):
-                                at[k] = _unit(point[k, n] ^ shift[k]) - 0.5
-                            pupil = _on_disc(2.0 * at[3], 2.0 * at[4])
-                            st = _traced(own, at[0], at[1], at[2], pupil[0] * camera[4], pupil[1] * camera[4])
-                            lens = nearest_lens(lattice, st[0], st[1], hexagonal)
-                            centre = lens_centre(lattice, lens[0], lens[1])
-                            x = (centre[0] + camera[0] * (st[0] - pupil[0] * camera[4])) * to_pixel + camera[2]
-                            y = (centre[1] + camera[0] * (st[1] - pupil[1] * camera[4])) * to_pixel + camera[3]
-                            lens_i[c], lens_j[c] = ti.cast(lens[0], ti.i32), ti.cast(lens[1], ti.i32)
-                            at_x[c], at_y[c] = ti.cast(ti.floor(x), ti.i32), ti.cast(ti.floor(y), ti.i32)
-                        for c in range(batch):
-                            i, j = lens_i[c] - array[0], lens_j[c] - array[1]
-                            own_i, own_j = lens_i[c] - first_lens[v, 0], lens_j[c] - first_lens[v, 1]
+            if task % share != 0:
+                continue
+            lane = task // share
+            edge = ti.cast(camera[7], ti.i32)
+            tiles = (edge + BLOCK_WIDTH - 1) // BLOCK_WIDTH
+            lenses, rows_of_lenses = corner.shape[1], corner.shape[0]
+            columns_of_sensor, rows_of_sensor = ti.cast(camera[5], ti.i32), ti.cast(camera[6], ti.i32)
+            to_pixel = 1.0 / camera[1]
+            voxels = model.shape[0]
+            for turn in range((voxels - lane + lanes - 1) // lanes):
+                v = lane + turn * lanes
+                own = ti.Vector.zero(ti.f32, MODEL_SIZE)
+                for k in range(MODEL_SIZE):
+                    own[k] = model[v, k]
+                shift = ti.Vector.zero(ti.i32, DIMENSIONS)
+                for k in ti.static(range(DIMENSIONS)):
+                    shift[k] = _hashed((first_voxel + v) * DIMENSIONS + k)
+                most = 0
+                lens_i, lens_j = ti.Vector.zero(ti.i32, batch), ti.Vector.zero(ti.i32, batch)
+                at_x, at_y = ti.Vector.zero(ti.i32, batch), ti.Vector.zero(ti.i32, batch)
+                for b in range(point.shape[1] // batch):
+                    for c in range(batch):
+                        n = b * batch + c
+                        at = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
+                        for k in ti.static(range(DIMENSIONS)):
+                            at[k] = _unit(point[k, n] ^ shift[k]) - 0.5
+                        pupil = _on_disc(2.0 * at[3], 2.0 * at[4])
+                        st = _traced(own, at[0], at[1], at[2], pupil[0] * camera[4], pupil[1] * camera[4])
+                        lens = nearest_lens(lattice, st[0], st[1], hexagonal)
+                        centre = lens_centre(lattice, lens[0], lens[1])
+                        x = (centre[0] + camera[0] * (st[0] - pupil[0] * camera[4])) * to_pixel + camera[2]
+                        y = (centre[1] + camera[0] * (st[1] - pupil[1] * camera[4])) * to_pixel + camera[3]
+                        lens_i[c], lens_j[c] = ti.cast(lens[0], ti.i32), ti.cast(lens[1], ti.i32)
+                        at_x[c], at_y[c] = ti.cast(ti.floor(x), ti.i32), ti.cast(ti.floor(y), ti.i32)
+                    for c in range(batch):
+                        i, j = lens_i[c] - array[0], lens_j[c] - array[1]
+                        own_i, own_j = lens_i[c] - first_lens[v, 0], lens_j[c] - first_lens[v, 1]
+                        if 0 <= own_i < box[0] and 0 <= own_j < box[1] and 0 <= i < lenses and 0 <= j < rows_of_lenses:
+                            column, row = at_x[c] - corner[j, i, 0], at_y[c] - corner[j, i, 1]
                             if (
-                                0 <= own_i < box[0]
-                                and 0 <= own_j < box[1]
-                                and 0 <= i < lenses
-                                and 0 <= j < rows_of_lenses
+                                0 <= at_x[c] < columns_of_sensor
+                                and 0 <= at_y[c] < rows_of_sensor
+                                and 0 <= column < edge
+                                and 0 <= row < edge
                             ):
-                                column, row = at_x[c] - corner[j, i, 0], at_y[c] - corner[j, i, 1]
-                                if (
-                                    0 <= at_x[c] < columns_of_sensor
-                                    and 0 <= at_y[c] < rows_of_sensor
-                                    and 0 <= column < edge
-                                    and 0 <= row < edge
-                                ):
-                                    slot = own_j * box[0] + own_i
-                                    place = (slot * edge + row) * edge + column
-                                    count = window_out[lane, place] + 1
-                                    window_out[lane, place] = count
-                                    most = ti.max(most, count)
-                                    tile = column // BLOCK_WIDTH
-                                    mark = (slot * tiles + tile) * edge + row
-                                    lit_out[lane, mark] = lit_out[lane, mark] | (1 << (column - BLOCK_WIDTH * tile))
-                    # the lit part of each tile of columns under a lens is a block; blocks of even lenses come first
-                    blocks, values, even_blocks, even_values = 0, 0, 0, 0
-                    for parity in range(2):
-                        for slot in range(box[0] * box[1]):
-                            i = first_lens[v, 0] + slot % box[0]
-                            j = first_lens[v, 1] + slot // box[0]
-                            if (i - array[0] + j - array[1]) & 1 == parity:
-                                for tile in range(tiles):
-                                    mark = (slot * tiles + tile) * edge
-                                    columns, low, high = 0, edge, -1
-                                    for row in range(edge):
-                                        bits = lit_out[lane, mark + row]
-                                        if bits != 0:
-                                            lit_out[lane, mark + row] = 0
-                                            columns |= bits
-                                            low, high = ti.min(low, row), row
-                                    if columns != 0:
-                                        left, right = 0, BLOCK_WIDTH - 1
-                                        while (columns >> left) & 1 == 0:
-                                            left += 1
-                                        while (columns >> right) & 1 == 0:
-                                            right -= 1
-                                        width, height = right - left + 1, high - low + 1
-                                        fits = (
-                                            blocks < ray_out.shape[1] and values + width * height <= value_out.shape[1]
-                                        )
-                                        if fits:
-                                            first = ((j - array[1]) * LAYERS + 1) * lenses + i - array[0]
-                                            ray_out[v, blocks] = (first * edge + low) * edge + tile * BLOCK_WIDTH + left
-                                            extent_out[v, blocks] = width + 256 * height
-                                        for row in range(height):
-                                            start = (slot * edge + low + row) * edge + tile * BLOCK_WIDTH + left
-                                            for column in range(width):
-                                                count = window_out[lane, start + column]
-                                                window_out[lane, start + column] = 0
-                                                if fits:
-                                                    level = (2 * TOP * count + most) // (2 * most)  # rounded, exactly
-                                                    value_out[v, values + width * row + column] = ti.cast(level, ti.u8)
-                                        blocks += 1
-                                        values += width * height
-                        if parity == 0:
-                            even_blocks, even_values = blocks, values
-                    needed_out[v, 0], needed_out[v, 1] = blocks, values
-                    needed_out[v, 2], needed_out[v, 3] = even_blocks, even_values
-                    needed_out[v, 4] = most
+                                slot = own_j * box[0] + own_i
+                                place = (slot * edge + row) * edge + column
+                                count = window_out[lane, place] + 1
+                                window_out[lane, place] = count
+                                most = ti.max(most, count)
+                                tile = column // BLOCK_WIDTH
+                                mark = (slot * tiles + tile) * edge + row
+                                lit_out[lane, mark] = lit_out[lane, mark] | (1 << (column - BLOCK_WIDTH * tile))
+                # the lit part of each tile of columns under a lens is a block; blocks of even lenses come first
+                blocks, values, even_blocks, even_values = 0, 0, 0, 0
+                for parity in range(2):
+                    for slot in range(box[0] * box[1]):
+                        i = first_lens[v, 0] + slot % box[0]
+                        j = first_lens[v, 1] + slot // box[0]
+                        if (i - array[0] + j - array[1]) & 1 == parity:
+                            for tile in range(tiles):
+                                mark = (slot * tiles + tile) * edge
+                                columns, low, high = 0, edge, -1
+                                for row in range(edge):
+                                    bits = lit_out[lane, mark + row]
+                                    if bits != 0:
+                                        lit_out[lane, mark + row] = 0
+                                        columns |= bits
+                                        low, high = ti.min(low, row), row
+                                if columns != 0:
+                                    left, right = 0, BLOCK_WIDTH - 1
+                                    while (columns >> left) & 1 == 0:
+                                        left += 1
+                                    while (columns >> right) & 1 == 0:
+                                        right -= 1
+                                    width, height = right - left + 1, high - low + 1
+                                    fits = blocks < ray_out.shape[1] and values + width * height <= value_out.shape[1]
+                                    if fits:
+                                        first = ((j - array[1]) * LAYERS + 1) * lenses + i - array[0]
+                                        ray_out[v, blocks] = (first * edge + low) * edge + tile * BLOCK_WIDTH + left
+                                        extent_out[v, blocks] = width + 256 * height
+                                    for row in range(height):
+                                        start = (slot * edge + low + row) * edge + tile * BLOCK_WIDTH + left
+                                        for column in range(width):
+                                            count = window_out[lane, start + column]
+                                            window_out[lane, start + column] = 0
+                                            if fits:
+                                                level = (2 * TOP * count + most) // (2 * most)  # rounded, exactly
+                                                value_out[v, values + width * row + column] = ti.cast(level, ti.u8)
+                                    blocks += 1
+                                    values += width * height
+                    if parity == 0:
+                        even_blocks, even_values = blocks, values
+                needed_out[v, 0], needed_out[v, 1] = blocks, values
+                needed_out[v, 2], needed_out[v, 3] = even_blocks, even_values
+                needed_out[v, 4] = most
 
     return _count_into_blocks
 

@@ -142,7 +142,7 @@ def estimate_pixels(pixels: BoardPixels, fits: Sequence[DotFit | None]) -> Board
     decoder = pixels.decoder
     deviations, lights, misses = [], [], []
     for fit in converged(fits):
-        chosen = fit.share > _SHARE * fit.share.max()  # the brightest pixels may be saturated, and are not fitted then
+        chosen = fit.share > _SHARE * fit.share.max()  # saturated pixels are not fitted, so none may see the whole dot
         at = tuple(fit.pixel[chosen].T)
         smooth = decoder.smooth_gain[at]
         light = (fit.base + fit.amplitude * fit.share[chosen]) * smooth
