@@ -106,13 +106,16 @@ class SegmentInstants:
         number = frame.number
         coming = range(self.last + 1, later.stop)
         for place, one in enumerate(coming):
+            if segment_of(one) != self.segment and self.before is not None and self.before.given_up:
+                self.last = one  # nobody reads it
+                continue
             step = part_of(progress, place / (len(coming) + 1), (place + 1) / (len(coming) + 1))
             self.trail[one] = self._follow(Frame(one, frame.name), step)
         self.done = number
         if segment_of(number) == self.segment:  # the others lead into it
             step = part_of(progress, len(coming) / (len(coming) + 1), 1.0)
             self.ahead[number] = self._corrected(frame, step)
-        own = self.trail[number]
+        own = self.trail.get(number)
         if isinstance(own, Followed):
             self.trail[number] = own.finished()
         self.trail = {one: found for one, found in self.trail.items() if one > number - segments.REACH}
