@@ -55,7 +55,7 @@ class Reconstruction:
     """Limit of the counts that was used, as a multiple of the typical peak; 0 for none."""
     settings: SmartSettings
 
-    @cached_property
+    @property
     def blurred(self) -> np.ndarray:
         """The volume smoothed by the size of a particle, in which instants are compared, float32."""
         blurred: np.ndarray = ndimage.gaussian_filter(self.volume, SMOOTHING_VOXEL, mode="constant")
