@@ -79,7 +79,7 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow
     change = np.exp(np.float32(SHARPNESS / (len(others) + 1)) * ratio)
     gain = np.zeros_like(volume)
     gain.ravel()[place] = np.minimum(change, np.float32(LARGEST_GAIN))
-    guess = coefficients(bright, own.sieve_voxel) * gain
+    guess: np.ndarray = coefficients(bright, own.sieve_voxel) * gain
     np.maximum(guess, FAINTEST * guess.max(), out=guess, where=bright > 0)
     guess *= np.float32(light / guess.sum(dtype=np.float64))
     return guess
