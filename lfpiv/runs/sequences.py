@@ -6,8 +6,8 @@ instants of a segment are always reconstructed from the same beginning
 (`lfpiv.experiment.segments`), so the numbers do not depend on the pairs that are asked for, on the processes, or on
 interruptions. A process that begins within a segment reconstructs the segment's instants up to there again.
 
-Where the flow is too rough to be followed, the rest of a segment is reconstructed by itself, and no further instant outside
-the segment is. The next segment tries again.
+Where the flow is too rough to be followed, the rest of a segment is reconstructed by itself. No further instant outside
+the segment is reconstructed for it. The next segment tries again.
 """
 
 from __future__ import annotations
