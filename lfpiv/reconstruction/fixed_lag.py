@@ -8,7 +8,8 @@ moves with the mean of the particles whose lines of sight cross in it, so it is 
 The guess is E ((G E_1 ... G E_n)^(1 / n) / G E)^S, with E the present volume, E_1 to E_n those of all instants moved to
 it, the present one included, and G a Gaussian of the size of a particle. So a volume keeps its own particles in their
 places, and only their brightness changes: the mean of moved volumes itself would draw displacements to the flow by
-which they were moved. Few iterations follow.
+which they were moved. Volumes are smoothed once and moved then. They are moved to bright voxels only, as dark ones stay
+dark. Few iterations follow.
 
 .. [1] K. P. Lynch, F. Scarano, "An efficient and accurate approach to MTE-MART for time-resolved tomographic PIV", Exp.
    Fluids 56 (2015) 66, doi:10.1007/s00348-015-1934-6.
@@ -21,10 +22,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
-from scipy import ndimage
 
+from lfpiv.reconstruction.resting_voxels import without_dark
 from lfpiv.reconstruction.result import Reconstruction
-from lfpiv.reconstruction.shared_light import FAINTEST, LARGEST_GAIN, SMOOTHING_VOXEL, MotionField
+from lfpiv.reconstruction.shared_light import FAINTEST, LARGEST_GAIN, MotionField
 from lfpiv.reconstruction.sieve import coefficients
 
 SHARPNESS = 1.3
@@ -34,6 +35,8 @@ DARK_SHARE = 0.005
 sum E^2 / sum E."""
 ROUGHEST = 0.18
 """Largest roughness of a displacement by which particles are moved [voxel]."""
+FAINT = 0.01
+"""Share of the light in the voxels that are left out of the guess before instants are compared, without a sieve."""
 ITERATIONS = 2
 """Iterations that follow. The last one is over all rays."""
 
@@ -53,25 +56,31 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow
     Returns
     -------
     ndarray, shape (z, y, x), float32
-        Coefficients of the sieve of `own`, with the light of its volume; zero where that is zero.
+        Coefficients of the sieve of `own`, with the light of its volume; zero where that is zero, and without a sieve
+        in its faintest voxels.
     """
     volume, light = own.volume, float(own.volume.sum(dtype=np.float64))
-    blurred = _blurred(volume)
     if not light > 0:
         return volume
+    bright = volume if own.sieve_voxel > 0 else without_dark(volume, FAINT)
+    blurred = own.blurred
     dark = np.float32(DARK_SHARE * np.square(blurred, dtype=np.float64).sum() / blurred.sum(dtype=np.float64))
-    logarithm, ratio = np.log(blurred + dark), np.zeros_like(volume)
+    place = np.flatnonzero(bright)
+    logarithm, ratio = np.log(blurred.ravel()[place] + dark), np.zeros(len(place), np.float32)
     motion = MotionField(own.to_dataarray(), flow)
+    trust = motion.trust.ravel()[place]
     for steps, other in others.items():
-        moved, inside = motion.carried(other.spline, motion.displacement(-steps))
-        np.maximum(moved, 0, out=moved)
-        total = float(moved.sum(dtype=np.float64))
+        total = float(other.volume.sum(dtype=np.float64))
         if total > 0:
-            trust = motion.trust * np.where(inside > 0.5, inside, 0)
-            ratio += trust * (np.log(_blurred(moved * np.float32(light / total)) + dark) - logarithm)
-    gain = np.minimum(np.exp(np.float32(SHARPNESS / (len(others) + 1)) * ratio), np.float32(LARGEST_GAIN))
-    guess = coefficients(volume, own.sieve_voxel) * gain
-    np.maximum(guess, FAINTEST * guess.max(), out=guess, where=volume > 0)
+            carried = motion.carried(other.spline, motion.displacement(-steps), bright)
+            moved, inside = (values.ravel()[place] for values in carried)
+            there = np.log(np.maximum(moved, 0) * np.float32(light / total) + dark)
+            ratio += trust * np.where(inside > 0.5, inside, 0) * (there - logarithm)
+    change = np.exp(np.float32(SHARPNESS / (len(others) + 1)) * ratio)
+    gain = np.zeros_like(volume)
+    gain.ravel()[place] = np.minimum(change, np.float32(LARGEST_GAIN))
+    guess: np.ndarray = coefficients(bright, own.sieve_voxel) * gain
+    np.maximum(guess, FAINTEST * guess.max(), out=guess, where=bright > 0)
     guess *= np.float32(light / guess.sum(dtype=np.float64))
     return guess
 
@@ -101,8 +110,3 @@ def roughness(flow: xr.Dataset) -> float:
     curved = [np.diff(field, 2, axis=axis) for axis in range(3) if field.shape[axis] > 2]
     squares = [float(np.nanmean(part**2)) for part in curved if np.isfinite(part).any()]
     return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
-
-
-def _blurred(volume: np.ndarray) -> np.ndarray:
-    blurred: np.ndarray = ndimage.gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant")
-    return blurred

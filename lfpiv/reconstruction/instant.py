@@ -16,7 +16,7 @@ from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.normalisation import Normalisation
 from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Partition, iterate_epochs
 from lfpiv.reconstruction.recording import Recording
-from lfpiv.reconstruction.resting_voxels import RestingVoxels
+from lfpiv.reconstruction.resting_voxels import DARK, RestingVoxels
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State, iterate
@@ -57,7 +57,8 @@ class PreparedInstant:
         `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes. A
         `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first one, whose
         misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN. Voxels rest only
-        where the first guess is that of the images: few epochs follow another one.
+        where the first guess is that of the images. Another one shows where particles are: without a sieve, voxels that
+        become dark are left out.
         """
         settings, normalisation = self.settings, self.normalisation
         guess = duplicate(self._from_images) if first is None else self._given(first)
@@ -151,9 +152,16 @@ class PreparedInstant:
         if not brief:  # exact, as all steps begin here
             history.append(self.equations.compare(self.normalisation.sieve(state.coefficients)))
         resting = RestingVoxels(self.equations) if rest or not brief else None
-        for epoch in iterate_epochs(
-            self.equations, state, self.normalisation.sieve, partitions=partitions, epochs=epochs, resting=resting
-        ):
+        epochs_of = iterate_epochs(
+            self.equations,
+            state,
+            self.normalisation.sieve,
+            partitions=partitions,
+            epochs=epochs,
+            resting=resting,
+            left_out=DARK if resting is None and self.normalisation.sieve.sigma_voxel == 0 else 0.0,
+        )
+        for epoch in epochs_of:
             state = epoch.state
             if brief or history.epochs:
                 history.append(epoch.misfit)

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfpiv.reconstruction.momentum import Momentum
-from lfpiv.reconstruction.resting_voxels import RestingVoxels
+from lfpiv.reconstruction.resting_voxels import RestingVoxels, leave_out
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State
 from lfpiv.reconstruction.steps import Step
@@ -136,6 +136,7 @@ def iterate_epochs(
     partitions: Sequence[Partition],
     epochs: int,
     resting: RestingVoxels | None = None,
+    left_out: float = 0.0,
 ) -> Iterator[Epoch]:
     """Iterate over the subsets; yield what each epoch leaves. End early where one subset is left.
 
@@ -155,11 +156,15 @@ def iterate_epochs(
         Largest number of epochs.
     resting : RestingVoxels, optional
         Lets dark voxels rest. Default: all voxels take part in all epochs.
+    left_out : float
+        Share of the light in the faintest voxels that are left out for good before each epoch but the first one.
     """
     coefficients = duplicate(state.coefficients)
     momentum = Momentum(duplicate(coefficients), largest=SUBSET_MOMENTUM)
     partition, following = partitions[0], list(partitions[1:])
     for epoch in range(epochs):
+        if epoch and left_out > 0:
+            leave_out(coefficients, momentum, left_out)
         active = None if resting is None else resting.active_in(epoch, sieve(coefficients))
         over = None
         if active is not None:

@@ -11,7 +11,8 @@ some bright voxel.
 No voxel is lost: one that rests and should be brighter is found in the next epoch of all voxels, or in the last passes,
 in which none rests. The light that the sieve spreads from active voxels into resting ones counts when these wake.
 
-A first guess from other instants shows where particles are. `without_dark` leaves its faintest voxels out for good.
+A first guess from other instants shows where particles are. `without_dark` leaves its faintest voxels out for good, and
+`leave_out` those that become dark later.
 
 .. [1] C. Atkinson, J. Soria, "An efficient simultaneous reconstruction technique for tomographic particle image
    velocimetry", Exp. Fluids 47 (2009) 553-568, doi:10.1007/s00348-009-0728-0. It leaves such voxels out for good.
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.smart import ImageEquations
 from lfpiv_kernels.reconstruction.sums import brightest_share
 from lfpiv_kernels.reconstruction.voxels import multiply, part_bright
@@ -35,11 +37,11 @@ FEWEST_VOXELS = 100_000
 LIGHT = 0.01
 """Share of the active voxels' light that rests from the next epoch on."""
 DARK = 0.03
-"""Share of the light of a good first guess in the voxels that `without_dark` leaves out."""
+"""Share of the light in the voxels that are left out of a good first guess, and again before each epoch from it."""
 
 
-def without_dark(guess: np.ndarray) -> np.ndarray:
-    """Return a first guess whose faintest voxels, with `DARK` of its light, are 0.
+def without_dark(guess: np.ndarray, share: float = DARK) -> np.ndarray:
+    """Return a first guess whose faintest voxels, with a share of its light, are 0.
 
     SMART leaves zeros as they are and does not visit their weights. So this is for a guess that shows where particles
     are, such as one from other instants.
@@ -48,6 +50,8 @@ def without_dark(guess: np.ndarray) -> np.ndarray:
     ----------
     guess : ndarray, shape (z, y, x), float32
         Light of each voxel, >= 0.
+    share : float
+        Share of the light.
 
     Returns
     -------
@@ -55,12 +59,19 @@ def without_dark(guess: np.ndarray) -> np.ndarray:
         With the light of the guess.
     """
     light = to_device(np.ascontiguousarray(guess).ravel(), float)
-    bright = to_host(multiply(light, part_bright(duplicate(light), brightest_share(light, DARK))))
+    bright = to_host(multiply(light, part_bright(duplicate(light), brightest_share(light, share))))
     total = bright.sum(dtype=np.float64)
     if not total > 0:
         return guess
     bright *= np.float32(guess.sum(dtype=np.float64) / total)
     return bright.reshape(guess.shape)
+
+
+def leave_out(coefficients: DeviceArray, momentum: Momentum, share: float) -> None:
+    """Set the faintest coefficients, with a share of their light, to 0, and the momentum's memory of them."""
+    bright = part_bright(duplicate(coefficients), brightest_share(coefficients, share))
+    for values in (coefficients, momentum.previous):
+        multiply(values, bright, values)
 
 
 class RestingVoxels:

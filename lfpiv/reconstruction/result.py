@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy import ndimage
 
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import MASKED, VIEWS
 from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.shared_light import SMOOTHING_VOXEL
 from lfpiv_kernels.correlation import deform
 
 
@@ -53,10 +55,16 @@ class Reconstruction:
     """Limit of the counts that was used, as a multiple of the typical peak; 0 for none."""
     settings: SmartSettings
 
+    @property
+    def blurred(self) -> np.ndarray:
+        """The volume smoothed by the size of a particle, in which instants are compared, float32."""
+        blurred: np.ndarray = ndimage.gaussian_filter(self.volume, SMOOTHING_VOXEL, mode="constant")
+        return blurred
+
     @cached_property
     def spline(self) -> np.ndarray:
-        """Spline coefficients of the volume, by which it is moved to other instants, float32."""
-        return deform.spline_coefficients(self.volume)
+        """Spline coefficients of the smoothed volume, by which it is moved to other instants, float32."""
+        return deform.spline_coefficients(self.blurred)
 
     @property
     def iterations(self) -> int:

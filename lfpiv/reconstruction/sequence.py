@@ -55,6 +55,8 @@ DIMMEST = 0.05
 FAINTEST = 1e-6
 """Least light of a voxel in the first guess, as a share of the brightest one. SMART can raise it; it cannot raise 0."""
 
+TRIES = 2
+"""Successive instants whose flow is too rough to be followed after which no flow of a segment is looked at any more."""
 LEAST_AGREEMENT = 0.9
 """Largest misfit of a prediction, as a share of the misfit of particles in other places."""
 
@@ -83,6 +85,13 @@ class Before:
     """The same of the instant before; None where the particles cannot be followed from it."""
     flow: xr.Dataset | None = None
     """Displacement from one instant to the next as known at the instant before; None if it is not known."""
+    unresolved: int = 0
+    """Number of the last instants, one after the other, whose flow was too rough to be followed."""
+
+    @property
+    def given_up(self) -> bool:
+        """Whether all following instants are reconstructed by themselves."""
+        return self.unresolved >= TRIES
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,7 +116,10 @@ class Solved:
         image does not change it.
         """
         earlier = None if last is None or self.start is Start.MISSED else last.measured
-        return Before(volume=self.found.volume, measured=measured, earlier=earlier, flow=self.flow)
+        known = 0 if last is None else last.unresolved
+        unresolved = known + 1 if self.start is Start.UNRESOLVED else 0
+        volume = self.found.volume
+        return Before(volume=volume, measured=measured, earlier=earlier, flow=self.flow, unresolved=unresolved)
 
 
 class SequenceSolver:
@@ -152,7 +164,8 @@ class SequenceSolver:
             If `SmartSolver.solve` or `correlate` refuse their arguments.
         """
         prepared = self.smart.prepare(images, floor=floor)
-        flow, vectors = (None, None) if before is None else self._flow(before)
+        given_up = before is not None and before.given_up
+        flow, vectors = (None, None) if before is None or given_up else self._flow(before)
 
         def solved(start: Start, share: float, first: np.ndarray | None = None, ratio: float = math.nan) -> Solved:
             if share == 1:
@@ -162,6 +175,8 @@ class SequenceSolver:
                 found = prepared.solve(iterations=count, whole_passes=0, first=first, brief=True, progress=progress)
             return Solved(prepared=prepared, found=found, start=start, flow=flow, vectors=vectors, misfit_ratio=ratio)
 
+        if given_up:
+            return solved(Start.UNRESOLVED, 1)
         if before is None or flow is None:
             return solved(Start.FIRST, FIRST_SHARE)
         if roughness(flow) > ROUGHEST:

@@ -115,12 +115,15 @@ class MotionField:
             moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in middle])
         return moved
 
-    def carried(self, coefficients: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def carried(
+        self, coefficients: np.ndarray, field: np.ndarray, wanted: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Sample a volume, given by its spline coefficients, at x + field(x) for all voxels x.
 
-        Returns its light, 0 outside, and how far inside the volume the place is: 1 inside, 0 a voxel beyond it.
+        Returns its light, 0 outside, and how far inside the volume the place is: 1 inside, 0 a voxel beyond it. Both
+        are 0 where `wanted`, shape (z, y, x), is 0.
         """
-        return carry(coefficients, np.moveaxis(field, 0, -1).astype(np.float32), self.midway.spacing)
+        return carry(coefficients, np.moveaxis(field, 0, -1).astype(np.float32), self.midway.spacing, wanted)
 
 
 def _linear(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:

@@ -5,6 +5,9 @@ second one of the present pair. Each is corrected by the few instants before and
 instants of a segment are always reconstructed from the same beginning
 (`lfpiv.experiment.segments`), so the numbers do not depend on the pairs that are asked for, on the processes, or on
 interruptions. A process that begins within a segment reconstructs the segment's instants up to there again.
+
+Where the flow is too rough to be followed, the rest of a segment is reconstructed by itself. No further instant outside
+the segment is reconstructed for it. The next segment tries again.
 """
 
 from __future__ import annotations
@@ -106,13 +109,16 @@ class SegmentInstants:
         number = frame.number
         coming = range(self.last + 1, later.stop)
         for place, one in enumerate(coming):
+            if segment_of(one) != self.segment and self.before is not None and self.before.given_up:
+                self.last = one  # it would correct none
+                continue
             step = part_of(progress, place / (len(coming) + 1), (place + 1) / (len(coming) + 1))
             self.trail[one] = self._follow(Frame(one, frame.name), step)
         self.done = number
         if segment_of(number) == self.segment:  # the others lead into it
             step = part_of(progress, len(coming) / (len(coming) + 1), 1.0)
             self.ahead[number] = self._corrected(frame, step)
-        own = self.trail[number]
+        own = self.trail.get(number)
         if isinstance(own, Followed):
             self.trail[number] = own.finished()
         self.trail = {one: found for one, found in self.trail.items() if one > number - segments.REACH}

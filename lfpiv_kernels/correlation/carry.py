@@ -42,6 +42,7 @@ def _carry(
     field: wp.array3d(dtype=wp.vec3),  # displacement (z, y, x) [voxel] on the control grid
     spacing: wp.vec3,  # distance of control points [voxel], the first one at voxel (0, 0, 0)
     margin: int,
+    wanted: wp.array3d(dtype=float),  # 0 for voxels that are left out, (z, y, x), if there is any
     first_layer: int,
     # out
     carried_out: wp.array3d(dtype=float),  # volume at x + d, (z, y, x)
@@ -49,6 +50,11 @@ def _carry(
 ):
     layer, y, x = wp.tid()
     z = first_layer + layer
+    if wanted.shape[0] > 0:
+        if wanted[z, y, x] == 0.0:
+            carried_out[z, y, x] = 0.0
+            inside_out[z, y, x] = 0.0
+            return
     fz = float(z) / spacing[0]
     fy = float(y) / spacing[1]
     fx = float(x) / spacing[2]
@@ -68,7 +74,12 @@ def _carry(
     inside_out[z, y, x] = within * _share_inside(px, shape[2] - 2 * margin)
 
 
-def carry(coefficients: Given, field: np.ndarray, spacing: tuple[float, float, float]) -> tuple[Given, Given]:
+def carry(
+    coefficients: Given,
+    field: np.ndarray,
+    spacing: tuple[float, float, float],
+    wanted: np.ndarray | None = None,
+) -> tuple[Given, Given]:
     """Sample a volume at ``x + d(x)`` for all voxels x.
 
     Parameters
@@ -79,6 +90,8 @@ def carry(coefficients: Given, field: np.ndarray, spacing: tuple[float, float, f
         Displacement d, order (z, y, x) [voxel], at control points, at least 2 per axis; linear between them.
     spacing : tuple of float
         Distance of the control points, order (z, y, x) [voxel]; the first lies on voxel (0, 0, 0).
+    wanted : ndarray, shape (z, y, x), float32, optional
+        0 for voxels that are left out: both results are 0 there. Default: all are wanted.
 
     Returns
     -------
@@ -98,6 +111,8 @@ def carry(coefficients: Given, field: np.ndarray, spacing: tuple[float, float, f
     shape = tuple(n - 2 * MARGIN for n in coefficients.shape)
     outputs = [empty_volume(shape) for _ in range(2)]
     control = to_device(np.ascontiguousarray(field, np.float32), wp.vec3)
-    inputs = [on_device(coefficients).flatten(), wp.vec3i(*coefficients.shape), control, wp.vec3(*spacing), MARGIN]
+    mask = None if wanted is None else to_device(np.ascontiguousarray(wanted, np.float32), float)
+    flat, shape_3i = on_device(coefficients).flatten(), wp.vec3i(*coefficients.shape)
+    inputs = [flat, shape_3i, control, wp.vec3(*spacing), MARGIN, mask]
     launch(Call(_carry, shape[0], inputs, outputs, inner=shape[1:]))
     return as_given(outputs[0], coefficients), as_given(outputs[1], coefficients)

@@ -2,9 +2,9 @@
 
     python perf/accuracy/predicted_series.py --flows dns,swirl,turbulence,points --seeds 1,3
 
-Flows are the DNS series of `dns_series`, a swirl and a frozen turbulence of blobs, and the turbulence of points. Each
-instant is reconstructed in both ways, one after the other, in one process, and the computing time is summed. Images and
-calibrations are kept in a folder.
+Flows are the DNS series of `dns_series`, the same with realistic images, a swirl and a frozen turbulence of blobs, and
+the turbulence of points. Each instant is reconstructed in both ways, one after the other, in one process, and the
+computing time is summed. Images and calibrations are kept in a folder.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.series import place_series
 from lfpiv.simulation.simulator import simulate
 
-FLOWS = ("dns", "swirl", "turbulence", "points")
+FLOWS = ("dns", "realistic", "swirl", "turbulence", "points")
 INSTANTS = 12
 BLOBS = {"per_microlens": 0.5, "sigma_mm": 0.07}
 POINTS = {"per_microlens": 0.5, "sigma_mm": 0.02}
@@ -53,10 +53,21 @@ def scene_of(flow: str, seed: int) -> Scene:
     """Return the series of a flow; the rig differs with the seed."""
     if flow == "dns":
         return dns_series.series_scene("small", seed)
+    if flow == "realistic":
+        return realistic(dns_series.series_scene("small", seed))
     tables = imperfect_scenes.ideal_tables("small", seed)
     tables["particles"] = (POINTS if flow == "points" else BLOBS) | {"instants": INSTANTS, "step": 1}
     if flow != "swirl":
         tables |= {"flow": STILL, "turbulence": TURBULENCE}
+    return Scene.model_validate(tables)
+
+
+def realistic(scene: Scene) -> Scene:
+    """Return a series with all imperfections of the images, of board and lens arrays; the cameras have not moved."""
+    tables = scene.model_dump(exclude_unset=True)
+    for name, table in imperfect_scenes.rows("small")["all"].tables.items():
+        if name != "particles":  # those of the series
+            tables[name] = tables[name] | table if isinstance(tables.get(name), dict) else table
     return Scene.model_validate(tables)
 
 

@@ -11,7 +11,7 @@ import lfpiv
 from lfpiv.reconstruction import resting_voxels, solver, steps
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.particle_size import ParticleSizer
-from lfpiv.reconstruction.resting_voxels import RestingVoxels, without_dark
+from lfpiv.reconstruction.resting_voxels import RestingVoxels, leave_out, without_dark
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
 from lfpiv_kernels.reconstruction.projector import EVEN, ODD
@@ -153,6 +153,19 @@ def test_momentum_forgets_voxels_that_stop():
     moving.forget(to_device(after), to_device(np.array([1.0, 0.0, 1.0], np.float32)))
     ahead = to_host(moving.extrapolate(to_device(after.copy()))[0])
     assert ahead[0] > 2 and ahead[1:].tolist() == [2, 2]
+
+
+def test_voxels_that_are_left_out_stay_dark():
+    rng = np.random.default_rng(6)
+    given, before = (rng.lognormal(0, 2, 400).astype(np.float32) for _ in range(2))
+    values, momentum = to_device(given.copy()), Momentum(to_device(before.copy()), time=5.0)
+    leave_out(values, momentum, 0.1)
+    left = to_host(values).copy()
+    out = left == 0
+    np.testing.assert_array_equal(left[~out], given[~out])
+    assert given[out].sum() <= 0.1 * given.sum() < given[out].sum() + given[~out].min()
+    assert given[out].max() < given[~out].min()
+    assert (to_host(momentum.extrapolate(values)[0])[out] == 0).all(), "not lifted by the momentum"
 
 
 def test_volumes_are_as_good_with_fewer_voxels_visited(recorded, monkeypatch):

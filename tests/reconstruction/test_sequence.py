@@ -1,5 +1,7 @@
 """A series in sequence: the guess is the moved volume before, volumes gain in fewer iterations, changes are noticed."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -123,6 +125,28 @@ def test_a_flow_that_is_not_resolved_moves_nothing(solver, series):
     expected = solver.smart.solve(images[2]).volume
     assert np.array_equal(done[2].found.volume, expected)
     assert np.array_equal(unresolved.correct(done, 2).volume, expected)
+
+
+def test_after_some_flows_that_are_not_resolved_none_is_measured(solver, series):
+    _, images, _ = series
+    rough = vectors_of(FLOW)
+    bumps = (-1.0) ** np.arange(rough.sizes["x"]) * sequence.ROUGHEST
+    rough = rough.assign({f"displacement_{axis}": rough[f"displacement_{axis}"] + bumps for axis in "xyz"})
+    measured = []
+    unresolved = SequenceSolver(solver.smart, CORRELATION, lambda *arguments: measured.append(arguments) or rough)
+    done, before = along(unresolved, images[:6])
+    assert [one.start for one in done] == [Start.FIRST] * 2 + [Start.UNRESOLVED] * 4
+    assert len(measured) == sequence.TRIES and before.given_up
+    assert np.array_equal(done[5].found.volume, solver.smart.solve(images[5]).volume)
+    assert not along(solver, images[:3])[1].given_up
+
+
+def test_tries_are_counted_one_after_the_other(solver, series):
+    _, images, _ = series
+    done, before = along(solver, images[:3])
+    assert done[2].start is Start.PREDICTED
+    nearly = dataclasses.replace(before, unresolved=sequence.TRIES - 1)
+    assert done[2].before(before.measured, nearly).unresolved == 0
 
 
 def test_a_change_of_the_scene_is_noticed_and_the_instant_starts_from_its_images(solver, series):

@@ -13,6 +13,7 @@ from support.series_run import FIRST, Processes, changed, make_work, write_serie
 from support.small_run import damage, same_vectors
 
 from lfpiv.experiment import segments
+from lfpiv.reconstruction import sequence
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import dispatch
@@ -128,6 +129,21 @@ def test_the_numbers_are_those_of_one_process_for_any_beginning(made, reference,
     shutil.rmtree(tmp_path / "out")
     sequential(changed(work, tmp_path / "out", instants=INSTANTS))
     assert solved["volumes"] == INSTANTS + 4, "two instants lead in, and two correct the last ones of their segments"
+
+
+def test_a_segment_whose_flow_is_given_up_has_the_numbers_of_instants_by_themselves(
+    made, tmp_path, solved, monkeypatch
+):
+    monkeypatch.setattr(sequence, "ROUGHEST", -1.0)
+    monkeypatch.setattr(sequence, "TRIES", 1)
+    work = changed(made[1], tmp_path / "out", instants=INSTANTS)
+    sequential(work)
+    assert solved["volumes"] == INSTANTS + 2, "two instants lead in; none after a segment is reconstructed"
+    sequential(predicting(changed(work, tmp_path / "alone", instants=INSTANTS), False))
+    assert same_vectors(tmp_path / "alone", tmp_path / "out") == INSTANTS - 1
+    for pair in reversed(work.experiment.numbers):
+        assert not sequential(changed(work, tmp_path / "again", instants=INSTANTS), [pair])[0].reason
+    assert same_vectors(tmp_path / "alone", tmp_path / "again") == INSTANTS - 1
 
 
 def warnings_of(folder):
