@@ -1,7 +1,7 @@
 """Correlation coefficients of windows and their two highest peaks on a GPU; host functions and CPU form: ``peaks``.
 
-A window has thousands of lags, and a coarse pass hundreds of windows: a warp forms the coefficients of 32 windows at
-a few lags, and another one looks for the peaks of a window. The coefficients of a window lie side by side between.
+A window has thousands of lags, and a coarse pass hundreds of windows: a warp forms the coefficients of 32 windows
+at one lag, and another one looks for the peaks of a window. The coefficients of a window lie side by side between.
 """
 
 import math
@@ -15,8 +15,8 @@ from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("peaks_gpu.h", contract="fast", gpu=True))
 
-LAGS_OF_TILE: int = native.constant("peaks_gpu.h", "LAGS_OF_TILE")
-"""Lags of a tile; a window's coefficients have room for whole tiles."""
+SECTOR = 8
+"""Floats that memory moves at once; the coefficients of a window begin one."""
 
 
 @wp.func_native("lfpiv::score_windows(sums, first, second, windows, count, task, score_out.data);")
@@ -49,7 +49,7 @@ def _score_windows(
     first: Statistics,  # of windows at every lag if symmetric, else at lag 0
     second: Statistics,  # at every lag
     windows: Windows,
-    count: int,  # windows; a warp per tile of lags and 32 windows
+    count: int,  # windows; a warp per lag and 32 windows
     begin: int,
     # out
     score_out: wp.array(dtype=float),  # coefficients, (layer, lane, lag)
@@ -72,13 +72,13 @@ def _find_window_peaks(
 
 
 def score_pitch(lags: tuple[int, int, int]) -> int:
-    """Elements from the coefficients of a window to those of the next: whole tiles."""
-    return -(-math.prod(lags) // LAGS_OF_TILE) * LAGS_OF_TILE
+    """Elements from the coefficients of a window to those of the next."""
+    return -(-math.prod(lags) // SECTOR) * SECTOR
 
 
 def peak_calls(inputs: list[object], count: int, scores: wp.array, peaks: wp.array) -> tuple[Call, Call]:
-    """Return the calls that form the coefficients of `count` windows, and that find their peaks, one after the other."""
+    """Return the calls that form the coefficients of `count` windows, and then find their peaks."""
     windows, inner = inputs[3], lanes_of_warp()
-    tasks = windows.score_pitch // LAGS_OF_TILE * -(-count // LANES)
+    tasks = math.prod(windows.lags) * -(-count // LANES)
     score = Call(_score_windows, tasks, [*inputs, count], [scores], inner=inner)
     return score, Call(_find_window_peaks, count, [windows, scores], [peaks], inner=inner)

@@ -10,52 +10,18 @@ namespace lfpiv {
 
 static_assert(WIDTH == 1, "a lane per window");
 
-/// Lags of a tile, whose coefficients a window writes side by side. And warps of a thread block.
-constexpr int LAGS_OF_TILE = 4;
-constexpr int SCORE_WARPS = 8;
-
-/// Coefficients of 32 windows at the lags of a tile, (lag, window). Every row is followed by a gap: lanes that read
-/// neighbouring lags of neighbouring windows then meet in different banks.
-struct ScoreTile {
-    static constexpr int PITCH = LANES_OF_WARP + 8, SIZE = LAGS_OF_TILE * PITCH;
-    float* scores;
-
-    LFPIV_INLINE float* at(int lag, int window) const {
-        LFPIV_EXCHANGED(1);
-        return scores + lag * PITCH + window;
-    }
-};
-
-/// Form the coefficients of 32 of `count` windows at the lags of a tile. Tasks are numbered (tile, group of windows).
-/// Neighbouring lanes read the sums of neighbouring windows, then write neighbouring lags.
+/// Form the coefficients of 32 of `count` windows at one lag. Tasks are numbered (lag, group of windows). Neighbouring
+/// lanes read the sums of neighbouring windows.
 template <class Sums, class Statistics, class Windows>
 LFPIV_INLINE void score_windows(const Sums& sums, const Statistics& first, const Statistics& second,
                                 const Windows& windows, int count, int task, float* score) {
-#if defined(__CUDA_ARCH__)
-    __shared__ float tile_of_warps[SCORE_WARPS][ScoreTile::SIZE];
-    const ScoreTile tile{tile_of_warps[threadIdx.x / LANES_OF_WARP % SCORE_WARPS]};
-#else
-    float tile_of_warp[ScoreTile::SIZE];
-    const ScoreTile tile{tile_of_warp};
-#endif
     const int groups = (count + LANES_OF_WARP - 1) / LANES_OF_WARP, ny = windows.lags[1], nx = windows.lags[2];
-    const int first_lag = task / groups * LAGS_OF_TILE, first_window = task % groups * LANES_OF_WARP;
-    const int lags = min(windows.lags[0] * ny * nx - first_lag, LAGS_OF_TILE);
+    const int lag = task / groups, z = lag / (ny * nx), y = lag / nx % ny, x = lag % nx;
     for_lanes([&](int lane) {
-        if (first_window + lane >= count) return;
-        const WindowTask window = windows_of(windows, first_window + lane);
-        for (int k = 0; k < lags; ++k) {
-            const int lag = first_lag + k, z = lag / (ny * nx), y = lag / nx % ny, x = lag % nx;
-            score_lag(sums, first, second, windows, window, z, y, x, nullptr, tile.at(k, lane));
-        }
-    });
-    sync_lanes();
-    for_lanes([&](int lane) {
-        for (int k = lane; k < LANES_OF_WARP * LAGS_OF_TILE; k += LANES_OF_WARP) {
-            const int window = k / LAGS_OF_TILE, lag = k % LAGS_OF_TILE;
-            if (first_window + window >= count || lag >= lags) continue;
-            score[(int64_t)(first_window + window) * windows.score_pitch + first_lag + lag] = *tile.at(lag, window);
-        }
+        const int window = task % groups * LANES_OF_WARP + lane;
+        if (window >= count) return;
+        float* to = score + (int64_t)window * windows.score_pitch + lag;
+        score_lag(sums, first, second, windows, windows_of(windows, window), z, y, x, nullptr, to);
     });
 }
 
