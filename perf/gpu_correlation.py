@@ -25,8 +25,8 @@ from lfpiv_kernels import runtime
 MODULES = tuple(
     f"lfpiv_kernels.correlation.{name}"
     for name in (
-        "blocks_gpu", "deform_gpu", "filters_gpu", "interpolation_gpu", "neighbours_gpu", "peaks", "peaks_gpu",
-        "split_gpu", "sums_gpu", "uncertainty_gpu", "voxelwise_gpu", "windows_gpu",
+        "blocks_gpu", "deform_gpu", "filters_gpu", "interpolation_gpu", "neighbours_gpu", "peaks_gpu", "split_gpu",
+        "sums_gpu", "uncertainty_gpu", "voxelwise_gpu", "windows_gpu",
     )
 )  # fmt: skip
 """Modules whose kernels a pair's correlation launches on a GPU."""

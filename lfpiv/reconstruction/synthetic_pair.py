@@ -115,10 +115,13 @@ class RecordedImages:
         return found
 
     def _ratios(self, name: str, image: np.ndarray) -> np.ndarray:
-        """Return the covariances at the same lens and one lens away over the square of the light, shape (2,)."""
+        """Return the covariances at the same lens and one lens away over the square of the light, shape (2,).
+
+        They are not numbers where there is no light.
+        """
         covariances: np.ndarray = self._sub_apertures[name].covariances(image).sum(1)
-        over: np.ndarray = covariances / self._light(name, image) ** 2
-        return over
+        ratios: np.ndarray = covariances / (self._light(name, image) ** 2 or np.nan)
+        return ratios
 
     def _light(self, name: str, image: np.ndarray) -> float:
         return float(image[self._seen[name]].sum(dtype=np.float64))

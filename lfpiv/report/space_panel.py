@@ -30,10 +30,10 @@ def in_space(fields: xr.Dataset, kinds: dict[str, Quantity]) -> str:
     velocity = np.stack([thin[name].values for name in "uvw"], axis=-1)
     speed = thin["speed"].values
     good = thin["valid"].values & np.isfinite(speed)
-    figure = Figure(figsize=(WIDTH_INCH, 3.4))
+    figure = Figure(figsize=(WIDTH_INCH, 3.8))
     FigureCanvasSVG(figure)
     figure.patch.set_alpha(0)
-    axes: Any = figure.add_axes((0.0, 0.15, 0.82, 0.85), projection="3d")  # matplotlib has no types for 3D axes
+    axes: Any = figure.add_axes((0.02, 0.25, 0.84, 0.75), projection="3d")  # matplotlib has no types for 3D axes
     axes.patch.set_alpha(0)
     longest = float(speed[good].max(initial=0.0))
     apart = step * min((_spacing(fields[axis].values) for axis in "zyx" if fields.sizes[axis] > 1), default=1.0)
@@ -53,7 +53,7 @@ def in_space(fields: xr.Dataset, kinds: dict[str, Quantity]) -> str:
         axis.set_tick_params(colors=INK, labelsize=8)
     axes.grid(False)
     axes.locator_params(nbins=4)
-    bar = figure.colorbar(shade, cax=figure.add_axes((0.2, 0.13, 0.5, 0.025)), orientation="horizontal")
+    bar = figure.colorbar(shade, cax=figure.add_axes((0.2, 0.14, 0.5, 0.025)), orientation="horizontal")
     style(bar.ax, xlabel=kinds["speed"].title)
     bar.outline.set(color=INK, linewidth=0.6)
     fastest = f"{significant(longest)} {kinds['speed'].unit}"

@@ -103,7 +103,7 @@ class Windows:
     pitch: int  # lanes per row
     lanes: int  # lanes per lag
     slot_pitch: wp.int64  # elements of scratch memory per slot
-    score_pitch: int  # elements from one lag's coefficients to the next
+    score_pitch: int  # elements from one lag's coefficients to the next; on a GPU from one window's to the next
     peak_pitch: wp.int64  # elements per value of the peaks
 
 

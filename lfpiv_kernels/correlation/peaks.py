@@ -40,7 +40,7 @@ def _find_peaks_of_group(
 ): ...
 
 
-@wp.kernel(cuda_max_registers=64)
+@wp.kernel
 def _find_peaks(
     # in
     sums: Sums,
@@ -70,7 +70,7 @@ class PeakFinder:
     group: int
     """Lanes per task."""
     rows: int
-    """Coefficients per lane: one per lag, and the highest of each row of lags."""
+    """Coefficients per lane on the CPU: one per lag, and the highest of each row of lags."""
     scratch: wp.array
     peaks: wp.array
 
@@ -85,7 +85,7 @@ class PeakFinder:
             group = LANES * min(-(-plan.lanes // LANES), max(1, SCORE_BYTES // (4 * LANES * lags)))
             size = runtime.CHUNKS * _slot_pitch(plan, rows, group)
         else:
-            size = depth * plan.lanes * rows
+            size = depth * plan.lanes * peaks_gpu.score_pitch(plan.lags)
         peaks = new_array(8 * plan.count[0] * plan.lanes)
         return cls(plan, sides, symmetric, reach, ring, group, rows, new_array(size), peaks)
 
@@ -95,9 +95,12 @@ class PeakFinder:
         sums, windows = Sums(), self._windows(layers)
         sums.ahead, sums.behind, sums.symmetric = ahead, behind, int(self.symmetric)
         inputs = [sums, first.statistics, second.statistics, windows]
-        if runtime.device().form == "gpu":
-            launch(peaks_gpu.score_call(inputs, math.prod(self.plan.lags) * windows.score_pitch, self.scratch))
-        launch(Call(_find_peaks, len(layers) * windows.groups, inputs, [self.scratch, self.peaks], scratch=True))
+        count = len(layers) * windows.groups
+        if runtime.device().form == "cpu":
+            launch(Call(_find_peaks, count, inputs, [self.scratch, self.peaks], scratch=True))
+            return
+        for call in peaks_gpu.peak_calls(inputs, count, self.scratch, self.peaks):
+            launch(call)
 
     def _windows(self, layers: range) -> Windows:
         plan, windows = self.plan, Windows()
@@ -109,7 +112,7 @@ class PeakFinder:
         windows.groups, windows.group = -(-plan.lanes // self.group), self.group
         windows.pitch, windows.lanes = plan.pitch, plan.lanes
         windows.slot_pitch = _slot_pitch(plan, self.rows, self.group)
-        windows.score_pitch = self.group if runtime.device().form == "cpu" else len(layers) * windows.groups
+        windows.score_pitch = self.group if runtime.device().form == "cpu" else peaks_gpu.score_pitch(plan.lags)
         windows.peak_pitch = plan.count[0] * plan.lanes
         return windows
 

@@ -1,25 +1,44 @@
-"""Coefficients of windows at every lag on a GPU; host functions and CPU form: ``peaks``.
+"""Correlation coefficients of windows and their two highest peaks on a GPU; host functions and CPU form: ``peaks``.
 
-A window has thousands of lags, and a coarse pass hundreds of windows: with a thread per lag more of a GPU has work.
+A window has thousands of lags, and a coarse pass hundreds of windows: a warp forms the coefficients of 32 windows
+at one lag, and another one looks for the peaks of a window. The coefficients of a window lie side by side between.
 """
+
+import math
 
 import warp as wp
 
 from lfpiv_kernels import native
 from lfpiv_kernels.correlation.layout import Statistics, Sums, Windows
+from lfpiv_kernels.lanes import LANES, lanes_of_warp
 from lfpiv_kernels.launch import Call
 
-wp.set_module_options(native.options("peaks.h", contract="fast", gpu=True))
+wp.set_module_options(native.options("peaks_gpu.h", contract="fast", gpu=True))
+
+SECTOR = 8
+"""Floats that memory moves at once; the coefficients of a window begin one."""
 
 
-@wp.func_native("lfpiv::score_window(sums, first, second, windows, task, score_out.data);")
-def _score_window(
+@wp.func_native("lfpiv::score_windows(sums, first, second, windows, count, task, score_out.data);")
+def _score(
     sums: Sums,
     first: Statistics,
     second: Statistics,
     windows: Windows,
+    count: int,
     task: int,
     score_out: wp.array(dtype=float),
+): ...
+
+
+@wp.func_native(
+    "lfpiv::find_peaks_of_window(windows, task, score.data, peak_out.data + (int64_t)windows.begin * windows.lanes);"
+)
+def _find(
+    windows: Windows,
+    score: wp.array(dtype=float),
+    task: int,
+    peak_out: wp.array(dtype=float),
 ): ...
 
 
@@ -29,14 +48,37 @@ def _score_windows(
     sums: Sums,
     first: Statistics,  # of windows at every lag if symmetric, else at lag 0
     second: Statistics,  # at every lag
-    windows: Windows,  # a thread per lag, layer and lane
+    windows: Windows,
+    count: int,  # windows; a warp per lag and 32 windows
     begin: int,
     # out
-    score_out: wp.array(dtype=float),  # coefficients, (lag, layer, lane)
+    score_out: wp.array(dtype=float),  # coefficients, (layer, lane, lag)
 ):
-    _score_window(sums, first, second, windows, begin + wp.tid(), score_out)
+    task, _lane = wp.tid()
+    _score(sums, first, second, windows, count, begin + task, score_out)
 
 
-def score_call(inputs: list[object], size: int, scores: wp.array) -> Call:
-    """Return the call that forms the coefficients: a thread per lag, layer and lane, `size` in all."""
-    return Call(_score_windows, size, inputs, [scores])
+@wp.kernel
+def _find_window_peaks(
+    # in
+    windows: Windows,  # a warp per window
+    score: wp.array(dtype=float),
+    begin: int,
+    # out
+    peak_out: wp.array(dtype=float),  # as in ``peaks._find_peaks``
+):
+    task, _lane = wp.tid()
+    _find(windows, score, begin + task, peak_out)
+
+
+def score_pitch(lags: tuple[int, int, int]) -> int:
+    """Elements from the coefficients of a window to those of the next."""
+    return -(-math.prod(lags) // SECTOR) * SECTOR
+
+
+def peak_calls(inputs: list[object], count: int, scores: wp.array, peaks: wp.array) -> tuple[Call, Call]:
+    """Return the calls that form the coefficients of `count` windows, and then find their peaks."""
+    windows, inner = inputs[3], lanes_of_warp()
+    tasks = math.prod(windows.lags) * -(-count // LANES)
+    score = Call(_score_windows, tasks, [*inputs, count], [scores], inner=inner)
+    return score, Call(_find_window_peaks, count, [windows, scores], [peaks], inner=inner)

@@ -326,28 +326,48 @@ struct LensTile {
     }
 #endif
 
+    /// What the levels of a column of pixels share.
+    struct Column {
+        V s, t, s_y, t_y;  // offset on the main lens and its slope along the rows
+        V n[4];            // matrix from that offset to rays in the lens's cell
+    };
+
+    /// Return what the levels of columns x from the reference pixel share.
+    LFPIV_INLINE Column column_at(V x) const {
+        const V *slope = values.slope, *matrix = values.matrix;
+        Column at;
+        at.s = of(values.s) + x * (of(slope[0]) + x * bend.s_xx);
+        at.t = of(values.t) + x * (of(slope[2]) + x * bend.t_xx);
+        at.s_y = of(slope[1]) + x * bend.s_xy, at.t_y = of(slope[3]) + x * bend.t_xy;
+        for (int n = 0; n < 4; ++n) at.n[n] = of(matrix[n]) + x * bend.along_column[n];
+        return at;
+    }
+    /// Return the levels of pixels of a column, y rows from the reference pixel.
+    LFPIV_INLINE V level_in(const Column& at, V y) const {
+        const V ds = at.s + y * (at.s_y + y * bend.s_yy), dt = at.t + y * (at.t_y + y * bend.t_yy);
+        const V k0 = at.n[0] + y * bend.along_row[0], k1 = at.n[1] + y * bend.along_row[1];
+        const V k2 = at.n[2] + y * bend.along_row[2], k3 = at.n[3] + y * bend.along_row[3];
+        const V inverse = 1.0f / (k0 * k3 - k1 * k2);
+        const V a = (k3 * ds - k1 * dt) * inverse, b = (k0 * dt - k2 * ds) * inverse;
+        const V level = abs(inverse) * inside_cell(a, b) * to_a + 0.5f;
+        return min(max(level, V{}), splat(LEVELS));
+    }
+
     /// Write the levels of all pixels of `height` rows, 8 to a row.
     LFPIV_INLINE void write_levels(int first, int height, unsigned char* out) const {
-        const V lane_column = lane_numbers(1, 8), lane_row = lane_numbers(8, WIDTH), none = {};
-        const V *slope = values.slope, *matrix = values.matrix;
-        for (int c = 0; c < 8; c += ACROSS) {
-            const V x = lane_column + (column0 + (float)c - of(values.column));
-            const V s_x = of(values.s) + x * (of(slope[0]) + x * bend.s_xx);
-            const V t_x = of(values.t) + x * (of(slope[2]) + x * bend.t_xx);
-            const V s_y = of(slope[1]) + x * bend.s_xy, t_y = of(slope[3]) + x * bend.t_xy;
-            const V n0 = of(matrix[0]) + x * bend.along_column[0], n1 = of(matrix[1]) + x * bend.along_column[1];
-            const V n2 = of(matrix[2]) + x * bend.along_column[2], n3 = of(matrix[3]) + x * bend.along_column[3];
-            for (int row = 0; row < height; row += DOWN) {
-                const V y = lane_row + ((float)(first + row) - of(values.row));
-                const V ds = s_x + y * (s_y + y * bend.s_yy), dt = t_x + y * (t_y + y * bend.t_yy);
-                const V k0 = n0 + y * bend.along_row[0], k1 = n1 + y * bend.along_row[1];
-                const V k2 = n2 + y * bend.along_row[2], k3 = n3 + y * bend.along_row[3];
-                const V inverse = 1.0f / (k0 * k3 - k1 * k2);
-                const V a = (k3 * ds - k1 * dt) * inverse, b = (k0 * dt - k2 * ds) * inverse;
-                const V level = abs(inverse) * inside_cell(a, b) * to_a + 0.5f;
-                store_bytes(out + 8 * row + c, min(max(level, none), splat(LEVELS)));
-            }
+#if LFPIV_GPU
+        for (int k = 0; k < 8 * height; ++k) {  // nothing is kept for a column: a thread lacks the registers
+            const V x = (float)(k % 8) + (column0 - of(values.column));
+            out[k] = (unsigned char)level_in(column_at(x), (float)(first + k / 8) - of(values.row));
         }
+#else
+        const V lane_column = lane_numbers(1, 8), lane_row = lane_numbers(8, WIDTH);
+        for (int c = 0; c < 8; c += ACROSS) {
+            const Column at = column_at(lane_column + (column0 + (float)c - of(values.column)));
+            for (int row = 0; row < height; row += DOWN)
+                store_bytes(out + 8 * row + c, level_in(at, lane_row + ((float)(first + row) - of(values.row))));
+        }
+#endif
     }
 
     /// Write the block of rows from `first` on, a value per pixel. Nothing is written where all weights round to zero.
@@ -398,10 +418,9 @@ LFPIV_INLINE int first_ray(const WeightInputs& in, const Lenses& lenses, const L
 }
 
 /// Write the blocks of one tile of the pixels under a group of lenses.
-LFPIV_INLINE void fill_tile(const LensGroup& group, const LensValues& values, const Bend& bend, const Outline& outline,
-                            int tile, M here, BlockWriter& out) {
+LFPIV_INLINE void fill_tile(const LensGroup& group, const Tile& rows, const LensValues& values, const Bend& bend,
+                            const Outline& outline, int tile, BlockWriter& out) {
     const Voxel& voxel = group.voxel;
-    const Tile rows(group, here, (float)(tile * BLOCK_WIDTH));
     for (unsigned live = rows.lit(); live; live &= live - 1) {
         const int lens = lowest_bit(live), layer = (int)in_memory(rows.layer, lens);
         const int ray = first_ray(voxel.in, group.lenses, values, lens, layer) + tile * BLOCK_WIDTH;
@@ -418,7 +437,7 @@ LFPIV_INLINE void fill_group(const LensGroup& group, const Top& top, const Bend&
     for (int tile = 0;; ++tile) {
         const M here = values.columns > (float)(tile * BLOCK_WIDTH);
         if (!any(here)) break;
-        fill_tile(group, values, bend, outline, tile, here, out);
+        fill_tile(group, Tile(group, here, (float)(tile * BLOCK_WIDTH)), values, bend, outline, tile, out);
     }
 }
 

@@ -69,13 +69,15 @@ LFPIV_INLINE void fill_tile(WeightInputs in, const Outline& outline, int index, 
     blocks_out[item] = bytes_out[item] = 0;
     if (room.blocks[item] == 0) return;
     in.profiles = PROFILES;
-    const int place = tile / room.tiles;
+    const int place = tile / room.tiles, tile_of_lens = tile - place * room.tiles;
     const Voxel voxel(in, index);
     ReachedLenses reached(voxel);
-    const Top top(voxel, reached.slope);
     const ReachedLens found(reached, place);
-    const Bend bend(voxel);
     const LensGroup group(voxel, found.lens, found.box);
+    const Tile rows(group, 1, (float)(tile_of_lens * BLOCK_WIDTH));  // first: what it branches over keeps registers
+    if (!rows.lit()) return;
+    const Top top(voxel, reached.slope);
+    const Bend bend(voxel);
     const LensValues values(group, top, bend, 1);
     const int first_block = room.first_block[item];
     unsigned char* const first_value = blocks.value + room.first_value[item];
@@ -87,7 +89,7 @@ LFPIV_INLINE void fill_tile(WeightInputs in, const Outline& outline, int index, 
                        first_value,
                        first_value + room.bytes[item],
                        (int)in.geometry->edge};
-    fill_tile(group, values, bend, outline, tile - place * room.tiles, 1, out);
+    fill_tile(group, rows, values, bend, outline, tile_of_lens, out);
     blocks_out[item] = out.block - first_block;
     bytes_out[item] = (int)(out.value - first_value);
 }

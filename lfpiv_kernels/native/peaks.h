@@ -80,15 +80,13 @@ struct Scores {
 };
 
 /// Form the coefficients of a task's windows at one lag from the sums of products of their blocks, in one direction or
-/// in both.
+/// in both. Only the CPU needs memory for sums of columns.
 template <class Sums, class Statistics, class Windows>
 LFPIV_INLINE void score_lag(const Sums& sums, const Statistics& first, const Statistics& second, const Windows& windows,
-                            const WindowTask& task, int z, int y, int x, const Scores& scores) {
-    const int nz = scores.nz, ny = scores.ny, nx = scores.nx, lags = nz * ny * nx, lag = (z * ny + y) * nx + x;
-    const int plane = task.layer * windows.stride;
+                            const WindowTask& task, int z, int y, int x, float* columns, float* to) {
+    const int nz = windows.lags[0], ny = windows.lags[1], nx = windows.lags[2];
+    const int lags = nz * ny * nx, lag = (z * ny + y) * nx + x, plane = task.layer * windows.stride;
     const float voxels = (float)windows.voxels;
-    float* columns = scores.highest + (int64_t)nz * ny * scores.pitch;
-    float* to = scores.score + (int64_t)lag * scores.pitch;
     const int64_t first_at = place_of(first, plane, first.centre[0], first.centre[1], first.centre[2], task.lane);
     const int64_t around = place_of(second, plane, z, y, x, task.lane);
     sum_blocks(sums.ahead.data, windows, task, lag, lags, columns, [&](int k, V total) {
@@ -198,14 +196,21 @@ LFPIV_INLINE float refine(const float* p, int64_t pitch) {
     return curvature >= 0.0f ? 0.0f : 0.5f * (a - c) / curvature;
 }
 
+/// Return the displacement of the peak at a lag along z, y or x. Its coefficient is `p`, those of the next lags follow
+/// after `pitch` elements each.
+template <class Triple>
+LFPIV_INLINE float displacement_along(int axis, const Triple& lags, const float* p, int lag, int64_t pitch) {
+    const int apart = axis == 0 ? lags[1] * lags[2] : axis == 1 ? lags[2] : 1;
+    const int count = axis == 0 ? lags[0] : axis == 1 ? lags[1] : lags[2];
+    return lag / apart % count - count / 2 + refine(p, apart * pitch);
+}
+
 /// Write the displacement at a lag along z, y and x, not-a-number if there is none.
 LFPIV_INLINE void write_displacement(const Scores& scores, int k, int lag, bool found, int64_t pitch, float* out) {
-    const int ny = scores.ny, nx = scores.nx;
-    const int64_t row = scores.pitch;
+    const int lags[3] = {scores.nz, scores.ny, scores.nx};
     const float* p = scores.at(lag) + k;
-    out[0] = found ? lag / (ny * nx) - scores.nz / 2 + refine(p, ny * nx * row) : NAN;
-    out[pitch] = found ? lag / nx % ny - ny / 2 + refine(p, nx * row) : NAN;
-    out[2 * pitch] = found ? lag % nx - nx / 2 + refine(p, row) : NAN;
+    for (int axis = 0; axis < 3; ++axis)
+        out[axis * pitch] = found ? displacement_along(axis, lags, p, lag, scores.pitch) : NAN;
 }
 
 /// Write both displacements, the highest coefficient and its rival of a vector of windows.
@@ -235,30 +240,17 @@ LFPIV_INLINE WindowTask windows_of(const Windows& windows, int task) {
     return {layer * windows.block_step, lane, min(windows.group, windows.lanes - lane)};
 }
 
-/// Form the coefficient of one window at one lag on a GPU. Tasks are numbered (lag, layer, lane): neighbouring threads
-/// read and write neighbouring places.
+/// Find the peaks of a group of windows. Tasks are numbered (layer, group of lanes).
 template <class Sums, class Statistics, class Windows>
-LFPIV_INLINE void score_window(const Sums& sums, const Statistics& first, const Statistics& second,
-                               const Windows& windows, int task, float* scratch) {
-    const int lag = task / windows.score_pitch, at = task - lag * windows.score_pitch;
-    const Scores scores = scores_of(windows, scratch + at);
-    const int z = lag / (scores.ny * scores.nx), y = lag / scores.nx % scores.ny, x = lag % scores.nx;
-    score_lag(sums, first, second, windows, windows_of(windows, at), z, y, x, scores);
-}
-
-/// Find the peaks of a group of windows. Tasks are numbered (layer, group of lanes); a negative `slot` shares the
-/// scratch memory between all tasks, element by element. A GPU has the coefficients from `score_window`.
-template <class Sums, class Statistics, class Windows>
-LFPIV_INLINE void find_peaks([[maybe_unused]] const Sums& sums, [[maybe_unused]] const Statistics& first,
-                             [[maybe_unused]] const Statistics& second, const Windows& windows, int slot, int task,
-                             float* scratch, float* out) {
+LFPIV_INLINE void find_peaks(const Sums& sums, const Statistics& first, const Statistics& second,
+                             const Windows& windows, int slot, int task, float* scratch, float* out) {
     const WindowTask where = windows_of(windows, task);
-    const Scores scores = scores_of(windows, scratch + (slot < 0 ? (int64_t)task : slot * windows.slot_pitch));
-#if !LFPIV_GPU
+    const Scores scores = scores_of(windows, scratch + slot * windows.slot_pitch);
+    float *to = scores.score, *columns = scores.highest + (int64_t)scores.nz * scores.ny * scores.pitch;
     for (int z = 0; z < scores.nz; ++z)
         for (int y = 0; y < scores.ny; ++y)
-            for (int x = 0; x < scores.nx; ++x) score_lag(sums, first, second, windows, where, z, y, x, scores);
-#endif
+            for (int x = 0; x < scores.nx; ++x, to += scores.pitch)
+                score_lag(sums, first, second, windows, where, z, y, x, columns, to);
     float* peak = out + (int64_t)(windows.begin + task / windows.groups) * windows.lanes + where.lane;
     for (int k = 0; k < where.lanes; k += WIDTH) {
         Peaks peaks = find_best(scores, k);

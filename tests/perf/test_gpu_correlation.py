@@ -16,7 +16,7 @@ ROUNDING = 1e-6
 MOST_TOUCHED = 1.5
 """Sectors that the instructions of a warp touch per sector that their bytes would fill: the goal."""
 CORRELATING = {
-    "peaks._find_peaks",
+    "peaks_gpu._find_window_peaks",
     "peaks_gpu._score_windows",
     "blocks_gpu._correlate_lanes",
     "split_gpu._split_voxels",

@@ -24,7 +24,7 @@ EVERY_PASS = {
     ("depth_planes_gpu", "_spread"),
     ("filters_gpu", "_filter"),
     ("neighbours_gpu", "_predict_vectors"),
-    ("peaks", "_find_peaks"),
+    ("peaks_gpu", "_find_window_peaks"),
     ("peaks_gpu", "_score_windows"),
     ("pixel_rays_gpu", "_collect"),
     ("pixel_rays_gpu", "_compare"),
@@ -43,8 +43,6 @@ EVERY_PASS = {
     ("windows_gpu", "_sum_rows"),
     ("windows_gpu", "_window_statistics"),
 }
-BELOW_LIMIT = {("footprint_gpu", "_fill_pixels", 100)}
-"""Known to miss the least occupancy: for 10.0 the compiler takes 133 registers, and spills 96 bytes if held to 128."""
 STORED = Path(__file__).resolve().parents[2] / "docs" / "figures" / "gpu_static.json"
 """The table of the pages; not installed."""
 
@@ -65,8 +63,7 @@ def kernels(request, measured):
 @pytest.mark.slow
 def test_enough_threads_fit_on_a_multiprocessor(kernels):
     assert set(kernels) >= EVERY_PASS
-    few = {(*key, one.architecture) for key, one in kernels.items() if one.occupancy < LEAST_OCCUPANCY}
-    assert few <= BELOW_LIMIT
+    assert not {(*key, one.architecture) for key, one in kernels.items() if one.occupancy < LEAST_OCCUPANCY}
     assert not {key for key in EVERY_PASS if kernels[key].occupancy < LEAST_OCCUPANCY_OF_A_PASS}
 
 
