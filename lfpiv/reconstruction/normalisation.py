@@ -7,14 +7,14 @@ device.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
 from lfpiv.reconstruction.ordered_subsets import Partition, Subset, step_sizes, subsets_of
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve, Smoothing
-from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
+from lfpiv.reconstruction.steps import BAND, SharpenedStep, SmartStep, Step
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.projector import ALL, ODD
 from lfpiv_kernels.transfer import DeviceArray, to_device
@@ -122,12 +122,25 @@ class Normalisation:
 
     def _partition(self, subsets: tuple[Subset, ...]) -> Partition:
         """Return the subsets with the step of each."""
-        sizes = step_sizes(self._column_sum, [self._subset_sum(one) for one in subsets], self._seen)
+        sums = [self._subset_sum(one) for one in subsets]
+        sizes = self._step_sizes(self._column_sum, sums)
+        if self.sieve.sigma_voxel == 0:
+            return Partition(subsets, tuple(SmartStep(size, self.sieve) for size in sizes))
+
+        def banded() -> tuple[Step, ...]:
+            return tuple(SharpenedStep(size, self.sieve.shape, BAND * self.sieve.sigma_voxel) for size in sizes)
+
+        @cache
+        def plain() -> tuple[Step, ...]:
+            blurred = self._step_sizes(self.sieve(self._column_sum), [self.sieve(one) for one in sums])
+            return tuple(SmartStep(size, self.sieve) for size in blurred)
+
+        return Partition(subsets, tuple(SharpenedStep(size, self.sieve.shape) for size in sizes), (banded, plain))
+
+    def _step_sizes(self, column_sum: np.ndarray, sums: list[np.ndarray]) -> list[DeviceArray]:
+        """Return mu / max(s_n, s / N) for each subset, on the device."""
         mu = np.float32(self._settings.relaxation)
-        on_device = [to_device(mu * size, float) for size in sizes]
-        if self.sieve.sigma_voxel > 0:
-            return Partition(subsets, tuple(SharpenedStep(size, self.sieve.shape) for size in on_device))
-        return Partition(subsets, tuple(SmartStep(size, self.sieve) for size in on_device))
+        return [to_device(mu * size, float) for size in step_sizes(column_sum, sums, self._seen)]
 
     def _subset_sum(self, subset: Subset) -> np.ndarray:
         """Return the sum of each voxel's weights over the pixels of a subset."""
