@@ -7,7 +7,7 @@ device.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
@@ -122,25 +122,17 @@ class Normalisation:
 
     def _partition(self, subsets: tuple[Subset, ...]) -> Partition:
         """Return the subsets with the step of each."""
-        sums = [self._subset_sum(one) for one in subsets]
-        sizes = self._step_sizes(self._column_sum, sums)
-        if self.sieve.sigma_voxel == 0:
-            return Partition(subsets, tuple(SmartStep(size, self.sieve) for size in sizes))
-
-        def banded() -> tuple[Step, ...]:
-            return tuple(SharpenedStep(size, self.sieve.shape, BAND * self.sieve.sigma_voxel) for size in sizes)
-
-        @cache
-        def plain() -> tuple[Step, ...]:
-            blurred = self._step_sizes(self.sieve(self._column_sum), [self.sieve(one) for one in sums])
-            return tuple(SmartStep(size, self.sieve) for size in blurred)
-
-        return Partition(subsets, tuple(SharpenedStep(size, self.sieve.shape) for size in sizes), (banded, plain))
-
-    def _step_sizes(self, column_sum: np.ndarray, sums: list[np.ndarray]) -> list[DeviceArray]:
-        """Return mu / max(s_n, s / N) for each subset, on the device."""
+        sizes = step_sizes(self._column_sum, [self._subset_sum(one) for one in subsets], self._seen)
         mu = np.float32(self._settings.relaxation)
-        return [to_device(mu * size, float) for size in step_sizes(column_sum, sums, self._seen)]
+        on_device = [to_device(mu * size, float) for size in sizes]
+        plain = tuple(SmartStep(size, self.sieve) for size in on_device)
+        if self.sieve.sigma_voxel == 0:
+            return Partition(subsets, plain)
+        sharpened, banded = (
+            tuple(SharpenedStep(size, self.sieve.shape, band * self.sieve.sigma_voxel) for size in on_device)
+            for band in (0.0, BAND)
+        )
+        return Partition(subsets, sharpened, (banded, plain))
 
     def _subset_sum(self, subset: Subset) -> np.ndarray:
         """Return the sum of each voxel's weights over the pixels of a subset."""

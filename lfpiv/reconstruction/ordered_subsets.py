@@ -16,9 +16,9 @@ single subsets. The exponents g_n of the subsets in an epoch show it. With <a, b
 their samples by such a test of norms [3]_.
 
 Sharpened steps can raise the misfit however short they are (`lfpiv.reconstruction.steps`). Where the misfit of an epoch
-rises, the epoch is undone, the momentum starts anew, and the next kind of steps follows: banded ones, then SMART's own.
-Where it rises again, larger subsets follow, and then the passes over all rays. Each iteration of those lowers the
-misfit.
+rises, the epoch is undone, the momentum starts anew, and the next kind of steps follows: banded ones, then SMART's own
+(here divided by sums that are not blurred). Where it rises again, larger subsets follow, and then the passes over all
+rays. Each iteration of those lowers the misfit.
 
 .. [1] D. Kim, S. Ramani, J. A. Fessler, "Combining ordered subsets and momentum for accelerated X-ray CT image
    reconstruction", IEEE Trans. Med. Imaging 34 (2015) 167-178, doi:10.1109/TMI.2014.2350962.
@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,12 +77,12 @@ class Partition:
     """The subsets in their order."""
     steps: tuple[Step, ...]
     """Step of each subset; all are of one kind."""
-    safer: tuple[Callable[[], tuple[Step, ...]], ...] = ()
-    """Make the steps of each subset that follow where the misfit of an epoch rises, one kind after another."""
+    safer: tuple[tuple[Step, ...], ...] = ()
+    """Steps of each subset that follow where the misfit of an epoch rises, one kind after another."""
 
     def steps_of(self, kind: int) -> tuple[Step, ...]:
         """Return the step of each subset; kind 0 is the fastest."""
-        return self.safer[kind - 1]() if kind else self.steps
+        return (self.steps, *self.safer)[kind]
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ def iterate_epochs(
         if not rose:
             before = misfit.divergence
         if rose or (agreement is not None and agreement.measured() < CONFLICT):
-            log.debug("epoch %d: misfit rises or subsets conflict, larger subsets follow", epoch + 1)
+            log.debug("epoch %d: %s, larger subsets follow", epoch + 1, "misfit rises" if rose else "subsets conflict")
             partition, before = following.pop(0), math.inf
             if len(partition.subsets) == 1:
                 return

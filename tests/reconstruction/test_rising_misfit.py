@@ -89,7 +89,7 @@ def epochs_of(small, factors, following=(), epochs=5):
     def steps(factor):
         return tuple(SmartStep(to_device(np.float32(factor) * size), sieve) for size in sizes)
 
-    safer = tuple(lambda factor=factor: steps(factor) for factor in factors[1:])
+    safer = tuple(steps(factor) for factor in factors[1:])
     partition = ordered_subsets.Partition(subsets, steps(factors[0]), safer)
     state = State(to_device(first), momentum.Momentum(to_device(first)), ())
     found = []
