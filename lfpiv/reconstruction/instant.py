@@ -168,7 +168,7 @@ class PreparedInstant:
             history.subsets.append(epoch.subsets)
             if progress is not None:
                 progress(history.epochs / (history.iterations + 1))
-            if history.settled:
+            if history.settled and not epoch.undone:
                 break
         if resting is not None:
             resting.wake()

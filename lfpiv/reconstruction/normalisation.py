@@ -14,7 +14,7 @@ import numpy as np
 from lfpiv.reconstruction.ordered_subsets import Partition, Subset, step_sizes, subsets_of
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve, Smoothing
-from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
+from lfpiv.reconstruction.steps import BAND, SharpenedStep, SmartStep, Step
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.projector import ALL, ODD
 from lfpiv_kernels.transfer import DeviceArray, to_device
@@ -125,9 +125,14 @@ class Normalisation:
         sizes = step_sizes(self._column_sum, [self._subset_sum(one) for one in subsets], self._seen)
         mu = np.float32(self._settings.relaxation)
         on_device = [to_device(mu * size, float) for size in sizes]
-        if self.sieve.sigma_voxel > 0:
-            return Partition(subsets, tuple(SharpenedStep(size, self.sieve.shape) for size in on_device))
-        return Partition(subsets, tuple(SmartStep(size, self.sieve) for size in on_device))
+        plain = tuple(SmartStep(size, self.sieve) for size in on_device)
+        if self.sieve.sigma_voxel == 0:
+            return Partition(subsets, plain)
+        sharpened, banded = (
+            tuple(SharpenedStep(size, self.sieve.shape, band * self.sieve.sigma_voxel) for size in on_device)
+            for band in (0.0, BAND)
+        )
+        return Partition(subsets, sharpened, (banded, plain))
 
     def _subset_sum(self, subset: Subset) -> np.ndarray:
         """Return the sum of each voxel's weights over the pixels of a subset."""

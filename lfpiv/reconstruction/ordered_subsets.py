@@ -15,6 +15,11 @@ single subsets. The exponents g_n of the subsets in an epoch show it. With <a, b
 0 where they cancel. Below `CONFLICT` the following epochs take larger subsets. Stochastic gradient methods enlarge
 their samples by such a test of norms [3]_.
 
+Sharpened steps can raise the misfit however short they are (`lfpiv.reconstruction.steps`). Where the misfit of an epoch
+rises, the epoch is undone, the momentum starts anew, and the next kind of steps follows: banded ones, then SMART's own
+(here divided by sums that are not blurred). Where it rises again, larger subsets follow, and then the passes over all
+rays. Each iteration of those lowers the misfit.
+
 .. [1] D. Kim, S. Ramani, J. A. Fessler, "Combining ordered subsets and momentum for accelerated X-ray CT image
    reconstruction", IEEE Trans. Med. Imaging 34 (2015) 167-178, doi:10.1109/TMI.2014.2350962.
 .. [2] S. Ahn, J. A. Fessler, "Globally convergent image reconstruction for emission tomography using relaxed ordered
@@ -26,6 +31,7 @@ their samples by such a test of norms [3]_.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -71,6 +77,12 @@ class Partition:
     """The subsets in their order."""
     steps: tuple[Step, ...]
     """Step of each subset; all are of one kind."""
+    safer: tuple[tuple[Step, ...], ...] = ()
+    """Steps of each subset that follow where the misfit of an epoch rises, one kind after another."""
+
+    def steps_of(self, kind: int) -> tuple[Step, ...]:
+        """Return the step of each subset; kind 0 is the fastest."""
+        return (self.steps, *self.safer)[kind]
 
 
 @dataclass(frozen=True)
@@ -82,6 +94,8 @@ class Epoch:
     """Sum of the subsets' misfits, each before its own step: no exact misfit of any volume."""
     subsets: int
     """Number of subsets of the epoch."""
+    undone: bool = False
+    """Whether the misfit rose, the state is that before the epoch, and other epochs can follow."""
 
 
 class Agreement:
@@ -138,7 +152,7 @@ def iterate_epochs(
     resting: RestingVoxels | None = None,
     left_out: float = 0.0,
 ) -> Iterator[Epoch]:
-    """Iterate over the subsets; yield what each epoch leaves. End early where one subset is left.
+    """Iterate over the subsets; yield what each epoch leaves. End early where one subset is left or the misfit rises.
 
     The next epoch overwrites the state that one leaves.
 
@@ -162,6 +176,7 @@ def iterate_epochs(
     coefficients = duplicate(state.coefficients)
     momentum = Momentum(duplicate(coefficients), largest=SUBSET_MOMENTUM)
     partition, following = partitions[0], list(partitions[1:])
+    steps, kind, before = partition.steps, 0, math.inf
     for epoch in range(epochs):
         if epoch and left_out > 0:
             leave_out(coefficients, momentum, left_out)
@@ -169,11 +184,12 @@ def iterate_epochs(
         over = None
         if active is not None:
             momentum.forget(coefficients, active)
-            over = partition.steps[0].over(active)
+            over = steps[0].over(active)
         length = float(np.float32(1 / (1 + SHORTENING * epoch)))
-        agreement = Agreement(duplicate(coefficients)) if following else None
+        start = duplicate(coefficients)
+        agreement = Agreement(start) if following else None
         equations.begin()
-        for subset, step in zip(partition.subsets, partition.steps, strict=True):
+        for subset, step in zip(partition.subsets, steps, strict=True):
             volume = sieve(coefficients)
             if active is not None:
                 volume = multiply(volume, active)
@@ -184,9 +200,26 @@ def iterate_epochs(
             coefficients, after = step(coefficients, exponent, momentum, length=length, over=over, in_place=True)
             assert after is not None  # with a momentum there is one after it
             momentum = after
-        yield Epoch(State(coefficients, momentum, state.steps), equations.measured(), len(partition.subsets))
-        if agreement is not None and (value := agreement.measured()) < CONFLICT:
-            log.debug("epoch %d: agreement of the subsets %.2f, larger subsets follow", epoch + 1, value)
-            partition = following.pop(0)
+        misfit, count = equations.measured(), len(partition.subsets)
+        rose = not misfit.divergence <= before  # true for NaN
+        if rose:
+            coefficients, momentum = start, Momentum(duplicate(start), largest=SUBSET_MOMENTUM)
+        is_last = rose and kind == len(partition.safer) and not following
+        yield Epoch(State(coefficients, momentum, state.steps), misfit, count, undone=rose and not is_last)
+        if is_last:
+            log.debug("epoch %d: misfit rises, passes over all rays follow", epoch + 1)
+            return
+        if rose and kind < len(partition.safer):
+            log.debug("epoch %d: misfit rises, safer steps follow", epoch + 1)
+            kind += 1
+            steps = partition.steps_of(kind)
+            continue
+        if not rose:
+            before = misfit.divergence
+        if rose or (agreement is not None and agreement.measured() < CONFLICT):
+            log.debug("epoch %d: %s, larger subsets follow", epoch + 1, "misfit rises" if rose else "subsets conflict")
+            partition, before = following.pop(0), math.inf
             if len(partition.subsets) == 1:
                 return
+            kind = min(kind, len(partition.safer))
+            steps = partition.steps_of(kind)
