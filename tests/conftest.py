@@ -63,6 +63,26 @@ def device(request):
     return runtime.start(request.config.getoption("--device"))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_counted_voxel(device):
+    """Hold integrated weights against counted rays in one voxel per camera; return how many users have.
+
+    The count takes half of a small run. `tests/weights`, and tests with `whole_count`, compare all voxels.
+    """
+    from lfpiv.weights import counting
+
+    whole = counting.VOXELS
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(counting, "VOXELS", 1)
+        yield whole
+
+
+@pytest.fixture
+def whole_count(one_counted_voxel, monkeypatch):
+    """Compare as many voxels with counted rays as users do."""
+    monkeypatch.setattr("lfpiv.weights.counting.VOXELS", one_counted_voxel)
+
+
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory, device):
     """Return a small simulated experiment, run from images to vectors; see `small_run.SmallRun`."""

@@ -20,6 +20,7 @@ import matplotlib
 import pytest
 from pydantic import BaseModel
 from support.public_names import public_modules
+from support.small_run import write_empty_report
 
 import lfpiv
 from lfpiv.cli import commands
@@ -85,9 +86,11 @@ def place(small_run, tmp_path_factory):
 
 
 @pytest.fixture
-def reader(place, monkeypatch):
-    """A process in that folder; what a snippet does to plots and logging is undone."""
+def reader(request, place, monkeypatch):
+    """A process in that folder; what a snippet does to plots and logging is undone. Only README.md writes reports."""
     monkeypatch.chdir(place)
+    if request.node.callspec.params["name"] != "README.md":
+        monkeypatch.setattr("lfpiv.report.write_report", write_empty_report)
     backend, handlers, level = matplotlib.get_backend(), logging.root.handlers[:], logging.root.level
     matplotlib.use("agg")
     yield place
