@@ -91,6 +91,14 @@ def small_run(tmp_path_factory, device):
     return make_small_run(tmp_path_factory.mktemp("small"), device.kind)
 
 
+@pytest.fixture
+def empty_report(monkeypatch):
+    """Write an empty page in place of the report of a run."""
+    from support.small_run import write_empty_report
+
+    monkeypatch.setattr("lfpiv.report.write_report", write_empty_report)
+
+
 @pytest.fixture(scope="session")
 def reported(tmp_path_factory, device):
     """Return a small finished run, and its report under `page`."""
