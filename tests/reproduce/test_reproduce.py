@@ -14,7 +14,6 @@ from lfpiv import reproduce
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
 from lfpiv.reproduce import angles, fig10, fig12, fig14, page, plots, rigs, store
-from lfpiv.weights import counting
 
 # -- the framework, with cases that take no time -----------------------------------------------------------------------
 
@@ -153,7 +152,6 @@ def tiny(tmp_path_factory):
         (rigs, "DOTS", (3, 3)),
         (rigs, "WHITE_RAYS", 16),
         (rigs, "PARTICLE_RAYS", 8192),
-        (counting, "VOXELS", 1),  # the check by counted rays has tests of its own
         (fig14, "SCHEDULES", {"default": (24, 12), "8": (24, 8)}),
     ):
         patch.setattr(module, name, value)

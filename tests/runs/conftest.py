@@ -4,7 +4,7 @@ import pytest
 
 
 @pytest.fixture(autouse=True)
-def brief_report(request, monkeypatch):
+def brief_report(request):
     """Write an empty page in place of the report, unless the test has the marker `whole_report`."""
     if "whole_report" not in request.keywords:
-        monkeypatch.setattr("lfpiv.report.write_report", lambda *given: given[-1].write_text("", "utf-8"))
+        request.getfixturevalue("empty_report")

@@ -75,7 +75,7 @@ def whole(out):
 @pytest.mark.slow
 def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path):
     """Kill -9 with two workers at work: they die too, nothing is half-written, and one process does the rest."""
-    out = small_run.calibrated(tmp_path / "out")
+    out = small_run.prepared(tmp_path / "out")
     run = start("run", small_run.experiment, "--out", out, "--workers", 2)
     wait_for(lambda: finished(out), run, "finished pair")
     children = psutil.Process(run.pid).children(recursive=True)
@@ -94,7 +94,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path):
 @pytest.mark.slow
 def test_a_killed_worker_costs_nothing_and_a_bad_pair_only_itself(small_run, tmp_path):
     """One of two workers dies by kill -9, one image is damaged: the other pairs are done, status 3, as documented."""
-    experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+    experiment, out = small_run.images(tmp_path / "data"), small_run.prepared(tmp_path / "out")
     spoilt = next((tmp_path / "data").rglob("*0002*"))
     damage(spoilt)
     run = start("run", experiment, "--out", out, "--workers", 2)
@@ -140,7 +140,7 @@ def cluster(tmp_path):
 def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_run, tmp_path, cluster):
     """Kill -9 the run, then in the next run a worker; let the scheduler hang for a while: the same numbers."""
     address, scheduler, start_worker = cluster
-    out, worker = small_run.calibrated(tmp_path / "out"), start_worker()
+    out, worker = small_run.prepared(tmp_path / "out"), start_worker()
     run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
     wait_for(lambda: finished(out), run, "finished pair")
     (dead,) = (out / ".shared").iterdir()
@@ -160,13 +160,30 @@ def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_ru
     assert worker.poll() is None and scheduler.poll() is None, "the cluster is not ours to end"
 
 
+def suspended(worker, out):
+    """Suspend a worker and its children, not while they write a file; return them."""
+    processes = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
+    while True:
+        for process in processes:
+            process.suspend()
+        if not list(out.rglob("*.tmp")):
+            return processes
+        for process in processes:
+            process.resume()
+        time.sleep(0.01)
+
+
 @pytest.mark.slow
 def test_a_lost_scheduler_ends_the_run_with_one_message(small_run, tmp_path, cluster):
-    """Kill -9: status 1, all files whole, and the same command goes on, here without the cluster."""
+    """Kill -9: status 1, all files whole, and the same command goes on, here without the cluster.
+
+    The worker is suspended meanwhile: it would finish its pairs however late the run sees that the scheduler is gone.
+    """
     address, scheduler, start_worker = cluster
-    out, worker = small_run.calibrated(tmp_path / "out"), start_worker()
+    out, worker = small_run.prepared(tmp_path / "out"), start_worker()
     run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
     wait_for(lambda: finished(out), run, "finished pair")
+    idle = suspended(worker, out)
     scheduler.kill()
     _, said = run.communicate(timeout=PATIENCE_S)
     last = said.splitlines()[-1]
@@ -176,6 +193,8 @@ def test_a_lost_scheduler_ends_the_run_with_one_message(small_run, tmp_path, clu
     assert 0 < len(before) < PAIRS
     pipeline.run(small_run.experiment, out)
     assert same_vectors(small_run.out, out) == PAIRS and whole(out)
+    for process in idle:
+        process.resume()
     worker.wait(PATIENCE_S)
 
 
@@ -199,7 +218,7 @@ def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
     for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL)):
         (tmp_path / "bin" / name).write_text(text)
         (tmp_path / "bin" / name).chmod(0o755)
-    experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+    experiment, out = small_run.images(tmp_path / "data"), small_run.prepared(tmp_path / "out")
     damage(next((tmp_path / "data").rglob("*0003*")))
     command = [sys.executable, ROOT / "docs" / "slurm.py", experiment.relative_to(tmp_path), "out", "--jobs", "1"]
     environment = {
@@ -231,7 +250,7 @@ def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "options"), [(signal.SIGINT, ["--workers", "2"]), (signal.SIGTERM, [])])
 def test_an_interrupted_run_ends_cleanly_and_says_how_to_go_on(small_run, tmp_path, number, options):
-    out = small_run.calibrated(tmp_path / "out")
+    out = small_run.prepared(tmp_path / "out")
     file = small_run.images(tmp_path / "data")
     slow = file.read_text("utf-8").replace("iterations = 8", "iterations = 400\ntolerance = 0.0")
     assert slow.count("iterations = 400") == 1
@@ -255,7 +274,7 @@ def mounts():
 @pytest.mark.slow
 def test_a_full_disk_leaves_nothing_half_written(small_run, tmp_path):
     """The second pair's vectors do not fit: one clear message, status 1, every file whole."""
-    out = small_run.calibrated(tmp_path / "out")
+    out = small_run.prepared(tmp_path / "out")
     room = (small_run.out / "vectors" / "pair_0000.nc").stat().st_size
     command = [sys.executable, "-m", "lfpiv", "run", str(small_run.experiment), "--out", str(out)]
     (out / "vectors").mkdir()

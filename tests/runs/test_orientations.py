@@ -26,7 +26,7 @@ FROM_ABOVE = {
 
 @pytest.mark.slow
 @pytest.mark.whole_report
-def test_a_camera_from_above_with_another_lens_and_a_hexagonal_array_needs_no_trick(tmp_path, device):
+def test_a_camera_from_above_with_another_lens_and_a_hexagonal_array_needs_no_trick(tmp_path, device, whole_count):
     above = scenes.camera("above", None, (360, 340), **FROM_ABOVE)
     del above["nominal_angle_deg"]
     scene = scenes.scene(

@@ -1,5 +1,6 @@
 """Pairs side by side: plans, weights that processes share, the same numbers from one worker, several, or a cluster."""
 
+import logging
 import os
 import subprocess
 import sys
@@ -40,6 +41,11 @@ CPU, GPU = Device("cpu", 8), Device("cuda", 8)
 
 
 FOUR = ("0", "1", "2", "3")
+
+
+def test_dask_logs_no_traceback_of_a_broken_connection():
+    local_workers.import_distributed("--scheduler")
+    assert not logging.getLogger("distributed.batched").isEnabledFor(logging.INFO)
 
 
 @pytest.mark.parametrize(

@@ -168,7 +168,9 @@ def test_cameras_that_stood_still_agree(small_run):
 
 
 @pytest.mark.slow
-def test_run_tells_that_a_camera_moved_and_corrects_it_where_asked(small_run, knocked, tmp_path):
+def test_run_tells_that_a_camera_moved_and_corrects_it_where_asked(
+    small_run, knocked, tmp_path, empty_report, monkeypatch
+):
     out = small_run.calibrated(tmp_path / "out")
     summary = pipeline.run(knocked, out, pairs=(0, 1))
     apart = [text for text in summary["warnings"] if "show the same particles" in text]
@@ -193,6 +195,7 @@ def test_run_tells_that_a_camera_moved_and_corrects_it_where_asked(small_run, kn
     points, pupil = np.random.default_rng(5).uniform(-0.5, 0.5, (20, 3)), np.zeros((20, 2))
     assert np.allclose(corrected.cameras["right"].map(points, pupil), expected.map(points, pupil), atol=0.01)
 
+    monkeypatch.undo()
     again = pipeline.run(file, out, pairs=(0, 2))
     assert "vectors of pair 0" in again["reused"] and again["weights"]["self_calibration"] == figures
     assert "Cameras against each other" in (out / "report.html").read_text("utf-8")
@@ -238,7 +241,7 @@ def test_what_cannot_be_told_is_refused(small_run, knocked, tmp_path):
 
 
 @pytest.mark.slow
-def test_cameras_of_different_instants_are_named(small_run, tmp_path):
+def test_cameras_of_different_instants_are_named(small_run, tmp_path, empty_report):
     file = small_run.images(tmp_path / "data")
     images = sorted((file.parent / "particles" / "right").iterdir())
     for path in images:

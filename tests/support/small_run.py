@@ -46,6 +46,13 @@ class SmallRun:
         shutil.copy2(self.out / "calibration.h5", folder)
         return folder
 
+    def prepared(self, folder: Path) -> Path:
+        """Create an output folder that holds what a run measures before its first pair; return it."""
+        self.calibrated(folder)
+        for name in ("background.h5", "guard.json", "refinement.json"):
+            shutil.copy2(self.out / name, folder)
+        return folder
+
 
 def small_scene(**moved):
     """Return a scene of two cameras. `moved` maps a camera to keys that are changed."""
@@ -77,14 +84,31 @@ def make_small_run(folder: Path, device: str) -> SmallRun:
     return SmallRun(experiment, folder / "out", summary)
 
 
+BRIEF = """
+import lfpiv.report
+from lfpiv.cli import commands
+from lfpiv.weights import counting
+
+lfpiv.report.write_report = lambda *given: given[-1].write_text("", "utf-8")
+counting.VOXELS = 1
+commands.main()
+"""
+"""The command line with an empty report and one counted voxel, as in tests that run in this process."""
+
+
 def start(*arguments, **options) -> subprocess.Popen:
-    """Start the command line in a process whose standard error is a pipe of text.
+    """Start `BRIEF` in a process whose standard error is a pipe of text.
 
     The handler of SIGINT is reset, because background jobs of a shell, and their children, ignore interrupts.
     """
-    command = [sys.executable, "-m", "lfpiv", *map(str, arguments)]
+    command = [sys.executable, "-c", BRIEF, *map(str, arguments)]
     options["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def write_empty_report(*given) -> None:
+    """Write an empty page in place of `lfpiv.write_report`, which takes as long as a small run."""
+    given[-1].write_text("", "utf-8")
 
 
 def damage(path: Path) -> None:
