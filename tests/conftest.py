@@ -85,7 +85,7 @@ def device(request):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def one_counted_voxel(device):
+def one_counted_voxel():
     """Hold integrated weights against counted rays in one voxel per camera; return how many users have.
 
     The count takes half of a small run. `tests/weights`, and tests with `whole_count`, compare all voxels.
