@@ -176,8 +176,9 @@ def iterate_epochs(
     coefficients = duplicate(state.coefficients)
     momentum = Momentum(duplicate(coefficients), largest=SUBSET_MOMENTUM)
     partition, following = partitions[0], list(partitions[1:])
-    steps, kind, before = partition.steps, 0, math.inf
+    kind, before = 0, math.inf
     for epoch in range(epochs):
+        steps = partition.steps_of(kind)
         if epoch and left_out > 0:
             leave_out(coefficients, momentum, left_out)
         active = None if resting is None else resting.active_in(epoch, sieve(coefficients))
@@ -212,7 +213,6 @@ def iterate_epochs(
         if rose and kind < len(partition.safer):
             log.debug("epoch %d: misfit rises, safer steps follow", epoch + 1)
             kind += 1
-            steps = partition.steps_of(kind)
             continue
         if not rose:
             before = misfit.divergence
@@ -222,4 +222,3 @@ def iterate_epochs(
             if len(partition.subsets) == 1:
                 return
             kind = min(kind, len(partition.safer))
-            steps = partition.steps_of(kind)

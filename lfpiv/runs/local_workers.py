@@ -65,7 +65,7 @@ def import_distributed(key: str) -> Any:
             f"{key}: expected the package `distributed`, which several processes need, found none. "
             "Install it: pip install 'lfpiv[distributed]'."
         ) from None
-    # of a connection that breaks while something is sent, it logs a traceback; a run says in one line what is lost
+    # It logs a traceback where a connection breaks while something is sent. A run says in one line what is lost.
     logging.getLogger("distributed.batched").setLevel(logging.WARNING)
     return distributed
 

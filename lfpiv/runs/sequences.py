@@ -110,7 +110,7 @@ class SegmentInstants:
         coming = range(self.last + 1, later.stop)
         for place, one in enumerate(coming):
             if segment_of(one) != self.segment and self.before is not None and self.before.given_up:
-                self.last = one  # it would correct none
+                self.last = one  # no instant of the segment is corrected by it
                 continue
             step = part_of(progress, place / (len(coming) + 1), (place + 1) / (len(coming) + 1))
             self.trail[one] = self._follow(Frame(one, frame.name), step)

@@ -111,7 +111,7 @@ def carry(
     shape = tuple(n - 2 * MARGIN for n in coefficients.shape)
     outputs = [empty_volume(shape) for _ in range(2)]
     control = to_device(np.ascontiguousarray(field, np.float32), wp.vec3)
-    mask = None if wanted is None else to_device(np.ascontiguousarray(wanted, np.float32), float)
+    mask = None if wanted is None else on_device(wanted)
     flat, shape_3i = on_device(coefficients).flatten(), wp.vec3i(*coefficients.shape)
     inputs = [flat, shape_3i, control, wp.vec3(*spacing), MARGIN, mask]
     launch(Call(_carry, shape[0], inputs, outputs, inner=shape[1:]))

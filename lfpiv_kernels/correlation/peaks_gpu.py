@@ -15,8 +15,8 @@ from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("peaks_gpu.h", contract="fast", gpu=True))
 
-SECTOR = 8
-"""Floats that memory moves at once; the coefficients of a window begin one."""
+FLOATS_OF_SECTOR: int = native.constant("projector_gpu.h", "SECTOR") // 4
+"""Floats that memory moves at once; the coefficients of a window begin such a sector."""
 
 
 @wp.func_native("lfpiv::score_windows(sums, first, second, windows, count, task, score_out.data);")
@@ -73,7 +73,7 @@ def _find_window_peaks(
 
 def score_pitch(lags: tuple[int, int, int]) -> int:
     """Elements from the coefficients of a window to those of the next."""
-    return -(-math.prod(lags) // SECTOR) * SECTOR
+    return -(-math.prod(lags) // FLOATS_OF_SECTOR) * FLOATS_OF_SECTOR
 
 
 def peak_calls(inputs: list[object], count: int, scores: wp.array, peaks: wp.array) -> tuple[Call, Call]:

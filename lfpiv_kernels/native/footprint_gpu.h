@@ -74,7 +74,7 @@ LFPIV_INLINE void fill_tile(WeightInputs in, const Outline& outline, int index, 
     ReachedLenses reached(voxel);
     const ReachedLens found(reached, place);
     const LensGroup group(voxel, found.lens, found.box);
-    const Tile rows(group, 1, (float)(tile_of_lens * BLOCK_WIDTH));  // first: what it branches over keeps registers
+    const Tile rows(group, 1, (float)(tile_of_lens * BLOCK_WIDTH));  // it branches: later values need no registers yet
     if (!rows.lit()) return;
     const Top top(voxel, reached.slope);
     const Bend bend(voxel);
