@@ -110,7 +110,7 @@ class Passes:
             light = ones(self._size)
             step, momentum = SmartStep(light, sieve), None
             if sieve_voxel > 0:
-                step, momentum = SharpenedStep(light, self._shape), Momentum(light)
+                step, momentum = SharpenedStep(light, sieve), Momentum(light)
             exponent = equations.back_project(light)
             proposal = next(State(light, momentum, (step,)).proposals(exponent, None))
             equations.compare(sieve(proposal.coefficients))
@@ -122,8 +122,8 @@ class Passes:
 
         def run() -> None:
             subsets, light = subsets_of(self._cameras, True), ones(self._size)
-            partition = Partition(subsets, (SharpenedStep(light, self._shape),) * len(subsets))
             state, sieve = State(light, None, ()), Sieve(SIEVE_VOXEL, self._shape)
+            partition = Partition(subsets, (SharpenedStep(light, sieve),) * len(subsets))
             for _ in iterate_epochs(self._equations(), state, sieve, partitions=(partition, partition), epochs=1):
                 pass
 

@@ -69,6 +69,8 @@ class Form:
     choice: Choice
     distance: int | None
     """Layers from one plane of nodes to the next; None where the weights of all voxels are stored."""
+    lines: bool
+    """Whether voxels are shared among lines of sight before."""
     size: int
     """Number of voxels, or of nodes."""
     stored_bytes: int
@@ -165,11 +167,12 @@ class Volume:
             blocks, values = sample_blocks(PackedCamera.of(camera), places, choice.form, choice.cuts)
             require_numbers(blocks * places.size, self.finest.grid.shape)
             size = int(places.size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES))
-            distance = None if nodes is None else nodes.distance
+            distance, lines = (None, False) if nodes is None else (nodes.distance, nodes.lines)
             counts = int(places.size * blocks), int(places.size * values)
             found[name] = Form(
                 choice=choice,
                 distance=distance,
+                lines=lines,
                 size=places.size,
                 stored_bytes=size,
                 device_bytes=device_bytes(choice.form, places.size, *counts, edge=camera.microimages.edge),
@@ -185,7 +188,9 @@ class Volume:
             stored, projectors = StoredGrid.for_cameras(grid, self.cameras.values()), {}
             for name, camera in self.cameras.items():
                 form = forms[name]
-                nodes = None if form.distance is None else NodeGrid.of(stored, camera, form.distance)
+                nodes = None
+                if form.distance is not None:
+                    nodes = NodeGrid.of(stored, camera, form.distance, lines=form.lines)
                 choice = form.choice
                 blocks = footprint_blocks(nodes or stored, camera, choice.form, _ignore, _ignore, choice.cuts)
                 projectors[name] = Projector(blocks, None if nodes is None else nodes.shares)

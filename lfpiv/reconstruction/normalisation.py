@@ -14,7 +14,7 @@ import numpy as np
 from lfpiv.reconstruction.ordered_subsets import Partition, Subset, step_sizes, subsets_of
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve, Smoothing
-from lfpiv.reconstruction.steps import BAND, SharpenedStep, SmartStep, Step
+from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.projector import ALL, ODD
 from lfpiv_kernels.transfer import DeviceArray, to_device
@@ -104,7 +104,7 @@ class Normalisation:
             size = unblurred = self._quotient(relaxation / self._weights.largest, pixels, self._lit & (pixels > 0))
         plain = SmartStep(size, self.sieve)
         sharpened = self._settings.accelerate and self.sieve.sigma_voxel > 0
-        return (SharpenedStep(unblurred, self.sieve.shape), plain) if sharpened else (plain,)
+        return (SharpenedStep(unblurred, self.sieve), plain) if sharpened else (plain,)
 
     @cached_property
     def smoothing(self) -> Smoothing | None:
@@ -128,11 +128,7 @@ class Normalisation:
         plain = tuple(SmartStep(size, self.sieve) for size in on_device)
         if self.sieve.sigma_voxel == 0:
             return Partition(subsets, plain)
-        sharpened, banded = (
-            tuple(SharpenedStep(size, self.sieve.shape, band * self.sieve.sigma_voxel) for size in on_device)
-            for band in (0.0, BAND)
-        )
-        return Partition(subsets, sharpened, (banded, plain))
+        return Partition(subsets, tuple(SharpenedStep(size, self.sieve) for size in on_device), plain)
 
     def _subset_sum(self, subset: Subset) -> np.ndarray:
         """Return the sum of each voxel's weights over the pixels of a subset."""

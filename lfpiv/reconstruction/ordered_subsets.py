@@ -16,9 +16,9 @@ single subsets. The exponents g_n of the subsets in an epoch show it. With <a, b
 their samples by such a test of norms [3]_.
 
 Sharpened steps can raise the misfit however short they are (`lfpiv.reconstruction.steps`). Where the misfit of an epoch
-rises, the epoch is undone, the momentum starts anew, and the next kind of steps follows: banded ones, then SMART's own
-(here divided by sums that are not blurred). Where it rises again, larger subsets follow, and then the passes over all
-rays. Each iteration of those lowers the misfit.
+rises, the epoch is undone, the momentum starts anew, and SMART's own steps follow (here divided by sums that are not
+blurred). Where it rises again, larger subsets follow, and then the passes over all rays. Each iteration of those lowers
+the misfit.
 
 .. [1] D. Kim, S. Ramani, J. A. Fessler, "Combining ordered subsets and momentum for accelerated X-ray CT image
    reconstruction", IEEE Trans. Med. Imaging 34 (2015) 167-178, doi:10.1109/TMI.2014.2350962.
@@ -77,12 +77,8 @@ class Partition:
     """The subsets in their order."""
     steps: tuple[Step, ...]
     """Step of each subset; all are of one kind."""
-    safer: tuple[tuple[Step, ...], ...] = ()
-    """Steps of each subset that follow where the misfit of an epoch rises, one kind after another."""
-
-    def steps_of(self, kind: int) -> tuple[Step, ...]:
-        """Return the step of each subset; kind 0 is the fastest."""
-        return (self.steps, *self.safer)[kind]
+    safer: tuple[Step, ...] = ()
+    """Step of each subset after the misfit of an epoch rose; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -176,9 +172,9 @@ def iterate_epochs(
     coefficients = duplicate(state.coefficients)
     momentum = Momentum(duplicate(coefficients), largest=SUBSET_MOMENTUM)
     partition, following = partitions[0], list(partitions[1:])
-    kind, before = 0, math.inf
+    safely, before = False, math.inf
     for epoch in range(epochs):
-        steps = partition.steps_of(kind)
+        steps = partition.safer if safely and partition.safer else partition.steps
         if epoch and left_out > 0:
             leave_out(coefficients, momentum, left_out)
         active = None if resting is None else resting.active_in(epoch, sieve(coefficients))
@@ -205,14 +201,15 @@ def iterate_epochs(
         rose = not misfit.divergence <= before  # true for NaN
         if rose:
             coefficients, momentum = start, Momentum(duplicate(start), largest=SUBSET_MOMENTUM)
-        is_last = rose and kind == len(partition.safer) and not following
+        may_be_safer = bool(partition.safer) and not safely
+        is_last = rose and not may_be_safer and not following
         yield Epoch(State(coefficients, momentum, state.steps), misfit, count, undone=rose and not is_last)
         if is_last:
             log.debug("epoch %d: misfit rises, passes over all rays follow", epoch + 1)
             return
-        if rose and kind < len(partition.safer):
+        if rose and may_be_safer:
             log.debug("epoch %d: misfit rises, safer steps follow", epoch + 1)
-            kind += 1
+            safely = True
             continue
         if not rose:
             before = misfit.divergence
@@ -221,4 +218,3 @@ def iterate_epochs(
             partition, before = following.pop(0), math.inf
             if len(partition.subsets) == 1:
                 return
-            kind = min(kind, len(partition.safer))

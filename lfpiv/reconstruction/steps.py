@@ -2,13 +2,12 @@
 
 `SmartStep` is Eq. 5: c' = c exp(mu G exponent / G s) with the column sums s = sum_i w and the sieve G. Its exponent is
 the misfit's gradient blurred once more. Each blur hides what is smaller than itself, so convergence is slow.
-`SharpenedStep` leaves that blur out and sharpens instead: log c' / c = mu F exponent / s with
-F = 1 + `SHARPENING` (1 - B), B a Gaussian blur of `SHARPENED_VOXEL`. This is an unmatched back projection [1]_. It is
+`SharpenedStep` sharpens instead: log c' / c = mu F exponent / s with F = (1 + `SHARPENING`) N - `SHARPENING` B. N is a
+Gaussian blur of `BAND` of the sieve's, B one of `SHARPENED_VOXEL`. This is an unmatched back projection [1]_. It is
 zero where the gradient is zero, so both steps have the same solutions.
 
 Sharpened steps need not converge to them, however short they are: eigenvalues of an unmatched pair can have negative
-real parts [2]_. The exponent has details that the sieve hides from the misfit. A banded step leaves most of them out:
-F = (1 + `SHARPENING`) N - `SHARPENING` B, N a Gaussian blur of `BAND` of the sieve's.
+real parts [2]_. The exponent has details that the sieve hides from the misfit. N leaves most of them out.
 
 .. [1] G. L. Zeng, G. T. Gullberg, "Unmatched projector/backprojector pairs in an iterative reconstruction algorithm",
    IEEE Trans. Med. Imaging 19 (2000) 548-555, doi:10.1109/42.870265.
@@ -38,7 +37,7 @@ LARGEST_STEP = 3.0
 """Largest absolute logarithm by which a sharpened step changes a voxel."""
 
 BAND = 0.5
-"""Standard deviation of the Gaussian that bounds the details of a banded step, as a part of the sieve's."""
+"""Standard deviation of the Gaussian that bounds the details of a sharpened step, as a part of the sieve's."""
 LEAST_ACTIVE = 0.05
 """Least share of active voxels, weighted by the sharpening's Gaussian, by which a blur of theirs is divided."""
 
@@ -119,14 +118,11 @@ class SmartStep:
 
 @dataclass(frozen=True)
 class SharpenedStep:
-    """Step without the sieve's second blur, sharpened, perhaps banded. The misfit may rise."""
+    """Step with a narrower blur than the sieve's, sharpened. The misfit may rise."""
 
     size: DeviceArray
     """mu / s, shape (voxel,), float32, on the device."""
-    shape: tuple[int, int, int]
-    """Voxel counts in stored order."""
-    band_voxel: float = 0.0
-    """Standard deviation of the Gaussian N of a banded step [voxel]; 0 for none."""
+    sieve: Sieve
 
     def __call__(
         self,
@@ -141,10 +137,9 @@ class SharpenedStep:
         """Return the next coefficients and the momentum after them."""
         logarithm = multiply(exponent, self.size, exponent if in_place else None, factor=length)
         blurred = self._blur(logarithm)
-        if self._narrow is not None:
-            logarithm = self._narrow(logarithm)
-            if over is not None:
-                multiply(logarithm, over.active, logarithm)
+        logarithm = self._narrow(logarithm)
+        if over is not None:
+            multiply(logarithm, over.active, logarithm)
         factor = None if over is None else over.factor
         stepped, leap = _targets(coefficients, momentum, in_place)
         sharpen(coefficients, logarithm, blurred, SHARPENING, LARGEST_STEP, over=factor, leap=leap, stepped=stepped)
@@ -157,12 +152,12 @@ class SharpenedStep:
 
     @cached_property
     def _blur(self) -> GaussianBlur:
-        return GaussianBlur(SHARPENED_VOXEL, self.shape, truncate=TRUNCATE, border="nearest")
+        return GaussianBlur(SHARPENED_VOXEL, self.sieve.shape, truncate=TRUNCATE, border="nearest")
 
     @cached_property
-    def _narrow(self) -> GaussianBlur | None:
-        width = self.band_voxel
-        return GaussianBlur(width, self.shape, truncate=TRUNCATE, border="nearest") if width > 0 else None
+    def _narrow(self) -> GaussianBlur:
+        width = BAND * self.sieve.sigma_voxel
+        return GaussianBlur(width, self.sieve.shape, truncate=TRUNCATE, border="nearest")
 
 
 def _targets(coefficients: DeviceArray, momentum: Momentum | None, in_place: bool) -> tuple[DeviceArray, Leap | None]:

@@ -7,9 +7,11 @@ apart, at the places where its line of sight meets the planes: W = V R with the 
 the optics per node. It needs a third of the weights, and of the time of a projection. `choose_planes` takes the widest
 distance of planes with which images of voxels agree with their own footprints.
 
-Across the line of sight nothing is interpolated, because images of voxels change fast there. So nodes lie whole voxels
-aside from one another, along the lattice direction next to the line of sight: 0 or 45 degrees from an axis. Where the
-two differ by more than some degrees, no distance serves, and the weights of all voxels are stored.
+Images of voxels change fast across the line of sight. So nodes lie whole voxels aside from one another where a lattice
+direction is near: 0 or 45 degrees from an axis, up to some degrees beside it. Then nothing is interpolated across the
+line of sight. Where none is near, nodes lie along the line of sight itself, and voxels are first shared among lines of
+sight in their layer, see `lfpiv.weights.line_shares`. Images of single voxels are not the same then, but those of
+particles are, up to the steps that voxels have at their edges. These are compared instead.
 
 .. [1] P. Lacroute, M. Levoy, "Fast volume rendering using a shear-warp factorization of the viewing transformation",
    SIGGRAPH 1994, 451-458, doi:10.1145/192161.192283.
@@ -25,27 +27,40 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import sparse
 
 from lfpiv.weights.blocks import WHOLE, Cuts, PackedCamera, blocks_of
 from lfpiv.weights.counting import draw_seen
+from lfpiv.weights.line_shares import BEFORE, line_shares
 from lfpiv.weights.ray_fit import grid_models, ray_models
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import TAPS, PlaneShares
-from lfpiv_kernels.reconstruction.projector import Blocks
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
 log = logging.getLogger(__name__)
 
-DISTANCES = (8, 7, 6, 5, 4, 3, 2)
+DISTANCES: tuple[int, ...] = (8, 7, 6, 5, 4, 3, 2)
 """Distances of planes that are tried, widest first [layer of voxels]."""
+LINE_DISTANCES = DISTANCES[2:]
+"""Those that are tried where voxels are shared among lines of sight. Wider ones were not measured."""
 LARGEST_ERROR = 0.015
 """Largest root mean square of the relative L2 differences of interpolated images from those of the voxels."""
 WORST_ERROR = 0.03
 """Largest of these differences."""
+PARTICLE_ERROR = 0.03
+"""Largest root mean square of the differences of particles where voxels are shared among lines of sight."""
+WORST_PARTICLE_ERROR = 0.04
+"""Largest of these differences."""
 LEAST_GAIN = 1.5
 """Least ratio of voxels to nodes with which nodes are used."""
+NEAR_LATTICE = 0.02
+"""Difference of the line of sight from a lattice direction up to which nodes lie along the latter [voxel/layer]."""
+PARTICLE_VOXEL = 0.85
+"""Standard deviation of the particles that are compared where voxels are shared among lines of sight [voxel]."""
+PARTICLES = 8
+"""Number of these particles."""
 FEWEST_VOXELS = 100_000
 """Voxels of a volume from which on nodes are used. The weights of smaller ones take little time and memory."""
 SEEDS = (1, 2, 3, 4)
@@ -54,41 +69,60 @@ SEEDS = (1, 2, 3, 4)
 
 @dataclass(frozen=True)
 class NodeGrid:
-    """Nodes of one camera for the voxels of a grid: its voxels in every n-th layer, and some beyond its sides."""
+    """Nodes of one camera for the voxels of a grid: lines of sight in every n-th layer, and some beyond its sides."""
 
     stored: StoredGrid
     axes: tuple[int, int, int]
     """Axes of the volume in memory that count rows, layers and columns; layers lie across the line of sight."""
-    slopes: tuple[int, int]
-    """Rows and columns by which nodes move from one layer to the next."""
+    slopes: tuple[float, float]
+    """Rows and columns by which lines of sight move from one layer to the next. Along an axis where this is no whole
+    number, voxels are shared among lines of sight."""
     distance: int
     """Layers from one plane to the next."""
 
     @classmethod
-    def of(cls, stored: StoredGrid, camera: CalibratedCamera, distance: int) -> NodeGrid:
-        """Lay nodes along the lattice direction next to the line of sight to the middle of the grid."""
+    def of(cls, stored: StoredGrid, camera: CalibratedCamera, distance: int, *, lines: bool = False) -> NodeGrid:
+        """Lay nodes along the lattice direction next to the line of sight to the middle of the grid.
+
+        With `lines` they lie along this line of sight itself, except along axes where the two differ by at most
+        `NEAR_LATTICE`.
+        """
         sight = line_of_sight(camera, stored.grid.centre_mm)
         along = np.array([sight[2 - axis] for axis in stored.order])
         layers = int(np.argmax(np.abs(along)))
         rows, columns = (axis for axis in range(3) if axis != layers)
-        row, column = np.rint(along[[rows, columns]] / along[layers]).astype(int).tolist()
+        slopes = along[[rows, columns]] / along[layers]
+        whole = np.rint(slopes)
+        kept = (np.abs(slopes - whole) > NEAR_LATTICE) & lines
+        row, column = np.where(kept, slopes, whole).tolist()
         return cls(stored, (rows, layers, columns), (row, column), distance)
+
+    @property
+    def lines(self) -> bool:
+        """Whether voxels are shared among lines of sight."""
+        return any(slope % 1 for slope in self.slopes)
 
     @cached_property
     def shares(self) -> PlaneShares:
         """How voxels are shared among the nodes."""
         rows, layers, columns = (self.stored.shape[axis] for axis in self.axes)
-        place = (np.arange(layers) - self._first_layer) / self.distance
-        plane = np.clip(np.floor(place).astype(int) - 1, 0, self._planes - TAPS)
-        share = np.stack(_lagrange(place - plane - 1), axis=-1)
-        low, high = self._aside
+        layer, plane = np.arange(layers), self._plane
+        share = np.stack(_lagrange((layer - self._first_layer) / self.distance - plane - 1), axis=-1)
+        low, high = (of.tolist() for of in self._aside)
+        row_share, column_share = (
+            line_shares(-part) if slope % 1 else np.ones((layers, 1))
+            for slope, part in zip(self.slopes, self._parts(layer).T, strict=True)
+        )
+        more = (row_share.shape[1] - 1, column_share.shape[1] - 1)
         return PlaneShares(
             axes=self.axes,
             voxels=self.stored.shape,
-            nodes=(rows + high[0] - low[0], self._planes, columns + high[1] - low[1]),
+            nodes=(rows + more[0] + high[0] - low[0], self._planes, columns + more[1] + high[1] - low[1]),
             plane=plane.astype(np.int32),
             share=share.astype(np.float32),
-            shift=(self._moved(plane) - low).astype(np.int32),
+            shift=(self._moved - low).astype(np.int32),
+            row_share=row_share.astype(np.float32),
+            column_share=column_share.astype(np.float32),
         )
 
     @property
@@ -101,18 +135,34 @@ class NodeGrid:
         """Layer of the first plane, below 0."""
         return (self.stored.shape[self.axes[1]] - 1 - (self._planes - 1) * self.distance) // 2
 
-    def _moved(self, plane: np.ndarray) -> np.ndarray:
-        """Return the rows and columns from each layer's voxels to their nodes on four planes, shape (layer, 4, 2)."""
-        gap = self._first_layer + self.distance * (plane[:, None] + np.arange(TAPS)) - np.arange(len(plane))[:, None]
-        moved: np.ndarray = gap[..., None] * np.array(self.slopes)
+    @property
+    def _plane(self) -> np.ndarray:
+        """First of the four planes of each layer, shape (layer,)."""
+        place = (np.arange(self.stored.shape[self.axes[1]]) - self._first_layer) / self.distance
+        plane: np.ndarray = np.clip(np.floor(place).astype(int) - 1, 0, self._planes - TAPS)
+        return plane
+
+    def _whole(self, layer: np.ndarray) -> np.ndarray:
+        """Return the whole rows and columns by which the line of sight through voxel 0 of layer 0 has moved."""
+        whole: np.ndarray = np.ceil(layer[..., None] * np.array(self.slopes)).astype(int)
+        return whole
+
+    def _parts(self, layer: np.ndarray) -> np.ndarray:
+        """Return the parts of a row and of a column, above -1 and at most 0, by which it has moved besides."""
+        parts: np.ndarray = layer[..., None] * np.array(self.slopes) - self._whole(layer)
+        return parts
+
+    @cached_property
+    def _moved(self) -> np.ndarray:
+        """Rows and columns from each layer's lines of sight to their nodes on four planes, shape (layer, 4, 2)."""
+        planes = self._first_layer + self.distance * (self._plane[:, None] + np.arange(TAPS))
+        moved: np.ndarray = self._whole(planes) - self._whole(np.arange(len(planes)))[:, None]
         return moved
 
-    @property
-    def _aside(self) -> tuple[tuple[int, int], tuple[int, int]]:
+    @cached_property
+    def _aside(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns by which nodes lie aside of their voxels: the least and the largest ones."""
-        reach = 2 * self.distance
-        row, column = (reach * abs(slope) for slope in self.slopes)
-        return (-row, -column), (row, column)
+        return self._moved.min((0, 1)), self._moved.max((0, 1))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -135,25 +185,38 @@ class NodeGrid:
         return self.stored.voxel_mm
 
     def positions_mm(self, steps: np.ndarray) -> np.ndarray:
-        """Return places (x, y, z) [mm] by indices along rows, planes and columns, shape (node, 3)."""
+        """Return places (x, y, z) [mm] by indices along rows, planes and columns, shape (place, 3).
+
+        Parts of a row or column by which lines of sight have moved on a plane are left out.
+        """
         low, _ = self._aside
+        before = [BEFORE if slope % 1 else 0 for slope in self.slopes]
         along = np.empty(np.shape(steps))
-        along[:, self.axes[0]] = steps[:, 0] + low[0]
+        along[:, self.axes[0]] = steps[:, 0] + low[0] - before[0]
         along[:, self.axes[1]] = self._first_layer + self.distance * steps[:, 1]
-        along[:, self.axes[2]] = steps[:, 2] + low[1]
+        along[:, self.axes[2]] = steps[:, 2] + low[1] - before[1]
         return self.stored.positions_mm(along)
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
         """Return places (x, y, z) [mm] of nodes by their index, shape (node, 3)."""
-        return self.positions_mm(np.stack(np.unravel_index(index, self.shape), axis=1))
+        steps = np.stack(np.unravel_index(index, self.shape), axis=1).astype(float)
+        steps[:, [0, 2]] += self._parts(self._first_layer + self.distance * steps[:, 1])
+        return self.positions_mm(steps)
 
     def models(self, camera: CalibratedCamera) -> Iterator[np.ndarray]:
         """Yield the ray models of the nodes, row by row."""
         world = [2 - self.stored.order[axis] for axis in self.axes]
         depth = world[1]
+        parts = self._parts(self._first_layer + self.distance * np.arange(self._planes))
         for model in grid_models(camera, self.shape, self.positions_mm, (world[0], world[1], world[2])):
             model[:, 12 + 2 * depth : 14 + 2 * depth] /= self.distance  # edges are those of voxels
             model[:, 18 + 4 * depth : 22 + 4 * depth] /= self.distance
+            of_planes = model.reshape(*self.shape[1:], -1)
+            for axis, part in zip((world[0], world[2]), parts.T[:, :, None], strict=True):
+                for of in range(2):  # the point on the array and its slopes; they change linearly over a voxel
+                    place, edge, slope = 6 * of, 12 + 2 * axis + of, 18 + 4 * axis + 2 * of
+                    of_planes[..., place] += part * of_planes[..., edge]
+                    of_planes[..., place + 1 : place + 3] += part[..., None] * of_planes[..., slope : slope + 2]
             yield model
 
 
@@ -187,50 +250,90 @@ def choose_planes(stored: StoredGrid, camera: CalibratedCamera, form: str, cuts:
     if stored.grid.size < FEWEST_VOXELS:
         return None
     sample = np.unique(np.concatenate([draw_seen(stored, camera, seed) for seed in SEEDS]))
-    for distance in DISTANCES if len(sample) else ():
-        nodes = NodeGrid.of(stored, camera, distance)
-        if LEAST_GAIN * nodes.size > stored.grid.size:
-            continue
-        errors = interpolation_errors(nodes, camera, sample, form, cuts)
-        error = float(np.sqrt(np.mean(np.square(errors))))
-        if error <= LARGEST_ERROR and max(errors) <= WORST_ERROR:
-            text = "%s: weights of %d nodes for %d voxels, planes %d layers apart: images differ by %.1f %%"
-            log.info(text, camera.name, nodes.size, stored.grid.size, distance, 100 * error)
-            return nodes
+    if not len(sample):
+        return None
+    for lines in (False, True):
+        if lines:
+            voxels, light = blobs_about(stored, sample[:: len(sample) // PARTICLES + 1])
+            distances, largest, worst = LINE_DISTANCES, PARTICLE_ERROR, WORST_PARTICLE_ERROR
+        else:
+            voxels, light, distances, largest, worst = sample, None, DISTANCES, LARGEST_ERROR, WORST_ERROR
+        for distance in distances:
+            nodes = NodeGrid.of(stored, camera, distance, lines=lines)
+            if LEAST_GAIN * nodes.size > stored.grid.size or nodes.lines != lines:
+                continue
+            errors = interpolation_errors(nodes, camera, voxels, form, cuts, light=light)
+            error = float(np.sqrt(np.mean(np.square(errors))))
+            if error <= largest and max(errors) <= worst:
+                text = "%s: weights of %d nodes for %d voxels, planes %d layers apart: images of %s differ by %.1f %%"
+                kind = "particles" if lines else "voxels"
+                log.info(text, camera.name, nodes.size, stored.grid.size, distance, kind, 100 * error)
+                return nodes
     return None
 
 
+def blobs_about(stored: StoredGrid, voxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Gaussian particles about some voxels, moved by parts of a voxel: indices and light, (particle, voxel)."""
+    reach = math.ceil(3 * PARTICLE_VOXEL)
+    steps = np.arange(-reach, reach + 1)
+    last = np.array(stored.shape) - 1
+    middle = np.stack(np.unravel_index(voxels, stored.shape), axis=1)
+    middle = np.clip(middle, np.minimum(reach, last // 2), np.maximum(last - reach, last // 2))
+    places, light = [], []
+    for at, part in zip(middle, np.random.default_rng(SEEDS[0]).uniform(-0.5, 0.5, (len(voxels), 3)), strict=True):
+        along = [np.clip(at[axis] + steps, 0, last[axis]) for axis in range(3)]
+        places.append(np.ravel_multi_index(np.meshgrid(*along, indexing="ij"), stored.shape).ravel())
+        of_axes = np.exp(-((steps - part[:, None]) ** 2) / (2 * PARTICLE_VOXEL**2))
+        light.append(np.einsum("a,b,c->abc", *of_axes).ravel())
+    return np.array(places), np.array(light)
+
+
 def interpolation_errors(
-    nodes: NodeGrid, camera: CalibratedCamera, voxels: np.ndarray, form: str, cuts: Cuts = WHOLE
+    nodes: NodeGrid,
+    camera: CalibratedCamera,
+    voxels: np.ndarray,
+    form: str,
+    cuts: Cuts = WHOLE,
+    *,
+    light: np.ndarray | None = None,
 ) -> list[float]:
-    """Return the relative L2 difference of the interpolated images of some voxels from their own footprints."""
-    found = [nodes.shares.nodes_of(int(voxel)) for voxel in voxels]
-    places = [nodes.centres_mm(node) for node, _ in found]
-    centres = np.concatenate([nodes.stored.centres_mm(voxels), *places])
-    models = ray_models(camera, centres, nodes.voxel_mm)
-    blocks = blocks_of(PackedCamera.of(camera), [models], form, cuts=cuts)
-    errors, first = [], len(voxels)
-    for number, (_, shares) in enumerate(found):
-        parts = [(number, -1.0), *zip(range(first, first + len(shares)), shares.tolist(), strict=True)]
-        first += len(shares)
-        own = _image(blocks, parts[:1])
-        light = math.sqrt(sum(value**2 for value in own.values()))
-        if light > 0:
-            errors.append(math.sqrt(sum(value**2 for value in _image(blocks, parts).values())) / light)
-    return errors or [math.inf]
+    """Compare interpolated images of groups of voxels with those from their own footprints.
 
+    Parameters
+    ----------
+    nodes : NodeGrid
+        The nodes.
+    camera : CalibratedCamera
+        The camera.
+    voxels : ndarray, shape (group,) or (group, voxel)
+        Indices of the voxels.
+    form : {"profiles", "pixels"}
+        Form of the weights.
+    cuts : tuple of int
+        Parts of a voxel along x, y, z.
+    light : ndarray, shape (group, voxel), optional
+        Light of the voxels; default: one.
 
-def _image(blocks: Blocks, parts: list[tuple[int, float]]) -> dict[int, float]:
-    """Return the pixels of a weighted sum of voxels' images."""
-    pixels, values = [], []
-    for voxel, factor in parts:
-        ray, weight = blocks.entries(voxel)
-        share = blocks.microimages.share[ray]
-        pixels.append(blocks.microimages.pixel[ray[share > 0]])
-        values.append(factor * (weight * share)[share > 0])
-    pixel, place = np.unique(np.concatenate(pixels), return_inverse=True)
-    sums = np.bincount(place, np.concatenate(values), len(pixel))
-    return dict(zip(pixel.tolist(), sums.tolist(), strict=True))
+    Returns
+    -------
+    list of float
+        Relative L2 difference of each group that the camera sees; infinity alone if it sees none.
+    """
+    groups = np.reshape(voxels, (len(voxels), -1))
+    own, inverse = np.unique(groups, return_inverse=True)
+    group = np.repeat(np.arange(len(groups)), groups.shape[1])
+    values = np.ones(groups.size) if light is None else light.ravel()
+    of_groups = sparse.coo_array((values, (group, inverse.ravel())), (len(groups), len(own))).tocsr()
+    found = [nodes.shares.nodes_of(int(voxel)) for voxel in own]
+    used, place = np.unique(np.concatenate([node for node, _ in found]), return_inverse=True)
+    first = np.cumsum([0, *(len(node) for node, _ in found)])
+    spread = sparse.csr_array((np.concatenate([share for _, share in found]), place, first), (len(own), len(used)))
+    models = ray_models(camera, np.concatenate([nodes.stored.centres_mm(own), nodes.centres_mm(used)]), nodes.voxel_mm)
+    images = blocks_of(PackedCamera.of(camera), [models], form, cuts=cuts).pixel_weights()
+    exact = of_groups @ images[: len(own)]
+    apart = exact - of_groups @ spread @ images[len(own) :]
+    norms, differences = (np.sqrt(one.power(2).sum(axis=1)) for one in (exact, apart))
+    return (differences[norms > 0] / norms[norms > 0]).tolist() or [math.inf]
 
 
 def _lagrange(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

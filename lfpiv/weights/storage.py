@@ -29,7 +29,7 @@ from lfpiv_kernels.weights.microimages import Microimages
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 _HEADER = "weights.json"
 _HASHED_BYTES = 1 << 24
 """Size of the pieces in which arrays are hashed [byte]."""

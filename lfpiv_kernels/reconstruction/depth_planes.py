@@ -1,11 +1,11 @@
 """Warp: voxels on planes across a camera's line of sight, and back: the factor R of the weights W = V R.
 
-A voxel is shared among the nodes of four planes, where its line of sight meets them. Each thread
+A voxel is shared among the nodes of four planes, where its line of sight meets them. Where this line follows no lattice
+direction of the voxels, they are shared first among the lines of sight on either side, see ``line_shares``. Each thread
 writes a row of nodes or of voxels, so that results do not depend on the number of threads. The loops are C++, see
 ``depth_planes.h``; a GPU has ``depth_planes_gpu``. Twin: `PlaneShares.nodes_of`, voxel by voxel.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction import depth_planes_gpu
+from lfpiv_kernels.reconstruction.line_shares import Layers, LineShares
 from lfpiv_kernels.reconstruction.plane_layout import PlaneMap
 from lfpiv_kernels.transfer import Given, as_given, empty, to_device, to_host
 
@@ -27,8 +28,10 @@ TAPS: int = native.constant("depth_planes.h", "TAPS")
 class PlaneShares:
     """Places and shares of voxels on planes of nodes.
 
-    The voxel in row a, layer z and column b has the share ``share[z, n]`` in plane ``plane[z] + n``, n from 0 to 3, at
-    row ``a + shift[z, n, 0]`` and column ``b + shift[z, n, 1]``.
+    The voxel in row a, layer z and column b has the share ``row_share[z, j] column_share[z, k]`` on the line of sight
+    in row ``a + j`` and column ``b + k`` of this layer. The line of sight in row a and column b has the share
+    ``share[z, n]`` in plane ``plane[z] + n``, n from 0 to 3, at row ``a + shift[z, n, 0]`` and column
+    ``b + shift[z, n, 1]``.
     """
 
     axes: tuple[int, int, int]
@@ -42,7 +45,11 @@ class PlaneShares:
     share: np.ndarray
     """Share of a layer on its planes, shape (layer, 4), float32."""
     shift: np.ndarray
-    """Rows and columns from a voxel to its nodes, shape (layer, 4, 2), int32."""
+    """Rows and columns from a line of sight to its nodes, shape (layer, 4, 2), int32."""
+    row_share: np.ndarray
+    """Share of a layer's voxels on lines of sight along the rows, shape (layer, line), float32; one line: all of it."""
+    column_share: np.ndarray
+    """The same along the columns."""
 
     @property
     def size(self) -> int:
@@ -53,10 +60,12 @@ class PlaneShares:
         """Return the nodes of a voxel and its shares, shapes (node,); shares of zero are left out."""
         place = np.unravel_index(voxel, self.voxels)
         row, layer, column = (int(place[axis]) for axis in self.axes)
-        rows, columns = row + self.shift[layer, :, 0], column + self.shift[layer, :, 1]
-        node = (rows * self.nodes[1] + self.plane[layer] + np.arange(TAPS)) * self.nodes[2] + columns
-        lit = self.share[layer] != 0
-        return node[lit], self.share[layer, lit].astype(np.float64)
+        of_row, of_column = (of[layer].astype(np.float64) for of in (self.row_share, self.column_share))
+        share = np.einsum("j,k,n->jkn", of_row, of_column, self.share[layer].astype(np.float64))
+        j, k, n = np.indices(share.shape)
+        rows, columns = row + j + self.shift[layer, n, 0], column + k + self.shift[layer, n, 1]
+        node = (rows * self.nodes[1] + self.plane[layer] + n) * self.nodes[2] + columns
+        return node[share != 0], share[share != 0]
 
 
 @wp.func_native("lfpiv::spread_row(lfpiv::plane_map(map), row, absolute, voxels.data, nodes_out.data);")
@@ -107,9 +116,19 @@ class DepthPlanes:
         for name, array in (("plane", shares.plane), ("shift", shares.shift)):
             setattr(self._map, name, to_device(np.ascontiguousarray(array, np.int32).ravel()))
         self._map.share = to_device(np.ascontiguousarray(shares.share, np.float32).ravel())
-        self._map.rows, self._map.layers, self._map.columns = rows, layers, columns
-        self._map.row_stride = layers * columns if self._moved else strides[shares.axes[0]]
-        self._map.layer_stride = columns if self._moved else strides[shares.axes[1]]
+        lattice = Layers(
+            rows,
+            columns,
+            layers * columns if self._moved else strides[shares.axes[0]],
+            columns if self._moved else strides[shares.axes[1]],
+        )
+        self._lines = []
+        for share, along_rows in ((shares.row_share, True), (shares.column_share, False)):
+            if share.shape[1] > 1:
+                self._lines.append(LineShares(share, along_rows, lattice))
+                lattice = self._lines[-1].shared
+        self._map.rows, self._map.layers, self._map.columns = lattice.rows, layers, lattice.columns
+        self._map.row_stride, self._map.layer_stride = lattice.row_stride, lattice.layer_stride
         self._map.node_rows, self._map.planes, self._map.node_columns = shares.nodes
         self._layers_of = to_device(depth_planes_gpu.layers_of_planes(shares.plane, shares.nodes[1]))
 
@@ -121,6 +140,8 @@ class DepthPlanes:
         voxels, nodes = to_device(volume, float), empty(self.shares.size)
         if self._moved:
             voxels = _transposed(voxels, self.shares.voxels, self.shares.axes)
+        for line in self._lines:
+            voxels = line.spread(voxels, absolute=absolute)
         if runtime.device().form == "gpu":
             depth_planes_gpu.spread(self._map, self._layers_of, absolute, voxels, nodes)
         else:
@@ -129,12 +150,14 @@ class DepthPlanes:
 
     def collect(self, nodes: Given) -> Given:
         """Return the adjoint's sum R^T nodes, shape (voxel,), float32, on the device if `nodes` are."""
-        found = empty(math.prod(self.shares.voxels))
+        found = empty(self._map.rows * self._map.layers * self._map.columns)
         light = to_device(nodes, float)
         if runtime.device().form == "gpu":
             depth_planes_gpu.collect(self._map, light, found)
         else:
             launch(Call(_collect, self._map.rows * self._map.layers, [self._map, light], [found]))
+        for line in reversed(self._lines):
+            found = line.collect(found)
         if self._moved:
             rows, layers, columns = (self.shares.voxels[axis] for axis in self.shares.axes)
             first, second, third = (self.shares.axes.index(axis) for axis in range(3))

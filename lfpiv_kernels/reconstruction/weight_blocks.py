@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
@@ -79,3 +80,24 @@ class Blocks:
         if not rays:
             return np.zeros(0, np.int64), np.zeros(0)
         return np.concatenate(rays, axis=None), np.concatenate(weights, axis=None) * float(self.scale[voxel])
+
+    def pixel_weights(self) -> sparse.csr_array:
+        """Return the weights of some voxels on pixels, shape (voxel, pixel), float64. For few voxels."""
+        width, height = self.width.astype(np.int64), self.height.astype(np.int64)
+        profiles = self.form == "profiles"
+        used = width + height if profiles else width * height
+        first, size = np.cumsum(used) - used, width * height
+        block = np.repeat(np.arange(len(size)), size)
+        step = np.arange(len(block)) - (np.cumsum(size) - size)[block]
+        row, column = np.divmod(step, width[block])
+        level = self.value.astype(np.float64)
+        if profiles:
+            weight = level[first[block] + column] * level[first[block] + width[block] + row]
+        else:
+            weight = level[first[block] + step]
+        voxel = np.repeat(np.arange(len(self.scale)), np.diff(self.first_block))[block]
+        ray = self.ray[block] + row * self.microimages.edge + column
+        weight *= self.microimages.share[ray] * self.scale[voxel].astype(np.float64)
+        lit = weight > 0
+        shape = len(self.scale), int(np.prod(self.microimages.sensor_shape))
+        return sparse.coo_array((weight[lit], (voxel[lit], self.microimages.pixel[ray[lit]])), shape).tocsr()

@@ -1,6 +1,7 @@
 """Compare volumes from the weights of nodes on planes with those from the weights of all voxels, on the same images.
 
     python perf/accuracy/depth_planes.py --cases blobs,points --conditions clean,real --flows ring,shear --seeds 11
+    python perf/accuracy/depth_planes.py --cases blobs,points --angles=30,-30 --flows ring --seeds 11,12,13
 
 The options are those of ``reconstruction_bench.py``. Volumes of its small scale have too few voxels for nodes, so that
 they are used here whatever the number of voxels. Nodes are as far apart as in large volumes. No figure is kept.
@@ -41,13 +42,14 @@ def main() -> None:
         parser.add_argument(f"--{option}", default=default)
     parser.add_argument("--ppm", default="0.5")
     parser.add_argument("--seeds", default="11")
-    parser.set_defaults(angles=None, scale="small", frames=2)
+    parser.add_argument("--angles")
+    parser.set_defaults(scale="small", frames=2)
     for case in parse_cases(parser.parse_args()):
         for used in (False, True):
             with nodes(used):
                 found = measure(case, WAYS["ours"], CACHE)
             text = ", ".join(f"{name} {found[name]:.4g}" for name in FIGURES)
-            print(f"{case.label}, {'nodes' if used else 'all voxels'}: {text}", flush=True)
+            print(f"{case.label}, seed {case.seed}, {'nodes' if used else 'all voxels'}: {text}", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,10 @@ from support.plain_rays import plain
 from support.random_blocks import VOXELS, matrix_of, random_blocks
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.reconstruction import blur_gpu, depth_planes_gpu, pixel_rays_gpu
+from lfpiv_kernels.reconstruction import blur_gpu, depth_planes_gpu, line_shares_gpu, pixel_rays_gpu
 from lfpiv_kernels.reconstruction.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes, PlaneShares
+from lfpiv_kernels.reconstruction.line_shares import Layers, LineShares
 from lfpiv_kernels.reconstruction.pixel_rays import RayMap
 from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD, Blocks, Projector
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector, device_bytes
@@ -181,6 +182,8 @@ def test_planes_of_a_gpu_are_those_of_the_cpu():
         plane=np.array([5, 4, 3, 3, 2, 1, 0], np.int32),
         share=share.astype(np.float32),
         shift=np.stack([rng.integers(0, 6, (7, 4)), rng.integers(0, 10, (7, 4))], axis=-1).astype(np.int32),
+        row_share=np.ones((7, 1), np.float32),
+        column_share=np.ones((7, 1), np.float32),
     )
     matrix = np.zeros((shares.size, 5 * 7 * 40))
     for voxel in range(matrix.shape[1]):
@@ -197,6 +200,31 @@ def test_planes_of_a_gpu_are_those_of_the_cpu():
     depth_planes_gpu.collect(planes._map, to_device(light, float), found)
     expected = matrix.T @ light
     np.testing.assert_allclose(to_host(found), expected, atol=TOLERANCE_SUM * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("along_rows", [False, True])
+def test_lines_of_a_gpu_are_those_of_the_cpu(along_rows):
+    if runtime.device().form == "gpu":
+        pytest.skip("the CPU's loops are not compiled")
+    rng = np.random.default_rng(9)
+    rows, layers, columns, taps = 5, 7, 40, 6
+    share = rng.uniform(-0.2, 1, (layers, taps)).astype(np.float32)
+    lines = LineShares(share, along_rows, Layers(rows, columns, layers * columns, columns))
+    size = lines.shared.rows * layers * lines.shared.columns
+    volume, light = rng.random(rows * layers * columns, np.float32), rng.random(size, np.float32)
+    for absolute in (False, True):
+        found, expected = (
+            to_device(np.empty(size, np.float32), float),
+            lines.spread(to_device(volume), absolute=absolute),
+        )
+        line_shares_gpu.share(lines._forth, absolute, to_device(volume), found)
+        np.testing.assert_allclose(to_host(found), to_host(expected), atol=TOLERANCE_SUM * to_host(expected).max())
+    found = to_device(np.empty_like(volume), float)
+    line_shares_gpu.share(lines._back, False, to_device(light), found)
+    expected = to_host(lines.collect(to_device(light)))
+    np.testing.assert_allclose(to_host(found), expected, atol=TOLERANCE_SUM * expected.max())
+    forth = np.vdot(to_host(lines.spread(to_device(volume))).astype(float), light)
+    assert np.vdot(to_host(found).astype(float), volume) == pytest.approx(forth, rel=TOLERANCE_ADJOINT)
 
 
 def test_constants_of_both_forms_agree():

@@ -23,6 +23,7 @@ EVERY_PASS = {
     ("depth_planes_gpu", "_collect"),
     ("depth_planes_gpu", "_spread"),
     ("filters_gpu", "_filter"),
+    ("line_shares_gpu", "_share"),
     ("neighbours_gpu", "_predict_vectors"),
     ("peaks_gpu", "_find_window_peaks"),
     ("peaks_gpu", "_score_windows"),

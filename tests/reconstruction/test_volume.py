@@ -395,7 +395,7 @@ def test_sharp_steps_reach_the_images_in_half_the_iterations(seed):
 def _misfits(weights, images, first, sharp):
     """Misfits of 60 iterations with a sieve and momentum, with sharp steps or without."""
     blur, total = sieve.Sieve(0.6, weights.stored.shape), weights.stored.store(weights.column_sum)
-    sharpened = (steps.SharpenedStep(to_device(1 / total), blur.shape),) if sharp else ()
+    sharpened = (steps.SharpenedStep(to_device(1 / total), blur),) if sharp else ()
     guess = to_device(weights.stored.store(first.astype(np.float32)))
     plain = steps.SmartStep(to_device(1 / blur(total)), blur)
     state = smart.State(guess, momentum.Momentum(guess), (*sharpened, plain))

@@ -12,7 +12,17 @@ from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
 from lfpiv.weights import depth_planes
 from lfpiv.weights.checks import estimate_memory
-from lfpiv.weights.depth_planes import LARGEST_ERROR, NodeGrid, choose_planes, interpolation_errors, line_of_sight
+from lfpiv.weights.depth_planes import (
+    LARGEST_ERROR,
+    PARTICLE_ERROR,
+    NodeGrid,
+    blobs_about,
+    choose_planes,
+    interpolation_errors,
+    line_of_sight,
+)
+from lfpiv.weights.line_shares import BEFORE, LINES, VARIANCE_VOXEL, line_shares
+from lfpiv.weights.ray_fit import ray_models
 from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
@@ -21,12 +31,15 @@ from lfpiv_kernels.transfer import to_device
 
 TOLERANCE_TWIN = 2e-6  # float32 sums of up to 64 shares
 TOLERANCE_ADJOINT = 1e-5  # as of the operator
+TOLERANCE_PITCH = 5e-4  # interpolated fits, 3e-4, and a second derivative over a voxel, half a squared one over 200 mm
 GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.2, 0.8, 1.4), voxel_mm=0.05)
 CAMERAS = {
     "45": rotation(45),
     "-44, rolled": rotation(-44, 0.5, 3),
     "from above": rotation(1, 45),
 }
+BETWEEN = {"30": rotation(30), "-60, rolled": rotation(-60, 0.5, 3), "35 and 20": rotation(35, 20)}
+"""Cameras whose line of sight follows no lattice direction."""
 
 
 @pytest.fixture
@@ -34,6 +47,20 @@ def for_small_volumes(monkeypatch):
     """Use nodes however small the volume and the gain are."""
     monkeypatch.setattr(depth_planes, "FEWEST_VOXELS", 0)
     monkeypatch.setattr(depth_planes, "LEAST_GAIN", 0.0)
+
+
+def rig_of(*yaws_deg):
+    return IdealRig({f"cam{n}": IdealCamera(f"cam{n}", rotation(yaw, 0.2 * n)) for n, yaw in enumerate(yaws_deg, 1)})
+
+
+@pytest.fixture(scope="module")
+def between(device):
+    """Return the weights of cameras at 30 and -60 degrees with nodes and those of all voxels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(depth_planes, "FEWEST_VOXELS", 0)
+        patch.setattr(depth_planes, "LEAST_GAIN", 0.0)
+        nodes = lfpiv.build_weights(rig_of(30, -60), GRID)
+    return nodes, lfpiv.build_weights(rig_of(30, -60), GRID, planes=False)
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +81,11 @@ def shares_matrix(shares):
     return matrix
 
 
-@pytest.mark.parametrize("pose", [*CAMERAS.values(), rotation(2, 1)])
+@pytest.mark.parametrize("pose", [*CAMERAS.values(), rotation(2, 1), *BETWEEN.values()])
 @pytest.mark.parametrize("order", [*permutations(range(3))])
 def test_voxels_are_shared_among_nodes_as_stated(pose, order, device):
     stored = StoredGrid(lfpiv.Grid(shape=(9, 7, 8), voxel_mm=0.1, first_centre_mm=(0.0, 0.0, 0.0)), order)
-    nodes = NodeGrid.of(stored, IdealCamera("one", pose), 3)
+    nodes = NodeGrid.of(stored, IdealCamera("one", pose), 3, lines=True)
     planes, matrix = DepthPlanes(nodes.shares), shares_matrix(nodes.shares)
     rng = np.random.default_rng(0)
     volume = rng.standard_normal(stored.size).astype(np.float32)
@@ -82,6 +109,54 @@ def test_shares_keep_light_and_lie_about_the_voxel_along_its_line_of_sight(pose)
         across = away - (away @ sight)[:, None] * sight
         assert np.linalg.norm(across, axis=1)[np.abs(share) > 0.2].max() < 2 * GRID.voxel_mm
         assert len(node) == 1 or np.abs(away @ sight).max() > 3 * GRID.voxel_mm  # else it lies on a plane
+
+
+@pytest.mark.parametrize("pose", BETWEEN.values(), ids=BETWEEN)
+def test_shares_among_lines_of_sight_keep_light_and_its_mean_place(pose):
+    camera = IdealCamera("one", pose)
+    stored = StoredGrid.for_cameras(GRID, [camera])
+    nodes = NodeGrid.of(stored, camera, 4, lines=True)
+    assert nodes.lines
+    sight = line_of_sight(camera, GRID.centre_mm)
+    for voxel in np.random.default_rng(1).choice(stored.size, 20):
+        node, share = nodes.shares.nodes_of(int(voxel))
+        away = nodes.centres_mm(node) - stored.centres_mm(np.array([voxel]))
+        assert share.sum() == pytest.approx(1, abs=1e-5)
+        np.testing.assert_allclose(share @ away, 0, atol=1e-6)
+        across = away - (away @ sight)[:, None] * sight
+        assert np.linalg.norm(across, axis=1).max() < 3 * np.sqrt(2) * GRID.voxel_mm  # three lines on either side
+
+
+def test_shares_among_lines_interpolate_blobs_better_than_a_polynomial():
+    place = np.linspace(0, 1, 11)
+    share, lines = line_shares(place), np.arange(LINES) - BEFORE
+    np.testing.assert_allclose(share[[0, -1]], np.eye(LINES)[[BEFORE, BEFORE + 1]], atol=1e-9)
+    np.testing.assert_allclose(share, line_shares(1 - place)[:, ::-1], atol=1e-9)
+    blobs = np.exp(-((np.linspace(-8, 8, 321) - lines[:, None]) ** 2) / (2 * VARIANCE_VOXEL))
+    polynomial = lagrange_shares(place, lines)
+    for at, ours, theirs in zip(place[1:-1], share[1:-1], polynomial[1:-1], strict=True):
+        exact = np.exp(-((np.linspace(-8, 8, 321) - at) ** 2) / (2 * VARIANCE_VOXEL))
+        assert np.linalg.norm(ours @ blobs - exact) < np.linalg.norm(theirs @ blobs - exact)
+
+
+def lagrange_shares(place, lines):
+    factors = [[(place - other) / (line - other) for other in lines if other != line] for line in lines]
+    return np.prod(factors, axis=1).T
+
+
+@pytest.mark.parametrize("pose", BETWEEN.values(), ids=BETWEEN)
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0)])
+def test_models_of_nodes_are_those_of_their_places(pose, order):
+    camera = IdealCamera("one", pose)
+    nodes = NodeGrid.of(StoredGrid(GRID, order), camera, 4, lines=True)
+    found = np.concatenate(list(nodes.models(camera)))
+    expected = ray_models(camera, nodes.centres_mm(np.arange(nodes.size)), GRID.voxel_mm)
+    radius, pitch = camera.optics.pupil_radius_mm, camera.lattice.pitch_mm
+    for place in (0, 6):
+        np.testing.assert_allclose(found[:, place], expected[:, place], atol=TOLERANCE_PITCH * pitch)
+        slopes = (found - expected)[:, place + 1 : place + 3]
+        assert np.abs(slopes).max() * radius < TOLERANCE_PITCH * pitch
+    assert np.abs(found - expected)[:, 12:18].max() < TOLERANCE_PITCH * pitch
 
 
 @pytest.mark.parametrize("pose", CAMERAS.values(), ids=CAMERAS)
@@ -119,6 +194,27 @@ def test_operator_with_nodes_is_that_of_all_voxels(both):
     assert apart.mean() < 0.04 and apart.max() < 0.4
 
 
+def test_operator_with_lines_of_sight_is_that_of_all_voxels(between):
+    nodes, every = between
+    assert all(nodes.projector(name).planes.column_share.shape[1] == LINES for name in nodes.cameras)
+    rng = np.random.default_rng(9)
+    sparse = np.zeros(GRID.shape, np.float32)
+    sparse[tuple(rng.integers(0, n, 40) for n in GRID.shape)] = 1.0
+    found, expected = (weights(ndimage.gaussian_filter(sparse, 0.9)) for weights in between)
+    for name in nodes.cameras:
+        assert np.linalg.norm(found[name] - expected[name]) < PARTICLE_ERROR * np.linalg.norm(expected[name])
+    images = {name: rng.standard_normal(camera.gain.shape).astype(np.float32) for name, camera in nodes.cameras.items()}
+    volume = rng.standard_normal(GRID.shape).astype(np.float32)
+    projected, back = nodes(volume), nodes.T(images)
+    left = sum(np.vdot(projected[name].astype(float), images[name]) for name in images)
+    assert left == pytest.approx(np.vdot(volume.astype(float), back), rel=TOLERANCE_ADJOINT, abs=1e-3)
+    np.testing.assert_allclose(nodes.column_sum, every.column_sum, rtol=0.01)
+    unit = np.zeros(GRID.shape, np.float32)
+    unit[13, 5, 9] = 1.0
+    for name, image in nodes(unit).items():
+        np.testing.assert_allclose(nodes.image(name, (13, 5, 9)), image, atol=1e-6 * image.max())
+
+
 def test_image_of_a_voxel_is_its_projection(both):
     nodes, _ = both
     unit = np.zeros(GRID.shape, np.float32)
@@ -146,8 +242,9 @@ def test_voxels_without_part_do_not_change(both):
     np.testing.assert_allclose(some[active > 0] - 7, every[active > 0], atol=1e-5 * np.abs(every).max())
 
 
-def test_stored_weights_keep_their_nodes(both, tmp_path):
-    nodes, _ = both
+@pytest.mark.parametrize("weights", ["both", "between"])
+def test_stored_weights_keep_their_nodes(weights, tmp_path, request):
+    nodes, _ = request.getfixturevalue(weights)
     content = save_weights(nodes, tmp_path)
     opened = open_weights(tmp_path, nodes.cameras, content)
     volume = np.random.default_rng(6).random(GRID.shape).astype(np.float32)
@@ -173,7 +270,9 @@ def test_no_voxel_rests_where_nodes_share_the_weights(both, monkeypatch):
 
 
 @pytest.mark.slow
-def test_volumes_are_as_good_as_with_the_weights_of_all_voxels(both):
+@pytest.mark.parametrize("weights", ["both", "between"])
+def test_volumes_are_as_good_as_with_the_weights_of_all_voxels(weights, request):
+    both = request.getfixturevalue(weights)
     every = both[1]
     rng = np.random.default_rng(8)
     truth = np.zeros(GRID.shape, np.float32)
@@ -198,8 +297,19 @@ def test_memory_with_nodes_is_estimated():
     assert estimate == pytest.approx(weights.memory_bytes, rel=0.1)
 
 
-def test_voxels_aslant_to_the_line_of_sight_keep_their_own_weights(for_small_volumes):
-    camera = IdealCamera("one", rotation(27, 12))
+@pytest.mark.parametrize("pose", [rotation(33), rotation(1, -60)], ids=["33", "-60 from above"])
+def test_cameras_between_lattice_directions_share_voxels_among_lines_of_sight(pose, for_small_volumes):
+    camera = IdealCamera("one", pose)
+    stored = StoredGrid.for_cameras(GRID, [camera])
+    nodes = choose_planes(stored, camera, "profiles")
+    voxels, light = blobs_about(stored, np.random.default_rng(10).choice(stored.size, 12))
+    error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, camera, voxels, "profiles", light=light))))
+    assert nodes.lines and error < 1.4 * PARTICLE_ERROR  # of other particles than those by which it was chosen
+
+
+def test_where_particles_differ_as_well_all_voxels_keep_their_own_weights(for_small_volumes):
+    """Few lines of sight lie between two voxels, so that edges of voxels show, along both axes."""
+    camera = IdealCamera("one", rotation(12, 12))
     assert choose_planes(StoredGrid.for_cameras(GRID, [camera]), camera, "profiles") is None
 
 
