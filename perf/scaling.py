@@ -54,7 +54,9 @@ def _pair(edge: int, cameras: int) -> dict[str, Any]:
     rows, columns = (int(edge * 0.1 * stretch / 0.0055) + 200 for stretch in (1, 2**0.5))
     calibration, user = inputs.rig((rows, columns), cameras=cameras), inputs.grid({"voxels": edge})
     factor = needed_refinement(BLOB_VOXEL)
-    weights, weights_s = _timed(lambda: _weights(calibration, user.padded(((1, 1),) * 3).refined(factor)))
+    weights, weights_s = _timed(
+        lambda: _weights(calibration, user.padded(((1, 1),) * 3).refined(factor), factor * BLOB_VOXEL)
+    )
     weights.volume = user
     settings, frames, volumes_s = Smart().of_one_frame(factor), [], 0.0
     for number in (0, 1):
@@ -75,11 +77,11 @@ def _pair(edge: int, cameras: int) -> dict[str, Any]:
     }
 
 
-def _weights(calibration, grid):
+def _weights(calibration, grid, particle_voxel):
     """Build weights and their sums, which a run needs once."""
     import lfpiv
 
-    weights = lfpiv.build_weights(calibration, grid)
+    weights = lfpiv.build_weights(calibration, grid, particle_voxel=particle_voxel)
     weights.camera_sums  # noqa: B018 - computed on first use
     return weights
 

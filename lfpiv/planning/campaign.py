@@ -268,7 +268,7 @@ def _prepared(
             found["calibration"] = dots
     if run.guard is None or run.refinement is None:
         looked = preparation.look_at_images(run.experiment, whole.calibration, large.images, frame)
-        _, estimated = timed(lambda: memory.weights_bytes(whole.finest))
+        _, estimated = timed(lambda: memory.weights_bytes(whole.finest, whole.particle_voxel))
         found["images"] = looked + 2 * estimated  # by the sizes of particles and volume, and once they are known
     return found
 

@@ -69,8 +69,8 @@ class Form:
     choice: Choice
     distance: int | None
     """Layers from one plane of nodes to the next; None where the weights of all voxels are stored."""
-    lines: bool
-    """Whether voxels are shared among lines of sight before."""
+    lines: tuple[bool, bool]
+    """Whether voxels are shared among lines of sight before, along rows and along columns."""
     size: int
     """Number of voxels, or of nodes."""
     stored_bytes: int
@@ -162,12 +162,12 @@ class Volume:
                 choice = (
                     choose_uncounted(stored, camera, compute.weights_form) if counted is None else choose_form(counted)
                 )
-                nodes = choose_planes(stored, camera, choice.form, choice.cuts)
+                nodes = choose_planes(stored, camera, choice.form, choice.cuts, particle_voxel=self.particle_voxel)
             places = nodes or stored
             blocks, values = sample_blocks(PackedCamera.of(camera), places, choice.form, choice.cuts)
             require_numbers(blocks * places.size, self.finest.grid.shape)
             size = int(places.size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES))
-            distance, lines = (None, False) if nodes is None else (nodes.distance, nodes.lines)
+            distance, lines = (None, (False, False)) if nodes is None else (nodes.distance, nodes.lines)
             counts = int(places.size * blocks), int(places.size * values)
             found[name] = Form(
                 choice=choice,

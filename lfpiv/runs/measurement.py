@@ -165,7 +165,7 @@ def prepare(
         _require_cameras(calibration, current.experiment)
         current, prepared = rig.prepare(current, calibration)
         finest = current.reconstructed_experiment
-        worker_plan.require_memory(finest, memory.weights_bytes(finest), 1)
+        worker_plan.require_memory(finest, memory.weights_bytes(finest, current.particle_voxel), 1)
         weights, _ = rig.build_weights(current, prepared, current.numbers[:1])
         work = rig.pair_work(current, weights, keep_volumes=False)
         return Rig(

@@ -50,16 +50,16 @@ OWN_GROUPS = Path("/proc/self/cgroup")
 """File that names the control groups of this process."""
 
 
-def weights_bytes(experiment: Experiment) -> int:
-    """Estimate the memory of the weights [byte] from the nominal rig, before any image is read.
+def weights_bytes(experiment: Experiment, particle_voxel: float = 0.0) -> int:
+    """Estimate the memory of the weights [byte] from the nominal rig, for particles of a size if it is known.
 
     Logs the upper limit if the form of the weights is chosen later.
     """
     from lfpiv.weights.checks import estimate_memory
 
     cameras, grid, form = nominal_cameras(experiment), experiment.grid, weights_form(experiment)
-    weights = estimate_memory(cameras, grid, form)
-    if form == "auto" and (most := estimate_memory(cameras, grid, "pixels")) > weights:
+    weights = estimate_memory(cameras, grid, form, particle_voxel)
+    if form == "auto" and (most := estimate_memory(cameras, grid, "pixels", particle_voxel)) > weights:
         log.info("memory: %s for weights, up to %s where rays bend", size_text(weights), size_text(most))
     return weights
 

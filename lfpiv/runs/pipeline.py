@@ -230,7 +230,7 @@ def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None)
     failed = current.check_images(todo) if some else None
     if some and failed is None:
         finest = current.reconstructed_experiment
-        needed = memory.weights_bytes(finest) if current.need_weights(todo) else 0
+        needed = memory.weights_bytes(finest, current.particle_voxel) if current.need_weights(todo) else 0
         if workers is None:
             planned = worker_plan.fit_installation(planned, current.device)
             planned = worker_plan.fit_memory(planned, finest, needed, current.device)

@@ -116,7 +116,7 @@ def decide(
     found = Refinement(
         pairs=tuple(instants),
         size_voxel=None if size is None else round(size, 3),
-        factor=_fitting(with_guard(experiment, guard), demanded),
+        factor=_fitting(with_guard(experiment, guard), demanded, size or 0.0),
         demanded=demanded,
     )
     _log(experiment, found, time.perf_counter() - start)
@@ -138,12 +138,12 @@ def warnings(experiment: Experiment, found: Refinement | None) -> list[Warning]:
     return [Warning(code=Code.COARSE_VOXELS, figures=figures)]
 
 
-def _fitting(experiment: Experiment, demanded: float) -> float:
+def _fitting(experiment: Experiment, demanded: float, size_voxel: float) -> float:
     """Return the largest refinement up to the demanded one that fits into the memory of one process."""
     limit, tried = memory.allowed_bytes(experiment), demanded
     while tried > 1:
         finer = refined(experiment, tried)
-        if memory.run_bytes(finer, memory.weights_bytes(finer), 1) <= limit:
+        if memory.run_bytes(finer, memory.weights_bytes(finer, size_voxel * tried), 1) <= limit:
             return tried
         tried = round(tried - STEP, 2)
     return 1.0

@@ -228,6 +228,7 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
             finest.grid,
             compute.weights,
             form=compute.weights_form,
+            particle_voxel=run.particle_voxel,
             rays=compute.count_rays,
             finished=run.folder.counts if compute.weights == "count" else None,
             limit_bytes=memory.left_for_weights(finest),

@@ -153,6 +153,12 @@ class Run:
         """Edge of a voxel over that of the reconstructed ones; 1 if it is yet to be measured."""
         return refinement.factor(self.experiment, self.refinement)
 
+    @property
+    def particle_voxel(self) -> float:
+        """Standard deviation of the particles [reconstructed voxel]; 0 for points, and where it was not measured."""
+        size = None if self.refinement is None else self.refinement.size_voxel
+        return (size or 0.0) * self.refinement_factor
+
     def has_light_of(self, other: Run) -> bool:
         """Return whether the volumes of both runs have the same subtracted light and the same reconstructed grid."""
         own, others = ((run.background, run.guard_layers, run.refinement_factor) for run in (self, other))

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
 
 
-def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto") -> int:
+def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto", particle_voxel: float = 0.0) -> int:
     """Estimate the memory that the weights of a grid will need [byte], from a sample of its voxels.
 
     Nothing large is allocated. The form "auto" is taken for profiles if the microlens layout is square.
     """
     total = 0.0
-    for camera, (_, size, blocks, values) in _samples(calibration, grid, form):
+    for camera, (_, size, blocks, values) in _samples(calibration, grid, form, particle_voxel):
         rays = rays_bytes(camera)
         total += (BLOCK_BYTES * blocks + values + VOXEL_BYTES) * size + 4 * MODEL_SIZE * CHUNK_VOXELS + rays
     return int(total)
@@ -36,20 +36,20 @@ def estimate_device_need(calibration: Calibration, grid: Grid, form: str = "auto
     """Do as `estimate_memory` for the memory of a GPU, volumes, images and correlation included."""
     sizes = tuple(
         device_bytes(chosen, size, int(blocks * size), int(values * size), edge=camera.microimages.edge)
-        for camera, (chosen, size, blocks, values) in _samples(calibration, grid, form)
+        for camera, (chosen, size, blocks, values) in _samples(calibration, grid, form, 0.0)
     )
     return DeviceNeed(sizes, beside_bytes(calibration.cameras.values(), grid))
 
 
 def _samples(
-    calibration: Calibration, grid: Grid, form: str
+    calibration: Calibration, grid: Grid, form: str, particle_voxel: float
 ) -> Iterator[tuple[CalibratedCamera, tuple[str, int, float, float]]]:
     """Yield each camera, its form, its number of voxels or nodes, and the mean numbers of their blocks and values."""
     runtime.device()
     stored = StoredGrid(grid, (0, 1, 2))
     for camera in calibration.cameras.values():
         chosen = form if form != "auto" else "profiles" if camera.lattice.layout == "square" else "pixels"
-        places = choose_planes(stored, camera, chosen) or stored
+        places = choose_planes(stored, camera, chosen, particle_voxel=particle_voxel) or stored
         yield camera, (chosen, places.size, *sample_blocks(PackedCamera.of(camera), places, chosen))
 
 

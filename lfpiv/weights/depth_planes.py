@@ -9,9 +9,9 @@ distance of planes with which images of voxels agree with their own footprints.
 
 Images of voxels change fast across the line of sight. So nodes lie whole voxels aside from one another where a lattice
 direction is near: 0 or 45 degrees from an axis, up to some degrees beside it. Then nothing is interpolated across the
-line of sight. Where none is near, nodes lie along the line of sight itself, and voxels are first shared among lines of
-sight in their layer, see `lfpiv.weights.line_shares`. Images of single voxels are not the same then, but those of
-particles are, up to the steps that voxels have at their edges. These are compared instead.
+line of sight. Where none is near along an axis across it, nodes lie along the line of sight itself, and voxels are
+first shared among lines of sight along this axis, see `lfpiv.weights.line_shares`. Images of single voxels are not the
+same then, but those of particles are, up to the steps that voxels have at their edges. These are compared instead.
 
 .. [1] P. Lacroute, M. Levoy, "Fast volume rendering using a shear-warp factorization of the viewing transformation",
    SIGGRAPH 1994, 451-458, doi:10.1145/192161.192283.
@@ -56,11 +56,13 @@ WORST_PARTICLE_ERROR = 0.04
 LEAST_GAIN = 1.5
 """Least ratio of voxels to nodes with which nodes are used."""
 NEAR_LATTICE = 0.02
-"""Difference of the line of sight from a lattice direction up to which nodes lie along the latter [voxel/layer]."""
+"""Difference of the line of sight from a lattice direction up to which voxels are not shared [voxel/layer]."""
 PARTICLE_VOXEL = 0.85
-"""Standard deviation of the particles that are compared where voxels are shared among lines of sight [voxel]."""
+"""Standard deviation of the smallest particles for which voxels are shared among lines of sight [voxel]."""
 PARTICLES = 8
-"""Number of these particles."""
+"""Number of such particles whose images are compared."""
+VOXELS_AT_A_TIME = 400
+"""Voxels whose images are compared at a time: more take more memory."""
 FEWEST_VOXELS = 100_000
 """Voxels of a volume from which on nodes are used. The weights of smaller ones take little time and memory."""
 SEEDS = (1, 2, 3, 4)
@@ -81,26 +83,22 @@ class NodeGrid:
     """Layers from one plane to the next."""
 
     @classmethod
-    def of(cls, stored: StoredGrid, camera: CalibratedCamera, distance: int, *, lines: bool = False) -> NodeGrid:
+    def of(
+        cls, stored: StoredGrid, camera: CalibratedCamera, distance: int, *, lines: tuple[bool, bool] = (False, False)
+    ) -> NodeGrid:
         """Lay nodes along the lattice direction next to the line of sight to the middle of the grid.
 
-        With `lines` they lie along this line of sight itself, except along axes where the two differ by at most
-        `NEAR_LATTICE`.
+        Along rows or columns for which `lines` is true they lie along this line of sight itself.
         """
-        sight = line_of_sight(camera, stored.grid.centre_mm)
-        along = np.array([sight[2 - axis] for axis in stored.order])
-        layers = int(np.argmax(np.abs(along)))
-        rows, columns = (axis for axis in range(3) if axis != layers)
-        slopes = along[[rows, columns]] / along[layers]
-        whole = np.rint(slopes)
-        kept = (np.abs(slopes - whole) > NEAR_LATTICE) & lines
-        row, column = np.where(kept, slopes, whole).tolist()
-        return cls(stored, (rows, layers, columns), (row, column), distance)
+        axes, slopes = _slopes(stored, camera)
+        row, column = np.where(lines, slopes, np.rint(slopes)).tolist()
+        return cls(stored, axes, (row, column), distance)
 
     @property
-    def lines(self) -> bool:
-        """Whether voxels are shared among lines of sight."""
-        return any(slope % 1 for slope in self.slopes)
+    def lines(self) -> tuple[bool, bool]:
+        """Whether voxels are shared among lines of sight, along rows and along columns."""
+        row, column = self.slopes
+        return row % 1 != 0, column % 1 != 0
 
     @cached_property
     def shares(self) -> PlaneShares:
@@ -228,7 +226,9 @@ def line_of_sight(camera: CalibratedCamera, point_mm: np.ndarray) -> np.ndarray:
     return direction
 
 
-def choose_planes(stored: StoredGrid, camera: CalibratedCamera, form: str, cuts: Cuts = WHOLE) -> NodeGrid | None:
+def choose_planes(
+    stored: StoredGrid, camera: CalibratedCamera, form: str, cuts: Cuts = WHOLE, *, particle_voxel: float = 0.0
+) -> NodeGrid | None:
     """Choose the nodes of a camera: the fewest whose images are accurate enough.
 
     Parameters
@@ -241,6 +241,9 @@ def choose_planes(stored: StoredGrid, camera: CalibratedCamera, form: str, cuts:
         Form of the weights.
     cuts : tuple of int
         Parts of a voxel along x, y, z.
+    particle_voxel : float
+        Standard deviation of the particles [voxel]; 0 for points and where it is unknown. Voxels are shared among lines
+        of sight for particles of `PARTICLE_VOXEL` or more.
 
     Returns
     -------
@@ -249,27 +252,89 @@ def choose_planes(stored: StoredGrid, camera: CalibratedCamera, form: str, cuts:
     """
     if stored.grid.size < FEWEST_VOXELS:
         return None
-    sample = np.unique(np.concatenate([draw_seen(stored, camera, seed) for seed in SEEDS]))
-    if not len(sample):
+    seen = np.unique(np.concatenate([draw_seen(stored, camera, seed) for seed in SEEDS]))
+    if not len(seen):
         return None
-    for lines in (False, True):
-        if lines:
-            voxels, light = blobs_about(stored, sample[:: len(sample) // PARTICLES + 1])
+    chosen: NodeGrid | None = None
+    ways = _ways_to_share(_slopes(stored, camera)[1])
+    for lines in ways if particle_voxel >= PARTICLE_VOXEL else ways[:1]:
+        if any(lines):
+            sample = Sample(camera, *blobs_about(stored, seen[:: len(seen) // PARTICLES + 1]), form, cuts)
             distances, largest, worst = LINE_DISTANCES, PARTICLE_ERROR, WORST_PARTICLE_ERROR
         else:
-            voxels, light, distances, largest, worst = sample, None, DISTANCES, LARGEST_ERROR, WORST_ERROR
+            sample = Sample(camera, seen[:, None], np.ones((len(seen), 1)), form, cuts)
+            distances, largest, worst = DISTANCES, LARGEST_ERROR, WORST_ERROR
+        own = sample.own_images(stored)
         for distance in distances:
             nodes = NodeGrid.of(stored, camera, distance, lines=lines)
-            if LEAST_GAIN * nodes.size > stored.grid.size or nodes.lines != lines:
-                continue
-            errors = interpolation_errors(nodes, camera, voxels, form, cuts, light=light)
+            if LEAST_GAIN * nodes.size > stored.grid.size or (chosen is not None and nodes.size >= chosen.size):
+                break
+            errors = interpolation_errors(nodes, sample, own)
             error = float(np.sqrt(np.mean(np.square(errors))))
             if error <= largest and max(errors) <= worst:
                 text = "%s: weights of %d nodes for %d voxels, planes %d layers apart: images of %s differ by %.1f %%"
-                kind = "particles" if lines else "voxels"
+                kind = "particles" if any(lines) else "voxels"
                 log.info(text, camera.name, nodes.size, stored.grid.size, distance, kind, 100 * error)
-                return nodes
-    return None
+                chosen = nodes
+                break
+    return chosen
+
+
+def _slopes(stored: StoredGrid, camera: CalibratedCamera) -> tuple[tuple[int, int, int], np.ndarray]:
+    """Return the axes of rows, layers and columns, and by how many rows and columns a line of sight moves per layer."""
+    sight = line_of_sight(camera, stored.grid.centre_mm)
+    along = np.array([sight[2 - axis] for axis in stored.order])
+    layers = int(np.argmax(np.abs(along)))
+    rows, columns = (axis for axis in range(3) if axis != layers)
+    return (rows, layers, columns), along[[rows, columns]] / along[layers]
+
+
+def _ways_to_share(slopes: np.ndarray) -> list[tuple[bool, bool]]:
+    """Return along which of rows and columns to share voxels: neither, where a lattice direction is farther, both.
+
+    Shares among lines of sight that move slowly are the least accurate, so one axis alone is often better than both.
+    """
+    aside = np.abs(slopes - np.rint(slopes))
+    along_rows = bool(aside[0] > aside[1])
+    ways = [(False, False), (along_rows, not along_rows), (True, True)]
+    return ways[: 1 + int((aside > NEAR_LATTICE).sum())]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Groups of voxels, such as particles, whose images are compared."""
+
+    camera: CalibratedCamera
+    voxels: np.ndarray
+    """Indices of the voxels, shape (group, voxel)."""
+    light: np.ndarray
+    """Their light, shape (group, voxel)."""
+    form: str
+    """Form of the weights, "profiles" or "pixels"."""
+    cuts: Cuts = WHOLE
+    """Parts of a voxel along x, y, z."""
+
+    @property
+    def parts(self) -> list[slice]:
+        """Groups that are compared at a time: those of some `VOXELS_AT_A_TIME` voxels."""
+        groups, each = self.voxels.shape
+        step = max(1, VOXELS_AT_A_TIME // each)
+        return [slice(first, first + step) for first in range(0, groups, step)]
+
+    def images(self, centres_mm: np.ndarray, voxel_mm: float, light: sparse.csr_array) -> sparse.csr_array:
+        """Return sums of the images of cubes at some places with the light (group, cube), shape (group, pixel)."""
+        models = ray_models(self.camera, centres_mm, voxel_mm)
+        return light @ blocks_of(PackedCamera.of(self.camera), [models], self.form, cuts=self.cuts).pixel_weights()
+
+    def own_images(self, stored: StoredGrid) -> list[sparse.csr_array]:
+        """Return the images of each part of the groups by the voxels' own footprints, shapes (group, pixel)."""
+        found = []
+        for part in self.parts:
+            voxels, light = self.voxels[part], self.light[part]
+            each = np.arange(voxels.size + 1)
+            groups = sparse.csr_array((light.ravel(), each[:-1], each[:: voxels.shape[1]]))
+            found.append(self.images(stored.centres_mm(voxels.ravel()), stored.voxel_mm, groups))
+        return found
 
 
 def blobs_about(stored: StoredGrid, voxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -288,52 +353,35 @@ def blobs_about(stored: StoredGrid, voxels: np.ndarray) -> tuple[np.ndarray, np.
     return np.array(places), np.array(light)
 
 
-def interpolation_errors(
-    nodes: NodeGrid,
-    camera: CalibratedCamera,
-    voxels: np.ndarray,
-    form: str,
-    cuts: Cuts = WHOLE,
-    *,
-    light: np.ndarray | None = None,
-) -> list[float]:
+def interpolation_errors(nodes: NodeGrid, sample: Sample, own: list[sparse.csr_array]) -> list[float]:
     """Compare interpolated images of groups of voxels with those from their own footprints.
 
     Parameters
     ----------
     nodes : NodeGrid
         The nodes.
-    camera : CalibratedCamera
-        The camera.
-    voxels : ndarray, shape (group,) or (group, voxel)
-        Indices of the voxels.
-    form : {"profiles", "pixels"}
-        Form of the weights.
-    cuts : tuple of int
-        Parts of a voxel along x, y, z.
-    light : ndarray, shape (group, voxel), optional
-        Light of the voxels; default: one.
+    sample : Sample
+        The groups of voxels.
+    own : list of csr_array
+        Their images, from `Sample.own_images`.
 
     Returns
     -------
     list of float
         Relative L2 difference of each group that the camera sees; infinity alone if it sees none.
     """
-    groups = np.reshape(voxels, (len(voxels), -1))
-    own, inverse = np.unique(groups, return_inverse=True)
-    group = np.repeat(np.arange(len(groups)), groups.shape[1])
-    values = np.ones(groups.size) if light is None else light.ravel()
-    of_groups = sparse.coo_array((values, (group, inverse.ravel())), (len(groups), len(own))).tocsr()
-    found = [nodes.shares.nodes_of(int(voxel)) for voxel in own]
-    used, place = np.unique(np.concatenate([node for node, _ in found]), return_inverse=True)
-    first = np.cumsum([0, *(len(node) for node, _ in found)])
-    spread = sparse.csr_array((np.concatenate([share for _, share in found]), place, first), (len(own), len(used)))
-    models = ray_models(camera, np.concatenate([nodes.stored.centres_mm(own), nodes.centres_mm(used)]), nodes.voxel_mm)
-    images = blocks_of(PackedCamera.of(camera), [models], form, cuts=cuts).pixel_weights()
-    exact = of_groups @ images[: len(own)]
-    apart = exact - of_groups @ spread @ images[len(own) :]
-    norms, differences = (np.sqrt(one.power(2).sum(axis=1)) for one in (exact, apart))
-    return (differences[norms > 0] / norms[norms > 0]).tolist() or [math.inf]
+    errors: list[float] = []
+    for part, exact in zip(sample.parts, own, strict=True):
+        voxels, light = sample.voxels[part], sample.light[part]
+        found = [nodes.shares.nodes_of(int(voxel)) for voxel in voxels.ravel()]
+        used, place = np.unique(np.concatenate([node for node, _ in found]), return_inverse=True)
+        shares = np.concatenate([of * share for of, (_, share) in zip(light.ravel(), found, strict=True)])
+        first = np.cumsum([0, *(len(node) for node, _ in found)])[:: voxels.shape[1]]
+        of_nodes = sparse.csr_array((shares, place, first), (len(voxels), len(used)))
+        apart = exact - sample.images(nodes.centres_mm(used), nodes.voxel_mm, of_nodes)
+        norms, differences = (np.sqrt(one.power(2).sum(axis=1)) for one in (exact, apart))
+        errors += (differences[norms > 0] / norms[norms > 0]).tolist()
+    return errors or [math.inf]
 
 
 def _lagrange(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -314,6 +314,7 @@ def build_weights(
     *,
     form: str = DEFAULTS.weights_form,
     planes: bool = True,
+    particle_voxel: float = 0.0,
     rays: int = DEFAULTS.count_rays,
     finished: Path | None = None,
     limit_bytes: float = math.inf,
@@ -336,6 +337,9 @@ def build_weights(
     planes : bool
         Store the weights of nodes on planes across each camera's line of sight where that is accurate, see
         `lfpiv.weights.depth_planes`. False: the weights of every voxel.
+    particle_voxel : float
+        Standard deviation of the particles [voxel], 0 if unknown. From 0.85 on most cameras have planes, else those
+        near 0, 45 and 90 degrees to the grid's axes.
     rays : int
         Rays that are counted per voxel and camera, one of ``compute.count_rays``.
     finished : Path, optional
@@ -387,12 +391,13 @@ def build_weights(
             choices[name] = choose_uncounted(stored, camera, form)
         chosen = choices[name]
         allow = memory_check(name, grid, chosen, limit_bytes - used)
-        nodes = choose_planes(stored, camera, chosen.form, chosen.cuts) if planes else None
+        nodes = None
+        if planes:
+            nodes = choose_planes(stored, camera, chosen.form, chosen.cuts, particle_voxel=particle_voxel)
         blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
         projectors[name] = share.projector(name, blocks, nodes.shares if nodes else None)
     if finished is not None:
         shutil.rmtree(finished, ignore_errors=True)
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)
-    text = "weights of %d voxels on %d cameras: %.0f MiB"
-    log.info(text, grid.size, len(cameras), weights.memory_bytes / 2**20)
+    log.info("weights of %d voxels on %d cameras: %.0f MiB", grid.size, len(cameras), weights.memory_bytes / 2**20)
     return weights

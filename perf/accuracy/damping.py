@@ -81,8 +81,10 @@ class Rehearsal:
         self.cases = [replace(case, seed=case.seed + number) for number in range(count)]
         self.folder, self.rig = folder, make_rig(case.scale, case.angles_deg)
         first = self._light(self.cases[0])[0]
-        self.refinement = needed_refinement(measure_size(self.rig.calibration, self.rig.grid, first))
-        self.weights = weights_of(self.rig, self.rig.grid.padded(_lit_layers(case)).refined(self.refinement))
+        size = measure_size(self.rig.calibration, self.rig.grid, first)
+        self.refinement = needed_refinement(size)
+        grid = self.rig.grid.padded(_lit_layers(case)).refined(self.refinement)
+        self.weights = weights_of(self.rig, grid, (size or 0.0) * self.refinement)
         self.weights.volume = self.rig.grid
 
     @cached_property

@@ -26,6 +26,7 @@ from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import rigs
 from lfpiv.runs.guard import LEAST_LAYERS
 from lfpiv.settings.processing import Smart
+from lfpiv.weights.depth_planes import PARTICLE_VOXEL
 from lfpiv.weights.operator import Weights, build_weights
 
 _KEYS_SINCE = {"subsets": 1, "refinement": 1.0, "predict": False}
@@ -84,8 +85,9 @@ def by_smart(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) -> Measu
     smart = Smart(**table_of(settings, "smart"))
     guard = settings.get("volume.guard_mm", "auto")
     guarded = rig.grid.padded(_guard_layers(rig, recorded) if guard == "auto" else rig.grid.layers(guard))
-    factor = _refinement(rig, recorded) if smart.refinement == "auto" else float(smart.refinement)
-    weights = weights_of(rig, guarded.refined(factor))
+    size = particle_size(rig, recorded)
+    factor = needed_refinement(size) if smart.refinement == "auto" else float(smart.refinement)
+    weights = weights_of(rig, guarded.refined(factor), (size or 0.0) * factor)
     start, found = time.process_time(), []
     for images in recorded.images:
         light = {name: rig.light(name, image) for name, image in images.items()}
@@ -146,13 +148,13 @@ WAYS = {
 and as printed, the multiplicative first guess alone, refocused stacks, and the true particles."""
 
 
-def weights_of(rig: Rig, grid: Grid) -> Weights:
+def weights_of(rig: Rig, grid: Grid, particle_voxel: float = 0.0) -> Weights:
     """Return the weights of a rig on a grid. Those of the last few rigs stay in memory."""
-    key = (tuple(camera.model_dump_json() for camera in rig.cameras), grid)
+    key = (tuple(camera.model_dump_json() for camera in rig.cameras), grid, particle_voxel >= PARTICLE_VOXEL)
     if key not in _WEIGHTS:
         while len(_WEIGHTS) >= 2:
             _WEIGHTS.pop(next(iter(_WEIGHTS)))
-        _WEIGHTS[key] = build_weights(rig.calibration, grid)
+        _WEIGHTS[key] = build_weights(rig.calibration, grid, particle_voxel=particle_voxel)
     return _WEIGHTS[key]
 
 
@@ -182,10 +184,10 @@ def _guard_layers(rig: Rig, recorded: Recorded) -> Layers:
 
 
 @lru_cache(maxsize=64)
-def _refinement(rig: Rig, recorded: Recorded) -> float:
-    """Return the refinement that the images demand, as a run finds it."""
+def particle_size(rig: Rig, recorded: Recorded) -> float | None:
+    """Return the size of the particles [voxel], as a run finds it."""
     light = [{name: rig.light(name, image) for name, image in images.items()} for images in recorded.images]
-    return needed_refinement(measure_size(rig.calibration, rig.grid, light))
+    return measure_size(rig.calibration, rig.grid, light)
 
 
 def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:

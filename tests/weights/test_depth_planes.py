@@ -15,7 +15,9 @@ from lfpiv.weights.checks import estimate_memory
 from lfpiv.weights.depth_planes import (
     LARGEST_ERROR,
     PARTICLE_ERROR,
+    PARTICLE_VOXEL,
     NodeGrid,
+    Sample,
     blobs_about,
     choose_planes,
     interpolation_errors,
@@ -59,7 +61,7 @@ def between(device):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(depth_planes, "FEWEST_VOXELS", 0)
         patch.setattr(depth_planes, "LEAST_GAIN", 0.0)
-        nodes = lfpiv.build_weights(rig_of(30, -60), GRID)
+        nodes = lfpiv.build_weights(rig_of(30, -60), GRID, particle_voxel=PARTICLE_VOXEL)
     return nodes, lfpiv.build_weights(rig_of(30, -60), GRID, planes=False)
 
 
@@ -85,7 +87,7 @@ def shares_matrix(shares):
 @pytest.mark.parametrize("order", [*permutations(range(3))])
 def test_voxels_are_shared_among_nodes_as_stated(pose, order, device):
     stored = StoredGrid(lfpiv.Grid(shape=(9, 7, 8), voxel_mm=0.1, first_centre_mm=(0.0, 0.0, 0.0)), order)
-    nodes = NodeGrid.of(stored, IdealCamera("one", pose), 3, lines=True)
+    nodes = NodeGrid.of(stored, IdealCamera("one", pose), 3, lines=(True, True))
     planes, matrix = DepthPlanes(nodes.shares), shares_matrix(nodes.shares)
     rng = np.random.default_rng(0)
     volume = rng.standard_normal(stored.size).astype(np.float32)
@@ -115,8 +117,8 @@ def test_shares_keep_light_and_lie_about_the_voxel_along_its_line_of_sight(pose)
 def test_shares_among_lines_of_sight_keep_light_and_its_mean_place(pose):
     camera = IdealCamera("one", pose)
     stored = StoredGrid.for_cameras(GRID, [camera])
-    nodes = NodeGrid.of(stored, camera, 4, lines=True)
-    assert nodes.lines
+    nodes = NodeGrid.of(stored, camera, 4, lines=(True, True))
+    assert any(nodes.lines)
     sight = line_of_sight(camera, GRID.centre_mm)
     for voxel in np.random.default_rng(1).choice(stored.size, 20):
         node, share = nodes.shares.nodes_of(int(voxel))
@@ -148,7 +150,7 @@ def lagrange_shares(place, lines):
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0)])
 def test_models_of_nodes_are_those_of_their_places(pose, order):
     camera = IdealCamera("one", pose)
-    nodes = NodeGrid.of(StoredGrid(GRID, order), camera, 4, lines=True)
+    nodes = NodeGrid.of(StoredGrid(GRID, order), camera, 4, lines=(True, True))
     found = np.concatenate(list(nodes.models(camera)))
     expected = ray_models(camera, nodes.centres_mm(np.arange(nodes.size)), GRID.voxel_mm)
     radius, pitch = camera.optics.pupil_radius_mm, camera.lattice.pitch_mm
@@ -165,10 +167,12 @@ def test_images_between_nodes_are_those_of_voxels(pose, for_small_volumes):
     stored = StoredGrid.for_cameras(GRID, [camera])
     nodes = choose_planes(stored, camera, "pixels")
     voxels = np.random.default_rng(2).choice(stored.size, 40)
-    error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, camera, voxels, "pixels"))))
+    sample = Sample(camera, voxels[:, None], np.ones((40, 1)), "pixels")
+    own = sample.own_images(stored)
+    error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, sample, own))))
     assert error < 1.4 * LARGEST_ERROR  # of other voxels than those by which the distance was chosen
     wide = NodeGrid.of(stored, camera, 3 * nodes.distance)
-    assert np.mean(interpolation_errors(wide, camera, voxels, "pixels")) > 2 * error
+    assert np.mean(interpolation_errors(wide, sample, own)) > 2 * error
 
 
 def test_operator_with_nodes_is_that_of_all_voxels(both):
@@ -297,20 +301,30 @@ def test_memory_with_nodes_is_estimated():
     assert estimate == pytest.approx(weights.memory_bytes, rel=0.1)
 
 
-@pytest.mark.parametrize("pose", [rotation(33), rotation(1, -60)], ids=["33", "-60 from above"])
-def test_cameras_between_lattice_directions_share_voxels_among_lines_of_sight(pose, for_small_volumes):
+@pytest.mark.parametrize(
+    ("pose", "lines"),
+    [
+        (rotation(33), (False, True)),
+        (rotation(1, -60), (True, False)),
+        (rotation(31.4, 2.5), (False, True)),  # a camera meant to look along a row is never quite there
+    ],
+    ids=["33", "-60 from above", "31 and 2.5"],
+)
+def test_cameras_between_lattice_directions_share_voxels_among_lines_of_sight(pose, lines, for_small_volumes):
     camera = IdealCamera("one", pose)
     stored = StoredGrid.for_cameras(GRID, [camera])
-    nodes = choose_planes(stored, camera, "profiles")
-    voxels, light = blobs_about(stored, np.random.default_rng(10).choice(stored.size, 12))
-    error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, camera, voxels, "profiles", light=light))))
-    assert nodes.lines and error < 1.4 * PARTICLE_ERROR  # of other particles than those by which it was chosen
+    nodes = choose_planes(stored, camera, "profiles", particle_voxel=PARTICLE_VOXEL)
+    sample = Sample(camera, *blobs_about(stored, np.random.default_rng(10).choice(stored.size, 12)), "profiles")
+    error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, sample, sample.own_images(stored)))))
+    assert nodes.lines == lines and error < 1.4 * PARTICLE_ERROR  # of other particles than those by which it was chosen
 
 
-def test_where_particles_differ_as_well_all_voxels_keep_their_own_weights(for_small_volumes):
-    """Few lines of sight lie between two voxels, so that edges of voxels show, along both axes."""
-    camera = IdealCamera("one", rotation(12, 12))
-    assert choose_planes(StoredGrid.for_cameras(GRID, [camera]), camera, "profiles") is None
+@pytest.mark.parametrize(("pose", "particle_voxel"), [(rotation(33), 0.6), (rotation(12, 12), PARTICLE_VOXEL)])
+def test_all_voxels_keep_their_own_weights(pose, particle_voxel, for_small_volumes):
+    """Edges of voxels show: particles are small, or few lines of sight lie between two voxels along both axes."""
+    camera = IdealCamera("one", pose)
+    stored = StoredGrid.for_cameras(GRID, [camera])
+    assert choose_planes(stored, camera, "profiles", particle_voxel=particle_voxel) is None
 
 
 def test_small_volumes_and_cameras_that_see_nothing_store_all_voxels():
