@@ -338,8 +338,8 @@ def build_weights(
         Store the weights of nodes on planes across each camera's line of sight where that is accurate, see
         `lfpiv.weights.depth_planes`. False: the weights of every voxel.
     particle_voxel : float
-        Standard deviation of the particles [voxel], 0 if unknown. From 0.85 on most cameras have planes, else those
-        near 0, 45 and 90 degrees to the grid's axes.
+        Standard deviation of the particles [voxel], 0 if unknown. Below 0.85 only cameras near 0, 45 and 90 degrees to
+        the grid's axes have planes.
     rays : int
         Rays that are counted per voxel and camera, one of ``compute.count_rays``.
     finished : Path, optional
