@@ -6,6 +6,7 @@ calibration. The sensor is just large enough for the volume.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -32,14 +33,20 @@ POSES = (
 """Name, angle about y and roll of the array [degree], and offset of the array [mm]."""
 
 
-def rig(sensor: tuple[int, int], bent_mm: float = 0.0, cameras: int = 2) -> Calibration:
-    """Make calibrated cameras. `bent_mm` scales the network's output. About a third of it is of second order."""
+def rig(
+    sensor: tuple[int, int], bent_mm: float = 0.0, cameras: int = 2, angles_deg: Sequence[float] = ()
+) -> Calibration:
+    """Make calibrated cameras, at other angles about y if any are given.
+
+    `bent_mm` scales the network's output. About a third of it is of second order.
+    """
     optics = Optics(
         focal_length_mm=100.0, magnification=-1.0, f_number=4.0, microlens_pitch_mm=0.1, pixel_mm=0.0055,
         microlens_focal_length_mm=0.8, sensor_shape=sensor,
     )  # fmt: skip
     calibrated = {}
-    for name, angle, roll, origin in POSES[:cameras]:
+    angles = angles_deg or [angle for _, angle, _, _ in POSES[:cameras]]
+    for (name, _, roll, origin), angle in zip(POSES, angles, strict=False):
         rng, turn = np.random.default_rng(abs(int(angle))), np.radians(roll)
         x, y = 0.1 * np.cos(turn), 0.1 * np.sin(turn)
         network = Network(

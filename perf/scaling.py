@@ -1,6 +1,7 @@
 """Measure time and memory of a pair against the volume's size and the number of cameras, for docs/performance.md.
 
     python perf/scaling.py --out docs/figures/scaling.json
+    python perf/scaling.py --case 100 2 --angles=30,-30
 
 Every case is a process of its own: weights, both volumes and vectors of blobs of 0.7 voxel with the default settings,
 on voxels as fine as these particles demand. Images are projections of known particles with noise.
@@ -36,14 +37,14 @@ SHARE_NOISE = 0.01
 """Standard deviation of the noise, relative to the brightest pixel."""
 
 
-def measure(edge: int, cameras: int) -> dict[str, Any]:
+def measure(edge: int, cameras: int, angles_deg: Sequence[float] = ()) -> dict[str, Any]:
     """Measure one case in this process, after a small one that loads all kernels."""
     os.environ.update(ENABLE_TAICHI_HEADER_PRINT="0")
-    _pair(WARM_EDGE, cameras)
-    return _pair(edge, cameras)
+    _pair(WARM_EDGE, cameras, angles_deg)
+    return _pair(edge, cameras, angles_deg)
 
 
-def _pair(edge: int, cameras: int) -> dict[str, Any]:
+def _pair(edge: int, cameras: int, angles_deg: Sequence[float]) -> dict[str, Any]:
     """Measure weights, volumes and vectors of one pair."""
     import inputs
 
@@ -52,7 +53,10 @@ def _pair(edge: int, cameras: int) -> dict[str, Any]:
     from lfpiv.settings.processing import Correlation, Smart
 
     rows, columns = (int(edge * 0.1 * stretch / 0.0055) + 200 for stretch in (1, 2**0.5))
-    calibration, user = inputs.rig((rows, columns), cameras=cameras), inputs.grid({"voxels": edge})
+    calibration, user = (
+        inputs.rig((rows, columns), cameras=cameras, angles_deg=angles_deg),
+        inputs.grid({"voxels": edge}),
+    )
     factor = needed_refinement(BLOB_VOXEL)
     weights, weights_s = _timed(
         lambda: _weights(calibration, user.padded(((1, 1),) * 3).refined(factor), factor * BLOB_VOXEL)
@@ -112,9 +116,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="JSON file of the figures")
     parser.add_argument("--case", type=int, nargs=2, metavar=("EDGE", "CAMERAS"), help="one case in this process")
+    parser.add_argument("--angles", default="", help="with --case: angles of the cameras, such as --angles=30,-30")
     options = parser.parse_args(arguments)
     if options.case:
-        print(json.dumps(measure(*options.case)))
+        angles_deg = [float(angle) for angle in options.angles.split(",") if angle]
+        print(json.dumps(measure(*options.case, angles_deg)))
         return 0
     cases = sorted({*((edge, 2) for edge in EDGES), *((CAMERAS_EDGE, count) for count in CAMERAS)})
     rows = []
