@@ -125,6 +125,17 @@ def test_background_is_read_between_the_microimages(camera):
     assert abs(sigma / READ_NOISE - 1) < 0.15
 
 
+@pytest.mark.parametrize("offset", [0.0, 0.4, DARK_LEVEL])
+@pytest.mark.parametrize("noise", [8.0, 60.0])
+def test_the_noise_of_a_camera_that_stores_no_negative_counts_is_known(camera, offset, noise):
+    """Without an offset half of the gap pixels have no counts at all."""
+    random, light = np.random.default_rng(10), WHITE_COUNTS * camera.coverage
+    stored = np.rint(light + noise * (offset + random.standard_normal(light.shape))).clip(0)
+    level, sigma = camera.background(stored.astype(np.uint16))
+    assert abs(sigma / noise - 1) < 0.15
+    assert abs(level / noise - offset) < 5 * 1.2533 / np.sqrt(camera.gaps.sum()) + 0.5 / noise
+
+
 def test_sub_aperture_images_are_the_scene_at_the_lens_centres(camera):
     """The scene varies over array and pupil, and the white image is uneven."""
     optics, lattice = camera.optics, camera.lattice
