@@ -36,14 +36,14 @@ def light_cut_off(image: np.ndarray) -> float:
     if image.min() < 0:
         return 0.0
     dark = _with_dark_neighbours(image)
-    return -float(_positive(dark).sum()) / max(np.count_nonzero(dark == 0), 1)
+    return -float(_positive(dark).sum()) / max(int(np.count_nonzero(dark == 0)), 1)
 
 
 def _with_dark_neighbours(image: np.ndarray) -> np.ndarray:
     """Return the counts of the pixels whose neighbours in rows and columns are all dark."""
     neighbours = image[:-2, 1:-1], image[2:, 1:-1], image[1:-1, :-2], image[1:-1, 2:]
-    dark: np.ndarray = np.logical_and.reduce([one <= 0 for one in neighbours])
-    return image[1:-1, 1:-1][dark]
+    counts: np.ndarray = image[1:-1, 1:-1][np.logical_and.reduce([one <= 0 for one in neighbours])]
+    return counts
 
 
 def _positive(counts: np.ndarray) -> np.ndarray:
