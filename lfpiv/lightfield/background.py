@@ -46,6 +46,7 @@ _UNLIKE_SHARE = 0.15  # share of unlike pixels above which the frames have backg
 _MANY_MICROIMAGES = 20.0  # least area of saturated pixels that no particle lights [squares of a pitch]
 _FILLED = 0.35  # least part of such an area, half a pitch around the pixels included, that is saturated
 _FEW = 0.03  # least share of the pixels of a lit tile
+_CUT_OFF = 0.01  # share of the pixels with the least count above which images are cut off there
 _STUCK_PIXELS = 0.01  # number of pixels that repeat their count in all images by chance
 _SHIFT_PITCHES = 24.0  # largest shift of an image along each axis
 _GOLDEN = (0.7548776662466927, 0.5698402909980532)  # steps of an even sequence in the plane
@@ -152,7 +153,7 @@ def standing_light(first: Series, second: Series | None, *, everywhere: bool = F
     scales = [1.0] * len(series) if pooled is None else [1.0, ratio]
     for part, smooth, scale in zip(parts, stray, scales, strict=True):
         excess = part.smallest - smooth / np.float32(scale)
-        level = np.maximum(excess + part.bias(decoder), 0)
+        level = np.where(_cut_off(part.smallest), 0, np.maximum(excess + part.bias(decoder), 0))
         if everywhere:
             stands = np.ones_like(region)
         else:
@@ -263,8 +264,9 @@ def _stray(series: Series, decoder: LightFieldDecoder) -> np.ndarray:
 def _unusable(first: Series, second: Series | None) -> np.ndarray:
     """Return pixels that are saturated in most images, or repeat one count in all where noise would change it.
 
-    Where noise alone may repeat a dark pixel's count, only bright pixels are meant. One pair alone may show
-    resting particles. So its saturated pixels must lie together and fill many microimages.
+    Where noise alone may repeat a dark pixel's count, only bright pixels are meant: half of the noise of images cut off
+    at 0 is one count. One pair alone may show resting particles. So its saturated pixels must lie together and fill
+    many microimages.
     """
     if second is None:
         images, saturated, low, high = first.count, first.saturated, first.smallest, first.largest
@@ -276,10 +278,21 @@ def _unusable(first: Series, second: Series | None) -> np.ndarray:
         return _extended(often, first)
     stuck: np.ndarray = high == low
     same = 1 / (2 * max(first.noise, 1e-3) * np.sqrt(np.pi))  # chance of two equal counts
+    if _cut_off(low).mean() > _CUT_OFF:
+        same = max(same, 0.5)
     if same >= 1 or same ** (images - 1) * low.size > _STUCK_PIXELS:
         stuck &= low > CLEAR_SIGMA * first.noise
     unusable: np.ndarray = often | stuck
     return unusable
+
+
+def _cut_off(smallest: np.ndarray) -> np.ndarray:
+    """Return the pixels whose smallest count is the least that the camera stores: they show no light that stands.
+
+    Levels of the images differ by less than a count. Where the camera has an offset, hardly a pixel is among them.
+    """
+    cut_off: np.ndarray = smallest < smallest.min() + 1
+    return cut_off
 
 
 def _extended(often: np.ndarray, series: Series) -> np.ndarray:

@@ -29,6 +29,8 @@ NORMAL_MAD = 1.4826
 _JUDGED_COVERAGE = 0.5  # least coverage of a pixel whose own response is measured
 _GAP_MARGIN_PX = 1.0  # least distance of a gap pixel from every microimage
 _GAP_PIXELS = 500  # least number of gap pixels that give the background
+_CUT_OFF = 0.8  # half the distance of the quartiles, relative to the upper one, of noise that is cut off at 0, or less
+_GOLDEN = 0.6180339887  # step of an even sequence from 0 to 1
 _FALLBACK_PERCENTILE = 1.0  # percentile of the image that gives the background without gaps
 _LEAST_SIGNAL = 3.0  # least white signal [standard deviations of the background]
 _PATTERN_BIN_PX = 0.5  # bin of the mean pattern of a microimage
@@ -126,8 +128,9 @@ class LightFieldDecoder:
     def background(self, image: np.ndarray) -> tuple[float, float]:
         """Return level and noise of the pixels that see no light [counts]. Images without a dark frame need them.
 
-        They are the median and the scaled median absolute deviation of the gaps between the microimages. Without gaps
-        they are a low percentile of the image and the spread below it.
+        They are the median and the scaled distance of the quartiles of the gaps between the microimages. Of noise cut
+        off at 0 the upper quartile alone tells. Without gaps they are a low percentile of the image and the spread
+        below it.
         """
         return _background(_checked("image", image, self.optics), self.gaps)
 
@@ -305,7 +308,9 @@ def _background(image: np.ndarray, gaps: np.ndarray) -> tuple[float, float]:
     sample = image[gaps]
     if sample.size >= _GAP_PIXELS:
         level = float(np.median(sample))
-        spread = float(np.median(np.abs(sample - level)))
+        low, high = np.percentile(sample + np.arange(sample.size) * _GOLDEN % 1 - 0.5, (25, 75))  # within whole counts
+        half, upper = float(high - low) / 2, float(high) - level
+        spread = half if half > _CUT_OFF * upper else upper
     else:
         level = float(np.percentile(image, _FALLBACK_PERCENTILE))
         spread = level - float(np.percentile(image, _FALLBACK_PERCENTILE / 4))

@@ -18,6 +18,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.progress import StepProgress
+from lfpiv.reconstruction.dark_noise import dark_noise
 from lfpiv.reconstruction.likely_flow import LikelyFlow
 from lfpiv.reconstruction.particle_light import LightField
 from lfpiv.reconstruction.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
@@ -66,7 +67,7 @@ def measure_damping(
     pairs : int
         Number of simulated pairs, >= 1. A pilot pair comes before them.
     noise : mapping of str to float, optional
-        Noise of each camera's background [counts]; default: the root mean square of the negative counts.
+        Noise of each camera's background [counts]; default: that of the dark pixels.
     volume : ndarray, shape (z, y, x), optional
         Volume of a recorded instant on the grid of the weights, whose smoothed intensity is the light of the particles;
         default: particles are equally bright in the whole grid.
@@ -143,9 +144,5 @@ def evenly_spread(pairs: Sequence[int], count: int) -> list[int]:
 
 
 def _noise(images: Sequence[Images]) -> dict[str, float]:
-    """Return the root mean square of the negative counts of each camera; 0 without any."""
-    noise = {}
-    for name in images[0]:
-        below = np.concatenate([one[name][one[name] < 0].ravel() for one in images])
-        noise[name] = float(np.sqrt(np.mean(np.square(below, dtype=float)))) if below.size else 0.0
-    return noise
+    """Return the root mean square over the frames of each camera's noise [counts]."""
+    return {name: float(np.sqrt(np.mean([dark_noise(one[name]) ** 2 for one in images]))) for name in images[0]}

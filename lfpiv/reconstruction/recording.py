@@ -15,6 +15,7 @@ import numpy as np
 
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.volume import is_finite
+from lfpiv.reconstruction.dark_noise import dark_noise, light_cut_off
 from lfpiv.reconstruction.intensity_cap import typical_peak
 from lfpiv.weights.operator import Weights
 
@@ -122,9 +123,10 @@ class _LitPixels:
                 f"images[{name!r}]: expected light where the volume is seen, got none there; check the volume's "
                 "position and the calibration."
             )
-        below = image[image < 0]
-        self.noise = float(np.sqrt(np.mean(below**2))) if below.size else 0.0
-        """Noise of the background: root mean square of the negative counts."""
+        self.noise = dark_noise(images[name])
+        """Noise of the dark pixels. A floor that the caller gives is no measure of it."""
+        self.cut_off = light_cut_off(images[name])
+        """Mean count of the pixels of 0 counts before the image was cut off."""
         whole = float(image[alive].sum(dtype=np.float64))
         inside = float(self.counts.sum(dtype=np.float64))
         self.outside = float(np.clip(1 - inside / whole, 0, 1)) if whole > 0 else 0.0
@@ -187,7 +189,8 @@ def _camera_gains(weights: Weights, lit: Mapping[str, _LitPixels]) -> dict[str, 
         counts, shared = seen.without_glare, even[name].shared
         if shared is not None:
             counts, all_see_all = counts[shared[seen.pixels]], False
-        light = float(counts.sum(dtype=np.float64))  # positive and negative noise cancel in the sum
+        # positive and negative noise cancel in the sum
+        light = float(counts.sum(dtype=np.float64)) + seen.cut_off * np.count_nonzero(counts == 0)
         if not light > LEAST_LIGHT * seen.noise * len(counts):
             return equal
         brightness[name] = light / even[name].light

@@ -62,8 +62,8 @@ def reconstruct(
         Relaxation parameter mu, > 0; 1 is safe, 3 diverges.
     floor : float or mapping of str to float, optional
         Noise floor b [counts], added to images and projections: without it one dark pixel would make a voxel dark.
-        Default: the root mean square of an image's negative counts, and at least 1e-4 of its brightest counts without
-        hot pixels. A given floor is raised to at least 1e-6 of these.
+        Default: the noise of an image's dark pixels, and at least 1e-4 of its brightest counts without hot pixels. A
+        given floor is raised to at least 1e-6 of these.
     floor_share : float
         Least floor as a share of each image's brightness, sum I^2 / sum I, hot pixels left out. Particles smaller than
         a voxel light fewer pixels than the voxel; the floor keeps the dark pixels beside them from counting against it.

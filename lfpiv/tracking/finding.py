@@ -18,6 +18,7 @@ import xarray as xr
 
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import is_finite, lies_in
+from lfpiv.reconstruction.dark_noise import dark_noise
 from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.recording import checked_images
 from lfpiv.settings.processing import Tracking
@@ -73,7 +74,7 @@ def find_particles(
     volume : DataArray, shape (z, y, x), optional
         SMART volume of the same images, whose peaks are the first candidates. Default: it is reconstructed.
     noise : float or mapping of str to float, optional
-        Standard deviation of the background [counts]. Default: root mean square of an image's negative counts.
+        Standard deviation of the background [counts]. Default: that of an image's dark pixels.
     clipped : mapping of str to ndarray, optional
         Camera name -> pixels at the end of the sensor's range, shape (rows, columns), bool. They only tell that light
         is not less. Default: none.
@@ -350,8 +351,7 @@ class ParticleSearch:
 def _noise(images: Mapping[str, np.ndarray], noise: float | Mapping[str, float] | None) -> dict[str, float]:
     """Return the standard deviation of each image's background [counts]."""
     if noise is None:
-        found = {name: image[image < 0] for name, image in images.items()}
-        return {name: float(np.sqrt(np.mean(below**2))) if below.size else 1.0 for name, below in found.items()}
+        return {name: dark_noise(image) or 1.0 for name, image in images.items()}
     given = noise if isinstance(noise, Mapping) else dict.fromkeys(images, noise)
     if not all(name in given and is_finite(given[name]) and given[name] >= 0 for name in images):
         raise ValueError(f"noise: expected a number >= 0, or one for each camera, got {noise!r}.")

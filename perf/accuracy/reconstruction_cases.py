@@ -71,6 +71,9 @@ class Condition:
 CONDITIONS = {
     "clean": Condition(counts=400.0, noise=Noise()),
     "poly": Condition(counts=400.0, noise=Noise(), brightness=Brightness(camera_log_sd=1.0, size_log_sd=0.35)),
+    "poly0": Condition(
+        counts=400.0, noise=Noise(background=0.0), brightness=Brightness(camera_log_sd=1.0, size_log_sd=0.35)
+    ),
     "real": Condition(
         counts=16.0,  # 39 electrons
         noise=Noise(read_noise=0.82),  # 2 electrons
@@ -81,8 +84,9 @@ CONDITIONS = {
     ),
 }
 """Clean: shot noise of a thousand electrons per pixel and particle, and read-out noise. Poly: the same, light unlike by
-a factor of e in each camera and of 2 from particle to particle. Real: 39 electrons, particles of unlike size that are
-unlike bright in the cameras, a Gaussian sheet wider than the volume, stray light."""
+a factor of e in each camera and of 2 from particle to particle. Poly0: the same without an offset, so that counts below
+0 are cut off. Real: 39 electrons, particles of unlike size that are unlike bright in the cameras, a Gaussian sheet
+wider than the volume, stray light."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -97,6 +97,21 @@ def test_the_minimum_and_the_median_of_sparse_particles_are_the_reflection(decod
     assert not light.unusable.any()
 
 
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_noise_cut_off_at_0_neither_stands_nor_sticks(decoder, everywhere):
+    """The smallest count of most dark pixels is 0 then, which noise has not lowered further."""
+    standing, found = streak(decoder), (Series(decoder, 0), Series(decoder, 1))
+    for pair in range(6):
+        for frame, one in enumerate(found):
+            image = np.maximum(record(particles(decoder, [pair, frame], count=40) + standing, [8, pair, frame]), 0)
+            one.add(image, NOISE, image >= SATURATION)
+    light = standing_light(*found, everywhere=everywhere)
+    assert not light.unusable.any()
+    for frame in light.light:
+        assert np.sqrt(np.mean((frame - standing) ** 2)) < SHARE_LEFT * np.sqrt(np.mean(standing**2))
+        assert frame[:, 300:].mean() < NOISE / 2
+
+
 def test_frames_lit_by_unlike_lasers_have_backgrounds_of_their_own(decoder):
     one, other = series(decoder, streak(decoder), 8)
     moved = Series(decoder, 1)

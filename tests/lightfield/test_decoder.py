@@ -10,6 +10,8 @@ from lfpiv.lightfield.decoder import LightFieldDecoder
 WHITE_COUNTS = 1000.0
 DARK_LEVEL = 40.0  # counts
 READ_NOISE = 2.0  # counts
+WHOLE = 1 / np.sqrt(12)  # noise of whole counts
+HALF_COUNT = 0.5  # error of a median of whole counts
 
 HALF_PIXEL = 0.5 + 1e-3  # a ray lands within half a pixel of its pixel's centre, plus float32 rounding
 SAMPLED_AREA = 0.012  # error of areas by 20 x 20 points per pixel: a quarter of one row of points
@@ -123,6 +125,17 @@ def test_background_is_read_between_the_microimages(camera):
     count = camera.gaps.sum()
     assert abs(level - DARK_LEVEL) < 5 * 1.2533 * READ_NOISE / np.sqrt(count) + 0.05  # errors of median and rounding
     assert abs(sigma / READ_NOISE - 1) < 0.15
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.2, DARK_LEVEL])
+@pytest.mark.parametrize("noise", [3.0, 8.0, 60.0])
+def test_the_noise_of_a_camera_that_stores_no_negative_counts_is_known(camera, offset, noise):
+    """Without an offset half of the gap pixels have no counts at all."""
+    random, light = np.random.default_rng(10), WHITE_COUNTS * camera.coverage
+    stored = np.rint(light + noise * (offset + random.standard_normal(light.shape))).clip(0)
+    level, sigma = camera.background(stored.astype(np.uint16))
+    assert abs(sigma / np.hypot(noise, WHOLE) - 1) < 0.15 + 1.4826 * HALF_COUNT / noise
+    assert abs(level / noise - offset) < 5 * 1.2533 / np.sqrt(camera.gaps.sum()) + HALF_COUNT / noise
 
 
 def test_sub_aperture_images_are_the_scene_at_the_lens_centres(camera):

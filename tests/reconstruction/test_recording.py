@@ -7,6 +7,7 @@ from support.ideal_rig import IdealCamera, IdealRig, optics, rotation, two_camer
 
 import lfpiv
 from lfpiv.reconstruction import recording
+from lfpiv.reconstruction.intensity_cap import CAP
 
 NOISE = 2.0  # [counts]
 TOLERANCE_F32 = 2e-4  # as in test_volume: float32 steps
@@ -63,8 +64,10 @@ def test_light_that_no_voxel_lights_changes_nothing_and_is_stated(weights):
         spot = np.zeros(image.shape, bool)
         spot[5:45, 20:60] = True
         assert not everywhere[name][spot].any()
-        image[spot & (image >= 0)] = 4095.0  # negative counts tell the noise
-    keywords = {"iterations": 20, "tolerance": 5e-4}
+        image[spot] = 4095.0
+    floors = [plain_steps.reconstruct(weights, seen, 0, floor_share=0.0).floor for seen in (images, glare)]
+    assert floors[1] == pytest.approx(floors[0], rel=TOLERANCE_FLOOR)
+    keywords = {"iterations": 20, "tolerance": 5e-4, "floor": NOISE}
     plain, beside = (plain_steps.reconstruct(weights, seen, **keywords) for seen in (images, glare))
     assert beside.values.tobytes() == plain.values.tobytes()
     assert beside.misfit == plain.misfit and beside.residual == plain.residual
@@ -92,7 +95,21 @@ def test_a_hot_pixel_raises_no_floor_and_no_particle_is_cut(weights, per_voxel):
         assert floor == pytest.approx((light**2).sum() / light.sum(), rel=TOLERANCE_FLOOR)
         assert floor < clean[name].max()
     default = plain_steps.reconstruct(weights, hot, 0, floor_share=0.0).floor
-    assert default == pytest.approx([NOISE] * 2, rel=2 * TOLERANCE_FLOOR)  # negative counts of the noise
+    assert default == pytest.approx([NOISE] * 2, rel=2 * TOLERANCE_FLOOR)  # dark pixels tell the noise
+
+
+@pytest.mark.parametrize("cap", [0.0, CAP])
+def test_images_cut_off_at_0_are_prepared_as_those_that_are_not(weights, cap):
+    """Their noise is as well known, so it lights no dark microimages, and the limit cuts no more light."""
+    images = recorded(weights, particles(weights.grid, 7), 7)
+    signed, cut = (
+        recording.record(weights, seen, floor=None, floor_share=0.0, intensity_cap=cap)
+        for seen in (images, {name: np.maximum(image, 0) for name, image in images.items()})
+    )
+    for name, one in cut.items():
+        np.testing.assert_array_equal(one.image, signed[name].image)
+        assert one.floor == signed[name].floor == pytest.approx(NOISE, rel=2 * TOLERANCE_FLOOR)
+        assert one.camera_gain == signed[name].camera_gain
 
 
 @pytest.mark.slow
@@ -149,10 +166,22 @@ def test_a_reflection_is_not_taken_for_a_brighter_camera(weights):
     assert found[1] == 1.0 and found[0] > 0.5  # by all its light it would be 0.055
 
 
-def test_an_image_of_noise_is_not_brightened(weights):
+@pytest.mark.parametrize("least", [-np.inf, 0.0])
+def test_an_image_of_noise_is_not_brightened(weights, least):
+    """Noise that is cut off at 0 is no light, either."""
     images = recorded(weights, particles(weights.grid, 4), 4)
-    images["cam2"] = np.random.default_rng(4).normal(0, NOISE, images["cam2"].shape).astype(np.float32)
+    images["cam2"] = np.random.default_rng(4).normal(0, NOISE, images["cam2"].shape).clip(least).astype(np.float32)
     assert plain_steps.reconstruct(weights, images, 0).camera_gain == [1.0, 1.0]
+
+
+def test_the_noise_of_images_cut_off_does_not_make_a_dim_camera_brighter(weights):
+    """Noise is as strong as the light, and what is left of it would add more than a step."""
+    truth = particles(weights.grid, 8)
+    light = weights(truth)["cam1"]
+    images = recorded(weights, truth, 8, 0.25, noise=float(light[light > 0].mean()) / 2)
+    cut = {name: np.maximum(image, 0) for name, image in images.items()}
+    signed, found = (plain_steps.reconstruct(weights, seen, 0).camera_gain for seen in (images, cut))
+    assert found == signed and found[1] < 0.4
 
 
 def test_an_image_that_is_dark_where_the_volume_is_seen_is_named(weights):

@@ -13,6 +13,8 @@ from scipy import ndimage
 from scipy.optimize import minimize
 from support import plain_steps
 from support.ideal_rig import IdealCamera, IdealRig, optics, two_cameras
+from support.noisy_blobs import NOISE as NOISE_OF_BLOBS
+from support.noisy_blobs import noisy_blobs
 from support.plain_rays import plain
 
 import lfpiv
@@ -34,6 +36,7 @@ TOLERANCE_NEAR = 5e-3  # projections rounded by 6e-8 in differences of 1e-4 from
 TOLERANCE_RATIO = 1e-6  # logarithms up to 6 in float32, relative to a voxel's weights
 TOLERANCE_MISFIT = 1e-6  # a misfit is a float32 image's sum: rounding of 24 pixels relative to their light
 TOLERANCE_SIZE = 0.08  # [voxel] some hundred particles: a tenth of their covariance, a twentieth of its root
+TOLERANCE_NOISE = 0.1  # faint light adds to the noise of dark pixels, as in test_dark_noise
 TOLERANCE_LIMIT = 2e-3  # SMART converges linearly: what is left after 2,000 iterations in float32, 400 with momentum
 
 
@@ -517,15 +520,12 @@ def test_truth_is_a_fixed_point():
     assert volume.residual[-1] <= TOLERANCE_F32
 
 
-def test_the_floor_is_the_noise_of_the_background_by_default():
-    weights = random_system(8)
-    rng = np.random.default_rng(8)
-    noise = {name: rng.normal(0, 0.2, (4, 8)) for name in weights.cameras}
-    image = images_of(weights, matrix_of(weights) @ rng.random(weights.grid.size) ** 8)
-    image = {name: np.where(np.arange(8) < 3, 0, image[name]) + noise[name] for name in image}  # three dark columns
-    floor = {name: float(np.sqrt((image[name][image[name] < 0] ** 2).mean())) for name in image}
-    given = plain_steps.reconstruct(weights, image, floor=floor, floor_share=0.0)
-    measured = plain_steps.reconstruct(weights, image, floor_share=0.0)
+def test_the_floor_is_the_noise_of_dark_pixels_by_default():
+    weights, _, images = noisy_blobs(120)
+    measured = plain_steps.reconstruct(weights, images, 2, floor_share=0.0)
+    assert measured.floor == pytest.approx([NOISE_OF_BLOBS] * 2, rel=TOLERANCE_NOISE)
+    floor = dict(zip(images, measured.floor, strict=True))
+    given = plain_steps.reconstruct(weights, images, 2, floor=floor, floor_share=0.0)
     assert np.allclose(measured.values, given.values, rtol=TOLERANCE_F32)
 
 

@@ -6,6 +6,8 @@ from support.ideal_rig import optics, two_cameras
 import lfpiv
 from lfpiv.reconstruction.sieve import Sieve
 
+NOISE = 8.0  # counts
+
 
 def noisy_blobs(count):
     """Weights of a volume of 10 x 16 x 16 voxels, so many blobs in it, and their noisy images by camera."""
@@ -15,5 +17,7 @@ def noisy_blobs(count):
     coefficients = np.zeros(grid.size, np.float32)
     coefficients[rng.choice(grid.size, count, replace=False)] = 4e5
     truth = Sieve(0.6, grid.shape)(coefficients).reshape(grid.shape)
-    noisy = {name: (image + rng.normal(0, 8, image.shape)).astype(np.float32) for name, image in weights(truth).items()}
+    noisy = {
+        name: (image + rng.normal(0, NOISE, image.shape)).astype(np.float32) for name, image in weights(truth).items()
+    }
     return weights, truth, noisy
