@@ -3,8 +3,9 @@
 Correlation statistics show what differs between two volumes. Ghosts, particles of unlike brightness in the cameras and
 light from beyond the volume move alike in both, so that part of the error does not show. The residual of the images
 measures how much of a volume is wrong. The same wrong light makes the random part, so one systematic part follows its
-typical size. Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_, so another one
-follows the distance of a vector from the mean of the volume.
+typical size. Its variance grows with the residual, as that of a sum of independent sources does with their number.
+Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_, so another one follows the
+distance of a vector from the mean of the volume.
 
 References
 ----------
@@ -17,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-RANDOM_SHARE = 2.45
-"""Systematic standard deviation over the median random one, at a residual of 1."""
+RANDOM_SHARE = 5.0
+"""Systematic variance over the square of the median random standard deviation, at a residual of 1."""
 DAMPING = 0.05
 """Share by which ghosts pull a vector towards the mean of the volume."""
 
@@ -36,7 +37,7 @@ def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, re
     """Add the systematic part to standard deviations of displacements.
 
     With the random standard deviation s of a component, its median over the valid vectors s', the displacement d, its
-    mean over the valid vectors d' and the residual r, it is ``sqrt(s^2 + (2.45 r s')^2 + (0.05 (d - d'))^2)``.
+    mean over the valid vectors d' and the residual r, it is ``sqrt(s^2 + 5 r s'^2 + (0.05 (d - d'))^2)``.
 
     Parameters
     ----------
@@ -58,7 +59,7 @@ def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, re
     if residual == 0 or not known.any():
         return random
     typical, mean = np.median(random[known], axis=0), field[known].mean(axis=0)
-    systematic = (residual * RANDOM_SHARE * typical) ** 2 + (DAMPING * (field - mean)) ** 2
+    systematic = RANDOM_SHARE * residual * typical**2 + (DAMPING * (field - mean)) ** 2
     whole: np.ndarray = np.sqrt(random**2 + systematic)
     return whole
 

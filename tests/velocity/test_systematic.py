@@ -34,8 +34,8 @@ def test_it_grows_with_residual_and_typical_scatter_in_each_component_apart(resi
     assert np.allclose(added, added[0, 0, 0]) and np.allclose(
         added[0, 0, 0] / [0.05, 0.1, 0.2], added[0, 0, 0, 0] / 0.05
     )
-    double = with_systematic(random, field_of(), valid, residual / 2)
-    assert np.allclose(stated**2 - random**2, 4 * (double**2 - random**2))
+    half = with_systematic(random, field_of(), valid, residual / 2)
+    assert np.allclose(stated**2 - random**2, 2 * (half**2 - random**2))
 
 
 def test_gradients_that_ghosts_damp_make_vectors_unsure():
