@@ -21,7 +21,7 @@ import xarray as xr
 
 RANDOM_SHARE = 5.0
 """Systematic variance over the square of the median random standard deviation, at a residual of 1."""
-POINT_SHARE = 1.0
+POINT_SHARE = 2.0
 """The same for volumes of particles that are smaller than voxels, which are made without a sieve."""
 DAMPING = 0.05
 """Share by which ghosts pull a vector towards the mean of the volume."""
