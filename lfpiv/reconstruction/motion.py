@@ -35,7 +35,7 @@ from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
 from lfpiv.velocity.peak_width import peak_reach, refine_search
 from lfpiv.velocity.settings import CorrelationSettings
-from lfpiv.velocity.systematic import image_residual, with_systematic
+from lfpiv.velocity.systematic import unexplained, with_systematic
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.velocity.windows import Windows
 from lfpiv.weights.operator import Weights
@@ -305,7 +305,7 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     valid = vectors["valid"].values
     deviation = np.maximum(scatter, np.abs(shown - measured))
     deviation[~valid] = np.nan
-    deviation = with_systematic(deviation, measured, valid, image_residual(*volumes))
+    deviation = with_systematic(deviation, measured, valid, unexplained(*volumes))
     stated = {f"uncertainty_{axis}": deviation[..., k] for k, axis in enumerate("zyx")}
     stated["uncertainty"] = np.sqrt((deviation**2).sum(-1))
     stated["correlation"] = left.correlation

@@ -3,8 +3,10 @@
 Correlation statistics show what differs between two volumes. Ghosts, particles of unlike brightness in the cameras and
 light from beyond the volume move alike in both, so that part of the error does not show. The residual of the images
 measures how much of a volume is wrong. The same wrong light makes the random part, so one systematic part follows its
-typical size. Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_, so another one
-follows the distance of a vector from the mean of the volume.
+typical size. Its variance grows with the residual, as that of a sum of independent sources does with their number.
+Where particles are smaller than voxels, most of the residual is their form. It moves as they do, so less of it counts.
+Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_, so another one follows the
+distance of a vector from the mean of the volume.
 
 References
 ----------
@@ -17,26 +19,33 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-RANDOM_SHARE = 2.45
-"""Systematic standard deviation over the median random one, at a residual of 1."""
+RANDOM_SHARE = 5.0
+"""Systematic variance over the square of the median random standard deviation, at a residual of 1."""
+POINT_SHARE = 2.0
+"""The same for volumes of particles that are smaller than voxels, which are made without a sieve."""
 DAMPING = 0.05
 """Share by which ghosts pull a vector towards the mean of the volume."""
 
 
-def image_residual(*volumes: xr.DataArray | np.ndarray) -> float:
-    """Return the largest final residual of volumes, ||I - P|| / ||I||; 0 if one does not state it.
+def unexplained(*volumes: xr.DataArray | np.ndarray) -> float:
+    """Return the systematic variance over the square of the median random standard deviation, the largest of volumes.
 
-    Volumes of `lfpiv.reconstruct` have it as the attribute ``residual``, one value per iteration.
+    It is `RANDOM_SHARE` or `POINT_SHARE` times the final residual of the images, ||I - P|| / ||I||. Volumes of
+    `lfpiv.reconstruct` have it as the attribute ``residual``, one value per iteration; 0 if none states it.
     """
-    stated = [volume.attrs.get("residual") if isinstance(volume, xr.DataArray) else None for volume in volumes]
-    return max(0.0 if values is None else float(np.atleast_1d(values)[-1]) for values in stated)
+    shares = [0.0]
+    for volume in volumes:
+        if isinstance(volume, xr.DataArray) and "residual" in volume.attrs:
+            share = RANDOM_SHARE if volume.attrs.get("sieve_voxel", 0.0) > 0 else POINT_SHARE
+            shares.append(share * float(np.atleast_1d(volume.attrs["residual"])[-1]))
+    return max(shares)
 
 
-def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, residual: float) -> np.ndarray:
+def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, share: float) -> np.ndarray:
     """Add the systematic part to standard deviations of displacements.
 
     With the random standard deviation s of a component, its median over the valid vectors s', the displacement d, its
-    mean over the valid vectors d' and the residual r, it is ``sqrt(s^2 + (2.45 r s')^2 + (0.05 (d - d'))^2)``.
+    mean over the valid vectors d' and the share q, it is ``sqrt(s^2 + q s'^2 + (0.05 (d - d'))^2)``.
 
     Parameters
     ----------
@@ -46,8 +55,8 @@ def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, re
         Displacement [voxel].
     valid : ndarray of bool, shape (z, y, x)
         Vectors that were measured.
-    residual : float
-        From `image_residual`; 0 adds nothing.
+    share : float
+        From `unexplained`; 0 adds nothing.
 
     Returns
     -------
@@ -55,10 +64,10 @@ def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, re
         Standard deviation [voxel]; NaN where `random` is.
     """
     known = np.isfinite(random).all(-1) & valid
-    if residual == 0 or not known.any():
+    if share == 0 or not known.any():
         return random
     typical, mean = np.median(random[known], axis=0), field[known].mean(axis=0)
-    systematic = (residual * RANDOM_SHARE * typical) ** 2 + (DAMPING * (field - mean)) ** 2
+    systematic = share * typical**2 + (DAMPING * (field - mean)) ** 2
     whole: np.ndarray = np.sqrt(random**2 + systematic)
     return whole
 

@@ -4,6 +4,9 @@ For two volumes that are deformed onto each other, the correlation at lags +1 an
 does not match: noise, ghosts, lost particles, gradients inside the window. The difference is a sum over voxels. Its
 variance follows from the scatter of its terms and their neighbours, and the slope of the peak fit turns it into voxels.
 
+A window with few particles has a peak of odd width by chance. Particles are equally wide everywhere, and so are peaks.
+The slope is therefore limited by the typical autocorrelation of the windows.
+
 References
 ----------
 .. [1] B. Wieneke, "PIV uncertainty quantification from correlation statistics", Meas. Sci. Technol. 26 (2015) 074002,
@@ -24,8 +27,10 @@ from lfpiv_kernels.transfer import Values, to_host
 
 REACH = 4
 """Edge of the cubes whose sums of terms are squared [voxel]: nearer terms count as correlated."""
-_FLATTEST = 1.02
-"""Least ratio of the peak to its neighbours; a window with a flatter peak is treated as if it had this one."""
+FLATTEST = 0.5
+"""Least logarithm of the ratio of a peak to its neighbours, relative to that of the typical autocorrelation."""
+_LEAST_RATIO = 1.02
+"""Least ratio of the typical autocorrelation at lag 0 to that at lag 1."""
 
 
 def displacement_deviation(
@@ -49,7 +54,8 @@ def displacement_deviation(
     Returns
     -------
     ndarray, shape (*count, 3)
-        Standard deviation of the displacement, order (z, y, x) [voxel]; NaN where the correlation has no peak at lag 0.
+        Standard deviation of the displacement, order (z, y, x) [voxel]; NaN where the correlation at lag 0 is not
+        positive.
     """
     layout = window, origin, step, count
     if runtime.device().form == "gpu":
@@ -57,21 +63,30 @@ def displacement_deviation(
     else:
         totals, terms = _window_sums(to_host(first), to_host(second), *layout)
     voxels = math.prod(window)
-    mean_product = totals[0] * totals[1] / voxels
-    peak = totals[2] - mean_product
+    mean_product, mean_squares = totals[0] * totals[1] / voxels, (totals[0] ** 2 + totals[1] ** 2) / voxels
+    peak, own_peak = totals[2] - mean_product, totals[3] - mean_squares
     deviation = np.full((*count, 3), np.nan)
-    for axis, (plus, minus, difference, squares) in enumerate(terms):
+    for axis, (plus, minus, difference, squares, own) in enumerate(terms):
         side = 0.5 * (plus + minus) - mean_product
         # The sum over pairs of terms of their product times the overlap of two cubes around them, which is 1 for a term
         # with itself and 0 beyond `REACH`. Unlike a sum of estimated covariances it is never negative.
         about_zero = squares / REACH**3
         about_mean = about_zero - difference**2 * REACH**3 / voxels
         variance = np.maximum(about_mean, 0.5 * about_zero)  # a small window's mean holds part of the noise
+        typical = _typical_sharpness(own_peak, own - mean_squares)
         with np.errstate(divide="ignore", invalid="ignore"):
-            sharpness = np.log(np.maximum(peak / side, _FLATTEST))
-            sigma = np.sqrt(variance) / (4 * side * sharpness)
-        deviation[..., axis] = np.where((side > 0) & (peak > 0), sigma, np.nan)
+            measured = np.where(side > 0, np.log(peak / side), np.inf)
+            sharpness = np.clip(measured, FLATTEST * typical, typical)
+            sigma = np.sqrt(variance) / (4 * peak * np.exp(-sharpness) * sharpness)
+        deviation[..., axis] = np.where(peak > 0, sigma, np.nan)
     return deviation
+
+
+def _typical_sharpness(peak: np.ndarray, side: np.ndarray) -> float:
+    """Return the median logarithm of the ratio of autocorrelations at lag 0 and at lag 1, shape `count` each."""
+    known = (side > 0) & (peak > side)
+    ratio = float(np.median(peak[known] / side[known])) if known.any() else 0.0
+    return math.log(max(ratio, _LEAST_RATIO))
 
 
 def _window_sums(
@@ -79,8 +94,9 @@ def _window_sums(
 ) -> tuple[list[np.ndarray], Iterator[list[np.ndarray]]]:
     """Return sums over windows, shape `count`, float64.
 
-    They are those of both volumes and of their product, and for each axis those of the products at a lag of 1 and of
-    -1, of their difference, and of the squares of the difference's sums over cubes.
+    They are those of both volumes, of their product and of their squares, and for each axis those of the products at a
+    lag of 1 and of -1, of their difference, of the squares of the difference's sums over cubes, and of the products of
+    each volume with itself at a lag of 1.
     """
     keep = tuple(slice(o, o + (c - 1) * s + 1, s) for o, c, s in zip(origin, count, step, strict=True))
 
@@ -94,15 +110,16 @@ def _window_sums(
             moved[inner] = volume[(slice(None),) * axis + (slice(1, None),)]
         plus, minus = first * ahead[1], ahead[0] * second
         difference = plus - minus
-        return [window_sum(of) for of in (plus, minus, difference, _squared_cubes(difference))]
+        own = first * ahead[0] + second * ahead[1]
+        return [window_sum(of) for of in (plus, minus, difference, _squared_cubes(difference), own)]
 
-    return [window_sum(of) for of in (first, second, first * second)], map(terms, range(3))
+    squares = first * first + second * second
+    return [window_sum(of) for of in (first, second, first * second, squares)], map(terms, range(3))
 
 
 def _squared_cubes(terms: np.ndarray) -> np.ndarray:
-    """Return the squares of the sums of terms over the cube around each voxel, 0 where it leaves the volume."""
-    cubes = box_sum(terms, (REACH,) * 3)
-    centred = np.zeros_like(cubes)  # box_sum starts at a voxel: move each cube's sum to its middle
-    shift = REACH // 2
-    centred[shift:, shift:, shift:] = cubes[: -shift or None, : -shift or None, : -shift or None]
+    """Return the squares of the sums of terms over the cube around each voxel; terms outside the volume are 0."""
+    before = REACH // 2  # box_sum starts at a voxel: the padding moves each cube's sum to its middle
+    cubes = box_sum(np.pad(terms, (before, REACH - 1 - before)), (REACH,) * 3)
+    centred = cubes[tuple(slice(n) for n in terms.shape)]
     return centred * centred

@@ -62,10 +62,9 @@ def _sum_differences(
     z = begin + layer
     first = k - before
     total = float(0.0)
-    if first >= 0 and first + window <= one.shape[2]:
-        for x in range(first, first + window):
-            ahead = one[z, y, x] * _value(other, z + lag[0], y + lag[1], x + lag[2])
-            total += ahead - _value(one, z + lag[0], y + lag[1], x + lag[2]) * other[z, y, x]
+    for x in range(wp.max(first, 0), wp.min(first + window, one.shape[2])):
+        ahead = one[z, y, x] * _value(other, z + lag[0], y + lag[1], x + lag[2])
+        total += ahead - _value(one, z + lag[0], y + lag[1], x + lag[2]) * other[z, y, x]
     sum_out[z, y, k] = total
 
 
@@ -85,9 +84,9 @@ def _square(
 def window_sums(
     first: wp.array, second: wp.array, window: Triple, origin: Triple, step: Triple, count: Triple, reach: int
 ) -> tuple[list[np.ndarray], list[list[np.ndarray]]]:
-    """Return the sums of both volumes and of their product, and of the terms of each axis; see ``uncertainty``."""
+    """Return the sums of both volumes, of their products, and of the terms of each axis; see ``uncertainty``."""
     taps = tuple(np.ones(edge) for edge in window)
-    sums = empty_volume((12, *count))
+    sums = empty_volume((20, *count))
 
     def product_sums(one: wp.array, other: wp.array, lag: wp.vec3i, out: wp.array) -> None:
         volume = empty_volume((count[0], *one.shape[1:]))
@@ -99,25 +98,29 @@ def window_sums(
 
     for k, volume in enumerate((first, second)):
         filters_gpu.window_sums(volume, origin, step, count, taps, sums[k])
-    product_sums(first, second, wp.vec3i(0, 0, 0), sums[2])
+    for k, (one, other) in enumerate(((first, second), (first, first), (second, second))):
+        product_sums(one, other, wp.vec3i(0, 0, 0), sums[2 + k])
     for axis in range(3):
         lag = wp.vec3i(*(int(k == axis) for k in range(3)))
-        to = 3 + 3 * axis
-        product_sums(first, second, lag, sums[to])
-        product_sums(second, first, lag, sums[to + 1])
+        to = 5 + 5 * axis
+        for k, (one, other) in enumerate(((first, second), (second, first), (first, first), (second, second))):
+            product_sums(one, other, lag, sums[to + k])
         squares = _squared_cubes(first, second, lag, reach)
-        filters_gpu.window_sums(squares, origin, step, count, taps, sums[to + 2])
+        filters_gpu.window_sums(squares, origin, step, count, taps, sums[to + 4])
     found = to_host(sums).astype(float)
-    terms = [[plus, minus, plus - minus, squares] for plus, minus, squares in found[3:].reshape(3, 3, *count)]
-    return list(found[:3]), terms
+    terms = [
+        [plus, minus, plus - minus, squares, own_first + own_second]
+        for plus, minus, own_first, own_second, squares in found[5:].reshape(3, 5, *count)
+    ]
+    return [*found[:3], found[3] + found[4]], terms
 
 
 def _squared_cubes(first: wp.array, second: wp.array, lag: wp.vec3i, reach: int) -> wp.array:
-    """Return the squares of the sums of differences over the cube around each voxel, 0 where it leaves the volume."""
+    """Return the squares of the sums of differences over the cube around each voxel; those outside the volume are 0."""
     cubes = empty_volume(first.shape)
     inputs = [first, second, lag, reach, reach // 2]
     launch(Call(_sum_differences, first.shape[0], inputs, [cubes], inner=tuple(first.shape[1:])))
     for axis in (1, 0):
-        cubes = filters_gpu.filter_along(cubes, axis, np.ones(reach), -(reach // 2), border=filters_gpu.WHOLE)
+        cubes = filters_gpu.filter_along(cubes, axis, np.ones(reach), -(reach // 2))
     launch(Call(_square, first.shape[0], [cubes], [cubes], inner=tuple(first.shape[1:])))
     return cubes

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lfpiv.velocity.systematic import DAMPING, image_residual, with_systematic
+from lfpiv.velocity.systematic import DAMPING, POINT_SHARE, RANDOM_SHARE, unexplained, with_systematic
 
 ROUNDING = 1e-12
 """Float64 sums of a few terms of order one."""
@@ -24,18 +24,13 @@ def test_volumes_that_explain_all_light_add_nothing():
     assert np.isnan(none).all()
 
 
-@pytest.mark.parametrize("residual", [0.2, 0.6])
-def test_it_grows_with_residual_and_typical_scatter_in_each_component_apart(residual):
+@pytest.mark.parametrize("share", [0.4, 3.0])
+def test_it_grows_with_share_and_typical_scatter_in_each_component_apart(share):
     random = np.broadcast_to([0.05, 0.1, 0.2], (3, 5, 6, 3)).copy()
     random[1, 2, 3] *= 10  # one window does not set what is typical
     valid = np.ones(random.shape[:3], bool)
-    stated = with_systematic(random, field_of(), valid, residual)
-    added = np.sqrt(stated**2 - random**2)
-    assert np.allclose(added, added[0, 0, 0]) and np.allclose(
-        added[0, 0, 0] / [0.05, 0.1, 0.2], added[0, 0, 0, 0] / 0.05
-    )
-    double = with_systematic(random, field_of(), valid, residual / 2)
-    assert np.allclose(stated**2 - random**2, 4 * (double**2 - random**2))
+    added = with_systematic(random, field_of(), valid, share) ** 2 - random**2
+    assert np.allclose(added, share * np.square([0.05, 0.1, 0.2]))
 
 
 def test_gradients_that_ghosts_damp_make_vectors_unsure():
@@ -60,9 +55,17 @@ def test_replaced_vectors_are_no_neighbours():
     assert np.isnan(stated[~valid]).all() and np.ptp(stated[valid]) < ROUNDING
 
 
-def test_the_residual_of_volumes_is_their_last_and_largest():
-    volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x"))
+def test_the_largest_final_residual_counts():
+    volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x")).assign_attrs(sieve_voxel=0.6)
     first, second = volume.assign_attrs(residual=[0.9, 0.3]), volume.assign_attrs(residual=np.array([0.8, 0.4]))
-    assert image_residual(first, second) == 0.4 and image_residual(second, first) == 0.4
-    assert image_residual(first, volume) == 0.3 and image_residual(first.assign_attrs(residual=0.5), volume) == 0.5
-    assert image_residual(np.zeros((2, 2, 2)), volume) == 0.0
+    assert unexplained(first, second) == unexplained(second, first) == RANDOM_SHARE * 0.4
+    assert unexplained(first, volume) == RANDOM_SHARE * 0.3
+    assert unexplained(first.assign_attrs(residual=0.5), volume) == RANDOM_SHARE * 0.5
+    assert unexplained(np.zeros((2, 2, 2)), volume) == 0.0
+
+
+def test_the_residual_of_particles_smaller_than_voxels_counts_less():
+    volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x")).assign_attrs(residual=0.4)
+    points, blobs = (volume.assign_attrs(sieve_voxel=sieve) for sieve in (0.0, 0.6))
+    assert unexplained(points, points) == unexplained(volume, volume) == POINT_SHARE * 0.4
+    assert unexplained(blobs, blobs) > unexplained(points, points) > 0
