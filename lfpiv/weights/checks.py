@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from lfpiv.geometry.grid import Grid
 from lfpiv.weights.blocks import BLOCK_BYTES, CHUNK_VOXELS, VOXEL_BYTES, PackedCamera, sample_blocks
-from lfpiv.weights.choice import warn_of_errors
+from lfpiv.weights.choice import form_errors, warn_of_errors
 from lfpiv.weights.depth_planes import choose_planes
 from lfpiv.weights.device_share import DeviceNeed, beside_bytes, rays_bytes
 from lfpiv.weights.operator import Weights
@@ -54,17 +54,26 @@ def _samples(
 
 
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:
-    """Compare stored weights with counted rays in a few random voxels of every camera.
+    """Compare weights with counted rays in a few random voxels of every camera.
 
-    Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
+    Weights of nodes stand for those of particles, so there the voxels' own footprints are compared; `choose_planes`
+    compared the nodes. Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
 
     Returns
     -------
     dict of str to list of float
         Camera name -> relative L2 difference per voxel that the camera sees, the noise of the count subtracted.
     """
-    errors = {name: weights.counted(name).errors(weights.projector(name)) for name in weights.cameras}
+    errors = {name: _count_errors(weights, name) for name in weights.cameras}
     for name, some in errors.items():
         if name not in weights.profile_errors and weights.method == "footprint":
             warn_of_errors(weights.counted(name), weights.forms[name], some, requested=True)
     return errors
+
+
+def _count_errors(weights: Weights, name: str) -> list[float]:
+    """Return the relative L2 differences of one camera's counted voxels."""
+    counted, projector = weights.counted(name), weights.projector(name)
+    if projector.planes is None:
+        return counted.errors(projector)
+    return form_errors(counted, weights.forms[name], weights.cuts[name])

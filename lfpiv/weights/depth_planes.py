@@ -41,26 +41,22 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-DISTANCES: tuple[int, ...] = (8, 7, 6, 5, 4, 3, 2)
+DISTANCES: tuple[int, ...] = (10, 8, 7, 6, 5, 4, 3, 2)
 """Distances of planes that are tried, widest first [layer of voxels]."""
-LINE_DISTANCES = DISTANCES[2:]
-"""Those that are tried where voxels are shared among lines of sight. Wider ones were not measured."""
-LARGEST_ERROR = 0.015
-"""Largest root mean square of the relative L2 differences of interpolated images from those of the voxels."""
-WORST_ERROR = 0.03
-"""Largest of these differences."""
-PARTICLE_ERROR = 0.03
-"""Largest root mean square of the differences of particles where voxels are shared among lines of sight."""
-WORST_PARTICLE_ERROR = 0.04
-"""Largest of these differences."""
+VOXEL_ERROR, WORST_VOXEL_ERROR = 0.015, 0.03
+"""Largest root mean square, and largest, of the relative L2 differences of voxels' interpolated images from their own
+ones: for points and particles of unknown size."""
+PARTICLE_ERROR, WORST_PARTICLE_ERROR = 0.03, 0.04
+"""The same of the images of particles, where these are large enough."""
 LEAST_GAIN = 1.5
 """Least ratio of voxels to nodes with which nodes are used."""
 NEAR_LATTICE = 0.02
 """Difference of the line of sight from a lattice direction up to which voxels are not shared [voxel/layer]."""
 PARTICLE_VOXEL = 0.85
-"""Standard deviation of the smallest particles for which voxels are shared among lines of sight [voxel]."""
+"""Standard deviation of the particles whose images are compared, and of the smallest ones that are large enough
+[voxel]."""
 PARTICLES = 8
-"""Number of such particles whose images are compared."""
+"""Number of particles whose images are compared."""
 VOXELS_AT_A_TIME = 400
 """Voxels whose images are compared at a time: more take more memory."""
 FEWEST_VOXELS = 100_000
@@ -242,8 +238,8 @@ def choose_planes(
     cuts : tuple of int
         Parts of a voxel along x, y, z.
     particle_voxel : float
-        Standard deviation of the particles [voxel]; 0 for points and where it is unknown. Voxels are shared among lines
-        of sight for particles of `PARTICLE_VOXEL` or more.
+        Standard deviation of the particles [voxel]; 0 for points and where it is unknown. From `PARTICLE_VOXEL` on
+        images of particles count in place of those of voxels, and voxels may be shared among lines of sight.
 
     Returns
     -------
@@ -255,17 +251,16 @@ def choose_planes(
     seen = np.unique(np.concatenate([draw_seen(stored, camera, seed) for seed in SEEDS]))
     if not len(seen):
         return None
-    chosen: NodeGrid | None = None
     ways = _ways_to_share(_slopes(stored, camera)[1])
-    for lines in ways if particle_voxel >= PARTICLE_VOXEL else ways[:1]:
-        if any(lines):
-            sample = Sample(camera, *blobs_about(stored, seen[:: len(seen) // PARTICLES + 1]), form, cuts)
-            distances, largest, worst = LINE_DISTANCES, PARTICLE_ERROR, WORST_PARTICLE_ERROR
-        else:
-            sample = Sample(camera, seen[:, None], np.ones((len(seen), 1)), form, cuts)
-            distances, largest, worst = DISTANCES, LARGEST_ERROR, WORST_ERROR
-        own = sample.own_images(stored)
-        for distance in distances:
+    if particle_voxel >= PARTICLE_VOXEL:
+        kind, largest, worst = "particles", PARTICLE_ERROR, WORST_PARTICLE_ERROR
+        sample = Sample(camera, *blobs_about(stored, seen[:: len(seen) // PARTICLES + 1]), form, cuts)
+    else:
+        kind, largest, worst, ways = "voxels", VOXEL_ERROR, WORST_VOXEL_ERROR, ways[:1]
+        sample = Sample(camera, seen[:, None], np.ones((len(seen), 1)), form, cuts)
+    own, chosen = sample.own_images(stored), None
+    for lines in ways:
+        for distance in DISTANCES:
             nodes = NodeGrid.of(stored, camera, distance, lines=lines)
             if LEAST_GAIN * nodes.size > stored.grid.size or (chosen is not None and nodes.size >= chosen.size):
                 break
@@ -273,7 +268,6 @@ def choose_planes(
             error = float(np.sqrt(np.mean(np.square(errors))))
             if error <= largest and max(errors) <= worst:
                 text = "%s: weights of %d nodes for %d voxels, planes %d layers apart: images of %s differ by %.1f %%"
-                kind = "particles" if any(lines) else "voxels"
                 log.info(text, camera.name, nodes.size, stored.grid.size, distance, kind, 100 * error)
                 chosen = nodes
                 break

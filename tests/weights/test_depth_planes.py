@@ -11,11 +11,11 @@ import lfpiv
 from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
 from lfpiv.weights import depth_planes
-from lfpiv.weights.checks import estimate_memory
+from lfpiv.weights.checks import compare_with_count, estimate_memory
 from lfpiv.weights.depth_planes import (
-    LARGEST_ERROR,
     PARTICLE_ERROR,
     PARTICLE_VOXEL,
+    VOXEL_ERROR,
     NodeGrid,
     Sample,
     blobs_about,
@@ -33,6 +33,7 @@ from lfpiv_kernels.transfer import to_device
 
 TOLERANCE_TWIN = 2e-6  # float32 sums of up to 64 shares
 TOLERANCE_ADJOINT = 1e-5  # as of the operator
+TOLERANCE_COUNT = 1e-4  # footprints of a few voxels and of a row of them, float32
 TOLERANCE_PITCH = 5e-4  # interpolated fits, 3e-4, and a second derivative over a voxel, half a squared one over 200 mm
 GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.2, 0.8, 1.4), voxel_mm=0.05)
 CAMERAS = {
@@ -170,7 +171,7 @@ def test_images_between_nodes_are_those_of_voxels(pose, for_small_volumes):
     sample = Sample(camera, voxels[:, None], np.ones((40, 1)), "pixels")
     own = sample.own_images(stored)
     error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, sample, own))))
-    assert error < 1.4 * LARGEST_ERROR  # of other voxels than those by which the distance was chosen
+    assert error < 1.4 * VOXEL_ERROR  # of other voxels than those by which the distance was chosen
     wide = NodeGrid.of(stored, camera, 3 * nodes.distance)
     assert np.mean(interpolation_errors(wide, sample, own)) > 2 * error
 
@@ -319,12 +320,24 @@ def test_cameras_between_lattice_directions_share_voxels_among_lines_of_sight(po
     assert nodes.lines == lines and error < 1.4 * PARTICLE_ERROR  # of other particles than those by which it was chosen
 
 
-@pytest.mark.parametrize(("pose", "particle_voxel"), [(rotation(33), 0.6), (rotation(12, 12), PARTICLE_VOXEL)])
-def test_all_voxels_keep_their_own_weights(pose, particle_voxel, for_small_volumes):
-    """Edges of voxels show: particles are small, or few lines of sight lie between two voxels along both axes."""
-    camera = IdealCamera("one", pose)
+def test_planes_lie_farther_apart_for_particles_than_for_points(for_small_volumes):
+    camera = IdealCamera("one", rotation(45))
     stored = StoredGrid.for_cameras(GRID, [camera])
-    assert choose_planes(stored, camera, "profiles", particle_voxel=particle_voxel) is None
+    points, particles = (choose_planes(stored, camera, "profiles", particle_voxel=size) for size in (0, PARTICLE_VOXEL))
+    assert particles.distance > points.distance and particles.size < points.size
+
+
+def test_counted_rays_are_compared_with_the_voxels_own_footprints_where_nodes_serve_particles(between):
+    nodes, every = between
+    expected = compare_with_count(every)
+    for name, errors in compare_with_count(nodes).items():
+        assert errors == pytest.approx(expected[name], rel=TOLERANCE_COUNT)
+
+
+def test_voxels_are_not_shared_among_lines_of_sight_for_small_particles(for_small_volumes):
+    camera = IdealCamera("one", rotation(33))
+    stored = StoredGrid.for_cameras(GRID, [camera])
+    assert choose_planes(stored, camera, "profiles", particle_voxel=0.6) is None
 
 
 def test_small_volumes_and_cameras_that_see_nothing_store_all_voxels():
