@@ -48,6 +48,9 @@ VOXEL_ERROR, WORST_VOXEL_ERROR = 0.015, 0.03
 ones: for points and particles of unknown size."""
 PARTICLE_ERROR, WORST_PARTICLE_ERROR = 0.03, 0.04
 """The same of the images of particles, where these are large enough."""
+FARTHEST_ASIDE = 1.0
+"""Rows or columns by which a line of sight may leave its nodes from one plane to the next. From 0.6 on images no longer
+agree."""
 LEAST_GAIN = 1.5
 """Least ratio of voxels to nodes with which nodes are used."""
 NEAR_LATTICE = 0.02
@@ -251,7 +254,8 @@ def choose_planes(
     seen = np.unique(np.concatenate([draw_seen(stored, camera, seed) for seed in SEEDS]))
     if not len(seen):
         return None
-    ways = _ways_to_share(_slopes(stored, camera)[1])
+    slopes = _slopes(stored, camera)[1]
+    aside, ways = np.abs(slopes - np.rint(slopes)), _ways_to_share(slopes)
     if particle_voxel >= PARTICLE_VOXEL:
         kind, largest, worst = "particles", PARTICLE_ERROR, WORST_PARTICLE_ERROR
         sample = Sample(camera, *blobs_about(stored, seen[:: len(seen) // PARTICLES + 1]), form, cuts)
@@ -260,7 +264,8 @@ def choose_planes(
         sample = Sample(camera, seen[:, None], np.ones((len(seen), 1)), form, cuts)
     own, chosen = sample.own_images(stored), None
     for lines in ways:
-        for distance in DISTANCES:
+        kept = aside[~np.array(lines)].max(initial=0)
+        for distance in (one for one in DISTANCES if one * kept <= FARTHEST_ASIDE):
             nodes = NodeGrid.of(stored, camera, distance, lines=lines)
             if LEAST_GAIN * nodes.size > stored.grid.size or (chosen is not None and nodes.size >= chosen.size):
                 break
@@ -318,7 +323,9 @@ class Sample:
     def images(self, centres_mm: np.ndarray, voxel_mm: float, light: sparse.csr_array) -> sparse.csr_array:
         """Return sums of the images of cubes at some places with the light (group, cube), shape (group, pixel)."""
         models = ray_models(self.camera, centres_mm, voxel_mm)
-        return light @ blocks_of(PackedCamera.of(self.camera), [models], self.form, cuts=self.cuts).pixel_weights()
+        found = light @ blocks_of(PackedCamera.of(self.camera), [models], self.form, cuts=self.cuts).pixel_weights()
+        found.sum_duplicates()  # sorts the pixels, without which a difference takes time for each pixel of the sensor
+        return found
 
     def own_images(self, stored: StoredGrid) -> list[sparse.csr_array]:
         """Return the images of each part of the groups by the voxels' own footprints, shapes (group, pixel)."""
