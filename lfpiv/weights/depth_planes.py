@@ -226,7 +226,7 @@ def line_of_sight(camera: CalibratedCamera, point_mm: np.ndarray) -> np.ndarray:
 
 
 def choose_planes(
-    stored: StoredGrid, camera: CalibratedCamera, form: str, cuts: Cuts = WHOLE, *, particle_voxel: float = 0.0
+    stored: StoredGrid, camera: CalibratedCamera, form: str, cuts: Cuts = WHOLE, particle_voxel: float = 0.0
 ) -> NodeGrid | None:
     """Choose the nodes of a camera: the fewest whose images are accurate enough.
 
@@ -272,8 +272,8 @@ def choose_planes(
             errors = interpolation_errors(nodes, sample, own)
             error = float(np.sqrt(np.mean(np.square(errors))))
             if error <= largest and max(errors) <= worst:
-                text = "%s: weights of %d nodes for %d voxels, planes %d layers apart: images of %s differ by %.1f %%"
-                log.info(text, camera.name, nodes.size, stored.grid.size, distance, kind, 100 * error)
+                text = "%s: planes %d layers apart, shared along (rows, columns) %s: images of %s differ by %.1f %%"
+                log.debug(text, camera.name, distance, lines, kind, 100 * error)
                 chosen = nodes
                 break
     return chosen

@@ -391,9 +391,7 @@ def build_weights(
             choices[name] = choose_uncounted(stored, camera, form)
         chosen = choices[name]
         allow = memory_check(name, grid, chosen, limit_bytes - used)
-        nodes = None
-        if planes:
-            nodes = choose_planes(stored, camera, chosen.form, chosen.cuts, particle_voxel=particle_voxel)
+        nodes = choose_planes(stored, camera, chosen.form, chosen.cuts, particle_voxel) if planes else None
         blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
         projectors[name] = share.projector(name, blocks, nodes.shares if nodes else None)
     if finished is not None:
