@@ -111,7 +111,8 @@ class PreparedInstant:
                 return self.equations.compare(volume).divergence
             self.equations.begin()
             for subset in sample:
-                self.equations.compare_subset(subset.camera, subset.lenses, volume)
+                for camera, ray_set in subset.parts:
+                    self.equations.compare_part(camera, ray_set, volume)
             return self.equations.measured().divergence
 
     def _given(self, first: np.ndarray) -> DeviceArray:

@@ -11,12 +11,12 @@ from functools import cached_property
 
 import numpy as np
 
-from lfpiv.reconstruction.ordered_subsets import Partition, Subset, step_sizes, subsets_of
+from lfpiv.reconstruction.ordered_subsets import CONFLICT, JOINT_CONFLICT, Partition, Subset, step_sizes, subsets_of
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve, Smoothing
 from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
 from lfpiv.weights.operator import Weights
-from lfpiv_kernels.reconstruction.projector import ALL, ODD
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.transfer import DeviceArray, to_device
 
 LEAST_COLUMN_SUM = 1e-6
@@ -71,7 +71,7 @@ class Normalisation:
     @property
     def sample(self) -> tuple[Subset, ...]:
         """Subsets by which guesses are compared: of each camera one. None without subsets."""
-        return tuple(subset for subset in self._subsets if subset.lenses != ODD) if self.has_subsets else ()
+        return tuple(subset for subset in self._subsets if subset.parts[0][1] != 1) if self.has_subsets else ()
 
     @cached_property
     def gains(self) -> dict[str, DeviceArray]:
@@ -116,27 +116,32 @@ class Normalisation:
     def partitions(self) -> tuple[Partition, ...]:
         """The subsets to begin with, and the whole cameras that may follow if "auto" began with halves."""
         cameras = len(self._weights.cameras)
+        joint = len(self._subsets[0].parts) > 1 or len(self._subsets) > 2 * cameras
+        if joint:
+            return (self._partition(self._subsets, JOINT_CONFLICT),)
         may_grow = self._settings.subsets == AUTO and len(self._subsets) > cameras
-        in_turn = (self._subsets, subsets_of(cameras, False)) if may_grow else (self._subsets,)
-        return tuple(self._partition(subsets) for subsets in in_turn)
+        in_turn = (self._subsets, subsets_of(cameras)) if may_grow else (self._subsets,)
+        return tuple(self._partition(subsets, CONFLICT if may_grow else 0.0) for subsets in in_turn)
 
-    def _partition(self, subsets: tuple[Subset, ...]) -> Partition:
+    def _partition(self, subsets: tuple[Subset, ...], conflict: float) -> Partition:
         """Return the subsets with the step of each."""
         sizes = step_sizes(self._column_sum, [self._subset_sum(one) for one in subsets], self._seen)
         mu = np.float32(self._settings.relaxation)
         on_device = [to_device(mu * size, float) for size in sizes]
         plain = tuple(SmartStep(size, self.sieve) for size in on_device)
         if self.sieve.sigma_voxel == 0:
-            return Partition(subsets, plain)
-        return Partition(subsets, tuple(SharpenedStep(size, self.sieve) for size in on_device), plain)
+            return Partition(subsets, plain, conflict=conflict)
+        sharpened = tuple(SharpenedStep(size, self.sieve) for size in on_device)
+        return Partition(subsets, sharpened, plain, conflict)
 
     def _subset_sum(self, subset: Subset) -> np.ndarray:
         """Return the sum of each voxel's weights over the pixels of a subset."""
-        if subset.lenses == ALL:
-            own = self._weights.camera_sums[subset.camera]
-        else:
-            own = self._weights.sums_of_lenses(list(self._weights.cameras)[subset.camera], subset.lenses)
-        total: np.ndarray = self._camera_gains[subset.camera] * own
+        names = list(self._weights.cameras)
+        total: np.ndarray = sum(
+            self._camera_gains[camera]
+            * (self._weights.camera_sums[camera] if part == ALL else self._weights.sums_of_set(names[camera], part))
+            for camera, part in subset.parts
+        )
         return total
 
     def _quotient(self, numerator: float, denominator: np.ndarray, where: np.ndarray) -> DeviceArray:

@@ -42,7 +42,7 @@ from lfpiv.reconstruction.resting_voxels import RestingVoxels, leave_out
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State
 from lfpiv.reconstruction.steps import Step
-from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.voxels import multiply
 from lfpiv_kernels.transfer import DeviceArray, duplicate, zeros
@@ -56,17 +56,17 @@ WHOLE_PASSES = 2
 SHORTENING = 0.05
 """Steps of epoch k are 1 / (1 + k SHORTENING) as long as those of the first one."""
 CONFLICT = 0.5
+JOINT_CONFLICT = 0.1
+"""The same for subsets of all cameras, after which the passes over all rays follow."""
 """Agreement of subsets below which the next epochs take larger ones: half that of independent exponents."""
 
 
 @dataclass(frozen=True)
 class Subset:
-    """Rays of one camera."""
+    """Rays that make a step."""
 
-    camera: int
-    """Index of the camera."""
-    lenses: int
-    """Lenses through which the rays go, ``projector.EVEN``, ``ODD`` or ``ALL``."""
+    parts: tuple[tuple[int, int], ...]
+    """Index of a camera and number of a set of its rays, or ``ALL``, for each camera that takes part."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,8 @@ class Partition:
     """Step of each subset; all are of one kind."""
     safer: tuple[Step, ...] = ()
     """Step of each subset after the misfit of an epoch rose; empty for none."""
+    conflict: float = 0.0
+    """Agreement of the subsets below which they are left."""
 
 
 @dataclass(frozen=True)
@@ -122,10 +124,17 @@ class Agreement:
         return square / squares if squares > 0 else 1.0
 
 
-def subsets_of(cameras: int, halves: bool) -> tuple[Subset, ...]:
-    """Return the subsets in their order: whole cameras, or every other lens of each camera."""
-    lenses = (EVEN, ODD) if halves else (ALL,)
-    return tuple(Subset(camera, part) for camera in range(cameras) for part in lenses)
+def subsets_of(cameras: int, sets: int = 1) -> tuple[Subset, ...]:
+    """Return the subsets in their order: each set of the rays of each camera; one set is the whole camera."""
+    numbers = range(sets) if sets > 1 else (ALL,)
+    return tuple(Subset(((camera, number),)) for camera in range(cameras) for number in numbers)
+
+
+def joint_subsets(cameras: int, sets: int) -> tuple[Subset, ...]:
+    """Return the subsets in their order: one set of the rays of all cameras each, far ones after each other."""
+    bits = max(sets - 1, 1).bit_length()
+    order = (int(f"{number:0{bits}b}"[::-1], 2) for number in range(1 << bits))
+    return tuple(Subset(tuple((camera, number) for camera in range(cameras))) for number in order if number < sets)
 
 
 def step_sizes(column_sum: np.ndarray, subset_sums: Sequence[np.ndarray], lit: np.ndarray) -> list[np.ndarray]:
@@ -184,14 +193,13 @@ def iterate_epochs(
             over = steps[0].over(active)
         length = float(np.float32(1 / (1 + SHORTENING * epoch)))
         start = duplicate(coefficients)
-        agreement = Agreement(start) if following else None
+        agreement = Agreement(start) if partition.conflict > 0 else None
         equations.begin()
         for subset, step in zip(partition.subsets, steps, strict=True):
             volume = sieve(coefficients)
             if active is not None:
                 volume = multiply(volume, active)
-            equations.compare_subset(subset.camera, subset.lenses, volume)
-            exponent = equations.back_project_subset(subset.camera, subset.lenses, volume)
+            exponent = equations.exponent_of(subset.parts, volume)
             if agreement is not None:
                 agreement.add(exponent)
             coefficients, after = step(coefficients, exponent, momentum, length=length, over=over, in_place=True)
@@ -213,8 +221,8 @@ def iterate_epochs(
             continue
         if not rose:
             before = misfit.divergence
-        if rose or (agreement is not None and agreement.measured() < CONFLICT):
+        if rose or (agreement is not None and agreement.measured() < partition.conflict):
             log.debug("epoch %d: %s, larger subsets follow", epoch + 1, "misfit rises" if rose else "subsets conflict")
-            partition, before = following.pop(0), math.inf
-            if len(partition.subsets) == 1:
+            if not following or len(following[0].subsets) == 1:
                 return
+            partition, before = following.pop(0), math.inf

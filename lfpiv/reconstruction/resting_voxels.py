@@ -86,7 +86,7 @@ class RestingVoxels:
     def __init__(self, equations: ImageEquations):
         self._equations = equations
         self._active: DeviceArray | None = None
-        self._possible = all(camera.projector.planes is None for camera in equations.cameras)
+        self._possible = all(camera.projector.rests for camera in equations.cameras)
 
     def active_in(self, epoch: int, volume: DeviceArray) -> DeviceArray | None:
         """Choose the voxels that take part in the next epoch.

@@ -16,7 +16,7 @@ import numpy as np
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.steps import Step
-from lfpiv_kernels.reconstruction.projector import Projector
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
 from lfpiv_kernels.transfer import DeviceArray, zeros
@@ -42,7 +42,7 @@ class CameraEquation:
     """Counts that a pixel records per unit of light, shape (pixel,), float32; or on the device, of lit pixels only."""
     floor: float
     """Noise floor b [counts]."""
-    projector: Projector
+    projector: RayProjector
     """The weights W."""
 
 
@@ -92,25 +92,27 @@ class ImageEquations:
             comparison.release()
 
     def begin(self) -> None:
-        """Begin to sum the misfits of `compare_subset` anew."""
+        """Begin to sum the misfits of `compare_part` anew."""
         self._totals.clear()
 
-    def compare_subset(self, camera: int, lenses: int, volume: DeviceArray) -> None:
-        """Do as `compare` for the rays of one camera through some lenses only, see ``projector.ALL``.
+    def compare_part(self, camera: int, ray_set: int, volume: DeviceArray) -> None:
+        """Do as `compare` for one set of the rays of one camera. The misfit is added to those since `begin`."""
+        self.comparisons[camera].compare(volume, self._totals, ray_set)
 
-        The misfit is added to that of the subsets before, since `begin`.
+    def exponent_of(self, parts: Sequence[tuple[int, int]], volume: DeviceArray) -> DeviceArray:
+        """Compare a volume with sets of rays, each given by its camera and number, and back-project the logarithms.
+
+        The misfits are added to those since `begin`. The exponent is 0 where `volume` is 0.
         """
-        self.comparisons[camera].compare(volume, self._totals, lenses)
+        exponent = zeros(volume.size)
+        for camera, ray_set in parts:
+            self.compare_part(camera, ray_set, volume)
+            self.cameras[camera].projector.gather(exponent, active=volume, ray_set=ray_set)
+        return exponent
 
     def measured(self) -> Misfit:
         """Return the misfit that was summed since `begin`."""
         return Misfit(*self._totals.read())
-
-    def back_project_subset(self, camera: int, lenses: int, volume: DeviceArray) -> DeviceArray:
-        """Do as `back_project` for the rays of one camera through some lenses only."""
-        exponent = zeros(volume.size)
-        self.cameras[camera].projector.gather(exponent, active=volume, lenses=lenses)
-        return exponent
 
 
 @dataclass(frozen=True)

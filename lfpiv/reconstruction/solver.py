@@ -12,7 +12,7 @@ from lfpiv.geometry.volume import checked_mask
 from lfpiv.reconstruction.instant import PreparedInstant
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
 from lfpiv.reconstruction.normalisation import Normalisation
-from lfpiv.reconstruction.ordered_subsets import Subset, subsets_of
+from lfpiv.reconstruction.ordered_subsets import Subset, joint_subsets, subsets_of
 from lfpiv.reconstruction.particle_size import UNLIKE, ParticleSizer
 from lfpiv.reconstruction.recording import checked_images, record
 from lfpiv.reconstruction.result import Reconstruction
@@ -20,7 +20,7 @@ from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
 from lfpiv.weights.operator import Weights
-from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
 
 FEW_CAMERAS = 2
 """Number of cameras up to which "auto" cuts the rays of each camera into two subsets."""
@@ -119,6 +119,10 @@ class SmartSolver:
             If the rays cannot be cut into the number of subsets that the settings ask for.
         """
         cameras, wanted = len(self.weights.cameras), self.settings.subsets
+        projectors = [self.weights.projector(name) for name in self.weights.cameras]
+        fewest = min(projector.ray_sets for projector in projectors)
+        if fewest > 2 and self.settings.allows_subsets and wanted == AUTO:
+            return joint_subsets(cameras, fewest)
         halves = all(self._can_halve(name) for name in self.weights.cameras)
         possible = sorted({1, cameras, 2 * cameras if halves else 1})
         if isinstance(wanted, str):
@@ -127,14 +131,14 @@ class SmartSolver:
         if wanted not in possible:
             numbers = ", ".join(map(str, possible))
             raise ValueError(f"subsets: with these cameras expected one of {numbers}, got {wanted}.")
-        return subsets_of(cameras, wanted == 2 * cameras) if wanted > 1 else subsets_of(1, False)
+        return subsets_of(cameras, 2 if wanted == 2 * cameras else 1) if wanted > 1 else subsets_of(1)
 
     def _can_halve(self, name: str) -> bool:
         """Return whether most of a camera's pixels see only even or only odd lenses."""
         projector = self.weights.projector(name)
-        if projector.lens_sets == 1:
+        if projector.ray_sets != 2:
             return False
-        even, odd, every = (len(projector.see_only(lenses)) for lenses in (EVEN, ODD, ALL))
+        even, odd, every = (len(projector.see_only(part)) for part in (0, 1, ALL))
         return min(even, odd) > 0 and even + odd >= LEAST_ALONE * every
 
     def _sieve_voxel(self, images: Mapping[str, np.ndarray]) -> float:

@@ -96,7 +96,7 @@ class Weights(Shown):
         self._choices = dict(choices or {})
         self._counted = dict(counted or {})
         self._camera_sums = camera_sums
-        self._lens_sums: dict[tuple[str, int], np.ndarray] = {}
+        self._set_sums: dict[tuple[str, int], np.ndarray] = {}
         self.volume = stored.grid
         """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
         self.derived: dict[tuple[Hashable, ...], Any] = {}
@@ -186,7 +186,7 @@ class Weights(Shown):
     @property
     def forms(self) -> dict[str, str]:
         """Camera name -> form in which its weights are stored."""
-        return {name: projector.blocks.form for name, projector in self._projectors.items()}
+        return {name: projector.form for name, projector in self._projectors.items()}
 
     @property
     def cuts(self) -> dict[str, Cuts]:
@@ -216,29 +216,29 @@ class Weights(Shown):
             warn_seen_by_one(self.views[self.volume.nearest_in(self.grid)], self.volume, len(self.cameras))
         return self._camera_sums
 
-    def sums_of_lenses(self, name: str, lenses: int) -> np.ndarray:
-        """Return the sum of each voxel's weights over one camera's pixels that see some lenses only.
+    def sums_of_set(self, name: str, ray_set: int) -> np.ndarray:
+        """Return the sum of each voxel's weights over one camera's pixels that see one set of rays only.
 
         Parameters
         ----------
         name : str
             The camera.
-        lenses : int
-            ``projector.EVEN``, ``ODD`` or ``ALL``.
+        ray_set : int
+            Number of the set.
 
         Returns
         -------
         ndarray, shape (voxel,), float32
             In stored order.
         """
-        if (name, lenses) not in self._lens_sums:
+        if (name, ray_set) not in self._set_sums:
             projector, gain = self.projector(name), self.gain(name)
-            pixels = projector.see_only(lenses)
+            pixels = projector.see_only(ray_set)
             image, sums = np.zeros_like(gain), np.zeros(self.grid.size, np.float32)
             image[pixels] = gain[pixels]
-            projector.back_project(image, sums, lenses)
-            self._lens_sums[name, lenses] = sums
-        return self._lens_sums[name, lenses]
+            projector.back_project(image, sums, ray_set)
+            self._set_sums[name, ray_set] = sums
+        return self._set_sums[name, ray_set]
 
     @property
     def column_sum(self) -> np.ndarray:
@@ -298,7 +298,7 @@ class Weights(Shown):
     @property
     def memory_bytes(self) -> int:
         """Memory of the stored weights [byte]."""
-        return sum(projector.blocks.nbytes for projector in self._projectors.values())
+        return sum(projector.nbytes for projector in self._projectors.values())
 
     def counted(self, name: str) -> CountedVoxels:
         """Return a few voxels of a camera, counted when first needed."""
@@ -378,7 +378,7 @@ def build_weights(
     projectors, choices, counted = dict[str, Projector](), dict[str, Choice](), dict[str, CountedVoxels]()
     whole = progress or (lambda fraction: None)
     for number, (name, camera) in enumerate(cameras.items()):
-        used = sum(projector.blocks.nbytes for projector in projectors.values())
+        used = sum(projector.nbytes for projector in projectors.values())
         step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
         if method == "count":
             allow = memory_check(name, grid, Choice(form="pixels"), limit_bytes - used)
@@ -391,6 +391,14 @@ def build_weights(
             choices[name] = choose_uncounted(stored, camera, form)
         chosen = choices[name]
         allow = memory_check(name, grid, chosen, limit_bytes - used)
+        import os
+        if chosen.form == "profiles" and os.environ.get("SEP"):
+            from lfpiv.weights.separable import separable_weights
+            from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
+            w = separable_weights(stored, camera, step, allow)
+            radius = camera.optics.pupil_radius_mm * camera.optics.sensor_per_pupil / camera.optics.pixel_mm
+            projectors[name] = SeparableProjector(w, min(16, int(2 * radius)))
+            continue
         nodes = choose_planes(stored, camera, chosen.form, chosen.cuts, particle_voxel) if planes else None
         blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
         projectors[name] = share.projector(name, blocks, nodes.shares if nodes else None)

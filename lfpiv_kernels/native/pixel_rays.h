@@ -84,15 +84,10 @@ struct PlacedRays {
     const int* starts;
     const int* pixel;  // per ray
     const float* share;
-    int size;       // pixels of the sensor
-    int lens_rays;  // in the microimage of one lens
-    int lenses;     // in a row of lenses
-
-    /// Return 1 for an even lens's ray, 2 for an odd one's: neighbours in a row or column of lenses differ.
-    LFPIV_INLINE int lens_bit(int ray) const {
-        const int lens = ray / lens_rays, row = lens / lenses;
-        return 1 + ((lens - row * lenses + row / LAYERS) & 1);
-    }
+    int size;                     // pixels of the sensor
+    const unsigned char* set_of;  // set of each group of rays
+    int group;                    // rays of a group
+    int sets;
 
     /// Call lit(place, ray) for rays with light that a pixel sees, dark(place) for those that none sees.
     template <class Lit, class Dark>
@@ -115,24 +110,31 @@ struct PlacedRays {
 template <class Placed>
 LFPIV_INLINE PlacedRays placed_rays(const Placed& placed) {
     return {placed.light.data, placed.parts.data, (int)placed.parts.shape[0], placed.starts.data, placed.pixel.data,
-            placed.share.data, placed.size,       placed.lens_rays,           placed.lenses};
+            placed.share.data, placed.size,       placed.set_of.data,         placed.group,       placed.sets};
 }
 
-/// Number the pixels that see light, and count their rays: those of even lenses, those of odd lenses, then those that
-/// see both. Within each they are in the order of their first rays. `number_out` and `first_out` must hold zeros.
+/// Sets of rays at most.
+constexpr int MOST_SETS = 64;
+
+/// Number the pixels that see light, and count their rays: those of the first set, those of the second one and so on,
+/// then those that see several. Within each they are in the order of their first rays. `number_out` and `first_out`
+/// must hold zeros. Write where each set's pixels end, then the numbers of pixels, rays and dark places.
 LFPIV_INLINE void number_pixels(const PlacedRays& placed, int* number_out, int* pixel_out, int* first_out,
                                 int* count_out) {
-    int rays = 0, darks = 0, next[5] = {};
+    const int several = placed.sets + 1;  // sets are counted from 1 on
+    int rays = 0, darks = 0, next[MOST_SETS + 3] = {};
     placed.for_places(
         [&](int, int ray) {
-            int& lenses = number_out[placed.pixel[ray]];
-            lenses = -(-lenses | placed.lens_bit(ray));
+            int& seen = number_out[placed.pixel[ray]];
+            const int set = 1 + placed.set_of[ray / placed.group];
+            seen = seen == 0 || seen == -set ? -set : -several;
         },
         [&](int) { ++darks; });
     for (int pixel = 0; pixel < placed.size; ++pixel) ++next[1 - number_out[pixel]];
     next[1] = 0;
-    for (int lenses = 2; lenses < 5; ++lenses) next[lenses] += next[lenses - 1];
-    const int even = next[2], odd = next[3], pixels = next[4];
+    for (int set = 1; set <= several; ++set) next[set + 1] += next[set];
+    for (int set = 0; set < placed.sets; ++set) count_out[set] = next[set + 2];
+    const int pixels = next[several + 1];
     placed.for_places(
         [&](int, int ray) {
             int& number = number_out[placed.pixel[ray]];
@@ -146,7 +148,7 @@ LFPIV_INLINE void number_pixels(const PlacedRays& placed, int* number_out, int* 
         },
         [&](int) {});
     for (int k = 2; k < pixels + 2; ++k) first_out[k] += first_out[k - 1];
-    count_out[0] = even, count_out[1] = odd, count_out[2] = pixels, count_out[3] = rays, count_out[4] = darks;
+    count_out[placed.sets] = pixels, count_out[placed.sets + 1] = rays, count_out[placed.sets + 2] = darks;
 }
 
 /// Put each pixel's rays side by side. Moves `first_out[n]` from where the rays of pixel n begin to where they end.

@@ -31,7 +31,7 @@ struct VoxelBlocks {
 };
 
 /// Lenses whose blocks take part.
-enum LensSet { EVEN_LENSES = 0, ODD_LENSES = 1, ALL_LENSES = 2 };
+enum LensSet { ALL_LENSES = -1, EVEN_LENSES = 0, ODD_LENSES = 1 };
 
 /// Return the blocks of a voxel from the device arrays of `Matrix`, see ``projector.py``.
 template <class Matrix>

@@ -131,7 +131,7 @@ LFPIV_INLINE float sum_blocks(const Matrix& matrix, int begin, int end, Value va
 template <class Matrix>
 LFPIV_INLINE void blocks_under(const Matrix& matrix, int voxel, int lenses, int& begin, int& end) {
     begin = matrix.first_block.data[voxel], end = matrix.first_block.data[voxel + 1];
-    if (lenses == 2) return;
+    if (lenses < 0) return;
     const int even = begin + matrix.even_blocks.data[voxel];
     (lenses == 0 ? end : begin) = even;
 }
@@ -182,7 +182,7 @@ LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const
     const TileLight light{light_of_warp};
 #endif
     const int head = matrix.tile_size.data[tile], rows = head & 0xff, columns = (head >> 8) & 0xff, set = head >> 16;
-    const bool lit = lenses == 2 || lenses == set;
+    const bool lit = lenses < 0 || lenses == set;
     if (matrix.adds && !lit) return;  // the whole warp
     float* const out = rays_out + matrix.tile_ray.data[tile];
     for_lanes([&](int lane) {

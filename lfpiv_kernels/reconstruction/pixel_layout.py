@@ -7,8 +7,8 @@ import warp as wp
 class PixelRays:
     """The rays of every pixel.
 
-    Pixels under even lenses come first, then those under odd lenses, then those that see an even and an odd one. Within
-    each they are in the order in which their first rays lie in memory.
+    Pixels that see rays of the first set only come first, then those of the second set and so on, then those that see
+    several. Within each they are in the order in which their first rays lie in memory.
     """
 
     pixel: wp.array(dtype=int)

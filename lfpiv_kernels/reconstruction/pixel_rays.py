@@ -6,7 +6,10 @@ The rays of a microimage are neighbours in memory. The loops are C++, see ``pixe
 ``pixel_rays_gpu``. Twin: ``reference.dense``.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import warp as wp
@@ -16,10 +19,14 @@ from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction import pixel_rays_gpu
 from lfpiv_kernels.reconstruction.pixel_layout import PixelRays
 from lfpiv_kernels.transfer import to_device
-from lfpiv_kernels.weights.microimages import Microimages
+from lfpiv_kernels.weights.microimages import LAYERS, Microimages
 
 wp.set_module_options(native.options("pixel_rays.h"))
 
+ALL = -1
+"""In place of the number of a set: the rays of all sets."""
+MOST_SETS: int = native.constant("pixel_rays.h", "MOST_SETS")
+"""Sets of rays at most."""
 RUN: int = native.constant("pixel_rays.h", "RUN")
 """Pixels that a thread goes through."""
 
@@ -40,10 +47,11 @@ class PlacedRays:
     """Fraction of the pixel's cell that each ray stands for."""
     size: int
     """Pixels of the sensor."""
-    lens_rays: int
-    """Rays of a lens."""
-    lenses: int
-    """Lenses in a row."""
+    set_of: wp.array(dtype=wp.uint8)
+    """Set of each group of rays."""
+    group: int
+    """Rays of a group."""
+    sets: int
 
 
 @wp.func_native("lfpiv::collect(lfpiv::pixel_run(map, run), rays.data, image_out.data);")
@@ -113,7 +121,7 @@ def _number_pixels(
     number_out: wp.array(dtype=int),  # (sensor pixel,): 1, 2, ... in their order; 0 without light
     pixel_out: wp.array(dtype=int),  # sensor pixel of each number
     first_out: wp.array(dtype=int),  # (sensor pixel + 2,): where the rays of each number begin
-    count_out: wp.array(dtype=int),  # ends of even and odd lenses' pixels and of all; rays, dark places
+    count_out: wp.array(dtype=int),  # ends of the pixels of each set and of all; rays, dark places
 ):
     _number(placed, number_out, pixel_out, first_out, count_out)
 
@@ -132,12 +140,47 @@ def _sort_rays(
     _sort(placed, number, first_out, place_out, share_out, dark_out)
 
 
+class Rays(Protocol):
+    """All rays of a camera."""
+
+    pixel: np.ndarray
+    """Sensor pixel of each ray, shape (ray,), int32: -1 outside the sensor."""
+    share: np.ndarray
+    """Fraction of the pixel's cell that each ray stands for, shape (ray,), float32."""
+    sensor_shape: tuple[int, int]
+    """Rows and columns of the sensor [pixel]."""
+
+
+@dataclass(frozen=True)
+class RaySets:
+    """Rays divided into sets that can be taken alone."""
+
+    of_group: np.ndarray
+    """Set of each group of rays, from 0 on, shape (group,), uint8."""
+    group: int
+    """Number of rays of a group; they are neighbours in memory."""
+    count: int
+    """Number of sets, at most `MOST_SETS`."""
+
+    @classmethod
+    def single(cls, rays: int) -> "RaySets":
+        """Return one set of all rays."""
+        return cls(np.zeros(1, np.uint8), max(rays, 1), 1)
+
+    @classmethod
+    def of_lenses(cls, microimages: Microimages) -> "RaySets":
+        """Return the rays of even and of odd lenses. Neighbours in a row or column of lenses differ."""
+        group, lenses = microimages.edge**2, microimages.lenses
+        row, lens = np.divmod(np.arange(-(-microimages.size // group)), lenses)
+        return cls(((lens + row // LAYERS) % 2).astype(np.uint8), group, 2)
+
+
 class RayMap:
     """The linear map from rays to pixels and its adjoint on the running device.
 
     Parameters
     ----------
-    microimages : Microimages
+    camera_rays : Rays
         All rays of the camera.
     light : ndarray, shape (place,), float32
         Light of the rays where they lie in memory, part after part. It is not zero where voxels light a ray.
@@ -145,35 +188,40 @@ class RayMap:
         Where each part's rays begin, and the end of the last.
     starts : sequence of int
         The first ray of each part. A ray may lie in several parts; their light adds up.
-    two_sets : bool
-        Whether rays belong to even or odd lenses. Otherwise all count as those of even lenses.
+    sets : RaySets
+        Sets of rays.
+    darken : bool
+        Whether `spread` writes zero on rays that voxels light but no pixel of the set sees.
     places : callable, optional
         Where rays lie in the device's memory by their place in `light`. Default: at the same place.
     """
 
     def __init__(
         self,
-        microimages: Microimages,
+        camera_rays: Rays,
         light: np.ndarray,
         parts: Sequence[int],
         starts: Sequence[int],
         *,
-        two_sets: bool,
+        sets: RaySets,
+        darken: bool = True,
         places: Callable[[np.ndarray], np.ndarray] | None = None,
     ):
-        size = int(np.prod(microimages.sensor_shape))
+        size = int(np.prod(camera_rays.sensor_shape))
         placed = PlacedRays()
-        placed.light, placed.pixel, placed.share = map(_on_cpu, (light, microimages.pixel, microimages.share))
+        placed.light, placed.pixel, placed.share = map(_on_cpu, (light, camera_rays.pixel, camera_rays.share))
         placed.parts, placed.starts = (_on_cpu(np.array(ends, np.int32)) for ends in (parts, starts))
-        placed.size, placed.lenses = size, microimages.lenses
-        placed.lens_rays = microimages.edge**2 if two_sets else max(microimages.size, 1)
-        number, seen, first, count = (np.zeros(length, np.int32) for length in (size, size, size + 2, 5))
+        placed.size, placed.sets = size, sets.count
+        placed.set_of, placed.group = _on_cpu(sets.of_group), sets.group
+        number, seen, first, count = (np.zeros(length, np.int32) for length in (size, size, size + 2, sets.count + 3))
         _run_once(_number_pixels, [placed], [number, seen, first, count])
-        even, odd, pixels, lit, darks = (int(n) for n in count)
+        *ends, pixels, lit, darks = count.tolist()
         place, share, dark = np.empty(lit, np.int32), np.empty(lit, np.float32), np.empty(darks, np.int32)
         _run_once(_sort_rays, [placed, _on_cpu(number)], [first, place, share, dark])
         if places is not None:
             place, dark = places(place), places(dark)
+        if not darken:
+            dark = dark[:0]
         self.pixel: np.ndarray = seen[:pixels].copy()
         """Sensor pixels that voxels light, in the order of `PixelRays`, shape (pixel,), int32."""
         arrays = {
@@ -186,8 +234,13 @@ class RayMap:
         on_device = {name: to_device(array) for name, array in arrays.items()}
         self.rays = _pixels(on_device, 0, pixels, pixels)
         """The rays of all pixels."""
-        self.of_lenses = _pixels(on_device, 0, even, odd), _pixels(on_device, even, odd, odd)
-        """The rays of the pixels that see even lenses only, and of those that see odd ones only."""
+        aside = ends[-1] if darken else pixels
+        self.of_sets = tuple(_pixels(on_device, a, b, aside) for a, b in itertools.pairwise([0, *ends]))
+        """For each set the rays of the pixels that see this set only."""
+
+    def of(self, number: int) -> PixelRays:
+        """Return the rays of the pixels that see one set only, or of all pixels for `ALL`."""
+        return self.rays if number == ALL else self.of_sets[number]
 
     def spread(self, image: wp.array, rays_out: wp.array) -> None:
         """Write each pixel's light, times their shares, on its rays: the adjoint of `collect`."""

@@ -27,8 +27,8 @@ def _spread_pixels(map: PixelRays, warp: int, image: wp.array(dtype=float), rays
 
 
 @wp.func_native("""
-    lfpiv::compare_pixels(map, warp, image.data, gain.data, held.data, floor, rays_out.data, squares_out.data,
-                          divergence_out.data);
+    lfpiv::compare_pixels(map, warp, image.data, gain.data, held.data, floor, rays.data, rays_out.data,
+                          squares_out.data, divergence_out.data);
 """)
 def _compare_pixels(
     map: PixelRays,
@@ -37,6 +37,7 @@ def _compare_pixels(
     gain: wp.array(dtype=float),
     held: wp.array(dtype=float),
     floor: float,
+    rays: wp.array(dtype=float),
     rays_out: wp.array(dtype=float),
     squares_out: wp.array(dtype=wp.float64),
     divergence_out: wp.array(dtype=wp.float64),
@@ -77,6 +78,7 @@ def _compare(
     gain: wp.array(dtype=float),
     held: wp.array(dtype=float),
     floor: float,
+    rays: wp.array(dtype=float),
     first_warp: int,
     # out
     rays_out: wp.array(dtype=float),
@@ -84,7 +86,7 @@ def _compare(
     divergence_out: wp.array(dtype=wp.float64),
 ):
     warp, _lane = wp.tid()
-    _compare_pixels(map, first_warp + warp, image, gain, held, floor, rays_out, squares_out, divergence_out)
+    _compare_pixels(map, first_warp + warp, image, gain, held, floor, rays, rays_out, squares_out, divergence_out)
 
 
 def collect(map: PixelRays, rays: wp.array, image_out: wp.array) -> None:

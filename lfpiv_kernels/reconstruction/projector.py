@@ -7,10 +7,7 @@ scatters: every part of the voxels adds to rays of its own, which each pixel sum
 are C++, see ``projector.h``. A GPU has ``projector_gpu`` instead. Twin: ``reference.dense``.
 """
 
-import contextlib
 import itertools
-import threading
-from collections.abc import Iterator
 
 import numpy as np
 import warp as wp
@@ -19,19 +16,20 @@ from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch, load
 from lfpiv_kernels.reconstruction import voxels
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes, PlaneShares
-from lfpiv_kernels.reconstruction.pixel_rays import RayMap
+from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
 from lfpiv_kernels.reconstruction.projector_streamed import StreamedProjector, fits_whole
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.weight_blocks import Blocks
-from lfpiv_kernels.transfer import Given, Values, empty, overwrite, to_device, to_host, zeros
+from lfpiv_kernels.transfer import Given, Values, overwrite, to_device, to_host, zeros
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
 wp.set_module_options(native.options("projector.h"))
 
 
-EVEN, ODD, ALL = 0, 1, 2
-"""Lenses whose rays take part: i + j is even, odd, or either. Neighbours in a row or column of lenses differ."""
+EVEN, ODD = 0, 1
+"""Lenses whose rays take part: i + j is even or odd. Neighbours in a row or column of lenses differ."""
 
 
 @wp.struct
@@ -135,33 +133,27 @@ def _count_lit(
         value += _values(matrix, width, height)
 
 
-class Projector:
-    """The linear map of one camera's weights on the running device: voxels to sensor pixels, and back.
+class Projector(RayProjector):
+    """The map of weights stored as blocks. Its sets of rays are those of even and of odd lenses.
 
-    Light goes from voxels to rays (`scatter`) and from rays to pixels; back from pixels to rays and from rays to voxels
-    (`gather`). Each part of the voxels that a CPU launch takes has memory of its own for its rays. So no two threads
-    write the same ray, and results do not depend on the number of threads. The light of a ray that voxels of two parts
-    light lies in both parts and is added up.
+    Each part of the voxels that a CPU launch takes has memory of its own for its rays. So no two threads write the same
+    ray, and results do not depend on the number of threads. The light of a ray that voxels of two parts light lies in
+    both parts and is added up.
 
     With `planes` the blocks are those of nodes on planes across the line of sight: voxels -> nodes -> rays, and back.
 
     On a GPU whose `limit_bytes` do not hold all weights they are streamed, see `projector_streamed`. Results are equal.
-
-    `project` and `back_project` may be called from several threads, which take turns. A caller of `scatter` and
-    `gather` that needs the light on the rays in between calls them inside `reserved`.
-
-    Arrays in and out are float32, C-contiguous and flat. Those of the device, and all on the CPU, are used in place.
     """
 
     def __init__(self, blocks: Blocks, planes: PlaneShares | None = None, limit_bytes: int | None = None):
-        self._turn, self._reserved = threading.RLock(), False
-        self.blocks = blocks
-        self.planes = planes
+        super().__init__()
+        self.blocks, self.form, self.nbytes = blocks, blocks.form, blocks.nbytes
+        self.planes, self.rests = planes, planes is None
         """How voxels are shared among the nodes whose weights `blocks` are; None if these are the voxels."""
         self._planes = None if planes is None else DepthPlanes(planes)
         self._on_cpu = runtime.device().form == "cpu"
-        self.lens_sets = 1 if blocks.even_blocks is None else 2
-        """Sets of lenses that can be taken alone."""
+        self.ray_sets = 1 if blocks.even_blocks is None else 2
+        """Sets of rays that can be taken alone: those of even and of odd lenses."""
         self._tiled: TiledProjector | StreamedProjector | None = None
         if not self._on_cpu:
             whole = limit_bytes is None or fits_whole(blocks, limit_bytes)
@@ -221,38 +213,23 @@ class Projector:
     def _map_rays(self) -> RayMap:
         """Return the map between pixels and the rays that voxels light."""
         self._scatter(voxels.ones(len(self.blocks.scale)), ALL)
-        rays, two = self.blocks.microimages, self.lens_sets == 2
+        rays = self.blocks.microimages
+        sets = RaySets.of_lenses(rays) if self.ray_sets == 2 else RaySets.single(rays.size)
         if self._tiled is not None:
             light = self._tiled.in_order(to_host(self.rays))
-            return RayMap(rays, light, [0, rays.size], [0], two_sets=two, places=self._tiled.places)
+            return RayMap(rays, light, [0, rays.size], [0], sets=sets, places=self._tiled.places)
         starts = [start for start, _ in self._spans]
-        return RayMap(rays, to_host(self.rays), self._places, starts, two_sets=two)
+        return RayMap(rays, to_host(self.rays), self._places, starts, sets=sets)
 
-    @contextlib.contextmanager
-    def reserved(self) -> Iterator[None]:
-        """Reserve the rays for this thread. Other threads wait.
+    @property
+    def returned(self) -> wp.array:
+        """The light on the rays that `gather` reads: the memory of `rays`."""
+        return self.rays
 
-        Raises
-        ------
-        RuntimeError
-            If this thread has reserved them already: it would overwrite the light on them.
-        """
-        with self._turn:
-            if self._reserved:
-                raise RuntimeError(
-                    "weights: these are in use by a reconstruction of the same thread, whose `progress` cannot project "
-                    "with them. Do so before or after it, or build weights of its own."
-                )
-            self._reserved = True
-            try:
-                yield
-            finally:
-                self._reserved = False
-
-    def scatter(self, volume: Values, lenses: int = ALL) -> None:
+    def scatter(self, volume: Values, ray_set: int = ALL) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
         light = to_device(volume, float)
-        self._scatter(light if self._planes is None else self._planes.spread(light), lenses)
+        self._scatter(light if self._planes is None else self._planes.spread(light), ray_set)
 
     def _scatter(self, light: wp.array, lenses: int) -> None:
         """Do as `scatter` with the light of what `blocks` are of."""
@@ -268,19 +245,19 @@ class Projector:
 
         runtime.run_chunks(light.size, scatter_part)
 
-    def gather(self, out: Given, active: Values | None = None, lenses: int = ALL) -> Given:
+    def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
         """Add the weighted sum of the light on each voxel's rays of some lenses to `out`, shape (voxel,). Return `out`.
 
         Voxels whose `active`, shape (voxel,), float32, is zero do not change.
         """
         volume, mask = to_device(out, float), None if active is None else to_device(active, float)
         if self._planes is None:
-            self._gather(volume, mask, lenses)
+            self._gather(volume, mask, ray_set)
         else:
             if mask is not None and self._on_cpu and to_host(mask).all():
                 mask = None
             lit = None if mask is None else self._planes.spread(voxels.indicator(mask), absolute=True)
-            found = self._planes.collect(self._gather(zeros(self._planes.shares.size), lit, lenses))
+            found = self._planes.collect(self._gather(zeros(self._planes.shares.size), lit, ray_set))
             voxels.add(found, volume, mask)
         overwrite(out, volume)
         return out
@@ -298,30 +275,6 @@ class Projector:
 
         runtime.run_chunks(volume.size, gather_part)
         return volume
-
-    def project(self, volume: Values, out: Given, lenses: int = ALL) -> Given:
-        """Write the image of `volume`, shape (voxel,), through some lenses into `out`, shape (pixel,). Return `out`."""
-        with self.reserved():
-            self.scatter(volume, lenses)
-            image = out if isinstance(out, wp.array) else empty(out.size) if not self._on_cpu else to_device(out, float)
-            image.zero_()  # pixels that no voxel lights
-            self.map.collect(self.rays, image)
-        overwrite(out, image)
-        return out
-
-    def back_project(self, image: Values, out: Given, lenses: int = ALL) -> Given:
-        """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
-
-        Rays of other lenses than `lenses` do not count. Return `out`.
-        """
-        with self.reserved():
-            self.map.spread(to_device(image, float), self.rays)
-            return self.gather(out, lenses=lenses)
-
-    def see_only(self, lenses: int) -> np.ndarray:
-        """Return the sensor pixels that see light through some lenses and through no others, shape (pixel,), int32."""
-        rays = self.map.rays if lenses == ALL else self.map.of_lenses[lenses]
-        return self.map.pixel[rays.start : rays.end]
 
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur several times."""

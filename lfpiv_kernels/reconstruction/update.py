@@ -8,8 +8,8 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction import pixel_rays_gpu
-from lfpiv_kernels.reconstruction.pixel_rays import PixelRays
-from lfpiv_kernels.reconstruction.projector import ALL, Projector
+from lfpiv_kernels.reconstruction.pixel_rays import ALL, PixelRays
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of, sweep
 from lfpiv_kernels.transfer import Values, empty, to_device, zeros
@@ -26,8 +26,8 @@ SMALLEST = float(np.finfo(np.float32).tiny)
 
 @wp.func_native("""
     lfpiv::compare(
-        lfpiv::pixel_run(map, run), image.data, gain.data, held.data, floor, rays_out.data, squares_out.data,
-        divergence_out.data
+        lfpiv::pixel_run(map, run), image.data, gain.data, held.data, floor, rays.data, rays_out.data,
+        squares_out.data, divergence_out.data
     );
 """)
 def _compare_run(
@@ -37,6 +37,7 @@ def _compare_run(
     gain: wp.array(dtype=float),
     held: wp.array(dtype=float),
     floor: float,
+    rays: wp.array(dtype=float),
     rays_out: wp.array(dtype=float),
     squares_out: wp.array(dtype=wp.float64),
     divergence_out: wp.array(dtype=wp.float64),
@@ -51,13 +52,14 @@ def _compare(
     gain: wp.array(dtype=float),
     held: wp.array(dtype=float),
     floor: float,
+    rays: wp.array(dtype=float),
     first_run: int,
     # out
     rays_out: wp.array(dtype=float),
     squares_out: wp.array(dtype=wp.float64),  # per run
     divergence_out: wp.array(dtype=wp.float64),
 ):
-    _compare_run(first_run + wp.tid(), map, image, gain, held, floor, rays_out, squares_out, divergence_out)
+    _compare_run(first_run + wp.tid(), map, image, gain, held, floor, rays, rays_out, squares_out, divergence_out)
 
 
 @wp.func
@@ -184,7 +186,7 @@ class Comparison:
 
     Parameters
     ----------
-    projector : Projector
+    projector : RayProjector
         The camera's weights.
     image : ndarray, shape (pixel,), float32
         Counts >= 0, zero where the gain is zero.
@@ -194,7 +196,7 @@ class Comparison:
         Noise floor [counts].
     """
 
-    def __init__(self, projector: Projector, image: np.ndarray, gain: Values, floor: float):
+    def __init__(self, projector: RayProjector, image: np.ndarray, gain: Values, floor: float):
         self.projector = projector
         self.floor = float(floor)
         pixel = projector.map.pixel
@@ -220,19 +222,21 @@ class Comparison:
         """Forget the volumes that are held."""
         self._held.zero_()
 
-    def compare(self, volume: Values, totals: Totals, lenses: int = ALL) -> None:
+    def compare(self, volume: Values, totals: Totals, ray_set: int = ALL) -> None:
         """Project `volume`, shape (voxel,), and write gain * log((image + floor) / (projection + floor)) on the rays.
 
-        With `lenses` only the pixels that see no other lenses count. The other rays become dark. Add to the first two
+        Of a set of rays only the pixels that see no other set count. The other rays become dark. Add to the first two
         totals:
 
         - the sum of (image - projection)^2, the projection with gain [counts^2];
         - the sum of P log(P / I) - P + I with P the projection and I the image, both plus floor [counts].
         """
-        self.projector.scatter(volume, lenses)
-        rays = self.projector.map.rays if lenses == ALL else self.projector.map.of_lenses[lenses]
-        inputs = [rays, self.image, self.gain, self._held, self.floor]
-        outputs = [self.projector.rays, *self._sums]
+        projector = self.projector
+        projector.scatter(volume, ray_set)
+        projector.darken(ray_set)
+        rays = projector.map.of(ray_set)
+        inputs = [rays, self.image, self.gain, self._held, self.floor, projector.rays]
+        outputs = [projector.returned, *self._sums]
         if runtime.device().form == "gpu":
             size = pixel_rays_gpu.compare(inputs, outputs)
         else:

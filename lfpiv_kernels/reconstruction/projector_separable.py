@@ -1,0 +1,256 @@
+"""Warp: projection of voxels to pixels and its adjoint, with profiles that planes of voxels share.
+
+Light goes from the voxels of a plane down to its line, which one ray row of a strip of lenses sees, and from lines
+across to rays. Each ray is computed by one thread, and so is each plane of voxels in the adjoint: results do not depend
+on the number of threads. The loops are C++, see ``separable.h``. Twin: ``reference.separable``.
+"""
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.reconstruction import voxels
+from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
+from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, STRIP, SeparableWeights
+from lfpiv_kernels.transfer import Given, Values, empty, overwrite, to_device, to_host, zeros
+
+wp.set_module_options(native.options("separable.h", contract="fast"))
+
+SEGMENT = 4 * native.constant("separable.h", "LENS_BLOCK")
+"""Lenses in a row whose rays a thread computes."""
+PARTS_OF_LAUNCH = 3 * runtime.CHUNKS
+"""Parts of a launch: more than usual, because the work differs from strip to strip."""
+MOST_TAPS: int = native.constant("separable.h", "MOST_TAPS")
+
+
+@wp.struct
+class Separable:
+    """The arrays of `SeparableWeights` on the device, see ``SeparableArrays``."""
+
+    rows: int
+    planes: int
+    columns: int
+    row_stride: int
+    plane_stride: int
+    strips: int
+    lenses: int
+    pixels: int
+    ray_rows: int
+    blocks: int
+    down_first: wp.array(dtype=wp.int16)
+    down: wp.array(dtype=wp.uint8)
+    down_start: wp.array(dtype=wp.int64)
+    down_taps: wp.array(dtype=int)
+    down_scale: wp.array(dtype=float)
+    lens: wp.array(dtype=int)
+    lens_count: wp.array(dtype=int)
+    taps: wp.array(dtype=int)
+    first_start: wp.array(dtype=wp.int64)
+    level_start: wp.array(dtype=wp.int64)
+    first: wp.array(dtype=wp.int16)
+    level: wp.array(dtype=wp.uint8)
+    turn: wp.array(dtype=float)
+    middle: wp.array(dtype=float)
+    rim: wp.array(dtype=wp.int8)
+
+
+@wp.func_native("""
+    const auto weights = lfpiv::separable_arrays(separable);
+    const int segments = (weights.lenses + segment - 1) / segment, number = task % segments;
+    const int strip = task / segments % weights.strips, row = first_row + step * (task / segments / weights.strips);
+    const int end = lfpiv::min((number + 1) * segment, weights.lenses);
+    const int64_t lines = (int64_t)weights.planes * lfpiv::line_size(weights);
+    lfpiv::project_segment(weights, volume.data, row, strip, number * segment, end,
+                           lines_out.data + (slot < 0 ? 0 : slot) * lines, rays_out.data);
+""")
+def _project_segment(
+    separable: Separable,
+    volume: wp.array(dtype=float),
+    first_row: int,
+    step: int,
+    segment: int,
+    task: int,
+    slot: int,
+    lines_out: wp.array(dtype=float),
+    rays_out: wp.array(dtype=float),
+): ...
+
+
+@wp.func_native("""
+    const auto weights = lfpiv::separable_arrays(separable);
+    const int64_t lens_rays = (int64_t)weights.pixels * lfpiv::STRIP;
+    const int64_t row = (int64_t)ray_row * weights.strips * weights.lenses;
+    lfpiv::turn_back_rim(weights, row + lens, rays.data, turned_out.data + lens * lens_rays);
+""")
+def _turn_back(
+    separable: Separable,
+    rays: wp.array(dtype=float),
+    ray_row: int,
+    lens: int,
+    turned_out: wp.array(dtype=float),
+): ...
+
+
+@wp.func_native("""
+    const auto weights = lfpiv::separable_arrays(separable);
+    lfpiv::gather_plane(weights, turned.data, ray_row, plane,
+                        line_out.data + (int64_t)(slot < 0 ? 0 : slot) * lfpiv::line_size(weights), volume_out.data);
+""")
+def _gather_plane(
+    separable: Separable,
+    turned: wp.array(dtype=float),
+    ray_row: int,
+    plane: int,
+    slot: int,
+    line_out: wp.array(dtype=float),
+    volume_out: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def _project(
+    # in
+    separable: Separable,
+    volume: wp.array(dtype=float),
+    first_row: int,
+    step: int,
+    segment: int,
+    slot: int,
+    first_task: int,
+    # out
+    lines_out: wp.array(dtype=float),
+    rays_out: wp.array(dtype=float),
+):
+    task = first_task + wp.tid()
+    _project_segment(separable, volume, first_row, step, segment, task, slot, lines_out, rays_out)
+
+
+@wp.kernel
+def _turn(
+    # in
+    separable: Separable,
+    rays: wp.array(dtype=float),
+    ray_row: int,
+    first_lens: int,
+    # out
+    turned_out: wp.array(dtype=float),
+):
+    _turn_back(separable, rays, ray_row, first_lens + wp.tid(), turned_out)
+
+
+@wp.kernel
+def _gather(
+    # in
+    separable: Separable,
+    turned: wp.array(dtype=float),
+    ray_row: int,
+    slot: int,
+    first_plane: int,
+    # out
+    line_out: wp.array(dtype=float),
+    volume_out: wp.array(dtype=float),
+):
+    _gather_plane(separable, turned, ray_row, first_plane + wp.tid(), slot, line_out, volume_out)
+
+
+class SeparableProjector(RayProjector):
+    """The map of weights stored as profiles of planes. Its sets of rays are those of every n-th ray row.
+
+    Parameters
+    ----------
+    weights : SeparableWeights
+        The weights.
+    sets : int
+        Number of sets of rays.
+    """
+
+    planes = None
+    streamed = None
+    rests = False
+
+    def __init__(self, weights: SeparableWeights, sets: int):
+        super().__init__()
+        self.weights, self.ray_sets = weights, sets
+        self.form, self.nbytes = weights.form, weights.nbytes
+        rows, planes, columns = weights.shape
+        strides = weights.voxels[1] * weights.voxels[2], weights.voxels[2], 1
+        self._moved = weights.axes[2] != 2
+        """Whether columns must be brought together in memory first."""
+        arrays = Separable()
+        arrays.rows, arrays.planes, arrays.columns = rows, planes, columns
+        arrays.row_stride = planes * columns if self._moved else strides[weights.axes[0]]
+        arrays.plane_stride = columns if self._moved else strides[weights.axes[1]]
+        for name in ("strips", "lenses", "pixels", "ray_rows", "blocks"):
+            setattr(arrays, name, getattr(weights, name))
+        for name in (
+            *("down_first", "down", "down_start", "down_taps", "down_scale", "lens", "lens_count", "taps"),
+            *("first_start", "level_start", "first", "level", "turn", "middle", "rim"),
+        ):
+            setattr(arrays, name, to_device(getattr(weights, name).ravel()))
+        self._arrays = arrays
+        self.rays = zeros(weights.ray_rows * weights.rays_of_row)
+        self.returned = zeros(weights.ray_rows * weights.rays_of_row)
+        self._turned = empty(weights.rays_of_row)
+        self._line_size = (weights.blocks * COLUMN_BLOCK + MOST_TAPS) * STRIP
+        self._lines = zeros(runtime.CHUNKS * planes * self._line_size)
+        self.map = self._map_rays()
+
+    @property
+    def device_bytes(self) -> int:
+        """Memory of the weights on a GPU [byte]; 0 on the CPU, where they are those of the host."""
+        return self.weights.nbytes if runtime.device().form == "gpu" else 0
+
+    def _map_rays(self) -> RayMap:
+        """Return the map between pixels and the rays that voxels light."""
+        weights = self.weights
+        self.scatter(voxels.ones(int(np.prod(weights.voxels))))
+        sets = RaySets((np.arange(weights.ray_rows) % self.ray_sets).astype(np.uint8), weights.rays_of_row, self.ray_sets)
+        return RayMap(weights, to_host(self.rays), [0, self.rays.size], [0], sets=sets, darken=False)
+
+    def _ray_rows(self, ray_set: int) -> range:
+        """Return the ray rows of a set."""
+        return range(self.weights.ray_rows) if ray_set == ALL else range(ray_set, self.weights.ray_rows, self.ray_sets)
+
+    def scatter(self, volume: Values, ray_set: int = ALL) -> None:
+        """Send the light of `volume`, shape (voxel,), to the rays of a set. Other rays stay as they are."""
+        light, rows = to_device(volume, float), self._ray_rows(ray_set)
+        if self._moved:
+            light = _transposed(light, self.weights.voxels, self.weights.axes)
+        segments = -(-self.weights.lenses // SEGMENT)
+        inputs = [self._arrays, light, rows.start, rows.step, SEGMENT]
+        tasks = len(rows) * self.weights.strips * segments
+        launch(Call(_project, tasks, inputs, [self._lines, self.rays], scratch=True), parts=PARTS_OF_LAUNCH)
+
+    def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
+        """Add the weighted sum of the light on each voxel's rays of a set to `out`, shape (voxel,). Return `out`.
+
+        Voxels whose `active`, shape (voxel,), float32, is zero do not change.
+        """
+        volume, mask = to_device(out, float), None if active is None else to_device(active, float)
+        found = volume if mask is None and not self._moved else zeros(volume.size)
+        lenses = self.weights.strips * self.weights.lenses
+        for row in self._ray_rows(ray_set):
+            launch(Call(_turn, lenses, [self._arrays, self.returned, row], [self._turned]))
+            outputs = [self._lines, found]
+            launch(Call(_gather, self.weights.shape[1], [self._arrays, self._turned, row], outputs, scratch=True), parts=PARTS_OF_LAUNCH)
+        if self._moved:
+            axes, shape = self.weights.axes, self.weights.shape
+            first, second, third = (axes.index(axis) for axis in range(3))
+            found = _transposed(found, shape, (first, second, third))
+        if found is not volume:
+            voxels.add(found, volume, mask)
+        overwrite(out, volume)
+        return out
+
+    def darken(self, ray_set: int = ALL) -> None:
+        """Make the rays of a set dark that `gather` reads."""
+        returned, size = to_host(self.returned), self.weights.rays_of_row
+        for row in self._ray_rows(ray_set):
+            returned[row * size : (row + 1) * size] = 0.0
+
+
+def _transposed(volume: wp.array, shape: tuple[int, int, int], axes: tuple[int, int, int]) -> wp.array:
+    """Return a flat volume of a shape with its axes in another order in memory."""
+    return to_device(np.ascontiguousarray(to_host(volume).reshape(shape).transpose(axes)).ravel())

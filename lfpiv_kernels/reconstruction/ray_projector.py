@@ -1,0 +1,105 @@
+"""What all forms of a camera's weights share: voxels send light to rays, rays to pixels, and back."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import runtime
+from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap
+from lfpiv_kernels.transfer import Given, Values, empty, overwrite, to_device
+
+
+class RayProjector:
+    """The linear map of one camera's weights on the running device: voxels to sensor pixels, and back.
+
+    Light goes from voxels to rays (`scatter`) and from rays to pixels; back from pixels to rays and from rays to voxels
+    (`gather`). `project` and `back_project` may be called from several threads, which take turns. A caller of `scatter`
+    and `gather` that needs the light on the rays in between calls them inside `reserved`.
+
+    Arrays in and out are float32, C-contiguous and flat. Those of the device, and all on the CPU, are used in place.
+    """
+
+    map: RayMap
+    """The map from rays to pixels."""
+    rays: wp.array
+    """The light on the rays after `scatter`."""
+    returned: wp.array
+    """The light on the rays that `gather` reads; it may be the memory of `rays`."""
+    ray_sets: int
+    """Sets of rays that can be taken alone."""
+
+    rests: bool
+    """Whether dark voxels cost no time."""
+    form: str
+    """Form of the weights, "profiles" or "pixels"."""
+    nbytes: int
+    """Memory of the weights [byte]."""
+
+    def __init__(self) -> None:
+        self._turn, self._reserved = threading.RLock(), False
+
+    @contextlib.contextmanager
+    def reserved(self) -> Iterator[None]:
+        """Reserve the rays for this thread. Other threads wait.
+
+        Raises
+        ------
+        RuntimeError
+            If this thread has reserved them already: it would overwrite the light on them.
+        """
+        with self._turn:
+            if self._reserved:
+                raise RuntimeError(
+                    "weights: these are in use by a reconstruction of the same thread, whose `progress` cannot project "
+                    "with them. Do so before or after it, or build weights of its own."
+                )
+            self._reserved = True
+            try:
+                yield
+            finally:
+                self._reserved = False
+
+    def scatter(self, volume: Values, ray_set: int = ALL) -> None:
+        """Send the light of `volume`, shape (voxel,), to the rays of a set. Other rays may become dark or stay."""
+        raise NotImplementedError
+
+    def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
+        """Add the weighted sum of the light on each voxel's rays of a set to `out`, shape (voxel,). Return `out`.
+
+        Voxels whose `active`, shape (voxel,), float32, is zero do not change.
+        """
+        raise NotImplementedError
+
+    def darken(self, ray_set: int = ALL) -> None:
+        """Make rays of a set dark that the map to pixels does not write."""
+
+    def project(self, volume: Values, out: Given, ray_set: int = ALL) -> Given:
+        """Write the image of `volume`, shape (voxel,), by the rays of a set into `out`, shape (pixel,). Return `out`."""
+        with self.reserved():
+            if ray_set != ALL:
+                self.rays.zero_()
+            self.scatter(volume, ray_set)
+            on_device = isinstance(out, wp.array)
+            image = out if on_device else empty(out.size) if runtime.device().form == "gpu" else to_device(out, float)
+            image.zero_()  # pixels that no voxel lights
+            self.map.collect(self.rays, image)
+        overwrite(out, image)
+        return out
+
+    def back_project(self, image: Values, out: Given, ray_set: int = ALL) -> Given:
+        """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
+
+        Rays of other sets do not count. Return `out`.
+        """
+        with self.reserved():
+            self.darken()
+            self.map.spread(to_device(image, float), self.returned)
+            return self.gather(out, ray_set=ray_set)
+
+    def see_only(self, ray_set: int) -> np.ndarray:
+        """Return the sensor pixels that see light by rays of one set and of no other one, shape (pixel,), int32."""
+        rays = self.map.of(ray_set)
+        return self.map.pixel[rays.start : rays.end]

@@ -1,0 +1,115 @@
+"""Weights of one camera as profiles that planes of voxels share, on the host."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from lfpiv_kernels import native
+
+STRIP: int = native.constant("separable.h", "STRIP")
+"""Rows of lenses side by side."""
+PARTS: int = native.constant("separable.h", "PARTS")
+"""Parts of a strip with profiles across of their own; their rows of lenses take turns."""
+COLUMN_BLOCK: int = native.constant("separable.h", "COLUMN_BLOCK")
+"""Columns of a plane whose profiles down begin at the same row of voxels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeparableWeights:
+    """Weights of all voxels of a grid for one camera, as products of two profiles each.
+
+    The volume is cut into planes of rows and columns. Lenses are taken in strips of `STRIP` rows. A ray row is one row
+    of pixels under all lenses. A ray lies at ``[ray row, strip, lens, pixel column, lens row of the strip]``.
+
+    The weight of voxel (row b, plane p, column a) on the ray in pixel column c under lens (i, j), in ray row r, is the
+    profile down ``D[p, r, j, a][b]`` times the profile across ``A[p, strip, i, c][a]``: rank 1 for each plane, ray row
+    and lens row. Across depends on the strip only: what differs from lens row to lens row within it moves the light
+    along the columns, by `turn`. A ray whose pixel is cut by the pupil's edge sees its middle inside: it takes `rim`
+    times the difference of its neighbours.
+    """
+
+    voxels: tuple[int, int, int]
+    """Voxels along the axes in memory."""
+    axes: tuple[int, int, int]
+    """Axes in memory that count rows, planes and columns."""
+    first_lens: tuple[int, int]
+    """Lattice indices (i, j) of the first lens."""
+    sensor_shape: tuple[int, int]
+    """Rows and columns of the sensor [pixel]."""
+    ray_rows: int
+    """Rows of pixels under a lens."""
+    first_column: np.ndarray
+    """First pixel column of each lens, shape (strip, lens), int32."""
+    first_row: np.ndarray
+    """First pixel row of each row of lenses, in their order, shape (STRIP * strip,), int32."""
+    pixels: int
+    """Columns of pixels under a lens."""
+    middle: np.ndarray
+    """Pixel row of the microimages' centres, counted from `first_row`, lane by lane, shape (STRIP * strip,), float32."""
+    down_first: np.ndarray
+    """First row of voxels of each profile down, shape (plane, ray row, strip, block, STRIP), int16; -1 for none."""
+    down: np.ndarray
+    """Levels of the profiles down, in this order, for each `down_taps` x COLUMN_BLOCK, flat, uint8."""
+    down_start: np.ndarray
+    """Where those of a plane begin, shape (plane,), int64."""
+    down_taps: np.ndarray
+    """Rows of voxels in a profile down, shape (plane,), int32."""
+    down_scale: np.ndarray
+    """Weight of one level down times one level across, shape (plane,), float32."""
+    lens: np.ndarray
+    """First lens of each plane and strip, shape (plane, strip), int32."""
+    lens_count: np.ndarray
+    """Number of lenses, shape (plane, strip), int32."""
+    taps: np.ndarray
+    """Columns in a profile across, shape (plane, strip), int32."""
+    first_start: np.ndarray
+    """Where the first columns begin, shape (plane, strip), int64."""
+    level_start: np.ndarray
+    """Where the levels of profiles across begin, shape (plane, strip), int64."""
+    first: np.ndarray
+    """First column of a plane that each pixel column of a lens sees, flat, int16."""
+    level: np.ndarray
+    """Levels of the profiles across, `taps` x PARTS for each pixel column, flat, uint8. Some more than there are are read."""
+    turn: np.ndarray
+    """Columns by which the light of a plane moves from one row of lenses, and one row of pixels, to the next, shape
+    (plane, strip, 2), float32."""
+    rim: np.ndarray
+    """How much a ray takes of the difference of its neighbours, in levels, shape (ray,), int8."""
+    pixel: np.ndarray
+    """Sensor pixel of each ray, shape (ray,), int32: -1 outside the sensor."""
+    share: np.ndarray
+    """Fraction of the pixel's cell inside the pupil, shape (ray,), float32."""
+
+    form = "profiles"
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Rows, planes and columns of voxels."""
+        rows, planes, columns = (self.voxels[axis] for axis in self.axes)
+        return rows, planes, columns
+
+    @property
+    def strips(self) -> int:
+        """Number of strips of lenses."""
+        return int(self.first_column.shape[0])
+
+    @property
+    def lenses(self) -> int:
+        """Number of lenses in a row."""
+        return int(self.first_column.shape[1])
+
+    @property
+    def blocks(self) -> int:
+        """Blocks of columns of a plane."""
+        return -(-self.shape[2] // COLUMN_BLOCK)
+
+    @property
+    def rays_of_row(self) -> int:
+        """Number of rays of a ray row."""
+        return self.strips * self.lenses * self.pixels * STRIP
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays but those of the rays themselves [byte]."""
+        arrays = (getattr(self, one.name) for one in fields(self) if one.name not in ("pixel", "share"))
+        return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))

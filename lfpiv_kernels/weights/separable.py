@@ -1,0 +1,350 @@
+"""Warp: the weights of a camera as profiles that planes of voxels share, from the ray models of the voxels.
+
+The weight of a voxel on a ray is integrated as in ``footprint``, along the two axes of the lenses apart. Where a
+camera's rays are straight, its lenses square and its array upright, the profile along the rows of the sensor is the same
+for all lenses of a row, and that along the columns the same for all voxels that one row of rays sees in a column. So a
+plane has few different profiles [1]_. The loops are C++, see ``separable_weights.h``. Twin: ``reference.separable``.
+
+.. [1] Y. Long, J. A. Fessler, J. M. Balter, "3D forward and back-projection for X-ray CT using separable footprints",
+   IEEE Trans. Med. Imaging 29 (2010) 1839-1850, doi:10.1109/TMI.2010.2050898.
+"""
+
+import numpy as np
+import warp as wp
+
+from lfpiv_kernels import native
+from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, PARTS, STRIP
+from lfpiv_kernels.transfer import to_device
+from lfpiv_kernels.weights.footprint_arrays import Inputs
+from lfpiv_kernels.weights.ray_model import LEVELS
+
+wp.set_module_options(native.options("separable_weights.h", contract="fast"))
+
+MOST_TAPS: int = native.constant("separable.h", "MOST_TAPS")
+"""Most columns of a plane that a pixel sees."""
+COMPILED_TAPS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16)
+"""Numbers of columns for which there are loops, see ``with_taps``."""
+LARGEST = 1.1
+"""Largest value of a profile across: rays gather where light converges on the array."""
+
+
+@wp.struct
+class RayLayout:
+    """Where rays lie on the sensor, see ``RayLayout`` in ``separable_weights.h``."""
+
+    first_column: wp.array(dtype=int)
+    first_row: wp.array(dtype=int)
+    strips: int
+    lenses: int
+    pixels: int
+    ray_rows: int
+
+
+@wp.func_native("""
+    top_out.data[block] = lfpiv::top_of_block(
+        {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
+         rays.pixels, rays.ray_rows},
+        {rows, columns, blocks}, block);
+""")
+def _top_of_block(
+    inputs: Inputs, rays: RayLayout, rows: int, columns: int, blocks: int, block: int, top_out: wp.array(dtype=float)
+): ...
+
+
+@wp.func_native("""
+    lfpiv::measure_down(
+        {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
+         rays.pixels, rays.ray_rows},
+        {rows, columns, blocks}, block, per_level, (short*)first_out.data, (short*)last_out.data);
+""")
+def _measure_block(
+    inputs: Inputs,
+    rays: RayLayout,
+    rows: int,
+    columns: int,
+    blocks: int,
+    block: int,
+    per_level: float,
+    first_out: wp.array(dtype=wp.int16),
+    last_out: wp.array(dtype=wp.int16),
+): ...
+
+
+@wp.func_native("""
+    lfpiv::fill_down(
+        {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
+         rays.pixels, rays.ray_rows},
+        {rows, columns, blocks}, block, per_level, taps, (const short*)first.data, level_out.data);
+""")
+def _fill_block(
+    inputs: Inputs,
+    rays: RayLayout,
+    rows: int,
+    columns: int,
+    blocks: int,
+    block: int,
+    per_level: float,
+    taps: int,
+    first: wp.array(dtype=wp.int16),
+    level_out: wp.array(dtype=wp.uint8),
+): ...
+
+
+@wp.func_native("""
+    const int64_t lenses = (int64_t)strip * rays.lenses * rays.pixels;
+    if (!lfpiv::find_across(
+            {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
+             rays.pixels, rays.ray_rows},
+            strip, columns, least, lens_out.data + 3 * strip, (short*)first_out.data + lenses,
+            value_out.data + lenses * lfpiv::MOST_TAPS * lfpiv::PARTS))
+        lens_out.data[3 * strip + 2] = lfpiv::MOST_TAPS + 1;
+""")
+def _across_strip(
+    inputs: Inputs,
+    rays: RayLayout,
+    columns: int,
+    strip: int,
+    least: float,
+    lens_out: wp.array(dtype=int),
+    first_out: wp.array(dtype=wp.int16),
+    value_out: wp.array(dtype=float),
+): ...
+
+
+@wp.func_native("""
+    const int strip = at / rays.lenses % rays.strips, lens = at % rays.lenses, row = at / (rays.lenses * rays.strips);
+    const int64_t ray = (int64_t)at * rays.pixels * lfpiv::STRIP;
+    lfpiv::write_ray_row(
+        {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
+         rays.pixels, rays.ray_rows},
+        row, strip, lens, pixel_out.data + ray, share_out.data + ray, (signed char*)rim_out.data + ray);
+""")
+def _write_rays_of(
+    inputs: Inputs,
+    rays: RayLayout,
+    at: int,
+    pixel_out: wp.array(dtype=int),
+    share_out: wp.array(dtype=float),
+    rim_out: wp.array(dtype=wp.int8),
+): ...
+
+
+@wp.kernel
+def _top(
+    # in
+    inputs: Inputs,
+    rays: RayLayout,
+    rows: int,
+    columns: int,
+    blocks: int,
+    first_block: int,
+    # out
+    top_out: wp.array(dtype=float),
+):
+    _top_of_block(inputs, rays, rows, columns, blocks, first_block + wp.tid(), top_out)
+
+
+@wp.kernel
+def _measure(
+    # in
+    inputs: Inputs,
+    rays: RayLayout,
+    rows: int,
+    columns: int,
+    blocks: int,
+    per_level: float,
+    first_block: int,
+    # out
+    first_out: wp.array(dtype=wp.int16),
+    last_out: wp.array(dtype=wp.int16),
+):
+    _measure_block(inputs, rays, rows, columns, blocks, first_block + wp.tid(), per_level, first_out, last_out)
+
+
+@wp.kernel
+def _fill(
+    # in
+    inputs: Inputs,
+    rays: RayLayout,
+    rows: int,
+    columns: int,
+    blocks: int,
+    per_level: float,
+    taps: int,
+    first: wp.array(dtype=wp.int16),
+    first_block: int,
+    # out
+    level_out: wp.array(dtype=wp.uint8),
+):
+    _fill_block(inputs, rays, rows, columns, blocks, first_block + wp.tid(), per_level, taps, first, level_out)
+
+
+@wp.kernel
+def _across(
+    # in
+    inputs: Inputs,
+    rays: RayLayout,
+    columns: int,
+    least: float,
+    first_strip: int,
+    # out
+    lens_out: wp.array(dtype=int),
+    first_out: wp.array(dtype=wp.int16),
+    value_out: wp.array(dtype=float),
+):
+    _across_strip(inputs, rays, columns, first_strip + wp.tid(), least, lens_out, first_out, value_out)
+
+
+@wp.kernel
+def _write_rays(
+    # in
+    inputs: Inputs,
+    rays: RayLayout,
+    first: int,
+    # out
+    pixel_out: wp.array(dtype=int),
+    share_out: wp.array(dtype=float),
+    rim_out: wp.array(dtype=wp.int8),
+):
+    _write_rays_of(inputs, rays, first + wp.tid(), pixel_out, share_out, rim_out)
+
+
+class Profiles:
+    """Computes the profiles of one camera, plane by plane, on the CPU.
+
+    Parameters
+    ----------
+    camera, lattice
+        From ``ray_model.pack_optics`` and ``lattice.pack_lattice``; a square one.
+    cell_mm : float
+        Half extent of a lens's cell along s and t [mm].
+    frame : ndarray, shape (2, 2)
+        From ``lattice.cell_frame``.
+    first_lens : tuple of int
+        Lattice indices (i, j) of the first lens.
+    lens_rows : int
+        Rows of lenses.
+    first_column, first_row : ndarray
+        As in ``SeparableWeights``.
+    pixels, ray_rows : int
+        Columns and rows of pixels under a lens.
+    """
+
+    across_per_level = LEVELS / LARGEST
+    """Levels of a profile across of 1."""
+
+    def __init__(self, camera, lattice, cell_mm, *, frame, first_lens, lens_rows, first_column, first_row, pixels, ray_rows):
+        geometry = np.concatenate([camera.to_numpy(), lattice.to_numpy(), [cell_mm], np.ravel(frame)], dtype=np.float32)
+        self._inputs = Inputs()
+        self._inputs.geometry = _on_cpu(geometry)
+        self._inputs.lenses = wp.vec4i(*first_lens, first_column.shape[1], lens_rows)
+        self._inputs.corners = _on_cpu(np.zeros(2 * first_column.shape[1] * lens_rows, np.int32))
+        self._inputs.cuts, self._inputs.profiles = wp.vec3i(1, 1, 1), True
+        self._layout = RayLayout()
+        self._layout.first_column, self._layout.first_row = _on_cpu(first_column.ravel()), _on_cpu(first_row)
+        self._layout.strips, self._layout.lenses = first_column.shape
+        self._layout.pixels, self._layout.ray_rows = pixels, ray_rows
+
+    def rays(self):
+        """Return sensor pixel, share and rim of all rays, see ``SeparableWeights``."""
+        layout = self._layout
+        runs = layout.ray_rows * layout.strips * layout.lenses
+        size = runs * layout.pixels * STRIP
+        pixel, share, rim = np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.int8)
+        _launch(_write_rays, runs, [self._inputs, layout], [_on_cpu(one) for one in (pixel, share, rim)])
+        return pixel, share, rim
+
+    def down(self, models, rows, columns):
+        """Compute the profiles down of a plane.
+
+        Parameters
+        ----------
+        models : ndarray, shape (rows * columns, MODEL_SIZE), float32
+            Ray models of its voxels, row by row.
+        rows, columns : int
+            Its voxels.
+
+        Returns
+        -------
+        first : ndarray, shape (ray row, strip, block, STRIP), int16
+            First row of voxels; -1 for none.
+        levels : ndarray, flat, uint8
+            Levels of `taps` x COLUMN_BLOCK voxels for each.
+        taps : int
+            Rows of voxels in a profile.
+        scale : float
+            Weight of one level.
+        """
+        layout, blocks = self._layout, -(-columns // COLUMN_BLOCK)
+        self._inputs.model = _on_cpu(np.ascontiguousarray(models, np.float32).ravel())
+        inputs = [self._inputs, layout, rows, columns, blocks]
+        top = np.zeros(blocks, np.float32)
+        _launch(_top, blocks, inputs, [_on_cpu(top)])
+        shape = layout.ray_rows, layout.strips, blocks, STRIP
+        first, last = np.full(shape, -1, np.int16), np.full(shape, -1, np.int16)
+        if not top.max(initial=0.0) > 0:
+            return first, np.zeros(0, np.uint8), 0, 0.0
+        per_level = float(LEVELS / top.max())
+        _launch(_measure, blocks, [*inputs, per_level], [_on_cpu(first.ravel()), _on_cpu(last.ravel())])
+        taps = int((last - first).max()) + 1 if (first >= 0).any() else 0
+        levels = np.zeros(first.size * taps * COLUMN_BLOCK, np.uint8)
+        if taps:
+            _launch(_fill, blocks, [*inputs, per_level, taps, _on_cpu(first.ravel())], [_on_cpu(levels)])
+        return first, levels, taps, 1 / per_level
+
+    def across(self, models, columns):
+        """Compute the profiles across of a plane for all strips.
+
+        Parameters
+        ----------
+        models : ndarray, shape (strip * PARTS * columns, MODEL_SIZE), float32
+            Ray models of the columns where the middle row of lenses of each part of a strip sees them.
+        columns : int
+            Columns of the plane.
+
+        Returns
+        -------
+        list of tuple
+            First lens, number of lenses, taps, first columns (lens, pixel), int16, and levels (lens, pixel, tap,
+            part), uint8, of each strip. Taps are 0 without any lens.
+
+        Raises
+        ------
+        ValueError
+            If a pixel sees more than `MOST_TAPS` columns.
+        """
+        layout = self._layout
+        self._inputs.model = _on_cpu(np.ascontiguousarray(models, np.float32).ravel())
+        lens = np.zeros((layout.strips, 3), np.int32)
+        first = np.full((layout.strips, layout.lenses, layout.pixels), -1, np.int16)
+        value = np.zeros((*first.shape, MOST_TAPS, PARTS), np.float32)
+        outputs = [_on_cpu(array.ravel()) for array in (lens, first, value)]
+        _launch(_across, layout.strips, [self._inputs, layout, columns, 0.5 / self.across_per_level], outputs)
+        found = []
+        for number, (low, count, taps) in enumerate(lens.tolist()):
+            if taps > MOST_TAPS:
+                raise ValueError(f"voxels: a pixel sees more than {MOST_TAPS} voxels side by side.")
+            taps = min((one for one in COMPILED_TAPS if one >= taps), default=taps) if count else 0
+            some = slice(low, low + count)
+            level = np.minimum(np.rint(value[number, some, :, :taps] * self.across_per_level), LEVELS).astype(np.uint8)
+            found.append((low if count else 0, count, taps, _within(first[number, some]), level))
+        return found
+
+
+def _within(first):
+    """Return first columns, with those of the nearest pixel where there are none."""
+    filled = first.copy()
+    for pixels in filled:  # a pixel without light sees the columns of its neighbour
+        known = np.flatnonzero(pixels >= 0)
+        if len(known):
+            pixels[:] = pixels[known[np.abs(np.arange(len(pixels))[:, None] - known).argmin(1)]]
+    return np.maximum(filled, 0)
+
+
+def _on_cpu(array):
+    return to_device(array, device="cpu")
+
+
+def _launch(kernel, size, inputs, outputs):
+    launch(Call(kernel, size, inputs, outputs), device="cpu")
